@@ -1,0 +1,45 @@
+# Everything starts here, from a clean clone: 'make demo' and 'make test' set up what they need.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DRIVES ?= builtin
+OUT ?= build/demo
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint types schema constraints clean
+
+help:                    ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
+
+setup: $(VENV)/.installed ## the virtual environment, pinned by constraints.txt
+
+$(VENV)/.installed: constraints.txt pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed; make PYTHON=python3.12 ..." if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r constraints.txt
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: setup              ## a fleet, its calibration, and the Kirchhoff sum before and after (DRIVES=folder: real drives)
+	$(BIN)/python tools/demo.py --drives $(DRIVES) --out $(OUT)
+
+test: setup              ## all tests; those of SocketCAN on a kernel that has it
+	$(BIN)/python -m pytest
+	tools/with_vcan --or-skip $(BIN)/python -m pytest tests/vcan
+
+lint: setup              ## ruff, formatting included
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: setup             ## mypy --strict
+	$(BIN)/mypy
+
+schema: setup            ## write the JSON Schema of the parameter file anew
+	$(BIN)/ecu-node schema > ecu_node/parameters.schema.json
+
+constraints:             ## pin the newest versions of all dependencies, with hashes (needs uv)
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --no-annotate \
+		--all-extras --upgrade pyproject.toml --output-file constraints.txt
+
+clean:                   ## what the other targets made
+	rm -rf $(VENV) build dist

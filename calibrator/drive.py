@@ -1,0 +1,63 @@
+"""Drive: one recording of one vehicle, every signal at its own instants.
+
+A drive keeps the times of its frames; :mod:`calibrator.align` puts them on one time base. Bad samples stay in place
+and are labelled, so that what was left out can always be counted.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Array", "Channel", "Drive", "Mask"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Channel:
+    """One signal as it was recorded.
+
+    Attributes
+    ----------
+    time_s : ndarray of shape (n,)
+        Instants of the samples since the start of the drive, increasing. [s]
+    value : ndarray of shape (n,)
+        Values; branch currents positive into the junction [A], inputs in the unit of the DBC.
+    good : ndarray of bool of shape (n,)
+        False where the sample is not available, not finite or outside the range that the DBC allows.
+    """
+
+    time_s: Array
+    value: Array
+    good: Mask
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """One recording of one vehicle.
+
+    Attributes
+    ----------
+    vehicle, name : str
+        Whose, and which; a vehicle has no two drives of one name.
+    branches : mapping of str to Channel
+        Measured branch currents, positive into the junction, by branch name. [A]
+    inputs : mapping of str to Channel
+        Inputs by name, in the unit of the DBC. Derived inputs are not stored.
+    """
+
+    vehicle: str
+    name: str
+    branches: Mapping[str, Channel]
+    inputs: Mapping[str, Channel]
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last sample of any channel. [s]"""
+        channels = [c for c in (*self.branches.values(), *self.inputs.values()) if c.time_s.size]
+        if not channels:
+            return 0.0
+        return float(max(c.time_s[-1] for c in channels) - min(c.time_s[0] for c in channels))

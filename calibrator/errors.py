@@ -1,0 +1,17 @@
+"""Errors of the off-board side; see :mod:`ecu_node.errors` for what they have in common."""
+
+from ecu_node.errors import UserError
+
+__all__ = ["DriveError", "FleetError", "LogError"]
+
+
+class LogError(UserError):
+    """A log file cannot be used (unreadable, truncated, empty, none of the signals in it)."""
+
+
+class DriveError(UserError):
+    """A drive cannot be used (too short, a branch missing, no valid samples)."""
+
+
+class FleetError(UserError):
+    """A fleet cannot be calibrated (too small, contradictory, wrong folder)."""

@@ -1,0 +1,115 @@
+"""Random fault parameters of an artificial fleet, section IV-B of [1]_.
+
+.. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
+"""
+
+import numpy as np
+
+from calibrator.drive import Array
+from calibrator.errors import FleetError
+from calibrator.faults import Faults
+
+__all__ = ["draw_faults", "nonzero_count"]
+
+
+def nonzero_count(branches: int, sparsity: float) -> int:
+    """How many of the fault parameters of one vehicle are not zero.
+
+    The paper counts 3K + 1 parameters (K = 3, S = 60: 4 of 10 are nonzero) and then draws them among the 3K that its
+    footnote 1 keeps. With K = 2, S = 60 these are 3 of 6, which gives the 40 % of vehicles with hardware faults that
+    its table 1 reports for the perfect classifier.
+
+    Parameters
+    ----------
+    branches : int
+        Number of branches K.
+    sparsity : float
+        Sparsity level S: share of zero parameters. [%]
+
+    Returns
+    -------
+    int
+        Number of nonzero parameters, 0 to 3K.
+    """
+    return min(round((1.0 - sparsity / 100.0) * (3 * branches + 1)), 3 * branches)
+
+
+def draw_faults(
+    rng: np.random.Generator,
+    *,
+    vehicles: int,
+    branches: int,
+    sparsity: float,
+    magnitude: tuple[float, float],
+    full_scale_a: float,
+    balanced: bool = False,
+    symmetric: bool = False,
+) -> Faults:
+    """Draw the fault parameters of a fleet, (20) and (22) in [1]_.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of chance.
+    vehicles : int
+        Fleet size N; a multiple of 4 for a symmetric fleet.
+    branches : int
+        Number of branches K.
+    sparsity : float
+        Sparsity level S. [%]
+    magnitude : tuple of float
+        a, b: magnitudes are U(a, b) with random sign; drifts [1], offsets in fractions of full scale.
+    full_scale_a : float
+        Full scale of the junction. [A]
+    balanced : bool
+        No hardware faults in half of the vehicles.
+    symmetric : bool
+        Vehicles come in groups of four whose measured currents have the ideal current as their mean (22).
+
+    Returns
+    -------
+    Faults
+        Of N vehicles, in random order.
+
+    Raises
+    ------
+    FleetError
+        If a symmetric fleet is wanted whose size is no multiple of 4.
+    """
+    if symmetric and vehicles % 4:
+        raise FleetError(f"a symmetric fleet needs a multiple of 4 vehicles, not {vehicles}")
+    n = vehicles // 4 if symmetric else vehicles
+    values = _sparse_values(rng, n, 3 * branches, nonzero_count(branches, sparsity), magnitude)
+    if balanced:
+        values[rng.permutation(n) < n // 2, :branches] = 0.0
+    hardware_drift, hardware_offset, drift, offset = np.split(values, [1, branches, 2 * branches], axis=1)
+    hardware_offset = np.concatenate([hardware_offset, -hardware_offset.sum(axis=1, keepdims=True)], axis=1)
+    faults = Faults(
+        hardware_drift=hardware_drift[:, 0],
+        hardware_offset_a=hardware_offset * full_scale_a,
+        drift=drift,
+        offset_a=offset * full_scale_a,
+    )
+    if symmetric:
+        faults = _symmetric_group(faults)
+    return faults.take(rng.permutation(vehicles))
+
+
+def _sparse_values(
+    rng: np.random.Generator, vehicles: int, parameters: int, nonzero: int, magnitude: tuple[float, float]
+) -> Array:
+    """Rows with a random support of the given size and values (2B - 1) U(a, b), (20) in [1]_."""
+    rank = np.argsort(np.argsort(rng.random((vehicles, parameters)), axis=1), axis=1)
+    sign = rng.choice([-1.0, 1.0], size=(vehicles, parameters))
+    return np.where(rank < nonzero, sign * rng.uniform(*magnitude, size=(vehicles, parameters)), 0.0)
+
+
+def _symmetric_group(faults: Faults) -> Faults:
+    """Each vehicle with the three others whose mean of (21) is the ideal current, section IV-B of [1]_."""
+    signs = ((1, 1, 1, 1), (-1, -1, -1, -1), (1, 1, -1, 1), (-1, -1, 1, -1))
+    return Faults(
+        hardware_drift=np.concatenate([s[0] * faults.hardware_drift for s in signs]),
+        hardware_offset_a=np.concatenate([s[1] * faults.hardware_offset_a for s in signs]),
+        drift=np.concatenate([s[2] * faults.drift for s in signs]),
+        offset_a=np.concatenate([s[3] * faults.offset_a for s in signs]),
+    )

@@ -1,0 +1,140 @@
+"""The DBC as the layout uses it: every named signal found, with its unit turned into A, V or W."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cantools
+from cantools.database.can import Database, Message, Signal
+
+from ecu_node.errors import DatabaseError
+from ecu_node.layout import Layout, file_digest, split_signal
+
+__all__ = ["AMPERE", "VOLT", "WATT", "VehicleDatabase", "read_database", "unit_factor"]
+
+AMPERE: Mapping[str, float] = {"A": 1.0, "mA": 1e-3, "kA": 1e3}
+VOLT: Mapping[str, float] = {"V": 1.0, "mV": 1e-3, "kV": 1e3}
+WATT: Mapping[str, float] = {"W": 1.0, "kW": 1e3, "mW": 1e-3, "MW": 1e6}
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleDatabase:
+    """The messages of one DBC, with look-ups whose errors name file, message and signal."""
+
+    layout: Layout
+    database: Database
+    digest: str
+    """SHA-256 of the DBC file."""
+
+    def message(self, name: str) -> Message:
+        """Return the message of this name, or raise :class:`DatabaseError`."""
+        try:
+            return self.database.get_message_by_name(name)
+        except KeyError:
+            raise DatabaseError(
+                f"{self.layout.dbc_path}: no message {name!r}, which {self.layout.path} names"
+            ) from None
+
+    def signal(self, name: str) -> tuple[Message, Signal]:
+        """Return message and signal of ``Message.Signal``, or raise :class:`DatabaseError`."""
+        message_name, signal_name = split_signal(name)
+        message = self.message(message_name)
+        for signal in message.signals:
+            if signal.name == signal_name:
+                return message, signal
+        known = ", ".join(signal.name for signal in message.signals)
+        raise DatabaseError(
+            f"{self.layout.dbc_path}: message {message_name} has no signal {signal_name!r}, which {self.layout.path} "
+            f"names; it has {known}"
+        )
+
+
+def read_database(layout: Layout) -> VehicleDatabase:
+    """Load the DBC of a layout and look every signal up that the layout names.
+
+    Parameters
+    ----------
+    layout : Layout
+        A layout read from a file.
+
+    Returns
+    -------
+    VehicleDatabase
+        The database, with all names of the layout known to exist.
+
+    Raises
+    ------
+    DatabaseError
+        If the file cannot be read or parsed, or lacks a message or signal; the message names both files.
+    """
+    path = layout.dbc_path
+    try:
+        database = cantools.database.load_file(path, strict=False)
+        digest = file_digest(path)
+    except OSError as error:
+        raise DatabaseError(f"{path}: cannot read the DBC that {layout.path} names: {error.strerror}") from None
+    except (cantools.Error, ValueError, KeyError, TypeError) as error:
+        first_line = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise DatabaseError(f"{path}: not a CAN database: {first_line}") from None
+    if not isinstance(database, Database):
+        raise DatabaseError(f"{path}: a diagnostics database; a CAN database (DBC) is needed")
+    vehicle = VehicleDatabase(layout=layout, database=database, digest=digest)
+    _look_everything_up(vehicle)
+    return vehicle
+
+
+def unit_factor(signal: Signal, known: Mapping[str, float], where: str) -> float:
+    """Factor that turns the values of a signal into the base unit, such as 1000 for kW into W.
+
+    Parameters
+    ----------
+    signal : Signal
+        A signal of the DBC. A signal without unit counts as being in the base unit.
+    known : mapping of str to float
+        One of :data:`AMPERE`, :data:`VOLT`, :data:`WATT`.
+    where : str
+        What the signal is for, for the message of the error.
+
+    Returns
+    -------
+    float
+        The factor. [base unit / unit of the signal]
+
+    Raises
+    ------
+    DatabaseError
+        If the unit is of another quantity.
+    """
+    if not signal.unit:
+        return 1.0
+    try:
+        return known[signal.unit]
+    except KeyError:
+        raise DatabaseError(
+            f"{where}: signal {signal.name} is in {signal.unit!r}; expected {', '.join(known)}"
+        ) from None
+
+
+def _look_everything_up(vehicle: VehicleDatabase) -> None:
+    layout = vehicle.layout
+    for branch in layout.branch:
+        where = f"{layout.path}: branch {branch.name}"
+        for name, unit in (
+            (branch.signal, AMPERE),
+            (branch.power, WATT),
+            (branch.voltage, VOLT),
+            (branch.corrected, AMPERE),
+        ):
+            if name is not None:
+                unit_factor(vehicle.signal(name)[1], unit, where)
+        if branch.quality is not None:
+            vehicle.signal(branch.quality)
+    for item in layout.input:
+        vehicle.signal(item.signal)
+    if layout.status is not None:
+        for field in ("state", "reason", "parameter_set", "sum_measured", "sum_corrected"):
+            signal = getattr(layout.status, field)
+            if signal is not None:
+                vehicle.signal(f"{layout.status.message}.{signal}")
+    if layout.e2e is not None:
+        for name in layout.e2e.messages:
+            vehicle.message(name)

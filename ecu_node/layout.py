@@ -1,0 +1,232 @@
+"""Layout: a TOML file that says what the signals of one DBC mean.
+
+It names the branches of the junction with their sign, the inputs, where corrected values go, timeouts and limits.
+All later steps use the names given here; the DBC's own names appear nowhere else.
+"""
+
+import hashlib
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal, NoReturn
+
+import msgspec
+
+from ecu_node.errors import LayoutError
+from ecu_node.formula import formula_names, parse_formula
+
+__all__ = [
+    "Branch",
+    "Derived",
+    "EndToEnd",
+    "Input",
+    "Layout",
+    "Limits",
+    "Name",
+    "SignalName",
+    "StatusMessage",
+    "file_digest",
+    "read_layout",
+    "split_signal",
+]
+
+Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+"""A name without blanks."""
+SignalName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]*\.[A-Za-z_][A-Za-z0-9_]*$")]
+"""``Message.Signal``, as both are called in the DBC."""
+
+_Positive = Annotated[float, msgspec.Meta(gt=0.0, le=1e6)]
+
+
+class Branch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One HV current at the junction: a current signal, or a power signal divided by a voltage signal."""
+
+    name: Name
+    sign: Literal[1, -1]
+    """+1 if the signal is positive into the junction, -1 if positive out of it."""
+    signal: SignalName | None = None
+    power: SignalName | None = None
+    voltage: SignalName | None = None
+    timeout_s: _Positive = 0.5
+    """Without a frame for this long the branch is stale. [s]"""
+    balance: bool = False
+    """In ground truth made from recordings, this branch is minus the sum of the others, (19) of the paper."""
+    corrected: SignalName | None = None
+    quality: SignalName | None = None
+
+    @property
+    def source(self) -> SignalName:
+        """The signal whose frames carry this branch."""
+        source = self.signal or self.power
+        assert source is not None
+        return source
+
+
+class Input(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One signal that the vehicle model may be driven by."""
+
+    name: Name
+    signal: SignalName
+
+
+class Derived(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One input computed from others at each instant of the aligned time base."""
+
+    name: Name
+    formula: str
+
+
+class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Largest parameters that the node accepts."""
+
+    drift: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.4
+    """Largest magnitude of a drift. [1]"""
+    offset_a: _Positive | None = None
+    """Largest magnitude of an offset [A]; 40 % of full scale where not given."""
+
+
+class StatusMessage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The message in which the node reports itself, and its signals."""
+
+    message: Name
+    period_s: _Positive = 0.1
+    state: Name
+    reason: Name
+    parameter_set: Name | None = None
+    sum_measured: Name | None = None
+    sum_corrected: Name | None = None
+
+
+class EndToEnd(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Messages protected by AUTOSAR E2E profile 1 (data identifier in both bytes)."""
+
+    profile: Literal["P01"]
+    messages: list[Name]
+    data_id: dict[str, Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)]] = {}
+    """Data identifier per message; the message's own identifier where not given."""
+
+
+class Layout(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole layout file, checked."""
+
+    schema: Literal[1]
+    name: Name
+    dbc: str
+    """Path of the DBC, relative to the layout file."""
+    full_scale_a: _Positive
+    branch: Annotated[list[Branch], msgspec.Meta(min_length=2, max_length=16)]
+    period_s: Annotated[float, msgspec.Meta(gt=0.0, le=10.0)] = 0.1
+    max_age_s: _Positive = 1.0
+    """An input without a frame for this long is stale. [s]"""
+    input: list[Input] = []
+    derived: list[Derived] = []
+    model_inputs: list[str] = []
+    limits: Limits = Limits()
+    status: StatusMessage | None = None
+    e2e: EndToEnd | None = None
+    path: Path = Path()
+    """Where the layout was read from; set by :func:`read_layout`."""
+    digest: str = ""
+    """SHA-256 of the file; set by :func:`read_layout`."""
+
+    @property
+    def branch_names(self) -> tuple[str, ...]:
+        """Names of the branches in the order of the file."""
+        return tuple(branch.name for branch in self.branch)
+
+    @property
+    def dbc_path(self) -> Path:
+        """Path of the DBC file."""
+        return self.path.parent / self.dbc
+
+    @property
+    def offset_limit_a(self) -> float:
+        """Largest magnitude of an offset that the node accepts. [A]"""
+        return self.limits.offset_a if self.limits.offset_a is not None else 0.4 * self.full_scale_a
+
+    def find_branch(self, name: str) -> Branch:
+        """Return the branch of this name; LayoutError lists the known ones if there is none."""
+        for branch in self.branch:
+            if branch.name == name:
+                return branch
+        raise LayoutError(f"{self.path}: no branch {name!r}; known are {', '.join(self.branch_names)}")
+
+
+def read_layout(path: Path) -> Layout:
+    """Read and check a layout file.
+
+    Parameters
+    ----------
+    path : Path
+        The TOML file. The DBC it names is not opened here.
+
+    Returns
+    -------
+    Layout
+        The checked layout, with its path and digest.
+
+    Raises
+    ------
+    LayoutError
+        If the file cannot be read, is not TOML, or a field is missing, unknown or contradictory.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        layout = msgspec.convert(tomllib.loads(text), Layout)
+    except OSError as error:
+        raise LayoutError(f"{path}: cannot read the layout: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise LayoutError(f"{path}: not a layout: the file is not UTF-8 text") from None
+    except tomllib.TOMLDecodeError as error:
+        raise LayoutError(f"{path}: not TOML: {error}") from None
+    except msgspec.ValidationError as error:
+        raise LayoutError(f"{path}: {error}") from None
+    _check(layout, path)
+    return msgspec.structs.replace(layout, path=path, digest=file_digest(path))
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a text file, the same for LF and CRLF line ends."""
+    return hashlib.sha256(path.read_bytes().replace(b"\r\n", b"\n")).hexdigest()
+
+
+def split_signal(name: SignalName) -> tuple[str, str]:
+    """Split ``Message.Signal`` into its two names."""
+    message, _, signal = name.partition(".")
+    return message, signal
+
+
+def _check(layout: Layout, path: Path) -> None:
+    """Refuse what types alone cannot express."""
+
+    def refuse(text: str) -> NoReturn:
+        raise LayoutError(f"{path}: {text}")
+
+    names = [*layout.branch_names, *(item.name for item in layout.input), *(item.name for item in layout.derived)]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        refuse(f"{', '.join(twice)} is named twice; branches, inputs and derived inputs need different names")
+    for branch in layout.branch:
+        _check_branch(branch, refuse)
+    if sum(branch.balance for branch in layout.branch) > 1:
+        refuse("more than one branch has 'balance = true'; at most one can take what the others leave")
+    known = {item.name for item in layout.input}
+    for item in layout.derived:
+        unknown = [name for name in formula_names(parse_formula(item.formula)) if name not in known]
+        if unknown:
+            refuse(f"derived input {item.name}: {', '.join(unknown)} is no input or derived input declared above it")
+        known.add(item.name)
+    unknown = [name for name in layout.model_inputs if name not in known]
+    if unknown:
+        refuse(f"model_inputs: {', '.join(unknown)} is no [[input]] or [[derived]]")
+
+
+def _check_branch(branch: Branch, refuse: Callable[[str], NoReturn]) -> None:
+    if (branch.signal is None) == (branch.power is None) or (branch.power is None) != (branch.voltage is None):
+        refuse(f"branch {branch.name}: give either 'signal' (a current), or 'power' and 'voltage'")
+    if branch.corrected is not None and branch.power is not None:
+        refuse(f"branch {branch.name}: 'corrected' needs a branch with a current 'signal'; leave it out here")
+    if branch.quality is not None and branch.corrected is None:
+        refuse(f"branch {branch.name}: 'quality' without 'corrected'")
+    if branch.quality and branch.corrected and split_signal(branch.quality)[0] != split_signal(branch.corrected)[0]:
+        refuse(f"branch {branch.name}: 'quality' and 'corrected' must be signals of one message")

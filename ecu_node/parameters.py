@@ -1,0 +1,244 @@
+"""Parameter file: what the calibrator found for one vehicle, and the contract with the node.
+
+JSON, UTF-8, one file per vehicle. The structures below are the schema: ``ecu-node schema`` prints the JSON Schema
+made from them, which stands in ``ecu_node/parameters.schema.json``. Currents are positive into the junction.
+"""
+
+import math
+import os
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import ParameterError
+from ecu_node.status import Reason
+
+__all__ = [
+    "BranchParameters",
+    "FileReference",
+    "HardwareFault",
+    "JunctionResidual",
+    "Provenance",
+    "UnfitError",
+    "VehicleParameters",
+    "Verdict",
+    "check_fit",
+    "parameter_schema",
+    "read_parameters",
+    "write_atomically",
+    "write_parameters",
+]
+
+MAX_FILE_BYTES = 1_000_000
+"""A parameter file has some kilobytes; a larger one is not one."""
+
+Verdict = Literal["no sensor fault", "corrected", "cannot tell", "not enough data"]
+_Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$", description="SHA-256, line ends counted as LF")]
+_Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+_NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+
+
+class BranchParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Sensor fault of one branch: measured = (1 + drift) * true + offset, (13) of the paper."""
+
+    drift: Annotated[float, msgspec.Meta(gt=-1.0, lt=1.0, description="relative gain error of the sensor [1]")]
+    offset_a: Annotated[float, msgspec.Meta(description="offset of the sensor, positive into the junction [A]")]
+    drift_sd: Annotated[_NotNegative | None, msgspec.Meta(description="standard deviation of the drift [1]")] = None
+    offset_sd_a: Annotated[_NotNegative | None, msgspec.Meta(description="standard deviation of the offset [A]")] = None
+    apply: Annotated[bool, msgspec.Meta(description="false: the node passes this branch through")] = True
+
+
+class HardwareFault(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Whether the vehicle itself differs from its fleet, (11) of the paper. Never corrected, only reported."""
+
+    suspected: bool
+    drift: Annotated[float, msgspec.Meta(description="common relative change of all currents [1]")] = 0.0
+    offset_a: Annotated[
+        dict[str, float], msgspec.Meta(description="change of each branch current; the sum is 0 [A]")
+    ] = {}
+
+
+class JunctionResidual(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Root mean square of the Kirchhoff sum on the drives used."""
+
+    measured_a: Annotated[_NotNegative, msgspec.Meta(description="from measured currents [A]")]
+    corrected_a: Annotated[_NotNegative, msgspec.Meta(description="from corrected currents [A]")]
+
+
+class FileReference(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A file that the parameters belong to."""
+
+    name: str
+    sha256: _Digest
+
+
+class Provenance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where the parameters come from."""
+
+    tool: str
+    method: str
+    created: Annotated[str, msgspec.Meta(description="ISO 8601, UTC")]
+    fleet: str
+    fleet_size: Annotated[int, msgspec.Meta(ge=1)]
+    drives: list[str]
+    duration_s: Annotated[_NotNegative, msgspec.Meta(description="length of the drives used [s]")]
+
+
+class VehicleParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One parameter file."""
+
+    schema_version: Literal[1] = 1
+    vehicle: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+    number: Annotated[int, msgspec.Meta(ge=1, description="number of the parameter set, published modulo 256")] = 1
+    layout: FileReference
+    dbc: FileReference
+    verdict: Verdict
+    confidence: Annotated[
+        _Share | None, msgspec.Meta(description="probability that the verdict holds; null if the method gives none")
+    ] = None
+    branches: Annotated[dict[str, BranchParameters], msgspec.Meta(min_length=1, max_length=16)]
+    hardware_fault: HardwareFault
+    junction_residual: JunctionResidual
+    provenance: Provenance
+
+
+class UnfitError(ParameterError):
+    """Parameters that must not be applied here, with the reason as the node publishes it."""
+
+    def __init__(self, reason: Reason, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+def read_parameters(path: Path) -> VehicleParameters:
+    """Read a parameter file and check it against the schema.
+
+    Parameters
+    ----------
+    path : Path
+        The JSON file.
+
+    Returns
+    -------
+    VehicleParameters
+        The parameters; nothing is applied yet, see :func:`check_fit`.
+
+    Raises
+    ------
+    UnfitError
+        With reason NO_PARAMETERS if there is no such file, else MALFORMED_PARAMETERS.
+    """
+    try:
+        if not path.is_file():
+            raise UnfitError(Reason.NO_PARAMETERS, f"{path}: no such parameter file")
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise UnfitError(
+                Reason.MALFORMED_PARAMETERS, f"{path}: larger than {MAX_FILE_BYTES} bytes; not a parameter file"
+            )
+        return msgspec.json.decode(path.read_bytes(), type=VehicleParameters)
+    except OSError as error:
+        raise UnfitError(Reason.NO_PARAMETERS, f"{path}: cannot read the parameter file: {error.strerror}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise UnfitError(
+            Reason.MALFORMED_PARAMETERS,
+            f"{path}: not a parameter file: {error}; write it anew with 'calibrator calibrate'",
+        ) from None
+
+
+def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:
+    """Check that parameters were made for this vehicle, layout and DBC, and lie within the layout's limits.
+
+    Parameters
+    ----------
+    parameters : VehicleParameters
+        From :func:`read_parameters`.
+    database : VehicleDatabase
+        Layout and DBC in use.
+    vehicle : str or None
+        Identity of the vehicle that the node rides in; None: not checked.
+
+    Raises
+    ------
+    UnfitError
+        With the reason that the node then publishes; the message gives both values.
+    """
+    layout = database.layout
+    if vehicle is not None and parameters.vehicle != vehicle:
+        raise UnfitError(
+            Reason.WRONG_VEHICLE, f"parameters are for vehicle {parameters.vehicle!r}, this is {vehicle!r}"
+        )
+    if parameters.layout.sha256 != layout.digest:
+        raise UnfitError(
+            Reason.WRONG_LAYOUT,
+            f"parameters were made with layout {parameters.layout.name} ({parameters.layout.sha256[:12]}), "
+            f"this is {layout.path} ({layout.digest[:12]}); calibrate with this layout",
+        )
+    if parameters.dbc.sha256 != database.digest:
+        raise UnfitError(
+            Reason.WRONG_DBC,
+            f"parameters were made with DBC {parameters.dbc.name} ({parameters.dbc.sha256[:12]}), "
+            f"this is {layout.dbc_path} ({database.digest[:12]}); calibrate with this DBC",
+        )
+    for name, branch in parameters.branches.items():
+        if name not in layout.branch_names:
+            raise UnfitError(Reason.WRONG_LAYOUT, f"parameters for branch {name!r}, which {layout.path} does not have")
+        if not abs(branch.drift) <= layout.limits.drift:
+            raise UnfitError(
+                Reason.IMPLAUSIBLE_PARAMETERS,
+                f"branch {name}: drift {branch.drift:+.4g} is beyond the layout's limit of {layout.limits.drift:g}",
+            )
+        if not abs(branch.offset_a) <= layout.offset_limit_a:
+            raise UnfitError(
+                Reason.IMPLAUSIBLE_PARAMETERS,
+                f"branch {name}: offset {branch.offset_a:+.4g} A is beyond the layout's limit of "
+                f"{layout.offset_limit_a:g} A",
+            )
+
+
+def write_parameters(parameters: VehicleParameters, path: Path) -> None:
+    """Write a parameter file, whole or not at all.
+
+    Parameters
+    ----------
+    parameters : VehicleParameters
+        What to write.
+    path : Path
+        Where; the folder must exist.
+
+    Raises
+    ------
+    ParameterError
+        If a number is not finite: JSON has no such number.
+    """
+    bad = [
+        name
+        for name, branch in parameters.branches.items()
+        if not (math.isfinite(branch.drift) and math.isfinite(branch.offset_a))
+    ]
+    if bad:
+        raise ParameterError(f"{path}: drift or offset of branch {', '.join(bad)} is not finite; nothing was written")
+    write_atomically(path, msgspec.json.format(msgspec.json.encode(parameters), indent=2) + b"\n")
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file by new content; after a power cut either the old or the new one stands there."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def parameter_schema() -> dict[str, Any]:
+    """JSON Schema (2020-12) of the parameter file, made from the structures of this module."""
+    schema = msgspec.json.schema(VehicleParameters)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Vehicle parameter file", **schema}

@@ -1,0 +1,36 @@
+"""What the node says of itself on the bus; the numbers are those of the DBC's value tables."""
+
+from enum import IntEnum
+
+__all__ = ["Quality", "Reason", "State"]
+
+
+class State(IntEnum):
+    """What the node does with the branch currents."""
+
+    STARTING = 0
+    CORRECTING = 1
+    PASSING_THROUGH = 2
+    FAULT = 3
+
+
+class Reason(IntEnum):
+    """Why the node does not correct."""
+
+    NONE = 0
+    NO_PARAMETERS = 1
+    MALFORMED_PARAMETERS = 2
+    WRONG_VEHICLE = 3
+    WRONG_LAYOUT = 4
+    WRONG_DBC = 5
+    IMPLAUSIBLE_PARAMETERS = 6
+    BRANCH_STALE = 7
+
+
+class Quality(IntEnum):
+    """What stands in one corrected signal."""
+
+    NOT_AVAILABLE = 0
+    PASSED_THROUGH = 1
+    CORRECTED = 2
+    INVALID = 3
