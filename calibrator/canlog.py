@@ -1,0 +1,162 @@
+"""Signals to CAN frames to a candump log, through the DBC and the layout's end-to-end protection."""
+
+import gzip
+import io
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from cantools.database.can import Signal
+from e2e.p01 import e2e_p01_protect
+from numpy.typing import NDArray
+
+from calibrator.drive import Array
+from ecu_node.database import VehicleDatabase
+
+__all__ = ["FrameSeries", "encode_message", "write_candump"]
+
+CLASSIC_BYTES = 8
+"""Longer frames are CAN FD."""
+
+COUNTER_MODULUS = 15
+"""The counter of AUTOSAR E2E profile 1 runs from 0 to 14."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSeries:
+    """Frames of one identifier.
+
+    Attributes
+    ----------
+    arbitration_id, extended : int, bool
+        Identifier, and whether it has 29 bits.
+    time_s : ndarray of shape (n,)
+        Instants. [s]
+    data : ndarray of uint8 of shape (n, length)
+        Payloads.
+    """
+
+    arbitration_id: int
+    extended: bool
+    time_s: Array
+    data: NDArray[np.uint8]
+
+
+def encode_message(
+    database: VehicleDatabase, message_name: str, time_s: Array, values: Mapping[str, Array]
+) -> FrameSeries:
+    """Encode one message at given instants.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        DBC and layout; messages that the layout protects get counter and CRC.
+    message_name : str
+        Message of the DBC.
+    time_s : ndarray of shape (n,)
+        Instants of the frames. [s]
+    values : mapping of str to ndarray of shape (n,)
+        Physical values by signal name, in the unit of the DBC. NaN, and every signal that is not given, becomes the
+        signal's code SNA where it has one, else 0. Values beyond the signal's range saturate.
+
+    Returns
+    -------
+    FrameSeries
+        The frames.
+    """
+    message = database.message(message_name)
+    bits = np.zeros((len(time_s), 8 * message.length), dtype=np.uint8)
+    for signal in message.signals:
+        raw = _raw_codes(signal, values.get(signal.name, np.full(len(time_s), np.nan)))
+        for weight, position in enumerate(_bit_positions(signal)):
+            bits[:, position] = (raw >> weight) & 1
+    data = np.packbits(bits, axis=1, bitorder="little")
+    layout = database.layout
+    if layout.e2e is not None and message_name in layout.e2e.messages:
+        _protect(data, layout.e2e.data_id.get(message_name, message.frame_id & 0xFFFF))
+    return FrameSeries(
+        arbitration_id=message.frame_id, extended=message.is_extended_frame, time_s=np.asarray(time_s), data=data
+    )
+
+
+def write_candump(path: Path, series: Iterable[FrameSeries], *, start_s: float = 0.0, channel: str = "can0") -> int:
+    """Write frames in the order of their instants as ``candump -L`` does.
+
+    Parameters
+    ----------
+    path : Path
+        ``.log``, or ``.log.gz`` to compress.
+    series : iterable of FrameSeries
+        The frames, one series per identifier.
+    start_s : float
+        Time of instant 0 since 1970. [s]
+    channel : str
+        Interface named in the log.
+
+    Returns
+    -------
+    int
+        Number of frames written.
+    """
+    lines: list[str] = []
+    times: list[Array] = []
+    for item in series:
+        name = f"{item.arbitration_id:08X}" if item.extended else f"{item.arbitration_id:03X}"
+        text = item.data.tobytes().hex().upper()
+        width = 2 * item.data.shape[1]
+        separator = "#" if item.data.shape[1] <= CLASSIC_BYTES else "##1"
+        lines += [
+            f"({start_s + t:.6f}) {channel} {name}{separator}{text[k * width : (k + 1) * width]}\n"
+            for k, t in enumerate(item.time_s.tolist())
+        ]
+        times.append(item.time_s)
+    order = np.argsort(np.concatenate([np.zeros(0), *times]), kind="stable")
+    content = "".join([lines[k] for k in order]).encode("ascii")
+    if path.suffix == ".gz":
+        buffer = io.BytesIO()
+        with gzip.GzipFile(fileobj=buffer, mode="wb", compresslevel=1, mtime=0) as file:
+            file.write(content)
+        content = buffer.getvalue()
+    path.write_bytes(content)
+    return len(lines)
+
+
+def _raw_codes(signal: Signal, physical: Array) -> NDArray[np.int64]:
+    """Nearest raw code of each value, inside the valid range; SNA or 0 for NaN."""
+    named = {str(name): int(code) for code, name in (signal.choices or {}).items()}
+    missing = named.get("SNA", 0)
+    lowest, highest = _valid_codes(signal)
+    known = np.isfinite(physical)
+    raw = np.rint((np.where(known, physical, 0.0) - signal.offset) / signal.scale)
+    return np.where(known, np.clip(raw, lowest, highest), missing).astype(np.int64)
+
+
+def _valid_codes(signal: Signal) -> tuple[int, int]:
+    """Least and greatest raw code inside the width of a signal and the range of its DBC."""
+    half = 1 << (signal.length - 1)
+    lowest, highest = (-half, half - 1) if signal.is_signed else (0, 2 * half - 1)
+    if signal.minimum is not None and signal.maximum is not None and signal.minimum < signal.maximum:
+        ends = sorted(round((limit - signal.offset) / signal.scale) for limit in (signal.minimum, signal.maximum))
+        lowest, highest = max(lowest, ends[0]), min(highest, ends[1])
+    return lowest, highest
+
+
+def _bit_positions(signal: Signal) -> list[int]:
+    """Position (byte * 8 + bit) of each bit of a signal, least significant first."""
+    if signal.byte_order == "little_endian":
+        return list(range(signal.start, signal.start + signal.length))
+    positions = [signal.start]
+    while len(positions) < signal.length:
+        last = positions[-1]
+        positions.append(last + 15 if last % 8 == 0 else last - 1)
+    return positions[::-1]
+
+
+def _protect(data: NDArray[np.uint8], data_id: int) -> None:
+    """Fill counter and CRC of AUTOSAR E2E profile 1A in place."""
+    counter = np.arange(len(data), dtype=np.uint8) % COUNTER_MODULUS
+    data[:, 1] = (data[:, 1] & 0xF0) | counter
+    length = data.shape[1]
+    for row in data:
+        e2e_p01_protect(row, data_id, length=length, increment_counter=False)
