@@ -6,13 +6,15 @@ and are labelled, so that what was left out can always be counted.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 __all__ = ["Array", "Channel", "Drive", "Mask"]
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
+"""Real numbers; always double precision in practice."""
 Mask = NDArray[np.bool_]
 
 

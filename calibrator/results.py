@@ -1,0 +1,143 @@
+"""Result of a calibration: ``RESULT/params/VEHICLE.json``, ``RESULT/results.parquet`` and ``RESULT/run.json``.
+
+``results.parquet`` has one row per vehicle and branch; a vehicle that was left out has one row without branch. The
+folder appears only when it is complete.
+"""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from calibrator.errors import FleetError
+from ecu_node.parameters import VehicleParameters, write_atomically, write_parameters
+
+__all__ = ["LeftOut", "RunRecord", "read_results", "write_results"]
+
+SCHEMA = pa.schema(
+    [
+        pa.field("vehicle", pa.string(), nullable=False),
+        pa.field("branch", pa.string()),
+        pa.field("verdict", pa.string(), nullable=False),
+        pa.field("drift", pa.float64(), metadata={"unit": "1"}),
+        pa.field("offset_a", pa.float64(), metadata={"unit": "A"}),
+        pa.field("hardware_fault", pa.bool_()),
+        pa.field("hardware_drift", pa.float64(), metadata={"unit": "1"}),
+        pa.field("hardware_offset_a", pa.float64(), metadata={"unit": "A"}),
+        pa.field("junction_rms_measured_a", pa.float64(), metadata={"unit": "A"}),
+        pa.field("junction_rms_corrected_a", pa.float64(), metadata={"unit": "A"}),
+        pa.field("duration_s", pa.float64(), metadata={"unit": "s"}),
+        pa.field("reason", pa.string()),
+    ]
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeftOut:
+    """A vehicle without parameters, and why."""
+
+    vehicle: str
+    reason: str
+
+
+class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """How a result was made."""
+
+    tool: str
+    method: str
+    fleet: str
+    layout: str
+    branches: list[str]
+    model_inputs: list[str]
+    created: str
+    unity_vehicle: str
+    unity_duration_s: float
+    simulation_snr_db: dict[str, float]
+    """Median over vehicles of each branch's simulation SNR on held-out data. [dB]"""
+    vehicles: int
+    left_out: dict[str, str]
+    notices: list[str]
+
+
+def write_results(
+    out: Path, parameters: Sequence[VehicleParameters], left_out: Sequence[LeftOut], run: RunRecord
+) -> None:
+    """Write a whole result folder, or none.
+
+    Parameters
+    ----------
+    out : Path
+        New or empty folder.
+    parameters : sequence of VehicleParameters
+        One per calibrated vehicle.
+    left_out : sequence of LeftOut
+        The other vehicles.
+    run : RunRecord
+        How it was made.
+
+    Raises
+    ------
+    FleetError
+        If the folder exists and is not empty.
+    """
+    require_new_folder(out)
+    partial = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    (partial / "params").mkdir(parents=True)
+    try:
+        for item in parameters:
+            write_parameters(item, partial / "params" / f"{item.vehicle}.json")
+        rows = [row for item in parameters for row in _rows(item)]
+        rows += [{"vehicle": v.vehicle, "verdict": "not enough data", "reason": v.reason} for v in left_out]
+        pq.write_table(pa.Table.from_pylist(rows, schema=SCHEMA), partial / "results.parquet", compression="zstd")
+        write_atomically(partial / "run.json", msgspec.json.format(msgspec.json.encode(run), indent=2) + b"\n")
+        if out.exists():
+            out.rmdir()
+        partial.rename(out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def require_new_folder(out: Path) -> None:
+    """Raise FleetError if a folder to be written exists and holds something."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FleetError(f"{out}: exists and is not empty; choose another --out or remove it")
+
+
+def read_results(result: Path) -> list[dict[str, Any]]:
+    """Rows of ``results.parquet`` of a result folder; FleetError if it is none."""
+    path = result / "results.parquet"
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowInvalid) as error:
+        first_line = str(error).splitlines()[0]
+        raise FleetError(f"{path}: not a result of 'calibrator calibrate': {first_line}") from None
+    missing = [name for name in SCHEMA.names if name not in table.column_names]
+    if missing:
+        raise FleetError(f"{path}: column {', '.join(missing)} is missing; write the result anew with this version")
+    rows: list[dict[str, Any]] = table.to_pylist()
+    return rows
+
+
+def _rows(item: VehicleParameters) -> list[dict[str, Any]]:
+    return [
+        {
+            "vehicle": item.vehicle,
+            "branch": name,
+            "verdict": item.verdict,
+            "drift": branch.drift,
+            "offset_a": branch.offset_a,
+            "hardware_fault": item.hardware_fault.suspected,
+            "hardware_drift": item.hardware_fault.drift,
+            "hardware_offset_a": item.hardware_fault.offset_a.get(name, 0.0),
+            "junction_rms_measured_a": item.junction_residual.measured_a,
+            "junction_rms_corrected_a": item.junction_residual.corrected_a,
+            "duration_s": item.provenance.duration_s,
+        }
+        for name, branch in item.branches.items()
+    ]

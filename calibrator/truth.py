@@ -1,0 +1,101 @@
+"""Truth of an artificial fleet: ``truth.json``, written by ``calibrator simulate`` and read by ``calibrator score``."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from calibrator.errors import FleetError
+from calibrator.faults import Faults
+from ecu_node.parameters import write_atomically
+
+__all__ = ["TRUTH_FILE", "FleetTruth", "VehicleTruth", "faults_of", "read_truth", "write_truth"]
+
+TRUTH_FILE = "truth.json"
+
+
+class VehicleTruth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What was put into one vehicle; branch values are positive into the junction."""
+
+    hardware_drift: float
+    hardware_offset_a: dict[str, float]
+    drift: dict[str, float]
+    offset_a: dict[str, float]
+    delay_s: dict[str, float]
+    """How much later than it flowed each current is seen. [s]"""
+    unmeasured_a: float
+    """Load that no branch measures. [A]"""
+    unseen_mean_a: dict[str, float]
+    """Mean of the true currents on a drive that is not in the logs. [A]"""
+    unseen_mean_square_a2: dict[str, float]
+    """Mean square of the same. [A^2]"""
+
+
+class FleetTruth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How an artificial fleet was made, and every vehicle of it."""
+
+    schema_version: Literal[1] = 1
+    layout: str
+    branches: list[str]
+    full_scale_a: float
+    seed: int
+    sparsity: float
+    magnitude: tuple[float, float]
+    """Range of fault magnitudes: drifts [1], offsets in fractions of full scale."""
+    balanced: bool
+    symmetric: bool
+    common_drive: bool
+    noise: float
+    """Standard deviation of the sensor noise in fractions of full scale."""
+    vehicles: dict[str, VehicleTruth]
+
+
+def write_truth(path: Path, truth: FleetTruth) -> None:
+    """Write ``truth.json``, whole or not at all."""
+    write_atomically(path, msgspec.json.format(msgspec.json.encode(truth), indent=1) + b"\n")
+
+
+def read_truth(path: Path) -> FleetTruth:
+    """Read ``truth.json``; FleetError says what is wrong with it."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=FleetTruth)
+    except OSError as error:
+        raise FleetError(f"{path}: cannot read the truth: {error.strerror}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise FleetError(f"{path}: not a truth.json of 'calibrator simulate': {error}") from None
+
+
+def faults_of(truth: FleetTruth, vehicles: list[str]) -> Faults:
+    """Fault parameters of some vehicles as arrays.
+
+    Parameters
+    ----------
+    truth : FleetTruth
+        The fleet.
+    vehicles : list of str
+        N names.
+
+    Returns
+    -------
+    Faults
+        In the order of ``vehicles`` and of ``truth.branches``.
+
+    Raises
+    ------
+    FleetError
+        If the fleet has no vehicle of a name.
+    """
+    unknown = [name for name in vehicles if name not in truth.vehicles]
+    if unknown:
+        raise FleetError(f"the truth knows no vehicle {', '.join(unknown[:5])}; is it the truth of another fleet?")
+
+    def rows(field: str) -> Any:
+        return np.array([[getattr(truth.vehicles[v], field)[b] for b in truth.branches] for v in vehicles])
+
+    return Faults(
+        hardware_drift=np.array([truth.vehicles[v].hardware_drift for v in vehicles]),
+        hardware_offset_a=rows("hardware_offset_a"),
+        drift=rows("drift"),
+        offset_a=rows("offset_a"),
+    )

@@ -1,0 +1,55 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibrator.faults import (
+    Faults,
+    corrected_currents,
+    measured_currents,
+    slopes_and_intercepts,
+    true_currents,
+)
+
+FAULTS = Faults(
+    hardware_drift=np.array([0.1, 0.0]),
+    hardware_offset_a=np.array([[5.0, -5.0], [0.0, 0.0]]),
+    drift=np.array([[0.2, 0.0], [0.0, 0.0]]),
+    offset_a=np.array([[-3.0, 0.0], [0.0, 0.0]]),
+)
+
+
+@given(st.floats(-0.9, 3.0), st.floats(-500.0, 500.0), st.floats(-1000.0, 1000.0))
+def test_correction_inverts_the_sensor(drift: float, offset_a: float, current_a: float) -> None:
+    faults = Faults(
+        hardware_drift=np.zeros(()),
+        hardware_offset_a=np.zeros(1),
+        drift=np.array([drift]),
+        offset_a=np.array([offset_a]),
+    )
+    measured = measured_currents(np.array([[current_a]]), faults)
+    corrected = corrected_currents(measured, drift=faults.drift, offset_a=faults.offset_a)
+    np.testing.assert_allclose(corrected, current_a, atol=1e-9)
+
+
+def test_hardware_faults_keep_the_junction_law() -> None:
+    i_s = np.array([[80.0, -80.0], [-20.0, 20.0]])
+    np.testing.assert_allclose(true_currents(i_s, FAULTS.take(0)).sum(axis=1), 0.0, atol=1e-12)
+
+
+def test_sensor_faults_break_the_junction_law() -> None:
+    i = np.array([[80.0, -80.0]])
+    np.testing.assert_allclose(measured_currents(i, FAULTS.take(0)).sum(axis=1), 0.2 * 80.0 - 3.0)
+
+
+def test_slopes_and_intercepts_reproduce_the_measured_currents() -> None:
+    i_s = np.array([[80.0, -80.0], [-20.0, 20.0], [1.0, -1.0]])
+    a, b = slopes_and_intercepts(FAULTS)
+    for j in range(2):
+        measured = measured_currents(true_currents(i_s, FAULTS.take(j)), FAULTS.take(j))
+        np.testing.assert_allclose(measured, a[j] * i_s + b[j])
+
+
+def test_kinds_of_faults_are_told_apart() -> None:
+    assert FAULTS.has_hardware_fault.tolist() == [True, False]
+    assert FAULTS.has_sensor_fault.tolist() == [True, False]
+    assert len(FAULTS) == 2
