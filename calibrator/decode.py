@@ -1,0 +1,206 @@
+"""Signals of a DBC decoded from whole columns of payloads.
+
+A signal is a run of bits: little-endian (Intel) from its lowest bit upwards, big-endian (Motorola) from its highest bit
+downwards. The bytes it touches are joined to one integer, shifted and masked; physical = raw * scale + offset.
+
+A value is *present* where the frame carries the signal (multiplexing), and *good* where it may be used: the frame is
+long enough, the raw value has no name that means "not available", and the physical value lies within the DBC's range
+(a range of 0 to 0 is none).
+"""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from cantools.database.can import Message, Signal
+from numpy.typing import NDArray
+
+from calibrator.drive import Array, Mask
+from ecu_node.errors import DatabaseError
+
+__all__ = ["Decoded", "decode_signal", "means_not_available", "raw_values"]
+
+Raw = NDArray[np.int64] | NDArray[np.uint64] | NDArray[np.float64]
+
+_WORD_BITS = 64
+_FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
+_RANGE_SLACK = 1e-6
+"""Rounding of decimal scales must not push a value out of its range. [steps of the signal]"""
+_NOT_AVAILABLE = re.compile(
+    r"(signal |value |data )?"
+    r"(sna|snv|na|n a|not available|unavailable|invalid|not valid|error|not defined|undefined|init)"
+    r"( signal| value| data| indicator)?"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decoded:
+    """One signal of some frames.
+
+    Attributes
+    ----------
+    value : ndarray of shape (n,)
+        Physical values in the unit of the DBC; NaN where the frame is too short.
+    present : ndarray of bool of shape (n,)
+        Whether the frame carries the signal; False only for multiplexed signals.
+    good : ndarray of bool of shape (n,)
+        Whether the value may be used; implies `present`.
+    """
+
+    value: Array
+    present: Mask
+    good: Mask
+
+
+def decode_signal(message: Message, signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]) -> Decoded:
+    """Decode one signal of frames of one identifier.
+
+    Parameters
+    ----------
+    message : Message
+        The message that the frames are.
+    signal : Signal
+        One of its signals.
+    data : ndarray of uint8, shape (n, W)
+        Payloads, zeros after the length.
+    length : ndarray of uint8, shape (n,)
+        Payload bytes of each frame.
+
+    Returns
+    -------
+    Decoded
+        Values and labels, one per frame.
+
+    Raises
+    ------
+    DatabaseError
+        If the signal is longer than 64 bits or a float of a width other than 16, 32 or 64 bits.
+    """
+    present, known = _presence(message, signal, data, length)
+    raw, complete = raw_values(signal, data, length)
+    value = np.where(complete, raw.astype(np.float64) * float(signal.scale) + float(signal.offset), np.nan)
+    good = present & known & complete & np.isfinite(value) & ~_is_named_bad(signal, raw) & _in_range(signal, value)
+    return Decoded(value=value, present=present, good=good)
+
+
+def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]) -> tuple[Raw, Mask]:
+    """Raw values of one signal, as integers or floats.
+
+    Parameters
+    ----------
+    signal : Signal
+        The signal; its multiplexing is not looked at.
+    data, length : ndarray
+        As in :func:`decode_signal`.
+
+    Returns
+    -------
+    raw : ndarray of int64, uint64 or float64, shape (n,)
+        Raw values; int64 for signed and uint64 for unsigned signals.
+    complete : ndarray of bool, shape (n,)
+        Whether the frame is long enough; the raw value is of no meaning where not.
+
+    Raises
+    ------
+    DatabaseError
+        As in :func:`decode_signal`.
+    """
+    bits = signal.length
+    if bits > _WORD_BITS or (signal.is_float and bits not in _FLOATS):
+        raise DatabaseError(
+            f"signal {signal.name} is a {'float' if signal.is_float else 'number'} of {bits} bits; "
+            f"integers up to 64 bits and floats of 16, 32 or 64 bits can be decoded"
+        )
+    columns, shift = _bit_run(signal)
+    last = max(columns)
+    complete = length > last
+    if last >= data.shape[1]:
+        return np.zeros(len(data), np.int64), np.zeros(len(data), np.bool_)
+    word = _joined(data, columns, shift)
+    if bits < _WORD_BITS:
+        word &= np.uint64((1 << bits) - 1)
+    if signal.is_float:
+        return word.astype(f"u{bits // 8}").view(_FLOATS[bits]).astype(np.float64), complete
+    if signal.is_signed:
+        sign = np.uint64(1 << (bits - 1))
+        return ((word ^ sign) - sign).view(np.int64), complete
+    return word, complete
+
+
+def means_not_available(name: str) -> bool:
+    """Whether a name of a value table says that the value is not one.
+
+    Such names are SNA, "Signal not available", "Invalid", "Error", "Not_Defined" or "Init", in any spelling, with or
+    without "signal", "value" or "data". Names that only contain such words ("No error") are values.
+
+    Parameters
+    ----------
+    name : str
+        The name that the DBC gives to a raw value.
+
+    Returns
+    -------
+    bool
+        True where the raw value stands for "not available".
+    """
+    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+", " ", name)
+    return _NOT_AVAILABLE.fullmatch(spaced.strip().lower()) is not None
+
+
+def _bit_run(signal: Signal) -> tuple[list[int], int]:
+    """Bytes from the least to the most significant, and how many bits the lowest one has below the signal."""
+    if signal.byte_order == "little_endian":
+        first, shift = divmod(signal.start, 8)
+        return list(range(first, (signal.start + signal.length - 1) // 8 + 1)), shift
+    highest = 8 * (signal.start // 8) + 7 - signal.start % 8
+    lowest = highest + signal.length - 1
+    return list(range(lowest // 8, highest // 8 - 1, -1)), 7 - lowest % 8
+
+
+def _joined(data: NDArray[np.uint8], columns: list[int], shift: int) -> NDArray[np.uint64]:
+    """Bytes joined to one integer, its lowest `shift` bits cut off. 64 bits may lie across nine bytes."""
+    word = np.zeros(len(data), np.uint64)
+    for place, column in enumerate(columns):
+        byte, move = data[:, column].astype(np.uint64), 8 * place - shift
+        word |= byte << np.uint64(move) if move >= 0 else byte >> np.uint64(-move)
+    return word
+
+
+def _presence(
+    message: Message, signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]
+) -> tuple[Mask, Mask]:
+    """Whether the frames carry a signal, and whether they are long enough to know; unknown counts as present."""
+    everywhere = np.ones(len(data), np.bool_)
+    if signal.multiplexer_ids is None or signal.multiplexer_signal is None:
+        return everywhere, everywhere
+    selector = message.get_signal_by_name(signal.multiplexer_signal)
+    present, known = _presence(message, selector, data, length)
+    raw, complete = raw_values(selector, data, length)
+    selected = np.isin(raw, np.array(signal.multiplexer_ids, raw.dtype))
+    return present & (selected | ~complete), known & complete
+
+
+def _is_named_bad(signal: Signal, raw: Raw) -> Mask:
+    bad = np.zeros(len(raw), np.bool_)
+    mask = (1 << signal.length) - 1
+    for code, name in (signal.choices or {}).items():
+        if not means_not_available(str(name)):
+            continue
+        if np.issubdtype(raw.dtype, np.floating):
+            bad |= raw == code
+        else:
+            bad |= raw.view(np.uint64) & np.uint64(mask) == np.uint64(int(code) & mask)
+    return bad
+
+
+def _in_range(signal: Signal, value: Array) -> Mask:
+    low, high = signal.minimum, signal.maximum
+    inside = np.ones(len(value), np.bool_)
+    if not low and not high:
+        return inside
+    slack = abs(float(signal.scale)) * _RANGE_SLACK
+    if low is not None:
+        inside &= value >= float(low) - slack
+    if high is not None:
+        inside &= value <= float(high) + slack
+    return inside

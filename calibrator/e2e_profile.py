@@ -1,0 +1,48 @@
+"""AUTOSAR E2E profile 1A over whole columns of payloads.
+
+Byte 0 is CRC-8 SAE J1850 (polynomial 0x1D, start and final value 0x00 in this profile) over the low and the high byte
+of the data identifier and the bytes after the CRC. AUTOSAR, "E2E Protocol Specification", profile 1, both bytes of the
+data identifier included.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrator.drive import Mask
+
+__all__ = ["p01_crc_is_right"]
+
+_POLYNOMIAL = 0x1D
+
+
+def _table() -> NDArray[np.uint8]:
+    crc = np.arange(256)
+    for _ in range(8):
+        crc = ((crc << 1) ^ np.where(crc & 0x80, _POLYNOMIAL, 0)) & 0xFF
+    return crc.astype(np.uint8)
+
+
+_TABLE = _table()
+
+
+def p01_crc_is_right(data: NDArray[np.uint8], length: NDArray[np.uint8], data_id: int) -> Mask:
+    """Check the CRC of frames of one message.
+
+    Parameters
+    ----------
+    data : ndarray of uint8, shape (n, W)
+        Payloads, zeros after the length.
+    length : ndarray of uint8, shape (n,)
+        Payload bytes of each frame.
+    data_id : int
+        Data identifier of the message, 0 to 65535.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        True where byte 0 is the right CRC; False for frames without CRC and counter (shorter than 2 bytes).
+    """
+    crc = np.full(len(data), _TABLE[_TABLE[data_id & 0xFF] ^ (data_id >> 8)], np.uint8)
+    for column in range(1, data.shape[1]):
+        crc = np.where(length > column, _TABLE[crc ^ data[:, column]], crc)
+    return np.asarray((length >= 2) & (crc == data[:, 0]))

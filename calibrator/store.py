@@ -1,0 +1,249 @@
+"""Drives on disk: ``STORE/drives/VEHICLE/DRIVE.parquet``, one row per channel.
+
+Columns: ``name``, ``kind`` (branch or input), ``time_s`` and ``value`` (lists of float64), ``good`` (list of bool). The
+file's metadata carries schema version, vehicle, drive, and name and digest of the layout, because branch names and
+signs mean something only together with it.
+"""
+
+import io
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from calibrator.drive import Channel, Drive
+from calibrator.errors import DriveError
+from ecu_node.errors import UserError
+from ecu_node.layout import Layout
+from ecu_node.parameters import write_atomically
+
+__all__ = ["DriveFile", "iterate_drives", "list_drives", "read_drive_file", "require_plain_name", "write_drive"]
+
+SCHEMA_VERSION = 1
+_FOLDER = "drives"
+_METADATA = b"calibrator.drive"
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+@ -]{0,63}")
+"""Also a file name on every system, and short enough for the parameter file."""
+_SCHEMA = pa.schema(
+    [
+        pa.field("name", pa.string(), nullable=False),
+        pa.field("kind", pa.string(), nullable=False),
+        pa.field("time_s", pa.list_(pa.float64()), nullable=False),
+        pa.field("value", pa.list_(pa.float64()), nullable=False),
+        pa.field("good", pa.list_(pa.bool_()), nullable=False),
+    ]
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveFile:
+    """One drive of a store, not yet opened."""
+
+    vehicle: str
+    name: str
+    path: Path
+
+
+def require_plain_name(name: str, what: str) -> None:
+    """Refuse a vehicle or drive name that cannot be a file name everywhere.
+
+    Parameters
+    ----------
+    name : str
+        The name.
+    what : str
+        What is named so, the start of the message.
+
+    Raises
+    ------
+    DriveError
+        If the name is empty, longer than 64 characters, starts with a dot or a blank, or has characters other than
+        letters, digits and ``_ . + @ -`` and blanks.
+    """
+    if _PLAIN_NAME.fullmatch(name) is None or name.endswith((" ", ".")):
+        raise DriveError(
+            f"{what} {name[:80]!r} cannot be used; expected 1 to 64 letters, digits, blanks or _ . + @ -, "
+            f"not starting with a dot; rename it"
+        )
+
+
+def write_drive(store: Path, drive: Drive, layout: Layout) -> Path:
+    """Write one drive into a store, whole or not at all; an older drive of the same name is replaced.
+
+    Parameters
+    ----------
+    store : Path
+        Folder of the store; made if needed.
+    drive : Drive
+        The drive.
+    layout : Layout
+        The layout it was made with.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    DriveError
+        If vehicle or drive has a name that is no file name, or the folder cannot be written.
+    """
+    require_plain_name(drive.vehicle, "vehicle")
+    require_plain_name(drive.name, f"vehicle {drive.vehicle}: drive")
+    path = store / _FOLDER / drive.vehicle / f"{drive.name}.parquet"
+    buffer = io.BytesIO()
+    pq.write_table(_table(drive, layout), buffer, compression="zstd", use_dictionary=False)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, buffer.getvalue())
+    except OSError as error:
+        raise DriveError(f"{path}: cannot write the drive: {error.strerror}; choose another folder") from None
+    return path
+
+
+def list_drives(store: Path) -> list[DriveFile]:
+    """List the drives of a store, sorted by vehicle and name.
+
+    Parameters
+    ----------
+    store : Path
+        Folder of the store.
+
+    Returns
+    -------
+    list of DriveFile
+        What is there; nothing is opened.
+
+    Raises
+    ------
+    DriveError
+        If the folder is no store.
+    """
+    folder = store / _FOLDER
+    if not folder.is_dir():
+        raise DriveError(f"{store}: not a drive store: no folder '{_FOLDER}' in it; make one with 'calibrator import'")
+    paths = sorted(folder.glob("*/[!.]*.parquet"), key=lambda path: (path.parent.name, path.stem))
+    return [DriveFile(vehicle=path.parent.name, name=path.stem, path=path) for path in paths]
+
+
+def iterate_drives(
+    store: Path, layout: Layout, *, on_error: Callable[[UserError], None] | None = None
+) -> Iterator[Drive]:
+    """Read the drives of a store one after the other.
+
+    Parameters
+    ----------
+    store : Path
+        Folder of the store.
+    layout : Layout
+        The layout it must have been made with.
+    on_error : callable, optional
+        Called with the error of a file that cannot be used, which is then left out; by default it is raised.
+
+    Yields
+    ------
+    Drive
+        In the order of :func:`list_drives`.
+
+    Raises
+    ------
+    DriveError
+        If the folder is no store; also as :func:`read_drive_file` if `on_error` is not given.
+    """
+    for entry in list_drives(store):
+        try:
+            yield read_drive_file(entry.path, layout)
+        except UserError as error:
+            if on_error is None:
+                raise
+            on_error(error)
+
+
+def read_drive_file(path: Path, layout: Layout) -> Drive:
+    """Read one drive.
+
+    Parameters
+    ----------
+    path : Path
+        A file of a store.
+    layout : Layout
+        The layout it must have been made with.
+
+    Returns
+    -------
+    Drive
+        The drive.
+
+    Raises
+    ------
+    DriveError
+        If the file is cut, no drive, of another version, or was made with another layout.
+    """
+    try:
+        table = pq.read_table(io.BytesIO(path.read_bytes()))
+        about = json.loads((table.schema.metadata or {})[_METADATA])
+        _check_identity(about, path, layout)
+        rows = {(kind, name): channel for kind, name, channel in _channels(table)}
+        vehicle, name = str(about["vehicle"]), str(about["drive"])
+    except OSError as error:
+        raise DriveError(f"{path}: cannot read the drive: {error.strerror or 'damaged'}; import it again") from None
+    except (pa.ArrowException, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DriveError(f"{path}: not a drive: {str(error).splitlines()[0][:120]}; import it again") from None
+    return Drive(
+        vehicle=vehicle,
+        name=name,
+        branches={key: channel for (kind, key), channel in rows.items() if kind == "branch"},
+        inputs={key: channel for (kind, key), channel in rows.items() if kind == "input"},
+    )
+
+
+def _table(drive: Drive, layout: Layout) -> pa.Table:
+    kinds = [("branch", drive.branches), ("input", drive.inputs)]
+    rows = [
+        {"name": name, "kind": kind, "time_s": channel.time_s, "value": channel.value, "good": channel.good}
+        for kind, channels in kinds
+        for name, channel in channels.items()
+    ]
+    about = {
+        "schema_version": SCHEMA_VERSION,
+        "vehicle": drive.vehicle,
+        "drive": drive.name,
+        "layout": layout.name,
+        "layout_sha256": layout.digest,
+    }
+    table = pa.Table.from_pylist(rows, schema=_SCHEMA)
+    return table.replace_schema_metadata({_METADATA: json.dumps(about)})
+
+
+def _check_identity(about: Mapping[str, object], path: Path, layout: Layout) -> None:
+    if about["schema_version"] != SCHEMA_VERSION:
+        raise DriveError(
+            f"{path}: schema version {about['schema_version']!r}, expected {SCHEMA_VERSION}; import the logs again"
+        )
+    if about["layout_sha256"] != layout.digest:
+        raise DriveError(
+            f"{path}: made with layout {about['layout']} ({str(about['layout_sha256'])[:12]}), this is {layout.path} "
+            f"({layout.digest[:12]}); import the logs again with this layout"
+        )
+
+
+def _channels(table: pa.Table) -> Iterator[tuple[str, str, Channel]]:
+    for row in range(table.num_rows):
+        time_s, value, good = (_row(table, column, row) for column in ("time_s", "value", "good"))
+        if not len(time_s) == len(value) == len(good):
+            raise ValueError("a channel has columns of different lengths")
+        channel = Channel(time_s=time_s.astype(np.float64), value=value.astype(np.float64), good=good.astype(np.bool_))
+        yield table.column("kind")[row].as_py(), table.column("name")[row].as_py(), channel
+
+
+def _row(table: pa.Table, column: str, row: int) -> "np.ndarray[tuple[int], np.dtype[np.generic]]":
+    values: np.ndarray[tuple[int], np.dtype[np.generic]] = table.column(column)[row].values.to_numpy(
+        zero_copy_only=False
+    )
+    return values
