@@ -1,0 +1,164 @@
+"""What the simulations of a fleet on the unity drive say of each vehicle: regressions (15) and features (5) (6).
+
+Symbols: N vehicles, K branches, T samples of the unity drive. Currents are positive into the junction. Equations are
+those of [1]_.
+
+.. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrator.drive import Array, Mask
+from calibrator.errors import DriveError, FleetError
+from calibrator.faults import Index
+
+__all__ = ["FleetEvidence", "collect_evidence", "fleet_mean", "junction_mean_square"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetEvidence:
+    """Regressions and features of N vehicles with K branches.
+
+    Attributes
+    ----------
+    slopes : ndarray of shape (N, K)
+        a_k of (15): simulated over reference current. [1]
+    intercepts_a : ndarray of shape (N, K)
+        b_k of (15). [A]
+    slope_variances, intercept_variances_a2 : ndarray of shape (N, K)
+        Of the same, for residuals without correlation in time. [1], [A^2]
+    deviation_a2 : ndarray of shape (N, K)
+        Mean square of simulated minus reference current, (5). [A^2]
+    junction_a2 : ndarray of shape (N,)
+        Mean square of the sum of the measured currents, (6). [A^2]
+    """
+
+    slopes: Array
+    intercepts_a: Array
+    slope_variances: Array
+    intercept_variances_a2: Array
+    deviation_a2: Array
+    junction_a2: Array
+
+    def __len__(self) -> int:
+        return len(self.slopes)
+
+    @property
+    def branches(self) -> int:
+        """Number of branches K."""
+        return int(self.slopes.shape[1])
+
+    @property
+    def features(self) -> Array:
+        """f_1 to f_K+1 of each vehicle, (5) and (6), shape (N, K + 1). [A^2]"""
+        return np.column_stack([self.deviation_a2, self.junction_a2])
+
+    def take(self, index: Index) -> "FleetEvidence":
+        """Return the evidence of some of the vehicles."""
+        return FleetEvidence(**{name: values[index] for name, values in vars(self).items()})
+
+
+def fleet_mean(simulated: Iterable[Array]) -> Array:
+    """Estimate the ideal currents by the mean of the fleet's simulations, (3) and (24).
+
+    Parameters
+    ----------
+    simulated : iterable of ndarray of shape (T, K)
+        Simulated currents, one vehicle after the other; an array of shape (N, T, K) will do. [A]
+
+    Returns
+    -------
+    ndarray of shape (T, K)
+        Fleet reference. [A]
+
+    Raises
+    ------
+    FleetError
+        If there is no vehicle.
+    """
+    total, count = np.zeros(()), 0
+    for currents in simulated:
+        total, count = total + currents, count + 1
+    if not count:
+        raise FleetError("no vehicle left to take the fleet mean of")
+    return np.asarray(total / count)
+
+
+def collect_evidence(simulated: Iterable[Array], reference: Array, junction_a2: Array) -> FleetEvidence:
+    """Compare each vehicle's simulation with the fleet reference, (5) and (15).
+
+    Parameters
+    ----------
+    simulated : iterable of ndarray of shape (T, K)
+        Simulated currents, one vehicle after the other. [A]
+    reference : ndarray of shape (T, K)
+        Fleet reference. [A]
+    junction_a2 : ndarray of shape (N,)
+        Of each vehicle's measured currents, see :func:`junction_mean_square`. [A^2]
+
+    Returns
+    -------
+    FleetEvidence
+        Of all vehicles.
+
+    Raises
+    ------
+    FleetError
+        If the reference does not vary, so that nothing can be regressed on it, or the vehicles differ in number.
+    """
+    centred = reference - reference.mean(axis=0)
+    power = np.sum(centred**2, axis=0)
+    if not (power > 0.0).all():
+        raise FleetError(f"the fleet reference of branch {power.argmin() + 1} is constant; choose another unity drive")
+    rows = np.array([_compare(currents, reference, centred, power) for currents in simulated])
+    if len(rows) != len(junction_a2):
+        raise FleetError(f"{len(rows)} vehicles were simulated, but {len(junction_a2)} have a measured junction sum")
+    slopes, intercepts, slope_variances, intercept_variances, deviation = rows.transpose(1, 0, 2)
+    return FleetEvidence(
+        slopes=slopes,
+        intercepts_a=intercepts,
+        slope_variances=slope_variances,
+        intercept_variances_a2=intercept_variances,
+        deviation_a2=deviation,
+        junction_a2=junction_a2,
+    )
+
+
+def junction_mean_square(measured: Array, valid: Mask | None = None) -> float:
+    """Mean square of the sum of the measured currents, (6).
+
+    Parameters
+    ----------
+    measured : ndarray of shape (T, K)
+        Measured currents. [A]
+    valid : ndarray of bool of shape (T,) or None
+        Samples to use.
+
+    Returns
+    -------
+    float
+        Zero for faultless sensors. [A^2]
+
+    Raises
+    ------
+    DriveError
+        If there is no valid sample, or one of them is not finite.
+    """
+    total = (measured if valid is None else measured[valid]).sum(axis=1)
+    if not total.size or not np.isfinite(total).all():
+        raise DriveError(f"the junction sum needs finite samples; {np.isfinite(total).sum()} of {total.size} are")
+    return float(np.mean(total**2))
+
+
+def _compare(currents: Array, reference: Array, centred: Array, power: Array) -> Array:
+    """Slope, intercept, their variances and the mean square deviation, (5, K)."""
+    samples = len(reference)
+    mean = reference.mean(axis=0)
+    slope = np.sum(centred * currents, axis=0) / power
+    intercept = currents.mean(axis=0) - slope * mean
+    residual = np.sum((currents - slope * reference - intercept) ** 2, axis=0) / max(samples - 2, 1)
+    deviation = np.mean((currents - reference) ** 2, axis=0)
+    return np.stack([slope, intercept, residual / power, residual * (1.0 / samples + mean**2 / power), deviation])
