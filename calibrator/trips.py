@@ -13,7 +13,15 @@ from calibrator.ground_truth import GroundTruth, cut_and_rejoin, ground_truth_fr
 from calibrator.store import iterate_drives
 from ecu_node.layout import Layout
 
-__all__ = ["BuiltinTrips", "CommonTrips", "Purpose", "RecordedTrips", "TripSource", "read_recorded_trips"]
+__all__ = [
+    "BuiltinTrips",
+    "CommonTrips",
+    "Purpose",
+    "RecordedTrips",
+    "TripSource",
+    "choose_trips",
+    "read_recorded_trips",
+]
 
 Purpose = Literal["calibration", "unseen"]
 """A trip to learn from, or one to test on."""
@@ -128,3 +136,37 @@ def read_recorded_trips(store: Path, layout: Layout) -> list[GroundTruth]:
     if not usable:
         raise FleetError(f"{store}: no drive with usable samples; import drives with 'calibrator import'")
     return usable
+
+
+def choose_trips(
+    drives: str, layout: Layout, *, vehicles: int, seed: int, duration_s: float, unseen_s: float, common: bool
+) -> TripSource:
+    """Choose where trips come from.
+
+    Parameters
+    ----------
+    drives : str
+        ``builtin``, or the path of a drive store.
+    layout : Layout
+        The layout.
+    vehicles : int
+        Fleet size.
+    seed : int
+        Seed of the trips.
+    duration_s, unseen_s : float
+        Length of each built-in trip to learn from, and of each trip to test on. [s]
+    common : bool
+        One trip for all vehicles.
+
+    Returns
+    -------
+    TripSource
+        The trips.
+    """
+    source: TripSource
+    if drives == "builtin":
+        source = BuiltinTrips(seed=seed, duration_s=duration_s, unseen_s=unseen_s)
+    else:
+        recorded = read_recorded_trips(Path(drives), layout)
+        source = RecordedTrips(seed=seed, recorded=recorded, vehicles=1 if common else vehicles, unseen_s=unseen_s)
+    return CommonTrips(source=source) if common else source

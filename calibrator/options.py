@@ -1,0 +1,19 @@
+"""Choices that the command line and the calibration share."""
+
+from enum import StrEnum
+
+__all__ = ["Classifier", "Method"]
+
+
+class Method(StrEnum):
+    """How sensor faults are estimated."""
+
+    PUBLISHED = "published"
+
+
+class Classifier(StrEnum):
+    """How the published method tells vehicles with hardware faults, section III-B of the paper."""
+
+    THRESHOLD = "threshold"
+    TREE = "tree"
+    PERFECT = "perfect"
