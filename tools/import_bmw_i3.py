@@ -1,0 +1,104 @@
+#!/usr/bin/env python3
+"""Recordings of a BMW i3 (CSV) as drives, and as CAN logs where asked. Each trip counts as a vehicle of its own."""
+
+import json
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibrator.bmw_i3 import BRANCHES, INPUTS, ImportedTrip, trip_from_table
+from calibrator.csv_table import read_csv_table
+from calibrator.drive_log import write_drive_log
+from calibrator.errors import LogError
+from calibrator.store import require_plain_name, write_drive
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.errors import LayoutError, UserError
+from ecu_node.layout import read_layout
+
+_SUFFIXES = (".csv", ".csv.gz")
+
+
+def main(
+    *,
+    csv: Annotated[list[Path], typer.Argument(help="CSV files (.csv, .csv.gz), or folders of them.")],
+    layout: Annotated[Path, typer.Option(help="Layout with the branches battery, motor and auxiliary.")],
+    out: Annotated[Path, typer.Option(help="Drive store to write to.")],
+    logs: Annotated[Path | None, typer.Option(help="Write CAN logs into this folder too: VEHICLE/TRIP.log.gz.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the account as JSON.")] = False,
+) -> None:
+    """Turn recordings of a BMW i3 into drives; each file becomes a vehicle named after it."""
+    failed: dict[str, str] = {}
+    done: dict[str, ImportedTrip] = {}
+    try:
+        database = read_database(read_layout(layout))
+        _require_names(database)
+        for name, paths in _trips(csv).items():
+            try:
+                done[name] = _import_trip(name, paths, database, out, logs)
+            except UserError as error:
+                failed[name] = str(error)
+    except UserError as error:
+        failed[""] = str(error)
+    _print_account(done, failed, as_json=as_json)
+    raise typer.Exit(1 if failed else 0)
+
+
+def _require_names(database: VehicleDatabase) -> None:
+    layout = database.layout
+    missing = [name for name in BRANCHES if name not in layout.branch_names]
+    missing += [name for name in INPUTS if name not in {item.name for item in layout.input}]
+    if missing:
+        raise LayoutError(f"{layout.path}: no branch or input named {', '.join(missing)}; use dbc/hv_powertrain.toml")
+
+
+def _trips(arguments: Iterable[Path]) -> dict[str, list[Path]]:
+    """Files by the name of the trip; more than one file is an error of that trip."""
+    trips: dict[str, list[Path]] = {}
+    for argument in arguments:
+        found = sorted(p for p in argument.iterdir() if p.name.endswith(_SUFFIXES)) if argument.is_dir() else [argument]
+        if not found:
+            raise LogError(f"{argument}: no CSV files in this folder; expected {' or '.join(_SUFFIXES)}")
+        for path in found:
+            paths = trips.setdefault(path.name.removesuffix(".gz").removesuffix(".csv"), [])
+            if path.resolve() not in [other.resolve() for other in paths]:
+                paths.append(path)
+    return trips
+
+
+def _import_trip(name: str, paths: list[Path], database: VehicleDatabase, out: Path, logs: Path | None) -> ImportedTrip:
+    if len(paths) > 1:
+        raise LogError(f"two files for one trip: {' and '.join(map(str, paths))}; remove or rename one")
+    require_plain_name(name, f"{paths[0]}: the file's name, which names the trip,")
+    table = read_csv_table(paths[0], delimiter=";", encoding="latin-1")
+    trip = trip_from_table(table, vehicle=name, name=name)
+    write_drive(out, trip.drive, database.layout)
+    if logs is not None:
+        write_drive_log(logs / name / f"{name}.log.gz", trip.drive, database)
+    return trip
+
+
+def _print_account(done: dict[str, ImportedTrip], failed: dict[str, str], *, as_json: bool) -> None:
+    duration_h = sum(trip.drive.duration_s for trip in done.values()) / 3600.0
+    if as_json:
+        account = {
+            "drives": {
+                name: {"duration_s": trip.drive.duration_s, "notices": trip.notices} for name, trip in done.items()
+            },
+            "failed": failed,
+        }
+        typer.echo(json.dumps(account, indent=2))
+    else:
+        for name, trip in done.items():
+            for notice in trip.notices:
+                typer.echo(f"{name}: {notice}")
+        typer.echo(f"{len(done)} trips imported, {duration_h:.1f} h; {len(failed)} left out")
+        typer.echo("motor is minus the sum of battery and auxiliary: not independent of the battery's sensor")
+    for text in failed.values():
+        print(f"import_bmw_i3: {text}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    typer.run(main)
