@@ -1,0 +1,221 @@
+"""The commands of the calibrator as a user types them, on one small artificial fleet."""
+
+import gzip
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from calibrator.results import read_results
+from calibrator.truth import read_truth
+from ecu_node.database import read_database
+from ecu_node.layout import read_layout
+from ecu_node.parameters import check_fit, read_parameters
+
+LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
+
+
+def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command: Sequence[str] = [sys.executable, "-m", "calibrator", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve vehicles on a common trip, few faults, no hardware faults."""
+    out = tmp_path_factory.mktemp("fleet") / "fleet"
+    run = calibrator(
+        *(
+            "simulate",
+            "--vehicles",
+            12,
+            "--currents",
+            2,
+            "--sparsity",
+            80,
+            "--common-drive",
+            "--symmetric",
+            "--balanced",
+        ),
+        *("--minutes", 4, "--unseen-minutes", 1, "--seed", 3, "--layout", LAYOUT, "--out", out, "--workers", 1),
+    )
+    assert run.returncode == 0, run.stderr
+    return out
+
+
+@pytest.fixture(scope="module")
+def result(fleet: Path) -> Path:
+    out = fleet.parent / "result"
+    run = calibrator(
+        *("calibrate", fleet, "--layout", LAYOUT, "--method", "published", "--out", out, "--workers", 1),
+        *("--classifier", "perfect", "--truth", fleet / "truth.json"),
+    )
+    assert run.returncode == 0, run.stderr
+    return out
+
+
+def test_fleet_is_a_folder_of_logs_per_vehicle_with_the_truth_beside(fleet: Path) -> None:
+    truth = read_truth(fleet / "truth.json")
+    logs = sorted(path.parent.name for path in (fleet / "logs").glob("*/*.log.gz"))
+    assert logs == sorted(truth.vehicles)
+    assert truth.branches == ["battery", "motor"]
+
+
+def test_symmetric_fleet_with_known_classes_is_recovered(fleet: Path, result: Path) -> None:
+    run = calibrator("score", result, "--truth", fleet / "truth.json", "--json")
+    figures = json.loads(run.stdout)
+    assert figures["vehicles"] == 12
+    assert figures["recovery_rate"] == 1.0
+    assert figures["recovery_rate_25"] >= figures["recovery_rate"]
+    assert 0.0 <= figures["harmed_rate"] <= 1.0
+
+
+def test_parameters_are_close_to_the_truth(fleet: Path, result: Path) -> None:
+    truth = read_truth(fleet / "truth.json")
+    for row in read_results(result):
+        vehicle = truth.vehicles[row["vehicle"]]
+        assert row["drift"] == pytest.approx(vehicle.drift[row["branch"]], abs=0.01)
+        assert row["offset_a"] == pytest.approx(vehicle.offset_a[row["branch"]], abs=1.0)
+
+
+def test_correction_makes_the_junction_sum_smaller(result: Path) -> None:
+    rows = read_results(result)
+    corrected = [row for row in rows if row["verdict"] == "corrected"]
+    assert len(corrected) == 16
+    assert all(row["junction_rms_corrected_a"] < 0.5 * row["junction_rms_measured_a"] for row in corrected)
+
+
+def test_parameter_files_fit_their_vehicle_and_equal_the_table(result: Path) -> None:
+    database = read_database(read_layout(LAYOUT))
+    rows = {(row["vehicle"], row["branch"]): row for row in read_results(result)}
+    for path in (result / "params").glob("*.json"):
+        parameters = read_parameters(path)
+        check_fit(parameters, database, path.stem)
+        for name, branch in parameters.branches.items():
+            assert rows[path.stem, name]["drift"] == branch.drift
+            assert rows[path.stem, name]["offset_a"] == branch.offset_a
+
+
+def test_results_table_is_plain_parquet(result: Path) -> None:
+    table = pq.read_table(result / "results.parquet")
+    assert table.num_rows == 24
+    assert table.schema.field("offset_a").metadata == {b"unit": b"A"}
+
+
+def test_store_made_by_import_gives_the_same_parameters_as_the_logs(fleet: Path, result: Path, tmp_path: Path) -> None:
+    imported = calibrator("import", fleet / "logs", "--layout", LAYOUT, "--out", tmp_path / "store", "--workers", 1)
+    assert imported.returncode == 0, imported.stderr
+    run = calibrator(
+        *("calibrate", tmp_path / "store", "--layout", LAYOUT, "--method", "published", "--out", tmp_path / "result"),
+        *("--classifier", "perfect", "--truth", fleet / "truth.json", "--workers", 2),
+    )
+    assert run.returncode == 0, run.stderr
+    for row, expected in zip(read_results(tmp_path / "result"), read_results(result), strict=True):
+        assert row["vehicle"] == expected["vehicle"]
+        assert row["drift"] == pytest.approx(expected["drift"], abs=1e-9)
+
+
+def test_second_import_changes_nothing_and_says_so(fleet: Path, tmp_path: Path) -> None:
+    log = sorted((fleet / "logs").glob("*/*.log.gz"))[0]
+    store = tmp_path / "store"
+    assert calibrator("import", log, "--layout", LAYOUT, "--out", store).returncode == 0
+    before = {path: path.read_bytes() for path in store.rglob("*.parquet")}
+    again = calibrator("import", log, "--layout", LAYOUT, "--out", store, "--json")
+    assert again.returncode == 1
+    assert "already has drive" in json.loads(again.stdout)["left_out"][f"{log.parent.name}/drive"]
+    assert {path: path.read_bytes() for path in store.rglob("*.parquet")} == before
+
+
+@pytest.fixture
+def broken_fleet(fleet: Path, tmp_path: Path) -> Path:
+    """Six good vehicles and five with one fault each."""
+    copy = tmp_path / "broken"
+    for folder in sorted((fleet / "logs").iterdir())[:6]:
+        shutil.copytree(folder, copy / folder.name)
+    lines = calibrator_lines(fleet)
+    logs = {
+        "short": b"".join(line for line in lines if float(line.split(b")")[0][1:]) < 3.0),
+        "empty": b"",
+        "no_branch": b"".join(line for line in lines if b" 200#" in line),
+        "no_motor": b"".join(line for line in lines if b" 120#" not in line),
+        "twin": b"",
+    }
+    for name, content in logs.items():
+        (copy / name).mkdir()
+        (copy / name / "drive.log").write_bytes(content)
+    (copy / "blf").mkdir()
+    (copy / "blf" / "drive.blf").write_bytes(b"LOGG" + bytes(300))
+    shutil.copytree(copy / "V001", copy / "elsewhere" / "V001")
+    return copy
+
+
+def calibrator_lines(fleet: Path) -> list[bytes]:
+    return gzip.decompress((fleet / "logs" / "V001" / "drive.log.gz").read_bytes()).splitlines(keepends=True)
+
+
+def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Path, tmp_path: Path) -> None:
+    out = tmp_path / "result"
+    run = calibrator("calibrate", broken_fleet, "--layout", LAYOUT, "--out", out, "--json", "--workers", 1)
+    assert run.returncode == 0, run.stderr
+    assert "Traceback" not in run.stderr
+    left_out = json.loads(run.stdout)["run"]["left_out"]
+    assert "at least 60 s are needed" in left_out["short"]
+    assert "drive.log" in left_out["empty"]
+    assert "0x110" in left_out["no_branch"] or "branch" in left_out["no_branch"]
+    assert "motor" in left_out["no_motor"]
+    assert "drive.blf" in left_out["blf"]
+    twins = [reason for reason in left_out.values() if "V001" in reason and "elsewhere" in reason]
+    assert twins, left_out
+    assert sorted(path.stem for path in (out / "params").iterdir()) == ["V002", "V003", "V004", "V005", "V006"]
+    assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("calibrate", "nowhere", "--layout", LAYOUT, "--out", "x"), 1, "nowhere: no such folder"),
+        (("calibrate", ".", "--layout", "none.toml", "--out", "x"), 1, "none.toml: cannot read the layout"),
+        (("score", "nowhere", "--truth", "none.json"), 1, "none.json: cannot read the truth"),
+        (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--classifier", "perfect"), 2, "belong together"),
+        (("simulate", "--vehicles", "0", "--layout", LAYOUT, "--out", "x"), 2, "--vehicles"),
+        (("simulate", "--vehicles", "3", "--symmetric", "--layout", LAYOUT, "--out", "x"), 1, "multiple of 4"),
+        (
+            ("simulate", "--vehicles", "3", "--currents", "6", "--layout", LAYOUT, "--out", "x"),
+            1,
+            "2 to 5 are possible",
+        ),
+        (("simulate", "--vehicles", "3", "--magnitude", "2", "1", "--layout", LAYOUT, "--out", "x"), 2, "LO <= HI"),
+        (("nonsense",), 2, "nonsense"),
+    ],
+)
+def test_wrong_use_is_answered_in_words(
+    arguments: tuple[object, ...], code: int, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = calibrator(*arguments)
+    assert run.returncode == code
+    assert message in " ".join(run.stderr.split())
+    assert "Traceback" not in run.stderr
+    assert not (tmp_path / "x").exists()
+
+
+def test_result_folder_in_use_is_not_touched(fleet: Path, result: Path) -> None:
+    before = sorted(path.name for path in result.iterdir())
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", result)
+    assert run.returncode == 1
+    assert "exists and is not empty" in run.stderr
+    assert sorted(path.name for path in result.iterdir()) == before
+
+
+def test_truth_of_another_fleet_is_refused(fleet: Path, result: Path, tmp_path: Path) -> None:
+    truth = json.loads((fleet / "truth.json").read_text())
+    truth["vehicles"] = {f"X{name}": value for name, value in truth["vehicles"].items()}
+    (tmp_path / "truth.json").write_text(json.dumps(truth))
+    run = calibrator("score", result, "--truth", tmp_path / "truth.json")
+    assert run.returncode == 1
+    assert "truth of another fleet" in run.stderr
