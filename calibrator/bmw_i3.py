@@ -173,7 +173,8 @@ def _defaults(heater_kw: Array) -> Mask:
     exact = np.abs(heater_kw - HEATER_DEFAULT_KW) < HEATER_RESOLUTION_KW
     jump = np.abs(np.diff(heater_kw)) > IMPOSSIBLE_JUMP_KW
     beside_jump = np.concatenate([jump, [False]]) | np.concatenate([[False], jump])
-    return exact | (beside_jump & (np.abs(heater_kw - HEATER_DEFAULT_KW) < NEAR_DEFAULT_KW))
+    near = np.abs(heater_kw - HEATER_DEFAULT_KW) < NEAR_DEFAULT_KW
+    return np.asarray(exact | (beside_jump & near))
 
 
 def _with_ramps(default: Mask, heater_kw: Array) -> Mask:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Mask
 
-__all__ = ["p01_crc_is_right"]
+__all__ = ["p01_is_sound"]
 
 _POLYNOMIAL = 0x1D
+_NO_COUNTER = 15
 
 
 def _table() -> NDArray[np.uint8]:
@@ -25,8 +26,8 @@ def _table() -> NDArray[np.uint8]:
 _TABLE = _table()
 
 
-def p01_crc_is_right(data: NDArray[np.uint8], length: NDArray[np.uint8], data_id: int) -> Mask:
-    """Check the CRC of frames of one message.
+def p01_is_sound(data: NDArray[np.uint8], length: NDArray[np.uint8], data_id: int) -> Mask:
+    """Check CRC and range of the counter of frames of one message.
 
     Parameters
     ----------
@@ -40,9 +41,10 @@ def p01_crc_is_right(data: NDArray[np.uint8], length: NDArray[np.uint8], data_id
     Returns
     -------
     ndarray of bool, shape (n,)
-        True where byte 0 is the right CRC; False for frames without CRC and counter (shorter than 2 bytes).
+        True where byte 0 is the right CRC and the counter, the low half of byte 1, is not 15; False for frames shorter
+        than these 2 bytes.
     """
     crc = np.full(len(data), _TABLE[_TABLE[data_id & 0xFF] ^ (data_id >> 8)], np.uint8)
     for column in range(1, data.shape[1]):
         crc = np.where(length > column, _TABLE[crc ^ data[:, column]], crc)
-    return np.asarray((length >= 2) & (crc == data[:, 0]))
+    return np.asarray((length >= 2) & (crc == data[:, 0]) & (data[:, 1] & 0x0F != _NO_COUNTER))

@@ -14,7 +14,7 @@ from cantools.database.can import Message
 
 from calibrator.decode import decode_signal
 from calibrator.drive import Array, Channel, Drive, Mask
-from calibrator.e2e_profile import p01_crc_is_right
+from calibrator.e2e_profile import p01_is_sound
 from calibrator.errors import LogError
 from calibrator.frame_arrays import EXTENDED_BIT, Frames, frame_key
 from calibrator.frames import read_frames
@@ -131,7 +131,7 @@ def read_recording(path: Path, database: VehicleDatabase, *, vehicle: str, name:
     Returns
     -------
     Recording
-        The drive; branches and inputs without frames are absent from it and named in the report.
+        The drive; branches without frames and inputs without a good one are absent from it and named in the report.
 
     Raises
     ------
@@ -162,7 +162,8 @@ def drive_from_frames(frames: Frames, database: VehicleDatabase, *, vehicle: str
         disordered=source.time.disordered,
         clock_steps=source.time.clock_steps,
     )
-    drive = Drive(vehicle=vehicle, name=name, branches=_present(branches), inputs=_present(inputs))
+    available = {key: channel for key, channel in inputs.items() if channel.good.any()}
+    drive = Drive(vehicle=vehicle, name=name, branches=_present(branches), inputs=available)
     return Recording(drive=drive, corrected=_present(corrected), report=report)
 
 
@@ -238,7 +239,7 @@ class _Source:
         if protection is None or message.name not in protection.messages:
             return np.ones(len(frames), np.bool_)
         data_id = protection.data_id.get(message.name, message.frame_id & 0xFFFF)
-        return p01_crc_is_right(frames.data, frames.length, data_id)
+        return p01_is_sound(frames.data, frames.length, data_id)
 
 
 def _held(channel: Channel, time_s: Array, max_age_s: float) -> tuple[Array, Mask]:
