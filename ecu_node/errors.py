@@ -3,7 +3,7 @@
 The command line turns every :class:`UserError` into that line and an exit code; nothing else is caught.
 """
 
-__all__ = ["DatabaseError", "LayoutError", "ParameterError", "UserError"]
+__all__ = ["BusError", "DatabaseError", "LayoutError", "ParameterError", "UserError"]
 
 
 class UserError(Exception):
@@ -20,3 +20,7 @@ class DatabaseError(UserError):
 
 class ParameterError(UserError):
     """The parameter file cannot be used (malformed, another vehicle, another DBC, implausible)."""
+
+
+class BusError(UserError):
+    """The CAN bus cannot be opened, or fails while in use."""

@@ -1,0 +1,165 @@
+"""Command line of the node: ``ecu-node run``, ``ecu-node check``, ``ecu-node schema``.
+
+Results go to standard output, what happens to standard error. Exit code 0: done, 1: failed, 2: wrong use.
+"""
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+
+from ecu_node import __version__
+from ecu_node.errors import UserError
+
+__all__ = ["main"]
+
+_VEHICLE_VARIABLE = "ECU_NODE_VEHICLE"
+_DEFAULT_STATUS_PERIOD_S = 0.1
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments without the program's name; those of the process if not given.
+
+    Returns
+    -------
+    int
+        Exit code: 0 done, 1 failed. Wrong use ends in SystemExit(2).
+    """
+    options = _parser().parse_args(argv)
+    logging.getLogger("can").addHandler(logging.NullHandler())
+    _load_python_can()
+    try:
+        return int(options.command(options))
+    except UserError as error:
+        _say(str(error))
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="ecu-node",
+        description="Corrects the high-voltage currents on a CAN bus with the parameters of this vehicle.",
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    run = commands.add_parser(
+        "run",
+        help="correct until SIGTERM or SIGINT",
+        description="Reads the branch currents from a bus and publishes them corrected, under identifiers of their "
+        "own on the same bus. With parameters that do not fit it passes the measured values through and says so in "
+        "its status message.",
+    )
+    _add_files(run)
+    run.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
+    run.add_argument("--channel", required=True, help="channel of the interface, such as can0 or vcan0")
+    run.add_argument("--fd", action="store_true", help="open the bus for CAN FD")
+    run.set_defaults(command=_run)
+    check = commands.add_parser(
+        "check",
+        help="would these parameters be applied?",
+        description="Checks parameters against layout, DBC and vehicle, and shows the integer plan of each branch. "
+        "Exit code 0: they fit, 1: they do not.",
+    )
+    _add_files(check)
+    check.add_argument("--json", action="store_true", help="print JSON")
+    check.set_defaults(command=_check)
+    schema = commands.add_parser("schema", help="print the JSON Schema of the parameter file")
+    schema.set_defaults(command=_schema)
+    return parser
+
+
+def _add_files(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--params", type=Path, required=True, metavar="FILE", help="parameter file of this vehicle")
+    parser.add_argument("--layout", type=Path, required=True, metavar="FILE", help="layout (TOML), which names the DBC")
+    parser.add_argument(
+        "--vehicle",
+        default=os.environ.get(_VEHICLE_VARIABLE) or None,
+        metavar="ID",
+        help=f"this vehicle; parameters of another are refused (default: ${_VEHICLE_VARIABLE}; else not checked)",
+    )
+
+
+def _load_python_can() -> None:
+    """Import python-can without asammdf: where that is installed, it would bring numpy and pandas into the node."""
+    if "can" in sys.modules or "asammdf" in sys.modules:
+        return
+    sys.modules["asammdf"] = None  # type: ignore[assignment]  # documented: makes its import fail
+    try:
+        import can  # noqa: F401, PLC0415
+    finally:
+        del sys.modules["asammdf"]
+
+
+def _run(options: argparse.Namespace) -> int:
+    from ecu_node.database import read_database  # noqa: PLC0415  # after _load_python_can
+    from ecu_node.layout import read_layout  # noqa: PLC0415
+    from ecu_node.node import choose_parameters, open_bus, serve  # noqa: PLC0415
+    from ecu_node.wiring import wire  # noqa: PLC0415
+
+    stop = _StopRequest()
+    database = read_database(read_layout(options.layout))
+    in_force, why_not = choose_parameters(options.params, database, options.vehicle)
+    corrector = wire(database, in_force, time.monotonic())
+    status = database.layout.status
+    with open_bus(database, interface=options.interface, channel=options.channel, fd=options.fd) as bus:
+        if why_not is not None:
+            _say(f"passing measured values through: {why_not}")
+        elif options.vehicle is None:
+            _say(f"the vehicle is not checked: give --vehicle or ${_VEHICLE_VARIABLE}")
+        applied = ", ".join(branch.name for branch in corrector.branches if branch.fault.applied)
+        _say(f"running on {options.interface} {options.channel}, correcting {applied or 'nothing'}")
+        try:
+            serve(
+                bus,
+                corrector,
+                stop=stop.requested,
+                status_period_s=status.period_s if status is not None else _DEFAULT_STATUS_PERIOD_S,
+            )
+        finally:
+            _say(f"ended: {corrector.counters.text()}")
+    return 0
+
+
+def _check(options: argparse.Namespace) -> int:
+    from ecu_node.check import check_report, report_text  # noqa: PLC0415  # after _load_python_can
+
+    report = check_report(options.params, options.layout, options.vehicle)
+    print(json.dumps(report, indent=2) if options.json else report_text(report))
+    return 0 if report["fit"] else 1
+
+
+def _schema(options: argparse.Namespace) -> int:  # noqa: ARG001
+    from ecu_node.parameters import parameter_schema  # noqa: PLC0415  # after _load_python_can
+
+    print(json.dumps(parameter_schema(), indent=2))
+    return 0
+
+
+class _StopRequest:
+    """Set by SIGTERM and SIGINT."""
+
+    def __init__(self) -> None:
+        self._set = False
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        self._set = True
+
+    def requested(self) -> bool:
+        return self._set
+
+
+def _say(text: str) -> None:
+    print(f"ecu-node: {text}", file=sys.stderr, flush=True)

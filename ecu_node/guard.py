@@ -1,0 +1,149 @@
+"""What the node receives and sends, and the checks that keep the two apart.
+
+Loop guard: no identifier may be both received and sent, else the node would correct its own output, or speak in the
+name of another control unit. And each bit it sends belongs to one signal only.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from cantools.database.can import Message, Signal
+
+from ecu_node.bits import bit_place
+from ecu_node.corrector import FrameKey
+from ecu_node.database import VehicleDatabase
+from ecu_node.e2e import HEADER_MASK
+from ecu_node.errors import DatabaseError, LayoutError
+from ecu_node.status import Quality, Reason, State
+
+__all__ = ["PARAMETER_SETS", "check_output", "is_fd", "key_of", "needs_fd", "received", "transmitted"]
+
+PARAMETER_SETS = 256
+"""The status publishes the number of the parameter set modulo this."""
+
+_CLASSIC_BYTES = 8
+_HEADER_BYTES = 2
+
+
+def key_of(message: Message) -> FrameKey:
+    """Identifier of a message of the DBC."""
+    return FrameKey(message.frame_id, message.is_extended_frame)
+
+
+def is_fd(message: Message) -> bool:
+    """Whether only CAN FD can carry a message, or the DBC says that it does."""
+    return bool(message.is_fd) or message.length > _CLASSIC_BYTES
+
+
+def received(database: VehicleDatabase) -> dict[FrameKey, Message]:
+    """Messages that carry the branches and their voltages, by identifier."""
+    branches = database.layout.branch
+    names = [name for branch in branches for name in (branch.source, branch.voltage) if name is not None]
+    return {key_of(message): message for message, _ in map(database.signal, names)}
+
+
+def transmitted(database: VehicleDatabase) -> dict[FrameKey, Message]:
+    """Messages that the node sends, by identifier."""
+    messages = {key_of(item.message): item.message for item in _written(database)}
+    layout = database.layout
+    if layout.status is not None:
+        message = database.message(layout.status.message)
+        messages[key_of(message)] = message
+    return messages
+
+
+def needs_fd(database: VehicleDatabase) -> list[str]:
+    """Names of the messages, received or sent, that need CAN FD."""
+    messages = {**received(database), **transmitted(database)}
+    return [message.name for message in messages.values() if is_fd(message)]
+
+
+def check_output(database: VehicleDatabase) -> None:
+    """Refuse a layout with which the node would disturb the bus or itself.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        Layout and DBC.
+
+    Raises
+    ------
+    LayoutError
+        If nothing is published, a message is both received and sent, or two signals are written in one place.
+    DatabaseError
+        If a signal to write does not fit its message or its values do not fit the signal.
+    """
+    where = database.layout.path
+    sent = transmitted(database)
+    if not sent:
+        raise LayoutError(f"{where}: nothing to publish: give branches a 'corrected' signal, or add [status]")
+    both = [message.name for key, message in sent.items() if key in received(database)]
+    if both:
+        raise LayoutError(
+            f"{where}: {', '.join(both)} would be both received and sent; corrected values and status need messages "
+            f"of their own"
+        )
+    for message in sent.values():
+        if _is_protected(database, message) and message.length < _HEADER_BYTES:
+            raise DatabaseError(f"{where}: message {message.name} has no room for the E2E header of 2 bytes")
+    taken = {key: HEADER_MASK if _is_protected(database, message) else 0 for key, message in sent.items()}
+    for item in _written(database):
+        _check_place(item)
+        key, mask = key_of(item.message), bit_place(item.signal).mask
+        if taken[key] & mask:
+            raise LayoutError(
+                f"{where}: {item.purpose}: {item.message.name}.{item.signal.name} is written twice, or overlaps "
+                f"another signal that is written, or the E2E header"
+            )
+        taken[key] |= mask
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Written:
+    """A signal that the node writes."""
+
+    message: Message
+    signal: Signal
+    purpose: str
+    largest: int = 0
+    """The greatest code it must hold."""
+
+
+def _written(database: VehicleDatabase) -> Iterable[_Written]:
+    layout = database.layout
+    for branch in layout.branch:
+        for name, largest in ((branch.corrected, 0), (branch.quality, max(Quality))):
+            if name is not None:
+                message, signal = database.signal(name)
+                yield _Written(message=message, signal=signal, purpose=f"branch {branch.name}", largest=largest)
+    status = layout.status
+    if status is None:
+        return
+    fields = (
+        (status.state, max(State)),
+        (status.reason, max(Reason)),
+        (status.parameter_set, PARAMETER_SETS - 1),
+        (status.sum_measured, 0),
+        (status.sum_corrected, 0),
+    )
+    for name, largest in fields:
+        if name is not None:
+            message, signal = database.signal(f"{status.message}.{name}")
+            yield _Written(message=message, signal=signal, purpose="status", largest=largest)
+
+
+def _check_place(item: _Written) -> None:
+    place = bit_place(item.signal)
+    name = f"{item.message.name}.{item.signal.name}"
+    if place.end > item.message.length:
+        raise DatabaseError(
+            f"{item.purpose}: signal {name} ends in byte {place.end}, but the message has {item.message.length} bytes"
+        )
+    if place.highest < item.largest:
+        raise DatabaseError(
+            f"{item.purpose}: signal {name} holds at most {place.highest}; {item.largest} must fit, widen it in the DBC"
+        )
+
+
+def _is_protected(database: VehicleDatabase, message: Message) -> bool:
+    return database.layout.e2e is not None and message.name in database.layout.e2e.messages

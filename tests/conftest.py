@@ -1,0 +1,70 @@
+"""What all tests share: real data where it is, the rule for skipped tests, and a guard against open buses."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from weakref import WeakSet
+
+import can
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SHARED_DATA = ROOT.parent / "shared" / "data"
+VCAN_TESTS = ROOT / "tests" / "vcan"
+NOTHING_MAY_BE_SKIPPED = os.environ.get("HV_REQUIRE_ALL") == "1"
+
+_open_buses: WeakSet[can.BusABC] = WeakSet()
+_bus_init, _bus_shutdown = can.BusABC.__init__, can.BusABC.shutdown
+
+
+def _init(self: can.BusABC, *arguments: Any, **options: Any) -> None:
+    _bus_init(self, *arguments, **options)
+    _open_buses.add(self)
+
+
+def _shutdown(self: can.BusABC) -> None:
+    _bus_shutdown(self)
+    _open_buses.discard(self)
+
+
+can.BusABC.__init__ = _init  # type: ignore[method-assign]
+can.BusABC.shutdown = _shutdown  # type: ignore[method-assign]
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of real recordings, which are not part of the repository."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(f"no real recordings in {SHARED_DATA}")
+    return SHARED_DATA
+
+
+@pytest.fixture(autouse=True)
+def no_bus_left_open() -> Iterator[None]:
+    """Fail a test that leaves a bus open: its frames would reach the next one."""
+    before = set(_open_buses)
+    yield
+    left = set(_open_buses) - before
+    for bus in left:
+        bus.shutdown()
+    assert not left, f"buses left open: {left}"
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave the tests of SocketCAN out unless asked for: they need a kernel that has it, and never skip."""
+    if collection_path != VCAN_TESTS:
+        return None
+    asked = [(config.invocation_params.dir / argument.partition("::")[0]).resolve() for argument in config.args]
+    return None if any(path.is_relative_to(VCAN_TESTS) for path in asked) else True
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail a run in which a test was skipped though HV_REQUIRE_ALL=1 says that all must run."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is None or not NOTHING_MAY_BE_SKIPPED:
+        return
+    skipped = reporter.stats.get("skipped", [])
+    if skipped and session.exitstatus == pytest.ExitCode.OK:
+        reporter.write_line(f"HV_REQUIRE_ALL=1, but {len(skipped)} tests were skipped", red=True)
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED

@@ -1,0 +1,89 @@
+"""Signals in frames; cantools is the oracle."""
+
+import pytest
+from cantools.database.can import Message, Signal
+from cantools.database.conversion import BaseConversion
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ecu_node.bits import bit_place
+from ecu_node.errors import DatabaseError
+
+
+@st.composite
+def placed_signals(draw: st.DrawFn) -> tuple[Message, Signal]:
+    """A signal of any width, order and sign, somewhere in a frame of 1 to 64 bytes."""
+    size = draw(st.integers(1, 64))
+    length = draw(st.integers(1, min(64, 8 * size)))
+    first = draw(st.integers(0, 8 * size - length))
+    big = draw(st.booleans())
+    signal = Signal(
+        "S",
+        start=8 * (first // 8) + 7 - first % 8 if big else first,
+        length=length,
+        byte_order="big_endian" if big else "little_endian",
+        is_signed=draw(st.booleans()),
+    )
+    return Message(frame_id=1, name="M", length=size, signals=[signal], is_fd=size > 8), signal
+
+
+@given(placed_signals(), st.data())
+def test_extract_reads_what_cantools_decodes(case: tuple[Message, Signal], data: st.DataObject) -> None:
+    message, signal = case
+    payload = data.draw(st.binary(min_size=message.length, max_size=message.length))
+    assert {"S": bit_place(signal).extract(payload)} == message.decode(payload, scaling=False)
+
+
+@given(placed_signals(), st.data())
+def test_put_writes_what_cantools_encodes_and_keeps_all_other_bits(
+    case: tuple[Message, Signal], data: st.DataObject
+) -> None:
+    message, signal = case
+    place = bit_place(signal)
+    before = data.draw(st.binary(min_size=message.length, max_size=message.length))
+    raw = data.draw(st.integers(place.lowest, place.highest))
+    payload = bytearray(before)
+    assert place.put(payload, raw)
+    own = int.from_bytes(message.encode({"S": -1 if signal.is_signed else place.highest}, scaling=False), "little")
+    wanted = int.from_bytes(message.encode({"S": raw}, scaling=False), "little")
+    assert place.mask == own
+    assert int.from_bytes(payload, "little") == int.from_bytes(before, "little") & ~own | wanted
+    assert place.extract(payload) == raw
+
+
+@given(placed_signals(), st.data())
+def test_a_frame_too_short_gives_none_and_is_left_alone(case: tuple[Message, Signal], data: st.DataObject) -> None:
+    _, signal = case
+    place = bit_place(signal)
+    payload = bytearray(data.draw(st.binary(max_size=place.end - 1)))
+    before = bytes(payload)
+    assert place.extract(payload) is None
+    assert not place.put(payload, 0)
+    assert payload == before
+
+
+def test_longer_frames_are_read_too() -> None:
+    place = bit_place(Signal("S", start=0, length=8))
+    assert place.extract(bytes([5, 1, 2, 3])) == 5
+
+
+def test_a_code_beyond_the_width_is_refused_and_never_wraps() -> None:
+    place = bit_place(Signal("S", start=0, length=8, is_signed=True))
+    with pytest.raises(ValueError, match="128 does not fit into 8 bits"):
+        place.put(bytearray(1), 128)
+
+
+@pytest.mark.parametrize(
+    ("signal", "words"),
+    [
+        (
+            Signal("S", start=0, length=32, conversion=BaseConversion.factory(is_float=True)),
+            "S is a floating-point number",
+        ),
+        (Signal("S", start=0, length=8, multiplexer_ids=[1], multiplexer_signal="X"), "S is multiplexed"),
+        (Signal("S", start=0, length=65), "has 65 bits"),
+    ],
+)
+def test_signals_that_are_no_plain_integers_are_refused(signal: Signal, words: str) -> None:
+    with pytest.raises(DatabaseError, match=words):
+        bit_place(signal)

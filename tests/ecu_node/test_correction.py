@@ -1,0 +1,190 @@
+"""Integer plan against exact fractions."""
+
+import math
+from fractions import Fraction
+
+import pytest
+from cantools.database.can import Signal
+from cantools.database.conversion import BaseConversion
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ecu_node.codes import Codes, not_available_code, read_codes, writable_range
+from ecu_node.correction import LARGEST_ERROR, IntegerPlan, corrected_current, integer_plan
+from ecu_node.database import AMPERE
+from ecu_node.errors import DatabaseError
+
+HALF = Fraction(1, 2)
+
+
+def current(
+    scale: float = 0.02,
+    offset: float = 0.0,
+    *,
+    length: int = 16,
+    signed: bool = True,
+    limits: tuple[float, float] | None = None,
+    unit: str = "A",
+    names: dict[int, str] | None = None,
+) -> Codes:
+    low, high = limits if limits is not None else (None, None)
+    signal = Signal(
+        "I",
+        start=0,
+        length=length,
+        is_signed=signed,
+        conversion=BaseConversion.factory(scale=scale, offset=offset, choices=names),  # type: ignore[arg-type]
+        minimum=low,
+        maximum=high,
+        unit=unit,
+    )
+    return read_codes(signal, AMPERE, "test")
+
+
+def exact(source: Codes, target: Codes, code: int, *, sign: int, drift: str, offset_a: str) -> Fraction:
+    """Corrected code without rounding, straight from (25)."""
+    i_m = sign * (source.scale * code + source.offset)
+    i = (i_m - Fraction(offset_a)) / (1 + Fraction(drift))
+    return (sign * i - target.offset) / target.scale
+
+
+def whole_range(codes: Codes) -> range:
+    return range(codes.lowest, codes.highest + 1)
+
+
+CASES = [
+    pytest.param(current(), current(), 1, "0.25", "0.0025", id="exact halves"),
+    pytest.param(current(), current(), -1, "-0.173", "12.34", id="consumer"),
+    pytest.param(current(names={-32768: "SNA"}), current(names={-32768: "SNA"}), 1, "0.4", "-150", id="saturating"),
+    pytest.param(current(-0.05), current(0.1, -1600.0, signed=False), -1, "0.0123", "-3.3", id="negative scale"),
+    pytest.param(current(20.0, unit="mA"), current(0.02), 1, "-0.4", "0.1", id="milliampere"),
+]
+
+
+@pytest.mark.parametrize(("source", "target", "sign", "drift", "offset"), CASES)
+def test_every_code_of_16_bits_is_rounded_half_up_and_clamped(
+    source: Codes, target: Codes, sign: int, drift: str, offset: str
+) -> None:
+    plan = integer_plan(source, target, sign=sign, drift=float(drift), offset_a=float(offset))
+    low, high = writable_range(target, "test")
+    for code in whole_range(source):
+        wanted = exact(source, target, code, sign=sign, drift=drift, offset_a=offset)
+        assert plan.apply(code) == min(max(math.floor(wanted + HALF), low), high)
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    drift=st.floats(-0.4, 0.4),
+    offset=st.floats(-150.0, 150.0),
+    sign=st.sampled_from([1, -1]),
+    scale=st.sampled_from([0.02, -0.1, 0.013]),
+)
+def test_the_error_over_all_codes_of_16_bits_is_at_most_half_a_code_and_a_little(
+    drift: float, offset: float, sign: int, scale: float
+) -> None:
+    source, target = current(scale), current(0.02)
+    plan = integer_plan(source, target, sign=sign, drift=drift, offset_a=offset)
+    slope = exact(source, target, 1, sign=sign, drift=repr(drift), offset_a=repr(offset))
+    start = exact(source, target, 0, sign=sign, drift=repr(drift), offset_a=repr(offset))
+    # |round(x) - x| <= 1/2 + 2^-10, in integers over one denominator: 65536 fractions would take seconds
+    common = math.lcm(slope.denominator, start.denominator)
+    gain, bias = int((slope - start) * common), int(start * common)
+    bound = int((HALF + LARGEST_ERROR) * common)
+    for code in whole_range(source):
+        got = plan.apply(code)
+        if plan.lowest < got < plan.highest:
+            assert abs(got * common - gain * code - bias) <= bound
+
+
+@given(
+    length=st.integers(2, 64),
+    signed=st.booleans(),
+    drift=st.floats(-0.4, 0.4),
+    offset=st.floats(-150.0, 150.0),
+    data=st.data(),
+)
+def test_signals_of_any_width_keep_the_error_bound(
+    length: int, signed: bool, drift: float, offset: float, data: st.DataObject
+) -> None:
+    source = current(0.02, -7.0, length=length, signed=signed)
+    plan = integer_plan(source, source, sign=1, drift=drift, offset_a=offset)
+    code = data.draw(st.integers(source.lowest, source.highest))
+    got = plan.apply(code)
+    wanted = exact(source, source, code, sign=1, drift=repr(drift), offset_a=repr(offset))
+    clamped = min(max(wanted, Fraction(source.lowest)), Fraction(source.highest))
+    assert abs(got - clamped) <= HALF + LARGEST_ERROR
+
+
+def test_16_bit_plans_fit_64_bit_words() -> None:
+    source = current()
+    plan = integer_plan(source, source, sign=1, drift=-0.4, offset_a=150.0)
+    for code in (source.lowest, source.highest):
+        assert abs(code * plan.gain) + abs(plan.bias) + (1 << (plan.shift - 1)) < 2**63
+
+
+def test_passing_through_changes_no_code() -> None:
+    source = current(limits=(-650, 650), names={-32768: "SNA"})
+    plan = integer_plan(source, source, sign=-1, drift=0.0, offset_a=0.0)
+    assert [plan.apply(code) for code in whole_range(source)] == list(whole_range(source))
+
+
+def test_correcting_undoes_the_sensor_fault() -> None:
+    fault = {"drift": 0.125, "offset_a": 4.0}
+    plan = integer_plan(current(), current(), sign=1, **fault)
+    for i in (-300.0, 0.0, 57.6):
+        measured = (1 + fault["drift"]) * i + fault["offset_a"]
+        assert plan.apply(round(measured / 0.02)) == pytest.approx(i / 0.02, abs=1)
+        assert corrected_current(measured, **fault) == pytest.approx(i)
+
+
+def test_turning_sign_and_offset_gives_the_same_plan() -> None:
+    one = integer_plan(current(), current(), sign=1, drift=0.07, offset_a=3.0)
+    other = integer_plan(current(), current(), sign=-1, drift=0.07, offset_a=-3.0)
+    assert one == other
+
+
+def test_results_saturate_beside_named_codes() -> None:
+    target = current(names={-32768: "SNA", 32767: "Error", 32766: "Init"})
+    plan = integer_plan(current(), target, sign=1, drift=-0.4, offset_a=0.0)
+    assert plan.apply(32767) == 32765
+    assert plan.apply(-32768) == -32767
+
+
+def test_results_saturate_at_the_range_of_the_dbc() -> None:
+    plan = integer_plan(current(), current(limits=(-650, 650)), sign=1, drift=-0.4, offset_a=0.0)
+    assert (plan.apply(32767), plan.apply(-32767)) == (32500, -32500)
+
+
+def test_the_plan_is_the_written_formula() -> None:
+    plan = IntegerPlan(gain=3, bias=1, shift=2, lowest=-100, highest=100)
+    assert [plan.apply(code) for code in (-1, 0, 1, 1000)] == [0, 0, 1, 100]
+
+
+def test_named_codes_and_codes_out_of_range_are_no_values() -> None:
+    codes = current(limits=(-650, 650), names={-32768: "SNA", 7: "Odd"})
+    assert [codes.is_value(code) for code in (-32768, 7, 32501, 32500, 0)] == [False, False, False, True, True]
+
+
+@pytest.mark.parametrize("names", [{5: "SNA"}, {3: "Error", 5: "Signal not available"}, {5: "invalid", 9: "x"}])
+def test_the_code_for_no_value_is_found_by_its_name(names: dict[int, str]) -> None:
+    assert not_available_code(current(names=names), "test") == 5
+
+
+def test_a_target_without_a_code_for_no_value_is_refused() -> None:
+    with pytest.raises(DatabaseError, match=r"branch x: signal I needs a code named SNA"):
+        not_available_code(current(), "branch x")
+
+
+def test_a_name_on_the_code_of_zero_is_refused() -> None:
+    with pytest.raises(DatabaseError, match="the code of 0 of signal I is named 'Off'"):
+        writable_range(current(names={0: "Off"}), "test")
+
+
+def test_a_scale_of_zero_is_refused() -> None:
+    with pytest.raises(DatabaseError, match="signal I has scale 0"):
+        current(0.0)
+
+
+def test_a_unit_of_another_quantity_is_refused() -> None:
+    with pytest.raises(DatabaseError, match="signal I is in 'W'; expected A, mA, kA"):
+        current(unit="W")

@@ -1,0 +1,86 @@
+"""Small vehicles for the node's tests: layouts and DBCs made to measure, parameters, and frames with cantools."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from e2e.p01 import e2e_p01_protect
+
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import (
+    BranchParameters,
+    FileReference,
+    HardwareFault,
+    JunctionResidual,
+    Provenance,
+    VehicleParameters,
+)
+
+LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
+
+SMALL_LAYOUT = """
+schema = 1
+name = "small"
+dbc = "small.dbc"
+full_scale_a = 400.0
+branch = [
+    { name = "battery", sign = 1, signal = "Pair.Battery", corrected = "PairOut.Battery", quality = "PairOut.Quality" },
+    { name = "motor", sign = -1, signal = "Pair.Motor", corrected = "PairOut.Motor" },
+    { name = "heater", sign = -1, power = "Heater.Power", voltage = "Net.Voltage" },
+]
+"""
+SMALL_DBC = """VERSION ""
+BU_: Node
+BO_ 256 Pair: 8 Node
+ SG_ Battery : 7|16@0- (0.1,0) [-3000|3000] "A" Node
+ SG_ Motor : 23|16@0- (-0.05,0) [-1600|1600] "A" Node
+BO_ 2147484160 Heater: 4 Node
+ SG_ Power : 0|16@1+ (1,0) [0|60000] "W" Node
+BO_ 258 Net: 2 Node
+ SG_ Voltage : 0|16@1+ (0.01,0) [0|650] "V" Node
+BO_ 512 PairOut: 8 Node
+ SG_ Battery : 0|16@1- (0.1,0) [-3000|3000] "A" Node
+ SG_ Motor : 16|16@1- (-0.05,0) [-1600|1600] "A" Node
+ SG_ Quality : 32|2@1+ (1,0) [0|3] "" Node
+VAL_ 256 Battery -32768 "SNA";
+VAL_ 512 Battery -32768 "SNA";
+VAL_ 512 Motor -32768 "SNA";
+"""
+
+
+def parameters_for(database: VehicleDatabase, **faults: tuple[float, float]) -> VehicleParameters:
+    """Parameters with drift and offset [A] per branch."""
+    layout = database.layout
+    return VehicleParameters(
+        vehicle="v1",
+        number=300,
+        layout=FileReference(name=layout.path.name, sha256=layout.digest),
+        dbc=FileReference(name=layout.dbc, sha256=database.digest),
+        verdict="corrected",
+        branches={name: BranchParameters(drift=drift, offset_a=offset) for name, (drift, offset) in faults.items()},
+        hardware_fault=HardwareFault(suspected=False),
+        junction_residual=JunctionResidual(measured_a=1.0, corrected_a=0.1),
+        provenance=Provenance(
+            tool="test",
+            method="truth",
+            created="2026-01-01T00:00:00Z",
+            fleet="f",
+            fleet_size=1,
+            drives=[],
+            duration_s=1,
+        ),
+    )
+
+
+def as_document(parameters: VehicleParameters) -> dict[str, Any]:
+    """Parameters as the JSON document they are written as."""
+    return dict(msgspec.to_builtins(parameters))
+
+
+def protected(database: VehicleDatabase, message: str, counter: int, **values: float) -> bytes:
+    """A frame of the project's DBC by cantools, with E2E protection; signals that are not given are 0."""
+    definition = database.message(message)
+    signals = {signal.name: 0 for signal in definition.signals} | values | {"AliveCounter": counter}
+    data = bytearray(definition.encode(signals, scaling=True, strict=False))
+    e2e_p01_protect(data, definition.frame_id, increment_counter=False)
+    return bytes(data)

@@ -1,0 +1,203 @@
+#!/usr/bin/env python3
+"""Play a CAN log onto a bus, with the timing of the recording or as fast as the bus takes it.
+
+Formats are those of python-can (.log of candump, .asc, .blf, .trc, .csv, .mf4), each also gzipped.
+"""
+
+import argparse
+import gzip
+import logging
+import math
+import struct
+import sys
+import time
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import BinaryIO, cast
+
+import can
+
+from calibrator.blf import check_blf
+from calibrator.errors import LogError
+from ecu_node.errors import BusError, UserError
+from ecu_node.node import connect
+
+__all__ = ["main", "read_log", "replay"]
+
+SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".mf4")
+_DAMAGE = (
+    ValueError, LookupError, TypeError, OSError, EOFError, NotImplementedError, struct.error, zlib.error,
+    can.io.blf.BLFParseError,
+)  # fmt: skip
+"""What python-can's readers raise on a damaged file."""
+_SEND_LIMIT_S = 1.0
+"""A bus that takes nothing for this long has nobody listening, or is off. [s]"""
+_SEND_PAUSE_S = 0.0005
+_PROGRESS_PERIOD_S = {True: 0.5, False: 10.0}
+"""Time between lines of progress, on a terminal and elsewhere. [s]"""
+
+
+def read_log(path: Path) -> Iterator[can.Message]:
+    """Read a log frame by frame.
+
+    Parameters
+    ----------
+    path : Path
+        The log; its suffix says the format.
+
+    Yields
+    ------
+    can.Message
+        The frames in the order of the file.
+
+    Raises
+    ------
+    LogError
+        If the file is missing, of an unknown format, damaged or empty.
+    """
+    suffix = Path(path.name.removesuffix(".gz")).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise LogError(f"{path}: not a known log format; expected {', '.join(SUFFIXES)}, each also with .gz")
+    if not path.is_file():
+        raise LogError(f"{path}: no such log file")
+    count = 0
+    try:
+        if suffix == ".blf":
+            with cast("BinaryIO", gzip.open(path) if path.suffix == ".gz" else path.open("rb")) as file:
+                check_blf(file, str(path))
+        with can.LogReader(path) as reader:
+            for message in reader:
+                yield message
+                count += 1
+    except _DAMAGE as error:
+        why = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise LogError(f"{path}: damaged after {count} frames ({why}); copy or record it again") from None
+    if not count:
+        raise LogError(f"{path}: the log is empty; record it again")
+
+
+def replay(
+    messages: Iterable[can.Message],
+    bus: can.BusABC,
+    *,
+    speed: float = 1.0,
+    progress: Callable[[int, float], None] | None = None,
+) -> int:
+    """Send messages in their order, at their instants.
+
+    Parameters
+    ----------
+    messages : iterable of can.Message
+        Frames with timestamps [s]; error frames are left out, a bus makes its own.
+    bus : can.BusABC
+        Where to.
+    speed : float
+        1 keeps the timing, 2 halves the time, 0 goes as fast as the bus takes frames. [1]
+    progress : callable, optional
+        Called after each frame with the number of frames sent and the time since the first one in the log [s].
+
+    Returns
+    -------
+    int
+        Number of frames sent.
+
+    Raises
+    ------
+    BusError
+        If the bus takes no frame for a second.
+    """
+    sent = 0
+    begin_s = time.monotonic()
+    first_s: float | None = None
+    for message in messages:
+        if message.is_error_frame:
+            continue
+        first_s = message.timestamp if first_s is None else first_s
+        age_s = message.timestamp - first_s
+        if speed > 0.0 and (wait_s := begin_s + age_s / speed - time.monotonic()) > 0.0:
+            time.sleep(wait_s)
+        _send(bus, message)
+        sent += 1
+        if progress is not None:
+            progress(sent, age_s)
+    return sent
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    options = _parser().parse_args(argv)
+    logging.getLogger("can").addHandler(logging.NullHandler())
+    show = _Progress()
+    try:
+        with connect(options.interface, options.channel, fd=options.fd) as bus:
+            sent = replay(read_log(options.log), bus, speed=options.speed, progress=show)
+    except UserError as error:
+        print(f"replay: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"replay: interrupted after {show.sent} frames", file=sys.stderr)
+        return 1
+    finally:
+        show.close()
+    print(f"{sent} frames in {time.monotonic() - show.begin_s:.1f} s")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="replay.py", description="Plays a CAN log onto a bus.")
+    parser.add_argument("log", type=Path, metavar="LOG", help=f"log file: {' '.join(SUFFIXES)}, each also .gz")
+    parser.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
+    parser.add_argument("--channel", required=True, help="channel of the interface, such as vcan0")
+    parser.add_argument("--speed", type=_speed, default=1.0, help="1: as recorded (default), 0: as fast as it goes")
+    parser.add_argument("--fd", action="store_true", help="open the bus for CAN FD")
+    return parser
+
+
+def _speed(text: str) -> float:
+    speed = float(text)
+    if not (math.isfinite(speed) and speed >= 0.0):
+        raise argparse.ArgumentTypeError(f"{text}: a number of at least 0 is expected")
+    return speed
+
+
+def _send(bus: can.BusABC, message: can.Message) -> None:
+    give_up_s = time.monotonic() + _SEND_LIMIT_S
+    while True:
+        try:
+            bus.send(message)
+        except can.CanError as error:
+            if time.monotonic() > give_up_s:
+                raise BusError(f"{bus.channel_info}: the bus takes no frame: {error}") from None
+            time.sleep(_SEND_PAUSE_S)
+        else:
+            return
+
+
+class _Progress:
+    """Shows on standard error how far it is: one line kept up to date on a terminal, a line now and then elsewhere."""
+
+    def __init__(self) -> None:
+        self.begin_s = time.monotonic()
+        self.sent = 0
+        self._terminal = sys.stderr.isatty()
+        self._due_s = self.begin_s + _PROGRESS_PERIOD_S[self._terminal]
+        self._line_open = False
+
+    def __call__(self, sent: int, age_s: float) -> None:
+        self.sent = sent
+        now_s = time.monotonic()
+        if now_s >= self._due_s:
+            self._due_s = now_s + _PROGRESS_PERIOD_S[self._terminal]
+            begin, end = ("\r", "") if self._terminal else ("", "\n")
+            print(f"{begin}replay: {sent} frames, {age_s:.0f} s of the log", end=end, file=sys.stderr, flush=True)
+            self._line_open = self._terminal
+
+    def close(self) -> None:
+        """End the line on a terminal."""
+        if self._line_open:
+            print(file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
