@@ -76,20 +76,20 @@ class RecordingReport:
         """Return what a user should know, one short text each; empty if the log is whole and sound."""
         absent = [item.name for item in self.channels if not item.frames]
         texts = [f"no frames of {', '.join(absent)}"] if absent else []
-        texts += [
-            f"{item.name}: {item.not_good} of {item.frames} frames not usable"
-            for item in self.channels
-            if item.not_good
-        ]
-        texts += [f"{self.damaged} damaged lines or frames left out"] if self.damaged else []
-        texts += [f"{self.error_frames} error frames"] if self.error_frames else []
-        texts += [f"{self.disordered} frames out of order, sorted"] if self.disordered else []
-        texts += (
-            [f"the clock was set {self.clock_steps} times, each step became a gap of {CLOCK_GAP_S:g} s"]
-            if self.clock_steps
-            else []
-        )
-        return texts
+        spoilt = [item for item in self.channels if item.not_good]
+        texts += [f"{item.name}: {item.not_good} of {item.frames} frames not usable" for item in spoilt]
+        return texts + self.log_notices()
+
+    def log_notices(self) -> list[str]:
+        """Return those of the notices that concern the log as a whole, not single channels."""
+        gap = f"each step became a gap of {CLOCK_GAP_S:g} s"
+        texts = {
+            f"{self.damaged} damaged lines or frames left out": self.damaged,
+            f"{self.error_frames} error frames": self.error_frames,
+            f"{self.disordered} frames out of order, sorted": self.disordered,
+            f"the clock was set {self.clock_steps} times, {gap}": self.clock_steps,
+        }
+        return [text for text, count in texts.items() if count]
 
 
 @dataclass(frozen=True, kw_only=True)

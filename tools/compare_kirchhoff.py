@@ -52,7 +52,7 @@ def main(
             plot_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {Path(where).name}")
     except UserError as error:
         _fail(str(error))
-    notices = recording.report.notices() + comparison.notices()
+    notices = recording.report.log_notices() + comparison.notices()
     if as_json:
         typer.echo(json.dumps(comparison.as_json() | {"notices": notices}, indent=2))
         return

@@ -1,0 +1,54 @@
+"""The recorded trips of a BMW i3."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrator.align import align, choose_inputs
+from calibrator.store import iterate_drives
+from ecu_node.layout import read_layout
+
+ROOT = Path(__file__).parents[2]
+LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
+
+STUCK_HEATER = {"TripA03", "TripA05", "TripA06", "TripA13", "TripA18"}
+"""Known from the energy balance. TripA20, also said to be implausible, agrees with its balance but for the defaults."""
+
+
+@pytest.fixture(scope="module")
+def imported(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, list[str]]]:
+    store = tmp_path_factory.mktemp("i3") / "store"
+    command = [
+        sys.executable, str(ROOT / "tools" / "import_bmw_i3.py"), str(shared_data / "bmw_i3_summer"),
+        "--layout", str(LAYOUT), "--out", str(store), "--json",
+    ]  # fmt: skip
+    account = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert account["failed"] == {}
+    return store, {name: drive["notices"] for name, drive in account["drives"].items()}
+
+
+def test_all_32_trips_are_imported_and_the_stuck_heaters_named(imported: tuple[Path, dict[str, list[str]]]) -> None:
+    _, notices = imported
+    assert len(notices) == 32
+    implausible = {name for name, texts in notices.items() if any("implausible" in text for text in texts)}
+    assert implausible == STUCK_HEATER
+    assert all(any("default of 5.52 kW" in text for text in texts) for texts in notices.values())
+
+
+def test_the_other_trips_give_valid_samples_whose_currents_sum_to_zero(
+    imported: tuple[Path, dict[str, list[str]]],
+) -> None:
+    layout = read_layout(LAYOUT)
+    drives = [drive for drive in iterate_drives(imported[0], layout) if drive.name not in STUCK_HEATER]
+    inputs, left_out = choose_inputs(layout, {name for drive in drives for name in drive.inputs})
+    assert left_out == ("low_voltage_current",)
+    for drive in drives:
+        samples = align(drive, layout, ("battery", "motor", "auxiliary"), inputs=inputs)
+        assert samples.valid.mean() > 0.7
+        currents_a = samples.currents_a[samples.valid]
+        np.testing.assert_allclose(currents_a.sum(axis=1), 0.0, atol=1e-9)
+        assert np.all(currents_a[:, 2] <= 0.0)

@@ -1,0 +1,80 @@
+"""The recorded drive of a Tesla Model 3 with its own DBC and the layout of this repository."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import can
+import cantools
+import msgspec
+import numpy as np
+import pytest
+from cantools.database.can import Database
+
+from calibrator.frames import read_frames
+from calibrator.readers import read_recording
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.layout import read_layout
+
+ROOT = Path(__file__).parents[2]
+LAYOUT = ROOT / "dbc" / "tesla_model3.toml"
+
+
+@pytest.fixture(scope="module")
+def folder(shared_data: Path) -> Path:
+    return shared_data / "tesla_model3"
+
+
+@pytest.fixture(scope="module")
+def tesla(folder: Path) -> VehicleDatabase:
+    layout = msgspec.structs.replace(read_layout(LAYOUT), dbc=str(folder / "Model3CAN.dbc"))
+    return read_database(layout)
+
+
+def test_compare_kirchhoff_prints_the_loads_that_nothing_measures(folder: Path) -> None:
+    """4.1 A +- 1.2 A of loads have no sensor on this bus; the other figures are the sensors' own."""
+    command = [
+        sys.executable, str(ROOT / "tools" / "compare_kirchhoff.py"), str(folder / "drive.log.gz"),
+        "--layout", str(LAYOUT), "--dbc", str(folder / "Model3CAN.dbc"), "--json",
+    ]  # fmt: skip
+    figures = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    total = figures["before"]["sum"]
+    assert round(total["mean_a"], 1) == 4.1
+    assert round(total["sd_a"], 1) == 1.2
+    assert figures["after"] is None
+    assert figures["valid"] == figures["instants"] == 946
+
+
+def test_every_frame_is_read_as_python_can_reads_it(folder: Path) -> None:
+    frames = read_frames(folder / "drive.log.gz")
+    messages = list(can.LogReader(folder / "drive.log.gz"))
+    assert frames.key.tolist() == [message.arbitration_id for message in messages]
+    assert [frames.data[k, :n].tobytes() for k, n in enumerate(frames.length)] == [bytes(m.data) for m in messages]
+    assert frames.damaged == 0
+
+
+def test_battery_and_inverters_decode_as_cantools_decodes_them(folder: Path, tesla: VehicleDatabase) -> None:
+    recording = read_recording(folder / "drive.log.gz", tesla, vehicle="model3", name="drive")
+    database = cantools.database.load_file(folder / "Model3CAN.dbc", strict=False)
+    assert isinstance(database, Database)
+    current: list[float] = []
+    rear: list[float] = []
+    voltage = np.nan
+    for message in can.LogReader(folder / "drive.log.gz"):
+        if message.arbitration_id not in {0x132, 0x266}:
+            continue
+        values = database.decode_message(message.arbitration_id, bytes(message.data), decode_choices=False)
+        assert isinstance(values, dict)
+        if message.arbitration_id == 0x132:
+            voltage = float(str(values["BattVoltage132"]))
+            current.append(float(str(values["SmoothBattCurrent132"])))
+        else:
+            rear.append(-1000.0 * float(str(values["RearPower266"])) / voltage)
+    assert recording.report.notices() == []
+    np.testing.assert_allclose(recording.drive.branches["battery"].value, current, rtol=1e-12)
+    np.testing.assert_allclose(recording.drive.branches["motor_rear"].value, rear, rtol=1e-12)
+
+
+def test_the_layout_is_about_a_dozen_lines() -> None:
+    assert len(LAYOUT.read_text().splitlines()) <= 14

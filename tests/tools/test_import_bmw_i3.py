@@ -1,0 +1,200 @@
+import gzip
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrator.bmw_i3 import COLUMNS, ImportedTrip, trip_from_table
+from calibrator.csv_table import read_csv_table
+from calibrator.drive import Array
+from calibrator.errors import DriveError, LogError
+from calibrator.readers import read_drive
+from calibrator.store import list_drives, read_drive_file
+from ecu_node.database import read_database
+from ecu_node.layout import read_layout
+
+ROOT = Path(__file__).parents[2]
+LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
+SAMPLES = 600
+IDLE_W = 500.0
+
+
+def columns() -> dict[str, Array]:
+    """A minute of a made-up trip: 1 kW of air conditioning, no heating, 500 W that nothing measures."""
+    time_s = np.round(0.1 * np.arange(SAMPLES), 1)
+    torque = np.where(np.arange(SAMPLES) % 200 < 100, 0.0, 40.0)
+    power_w = 1000.0 + IDLE_W + 300.0 * torque
+    return {
+        "time": time_s,
+        "speed": np.full(SAMPLES, 30.0),
+        "accelerator": np.full(SAMPLES, 20.0),
+        "torque": torque,
+        "acceleration": np.zeros(SAMPLES),
+        "voltage": np.full(SAMPLES, 400.0),
+        "current": -power_w / 400.0,
+        "heater": np.zeros(SAMPLES),
+        "aircon": np.full(SAMPLES, 1.0),
+    }
+
+
+def write_csv(path: Path, values: dict[str, Array]) -> Path:
+    header = ";".join(COLUMNS[key] + " " for key in values) + ";Battery Temperature [\xb0C]"
+    rows = [";".join(f"{cell:g}" for cell in row) + ";20" for row in zip(*values.values(), strict=True)]
+    text = "\n".join([header, *rows]) + "\n"
+    data = text.encode("latin-1")
+    path.write_bytes(gzip.compress(data) if path.suffix == ".gz" else data)
+    return path
+
+
+def imported(path: Path) -> ImportedTrip:
+    return trip_from_table(read_csv_table(path, delimiter=";", encoding="latin-1"), vehicle="v", name="d")
+
+
+def with_text(path: Path, old: str, new: str, line: int) -> Path:
+    lines = path.read_bytes().decode("latin-1").splitlines()
+    assert old in lines[line - 1]
+    lines[line - 1] = lines[line - 1].replace(old, new, 1)
+    path.write_bytes("\n".join(lines).encode("latin-1"))
+    return path
+
+
+def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, str(ROOT / "tools" / "import_bmw_i3.py"), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+
+
+def test_currents_are_positive_into_the_junction_and_sum_to_zero(tmp_path: Path) -> None:
+    trip = imported(write_csv(tmp_path / "a.csv", columns()))
+    values = {name: channel.value for name, channel in trip.drive.branches.items()}
+    assert trip.notices == ()
+    assert np.all(values["battery"] > 0.0)
+    np.testing.assert_allclose(values["auxiliary"], -1000.0 / 400.0)
+    np.testing.assert_allclose(values["motor"], -(IDLE_W + 300.0 * columns()["torque"]) / 400.0, rtol=1e-4)
+    np.testing.assert_allclose(sum(values.values()), 0.0, atol=1e-12)
+    assert trip.drive.inputs["aircon_demand"].value[0] == 1000.0
+
+
+def test_the_heaters_default_and_the_lines_beside_it_are_labelled(tmp_path: Path) -> None:
+    values = columns()
+    values["heater"][200:210] = 5.52
+    values["heater"][400:405] = [1.0, 2.0, 3.0, 4.0, 5.0]
+    values["heater"][405:415] = 5.52
+    trip = imported(write_csv(tmp_path / "a.csv", values))
+    bad = np.flatnonzero(~trip.drive.branches["auxiliary"].good)
+    assert bad.tolist() == [*range(199, 211), *range(399, 416)]
+    assert trip.drive.branches["battery"].good.all()
+    assert np.array_equal(trip.drive.branches["motor"].good, trip.drive.inputs["heater_demand"].good)
+    assert trip.notices == (
+        "heater power reads its default of 5.52 kW 2 times: 29 samples of auxiliary, motor and heater_demand not good",
+    )
+
+
+def test_a_heater_power_that_the_battery_does_not_give_is_implausible(tmp_path: Path) -> None:
+    trip = imported(write_csv(tmp_path / "a.csv", columns() | {"heater": np.full(SAMPLES, 1.4)}))
+    assert not trip.drive.branches["auxiliary"].good.any()
+    assert trip.drive.branches["battery"].good.all()
+    assert "implausible over the whole trip: with the inverter idle it leaves -900 W" in trip.notices[0]
+
+
+def test_a_heater_power_that_the_battery_gives_is_believed(tmp_path: Path) -> None:
+    values = columns()
+    values["heater"] = np.full(SAMPLES, 1.4)
+    values["current"] = values["current"] - 1400.0 / 400.0
+    assert imported(write_csv(tmp_path / "a.csv", values)).notices == ()
+
+
+def test_an_empty_cell_is_labelled_with_its_line(tmp_path: Path) -> None:
+    path = with_text(write_csv(tmp_path / "a.csv", columns()), ";400;", ";;", line=12)
+    trip = imported(path)
+    assert np.flatnonzero(~trip.drive.inputs["voltage"].good).tolist() == [10]
+    assert np.flatnonzero(~trip.drive.branches["auxiliary"].good).tolist() == [10]
+    assert trip.notices == (
+        "column 'Battery Voltage [V]': 1 cells without a number, the first at line 12; labelled as not good",
+    )
+
+
+def test_a_zero_voltage_is_labelled(tmp_path: Path) -> None:
+    trip = imported(with_text(write_csv(tmp_path / "a.csv", columns()), ";400;", ";0;", line=12))
+    assert np.flatnonzero(~trip.drive.branches["motor"].good).tolist() == [10]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "message"),
+    [
+        ("Battery Voltage [V]", "Batery Voltage [V]", 1, r"a\.csv: there is no column 'Battery Voltage \[V\]'; the"),
+        ("AirCon Power [kW]", "Battery Voltage [V]", 1, r"2 columns have the header 'Battery Voltage \[V\]'"),
+        (";400;", ";4OO;", 7, r"a\.csv: line 7, column 'Battery Voltage \[V\]': '4OO' is not a number"),
+        ("0.5;", "0.4;", 7, r"a\.csv: line 7, column 'Time \[s\]': 0\.4 does not come after the line before"),
+        ("0.5;", "0.3;", 7, r"line 7, column 'Time \[s\]': 0\.3 does not come after"),
+        ("0.5;", ";", 7, r"line 7, column 'Time \[s\]': an empty cell does not come after"),
+        (";400;", "", 7, r"a\.csv: line 7 has 8 cells, the header 10"),
+    ],
+)  # fmt: skip
+def test_a_fault_in_the_file_is_named_with_its_place(
+    tmp_path: Path, old: str, new: str, line: int, message: str
+) -> None:
+    path = with_text(write_csv(tmp_path / "a.csv", columns()), old, new, line)
+    with pytest.raises(LogError, match=message):
+        imported(path)
+
+
+def test_three_seconds_are_too_short(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "a.csv", {key: value[:31] for key, value in columns().items()})
+    with pytest.raises(DriveError, match=r"a\.csv: only 3\.0 s long; at least 10 s are needed"):
+        imported(path)
+
+
+def test_an_empty_or_cut_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty.csv").touch()
+    with pytest.raises(LogError, match="the file is empty"):
+        imported(tmp_path / "empty.csv")
+    path = write_csv(tmp_path / "cut.csv.gz", columns())
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(LogError, match=r"cut\.csv\.gz: cannot be read"):
+        imported(path)
+
+
+def test_one_bad_file_does_not_stop_the_others_and_the_exit_code_says_so(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    write_csv(tmp_path / "in" / "A.csv", columns())
+    write_csv(tmp_path / "in" / "B.csv.gz", columns())
+    with_text(write_csv(tmp_path / "in" / "C.csv", columns()), "Time [s]", "Tme [s]", line=1)
+    write_csv(tmp_path / "B.csv", columns())
+    done = run(tmp_path / "in", tmp_path / "B.csv", "--layout", LAYOUT, "--out", tmp_path / "store")
+    assert done.returncode == 1
+    assert [entry.vehicle for entry in list_drives(tmp_path / "store")] == ["A"]
+    errors = done.stderr.splitlines()
+    assert len(errors) == 2
+    assert "two files for one trip" in errors[0]
+    assert "C.csv: there is no column 'Time [s]'" in errors[1]
+    assert "1 trips imported, 0.0 h; 2 left out" in done.stdout
+
+
+def test_the_log_holds_what_the_drive_holds(tmp_path: Path) -> None:
+    values = columns()
+    values["heater"][200:210] = 5.52
+    path = write_csv(tmp_path / "A.csv", values)
+    done = run(path, "--layout", LAYOUT, "--out", tmp_path / "store", "--logs", tmp_path / "logs", "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["drives"]["A"]["duration_s"] == pytest.approx(59.9)
+    database = read_database(read_layout(LAYOUT))
+    drive = read_drive_file(list_drives(tmp_path / "store")[0].path, database.layout)
+    read = read_drive(tmp_path / "logs" / "A" / "A.log.gz", database, vehicle="A", name="A")
+    assert set(read.inputs) == set(drive.inputs)
+    for name, channel in drive.branches.items():
+        found = read.branches[name]
+        np.testing.assert_allclose(found.time_s, channel.time_s, atol=1e-6)
+        assert np.array_equal(found.good, channel.good)
+        np.testing.assert_allclose(found.value[found.good], channel.value[channel.good], atol=0.0101)
+
+
+def test_a_layout_without_these_branches_is_refused(tmp_path: Path) -> None:
+    text = LAYOUT.read_text().replace('name = "auxiliary"', 'name = "heater"')
+    (tmp_path / "l.toml").write_text(text.replace('"hv_powertrain.dbc"', f'"{LAYOUT.parent / "hv_powertrain.dbc"}"'))
+    path = write_csv(tmp_path / "A.csv", columns())
+    done = run(path, "--layout", tmp_path / "l.toml", "--out", tmp_path / "store")
+    assert done.returncode == 1
+    assert "no branch or input named auxiliary" in done.stderr
