@@ -96,13 +96,16 @@ class BasisPursuit:
         Raises
         ------
         BasisPursuitError
-            If the solver reports anything but an optimum.
+            If slopes or intercepts are not finite, or the solver reports anything but an optimum.
         """
-        self._y.value = np.concatenate([slopes, intercepts])
+        y = np.concatenate([slopes, intercepts])
+        if not np.isfinite(y).all():
+            raise BasisPursuitError("basis pursuit has nothing to solve: slopes or intercepts are not finite")
+        self._y.value = y
         self._radius.value = max(float(np.sqrt(epsilon)), SMALLEST_RADIUS)
         try:
             self._problem.solve(solver=cp.CLARABEL)
-        except (cp.error.SolverError, ValueError) as error:
+        except cp.error.SolverError as error:
             raise BasisPursuitError(f"basis pursuit failed: {error}") from None
         if self._problem.status != cp.OPTIMAL:
             raise BasisPursuitError(f"basis pursuit ended with status '{self._problem.status}'")

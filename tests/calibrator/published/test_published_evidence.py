@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+
+from calibrator.drive import Array
+from calibrator.errors import DriveError, FleetError
+from calibrator.faults import Faults, slopes_and_intercepts
+from calibrator.published.evidence import collect_evidence, fleet_mean, junction_mean_square
+from calibrator.random_fleet import draw_faults
+
+
+def ideal_currents(samples: int = 600) -> Array:
+    t = np.arange(float(samples))
+    battery = 40.0 * np.sin(t / 20.0) + 15.0 * np.cos(t / 7.0) + 10.0
+    return np.column_stack([battery, -0.7 * battery + 3.0 * np.sin(t / 50.0), -0.3 * battery - 3.0 * np.sin(t / 50.0)])
+
+
+def symmetric_fleet(vehicles: int = 40) -> Faults:
+    rng = np.random.default_rng(0)
+    return draw_faults(
+        rng, vehicles=vehicles, branches=3, sparsity=60.0, magnitude=(0.05, 0.25), full_scale_a=400.0, symmetric=True
+    )
+
+
+def simulations(i_s: Array, faults: Faults, noise_a: float) -> Array:
+    a, b = slopes_and_intercepts(faults)
+    clean = a[:, None, :] * i_s + b[:, None, :]
+    return np.asarray(clean + noise_a * np.random.default_rng(1).normal(size=clean.shape))
+
+
+def test_mean_of_a_symmetric_fleet_is_the_ideal_current() -> None:
+    i_s = ideal_currents()
+    np.testing.assert_allclose(fleet_mean(simulations(i_s, symmetric_fleet(), 0.0)), i_s, atol=1e-10)
+
+
+def test_mean_takes_vehicles_one_by_one() -> None:
+    simulated = simulations(ideal_currents(), symmetric_fleet(), 1.0)
+    np.testing.assert_allclose(fleet_mean(iter(simulated)), simulated.mean(axis=0), atol=1e-12)
+
+
+def test_noise_free_slopes_and_intercepts_are_those_of_the_faults() -> None:
+    i_s, faults = ideal_currents(), symmetric_fleet()
+    evidence = collect_evidence(simulations(i_s, faults, 0.0), i_s, np.zeros(len(faults)))
+    a, b = slopes_and_intercepts(faults)
+    np.testing.assert_allclose(evidence.slopes, a, atol=1e-12)
+    np.testing.assert_allclose(evidence.intercepts_a, b, atol=1e-9)
+
+
+def test_variances_are_those_of_white_noise() -> None:
+    i_s, faults = ideal_currents(), symmetric_fleet(400)
+    evidence = collect_evidence(simulations(i_s, faults, 5.0), i_s, np.zeros(len(faults)))
+    a, b = slopes_and_intercepts(faults)
+    slope_score = (evidence.slopes - a) / np.sqrt(evidence.slope_variances)
+    offset_score = (evidence.intercepts_a - b) / np.sqrt(evidence.intercept_variances_a2)
+    assert slope_score.std() == pytest.approx(1.0, abs=0.06)
+    assert offset_score.std() == pytest.approx(1.0, abs=0.06)
+
+
+def test_features_are_the_mean_squares_of_deviation_and_junction_sum() -> None:
+    i_s, faults = ideal_currents(), symmetric_fleet(4)
+    simulated = simulations(i_s, faults, 2.0)
+    junction = np.array([junction_mean_square(x) for x in simulated])
+    features = collect_evidence(simulated, i_s, junction).features
+    np.testing.assert_allclose(features[:, :3], np.mean((simulated - i_s) ** 2, axis=1))
+    np.testing.assert_allclose(features[:, 3], np.mean(simulated.sum(axis=2) ** 2, axis=1))
+
+
+def test_evidence_scales_with_the_currents() -> None:
+    i_s, faults = ideal_currents(), symmetric_fleet(4)
+    simulated = simulations(i_s, faults, 2.0)
+    plain = collect_evidence(simulated, i_s, np.zeros(4))
+    scaled = collect_evidence(3.0 * simulated, 3.0 * i_s, np.zeros(4))
+    np.testing.assert_allclose(scaled.slopes, plain.slopes)
+    np.testing.assert_allclose(scaled.intercepts_a, 3.0 * plain.intercepts_a)
+    np.testing.assert_allclose(scaled.deviation_a2, 9.0 * plain.deviation_a2)
+
+
+def test_faultless_sensors_have_no_junction_sum() -> None:
+    assert junction_mean_square(ideal_currents()) == pytest.approx(0.0, abs=1e-20)
+
+
+def test_junction_sum_leaves_out_samples_that_are_not_valid() -> None:
+    measured = ideal_currents() + 1.0
+    valid = np.ones(len(measured), bool)
+    valid[10], measured[10] = False, np.nan
+    assert junction_mean_square(measured, valid) == pytest.approx(9.0)
+
+
+def test_junction_sum_of_nothing_or_nan_is_refused() -> None:
+    with pytest.raises(DriveError, match="0 of 0"):
+        junction_mean_square(np.empty((0, 2)))
+    with pytest.raises(DriveError, match="1 of 2"):
+        junction_mean_square(np.array([[1.0, np.nan], [1.0, -1.0]]))
+
+
+def test_empty_fleet_is_refused() -> None:
+    with pytest.raises(FleetError, match="no vehicle left"):
+        fleet_mean([])
+
+
+def test_constant_reference_is_refused() -> None:
+    reference = ideal_currents()
+    reference[:, 1] = 4.0
+    with pytest.raises(FleetError, match="branch 2 is constant"):
+        collect_evidence([reference], reference, np.zeros(1))
+
+
+def test_fleets_of_different_size_are_refused() -> None:
+    reference = ideal_currents()
+    with pytest.raises(FleetError, match="1 vehicles were simulated, but 2"):
+        collect_evidence([reference], reference, np.zeros(2))

@@ -1,0 +1,156 @@
+import numpy as np
+import pytest
+
+from calibrator.drive import Array
+from calibrator.errors import FleetError
+from calibrator.faults import Faults, slopes_and_intercepts
+from calibrator.published.basis_pursuit import BasisPursuit, BasisPursuitError, quadratic_forms
+from calibrator.published.classify import Classification, classify_by_truth
+from calibrator.published.evidence import FleetEvidence
+from calibrator.published.recovery import recover_fleet
+from calibrator.published.refit import refit_support, support_of
+from calibrator.random_fleet import draw_faults
+from calibrator.score import recovered
+
+FULL_SCALE_A = 400.0
+
+
+def faults_from(x: Array) -> Faults:
+    """Fault parameters of rows (d_h, o_h,1 .. o_h,K-1, D_m, o_m), offsets in fractions of full scale."""
+    K = x.shape[1] // 3
+    free = FULL_SCALE_A * x[:, 1:K]
+    return Faults(
+        hardware_drift=x[:, 0],
+        hardware_offset_a=np.column_stack([free, -free.sum(axis=1)]),
+        drift=x[:, K : 2 * K],
+        offset_a=FULL_SCALE_A * x[:, 2 * K :],
+    )
+
+
+def evidence_of(faults: Faults, *, slope_sd: float = 0.0, offset_sd: float = 0.0, seed: int = 0) -> FleetEvidence:
+    a, b = slopes_and_intercepts(faults)
+    rng = np.random.default_rng(seed)
+    return FleetEvidence(
+        slopes=a + slope_sd * rng.normal(size=a.shape),
+        intercepts_a=b + offset_sd * FULL_SCALE_A * rng.normal(size=b.shape),
+        slope_variances=np.full(a.shape, slope_sd**2),
+        intercept_variances_a2=np.full(b.shape, (offset_sd * FULL_SCALE_A) ** 2),
+        deviation_a2=np.zeros(a.shape),
+        junction_a2=np.zeros(len(a)),
+    )
+
+
+@pytest.mark.parametrize("branches", [2, 3, 5])
+def test_quadratic_forms_are_the_slopes_and_intercepts(branches: int) -> None:
+    x = np.random.default_rng(0).normal(size=3 * branches)
+    a, b = slopes_and_intercepts(faults_from(x[None]))
+    lifted = np.append(x, 1.0)
+    values = np.einsum("i,kij,j->k", lifted, quadratic_forms(branches), lifted)
+    np.testing.assert_allclose(values, np.append(a[0], b[0] / FULL_SCALE_A), atol=1e-12)
+
+
+@pytest.mark.parametrize("branches", [2, 3, 4])
+def test_single_faults_are_recovered_exactly_without_noise(branches: int) -> None:
+    x = 0.15 * np.eye(3 * branches)
+    truth = faults_from(x)
+    both = Classification(hardware=np.ones(len(x), bool), sensor=np.ones(len(x), bool))
+    found = recover_fleet(evidence_of(truth), both, full_scale_a=FULL_SCALE_A)
+    assert not found.failed
+    np.testing.assert_allclose(found.faults.drift, truth.drift, atol=1e-6)
+    np.testing.assert_allclose(found.faults.offset_a, truth.offset_a, atol=1e-4)
+    np.testing.assert_allclose(found.faults.hardware_drift, truth.hardware_drift, atol=1e-6)
+
+
+def test_fleet_of_sparse_faults_is_recovered_through_noise() -> None:
+    rng = np.random.default_rng(1)
+    truth = draw_faults(
+        rng, vehicles=120, branches=2, sparsity=80.0, magnitude=(0.05, 0.25), full_scale_a=FULL_SCALE_A, balanced=True
+    )
+    evidence = evidence_of(truth, slope_sd=0.001, offset_sd=0.0002)
+    found = recover_fleet(evidence, classify_by_truth(truth), full_scale_a=FULL_SCALE_A)
+    assert recovered(found.faults, truth, full_scale_a=FULL_SCALE_A, smallest_fault=0.05).mean() > 0.99
+
+
+def test_cases_one_and_two_get_no_sensor_parameters() -> None:
+    truth = faults_from(np.array([[0.1, 0.0, 0.0, 0.2, 0.1, 0.0]]).repeat(2, axis=0))
+    classes = Classification(hardware=np.array([False, True]), sensor=np.array([False, False]))
+    found = recover_fleet(evidence_of(truth), classes, full_scale_a=FULL_SCALE_A)
+    assert not found.faults.drift.any()
+    assert not found.faults.offset_a.any()
+
+
+def test_case_three_reads_the_parameters_from_the_regression() -> None:
+    truth = faults_from(np.array([[0.0, 0.0, 0.1, -0.2, 0.05, -0.15]]))
+    classes = Classification(hardware=np.array([False]), sensor=np.array([True]))
+    found = recover_fleet(evidence_of(truth), classes, full_scale_a=FULL_SCALE_A)
+    np.testing.assert_allclose(found.faults.drift, truth.drift)
+    np.testing.assert_allclose(found.faults.offset_a, truth.offset_a)
+
+
+def test_result_does_not_depend_on_the_unit_of_current() -> None:
+    truth = faults_from(np.array([[0.1, 0.0, 0.2, 0.0, 0.1, 0.0], [0.0, 0.2, 0.0, -0.1, 0.0, 0.0]]))
+    plain = evidence_of(truth, slope_sd=0.001, offset_sd=0.001)
+    milli = FleetEvidence(
+        slopes=plain.slopes,
+        intercepts_a=1e3 * plain.intercepts_a,
+        slope_variances=plain.slope_variances,
+        intercept_variances_a2=1e6 * plain.intercept_variances_a2,
+        deviation_a2=1e6 * plain.deviation_a2,
+        junction_a2=1e6 * plain.junction_a2,
+    )
+    in_a = recover_fleet(plain, classify_by_truth(truth), full_scale_a=FULL_SCALE_A)
+    in_ma = recover_fleet(milli, classify_by_truth(truth), full_scale_a=1e3 * FULL_SCALE_A)
+    np.testing.assert_allclose(in_ma.faults.offset_a, 1e3 * in_a.faults.offset_a, atol=1e-3)
+    np.testing.assert_allclose(in_ma.faults.drift, in_a.faults.drift, atol=1e-9)
+
+
+def test_a_failed_optimisation_is_named_and_the_fleet_goes_on() -> None:
+    truth = faults_from(np.array([[0.1, 0.0, 0.0, 0.0, 0.1, 0.0], [0.1, 0.0, 0.0, 0.0, 0.1, 0.0]]))
+    evidence = evidence_of(truth)
+    evidence.slopes[0, 0] = np.nan
+    found = recover_fleet(evidence, classify_by_truth(truth), full_scale_a=FULL_SCALE_A)
+    assert list(found.failed) == [0]
+    assert "basis pursuit" in found.failed[0]
+    assert not found.faults.offset_a[0].any()
+    np.testing.assert_allclose(found.faults.offset_a[1], truth.offset_a[1], atol=1e-4)
+
+
+def test_slopes_that_are_not_finite_are_refused() -> None:
+    with pytest.raises(BasisPursuitError, match="slopes or intercepts are not finite"):
+        BasisPursuit(2).solve(np.array([np.inf, 1.0]), np.zeros(2), epsilon=1e-6)
+
+
+def test_solver_that_gives_up_is_named() -> None:
+    with pytest.raises(BasisPursuitError, match=r"basis pursuit (failed|ended)"):
+        BasisPursuit(2).solve(np.array([1e90, 1.0]), np.zeros(2), epsilon=1e-6)
+
+
+def test_support_has_no_more_parameters_than_equations() -> None:
+    support = support_of(np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.01]))
+    assert support.tolist() == [False, True, True, True, True, False]
+
+
+def test_refit_takes_out_the_shrinkage() -> None:
+    x = np.array([0.1, 0.0, 0.0, -0.2, 0.15, 0.0])
+    a, b = slopes_and_intercepts(faults_from(x[None]))
+    start = 0.8 * x + 0.005
+    fitted = refit_support(start, a[0], b[0] / FULL_SCALE_A, np.full(4, 0.001))
+    np.testing.assert_allclose(fitted, x, atol=1e-9)
+
+
+def test_refit_that_runs_away_keeps_the_start() -> None:
+    start = np.array([0.5, 0.0, 0.3, 0.0, 0.0, 0.0])
+    fitted = refit_support(start, np.array([9.0, -9.0]), np.zeros(2), np.full(4, 0.001))
+    np.testing.assert_array_equal(fitted, start)
+
+
+def test_classes_of_another_fleet_are_refused() -> None:
+    truth = faults_from(np.zeros((3, 6)))
+    with pytest.raises(FleetError, match="3 vehicles, but 2 were classified"):
+        recover_fleet(evidence_of(truth), classify_by_truth(truth.take(slice(0, 2))), full_scale_a=FULL_SCALE_A)
+
+
+def test_full_scale_must_be_positive() -> None:
+    truth = faults_from(np.zeros((3, 6)))
+    with pytest.raises(FleetError, match="positive, not 0 A"):
+        recover_fleet(evidence_of(truth), classify_by_truth(truth), full_scale_a=0.0)
