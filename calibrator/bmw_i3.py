@@ -16,7 +16,7 @@ Known faults of the recordings, found in the data and labelled:
 * heater power reads exactly 5.52 kW for single seconds (a default of the signal), often at the end of a straight
   line of up to ten seconds that comes from interpolation over a gap;
 * heater power that does not flow: with the inverter idle, battery power minus heater minus air conditioning is what the
-  DC/DC converter takes; in sound trips its median is 270 W or more, in trips with a stuck heater signal below 100 W.
+  DC/DC converter takes; in sound trips its median is 330 W or more, in trips with a stuck heater signal below 100 W.
 """
 
 from collections.abc import Mapping
@@ -53,7 +53,7 @@ HEATER_RESOLUTION_KW = 0.005
 IDLE_TORQUE_NM = 1.0
 """Below this the inverter takes next to nothing."""
 LEAST_DCDC_W = 200.0
-"""The control units of a running car take more than this; sound trips have 270 W or more."""
+"""The control units of a running car take more than this; sound trips have 330 W or more."""
 IMPOSSIBLE_JUMP_KW = 3.0
 """No heater does this within one sample."""
 NEAR_DEFAULT_KW = 0.6
