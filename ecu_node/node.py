@@ -126,7 +126,7 @@ def connect(
             receive_own_messages=False,
             **options,
         )
-    except (can.CanError, OSError, ValueError, TypeError) as error:
+    except (can.CanError, OSError, ValueError, TypeError, NotImplementedError) as error:
         raise BusError(f"{interface} {channel}: cannot open the bus: {_why(error)}") from None
 
 

@@ -48,6 +48,14 @@ def exact(source: Codes, target: Codes, code: int, *, sign: int, drift: str, off
     return (sign * i - target.offset) / target.scale
 
 
+def exact_line(source: Codes, target: Codes, *, sign: int, drift: str, offset_a: str) -> tuple[int, int, int]:
+    """The same as (gain * code + bias) / common in integers: fractions of 65536 codes would take seconds."""
+    start = exact(source, target, 0, sign=sign, drift=drift, offset_a=offset_a)
+    slope = exact(source, target, 1, sign=sign, drift=drift, offset_a=offset_a) - start
+    common = math.lcm(slope.denominator, start.denominator)
+    return int(slope * common), int(start * common), common
+
+
 def whole_range(codes: Codes) -> range:
     return range(codes.lowest, codes.highest + 1)
 
@@ -66,10 +74,11 @@ def test_every_code_of_16_bits_is_rounded_half_up_and_clamped(
     source: Codes, target: Codes, sign: int, drift: str, offset: str
 ) -> None:
     plan = integer_plan(source, target, sign=sign, drift=float(drift), offset_a=float(offset))
+    gain, bias, common = exact_line(source, target, sign=sign, drift=drift, offset_a=offset)
     low, high = writable_range(target, "test")
-    for code in whole_range(source):
-        wanted = exact(source, target, code, sign=sign, drift=drift, offset_a=offset)
-        assert plan.apply(code) == min(max(math.floor(wanted + HALF), low), high)
+    got = [plan.apply(code) for code in whole_range(source)]
+    wanted = [(2 * (gain * code + bias) + common) // (2 * common) for code in whole_range(source)]
+    assert got == [min(max(code, low), high) for code in wanted]
 
 
 @settings(max_examples=8, deadline=None)
@@ -84,11 +93,7 @@ def test_the_error_over_all_codes_of_16_bits_is_at_most_half_a_code_and_a_little
 ) -> None:
     source, target = current(scale), current(0.02)
     plan = integer_plan(source, target, sign=sign, drift=drift, offset_a=offset)
-    slope = exact(source, target, 1, sign=sign, drift=repr(drift), offset_a=repr(offset))
-    start = exact(source, target, 0, sign=sign, drift=repr(drift), offset_a=repr(offset))
-    # |round(x) - x| <= 1/2 + 2^-10, in integers over one denominator: 65536 fractions would take seconds
-    common = math.lcm(slope.denominator, start.denominator)
-    gain, bias = int((slope - start) * common), int(start * common)
+    gain, bias, common = exact_line(source, target, sign=sign, drift=repr(drift), offset_a=repr(offset))
     bound = int((HALF + LARGEST_ERROR) * common)
     for code in whole_range(source):
         got = plan.apply(code)

@@ -1,7 +1,7 @@
 """Small vehicles for the node's tests: layouts and DBCs made to measure, parameters, and frames with cantools."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 from e2e.p01 import e2e_p01_protect
@@ -84,3 +84,8 @@ def protected(database: VehicleDatabase, message: str, counter: int, **values: f
     data = bytearray(definition.encode(signals, scaling=True, strict=False))
     e2e_p01_protect(data, definition.frame_id, increment_counter=False)
     return bytes(data)
+
+
+def decoded(database: VehicleDatabase, message: str, data: bytes) -> dict[str, Any]:
+    """The signals of a frame by cantools; named codes as numbers."""
+    return cast("dict[str, Any]", database.message(message).decode(data, decode_choices=False))

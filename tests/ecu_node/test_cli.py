@@ -1,0 +1,130 @@
+"""The command line: exit codes, one-line messages, and what a light process it is."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ecu_node import __version__
+from ecu_node.cli import main
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import parameter_schema, write_parameters
+from tests.ecu_node.vehicles import LAYOUT, parameters_for
+
+
+@pytest.fixture
+def params(database: VehicleDatabase, tmp_path: Path) -> Path:
+    path = tmp_path / "v1.json"
+    write_parameters(parameters_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0)), path)
+    return path
+
+
+def check(params: Path, *more: str) -> list[str]:
+    return ["check", "--params", str(params), "--layout", str(LAYOUT), *more]
+
+
+def test_fit_parameters_are_shown_with_their_integer_plan(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(check(params, "--vehicle", "v1", "--json")) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["fit"], report["reason"], report["vehicle"], report["parameter_set"]) == (True, "NONE", "v1", 300)
+    battery, motor = report["branches"]["battery"], report["branches"]["motor"]
+    assert (battery["drift"], battery["offset_a"], battery["applied"]) == (0.25, 5.0, True)
+    assert battery["target"] == "HV_BatteryCorrected.BatteryCurrentCorrected"
+    assert battery["plan"]["gain"] / 2 ** battery["plan"]["shift"] == pytest.approx(1 / 1.25)
+    assert battery["plan"]["bias"] / 2 ** battery["plan"]["shift"] == pytest.approx(-5.0 / 1.25 / 0.02)
+    assert motor["plan"]["gain"] == 2 ** motor["plan"]["shift"]
+    assert not report["branches"]["dcdc"]["applied"]
+
+
+def test_the_same_as_text(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(check(params)) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "vehicle v1, parameter set 300: fit"
+    assert lines[2].split()[:3] == ["battery", "+25.0000%", "+5.000"]
+    assert lines[5].endswith("HV_DcdcCorrected.DcdcCurrentCorrected  (passed through)")
+
+
+def test_unfit_parameters_end_in_1_and_say_why(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(check(params, "--vehicle", "v2", "--json")) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert (report["fit"], report["reason"]) == (False, "WRONG_VEHICLE")
+    assert report["message"] == "parameters are for vehicle 'v1', this is 'v2'"
+
+
+def test_the_vehicle_can_come_from_the_environment(
+    params: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ECU_NODE_VEHICLE", "v2")
+    assert main(check(params)) == 1
+    assert capsys.readouterr().out.startswith("NOT FIT (WRONG_VEHICLE): parameters are for vehicle 'v1'")
+
+
+def test_the_schema_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["schema"]) == 0
+    assert json.loads(capsys.readouterr().out) == parameter_schema()
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["fly"], ["check"], ["run", "--params", "p", "--layout", "l"], ["run", "--nonsense"]]
+)
+def test_wrong_use_ends_in_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert "usage: ecu-node" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["check", "--help"], ["schema", "--help"]])
+def test_help_is_given(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 0
+    assert "usage: ecu-node" in capsys.readouterr().out
+
+
+def test_the_version_is_given(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert capsys.readouterr().out == f"ecu-node {__version__}\n"
+
+
+def run_node(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "ecu_node", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        env={**os.environ, **environment},
+    )
+
+
+@pytest.mark.parametrize(
+    ("layout", "interface", "words"),
+    [
+        ("missing.toml", "socketcan", "ecu-node: missing.toml: cannot read the layout: No such file or directory"),
+        (str(LAYOUT), "socketcan", "ecu-node: socketcan nobus0: cannot open the bus: "),
+        (str(LAYOUT), "carrier_pigeon", "ecu-node: carrier_pigeon nobus0: cannot open the bus: "),
+    ],
+)
+def test_what_keeps_the_node_from_running_is_one_line(params: Path, layout: str, interface: str, words: str) -> None:
+    result = run_node(
+        "run", "--params", str(params), "--layout", layout, "--interface", interface, "--channel", "nobus0"
+    )
+    assert result.returncode == 1
+    assert result.stdout == ""
+    assert result.stderr.startswith(words)
+    assert result.stderr.count("\n") == 1
+
+
+def test_the_node_brings_no_numpy_with_it(params: Path) -> None:
+    code = (
+        "import sys; from ecu_node.cli import main; "
+        f"assert 'can' not in sys.modules; main({check(params)!r}); import can; "
+        "assert not {'numpy', 'pandas', 'asammdf'} & set(sys.modules), 'heavy'"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0, result.stderr

@@ -1,0 +1,134 @@
+"""Layout, formulas and the DBC behind them: good ones are read, bad ones refused with file and place."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.errors import DatabaseError, LayoutError
+from ecu_node.formula import formula_names, parse_formula
+from ecu_node.layout import file_digest, read_layout
+from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT
+
+MakeDatabase = Callable[..., VehicleDatabase]
+
+
+def test_the_projects_own_layout_is_read() -> None:
+    layout = read_layout(LAYOUT)
+    assert layout.branch_names == ("battery", "motor", "auxiliary", "dcdc", "motor_rear")
+    assert layout.find_branch("motor").sign == -1
+    assert layout.offset_limit_a == 150.0
+    assert layout.digest == file_digest(LAYOUT)
+
+
+def test_a_power_branch_is_named_by_its_power(make_database: MakeDatabase) -> None:
+    layout = make_database().layout
+    assert layout.find_branch("heater").source == "Heater.Power"
+    assert layout.offset_limit_a == pytest.approx(0.4 * 400.0)
+
+
+def test_line_ends_do_not_change_the_digest(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"x\ny\n")
+    (tmp_path / "b").write_bytes(b"x\r\ny\r\n")
+    assert file_digest(tmp_path / "a") == file_digest(tmp_path / "b")
+
+
+def test_an_unknown_branch_is_answered_with_the_known_ones(database: VehicleDatabase) -> None:
+    with pytest.raises(LayoutError, match="no branch 'fridge'; known are battery, motor"):
+        database.layout.find_branch("fridge")
+
+
+BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("schema = 1", "schema = 2", "schema"),
+        ('name = "small"', 'name = "small"\nextra = 1', "unknown field `extra`"),
+        ("full_scale_a = 400.0", "full_scale_a = -1.0", "full_scale_a"),
+        ("full_scale_a = 400.0", "", "missing required field `full_scale_a`"),
+        ("full_scale_a = 400.0", "full_scale_a = 4 00", "not TOML"),
+        ('name = "battery", sign = 1', 'name = "battery", sign = 2', "sign"),
+        ('"Pair.Battery"', '"Battery"', "signal"),
+        ('name = "battery"', 'name = "motor"', "motor is named twice"),
+        (BATTERY, BATTERY + ', power = "Heater.Power"', "branch battery: give either 'signal'"),
+        (', voltage = "Net.Voltage"', "", "branch heater: give either 'signal'"),
+        ('voltage = "Net.Voltage"', 'voltage = "Net.Voltage", corrected = "PairOut.Motor"', "'corrected' needs"),
+        ('"Net.Voltage"', '"Net.Voltage", quality = "PairOut.Quality"', "'quality' without 'corrected'"),
+        ('quality = "PairOut.Quality"', 'quality = "Net.Voltage"', "must be signals of one message"),
+        ("full_scale_a", 'model_inputs = ["speed"]\nfull_scale_a', "model_inputs: speed is no"),
+        ("full_scale_a", 'derived = [{ name = "d", formula = "speed * 2" }]\nfull_scale_a', "speed is no input"),
+        ("full_scale_a", 'derived = [{ name = "d", formula = "open(1)" }]\nfull_scale_a', "not allowed"),
+    ],
+)
+def test_a_layout_with_a_mistake_is_refused(make_database: MakeDatabase, old: str, new: str, words: str) -> None:
+    assert old in SMALL_LAYOUT
+    with pytest.raises(LayoutError, match=words) as caught:
+        make_database(SMALL_LAYOUT.replace(old, new))
+    assert "small.toml: " in str(caught.value) or "formula" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_two_balancing_branches_are_refused(make_database: MakeDatabase) -> None:
+    with pytest.raises(LayoutError, match="more than one branch has 'balance = true'"):
+        make_database(SMALL_LAYOUT.replace("sign = -1", "sign = -1, balance = true"))
+
+
+@pytest.mark.parametrize(
+    ("content", "words"), [(None, "cannot read the layout: No such file"), (b"\xff", "the file is not UTF-8")]
+)
+def test_a_layout_file_that_cannot_be_read_is_named(tmp_path: Path, content: bytes | None, words: str) -> None:
+    path = tmp_path / "x.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(LayoutError, match=rf"x\.toml: .*{words}"):
+        read_layout(path)
+
+
+@pytest.mark.parametrize(
+    ("dbc", "words"),
+    [
+        (SMALL_DBC.replace("BO_ 256 Pair:", "BO_ 256 Other:"), "no message 'Pair', which .*small.toml names"),
+        (SMALL_DBC.replace("SG_ Voltage", "SG_ Volt"), "message Net has no signal 'Voltage', .* it has Volt"),
+        (SMALL_DBC.replace('"V" Node', '"A" Node'), "branch heater: signal Voltage is in 'A'; expected V, mV, kV"),
+        (SMALL_DBC.replace('"W" Node', '"V" Node'), "branch heater: signal Power is in 'V'; expected W"),
+        ("this is no dbc", "small.dbc: not a CAN database"),
+        ("", "small.dbc: not a CAN database"),
+    ],
+)
+def test_a_dbc_that_lacks_what_the_layout_names_is_refused(make_database: MakeDatabase, dbc: str, words: str) -> None:
+    with pytest.raises(DatabaseError, match=words) as caught:
+        make_database(SMALL_LAYOUT, dbc)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_dbc_is_named_with_its_layout(tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
+    with pytest.raises(DatabaseError, match=r"small\.dbc: cannot read the DBC that .*small\.toml names: No such file"):
+        read_database(read_layout(tmp_path / "small.toml"))
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("torque * speed / voltage", ["speed", "torque", "voltage"]),
+        ("positive(a) - negative(b) ** 2", ["a", "b"]),
+        ("-(a + 1.5)", ["a"]),
+        ("sqrt(abs(a))", ["a"]),
+    ],
+)
+def test_arithmetic_is_understood(text: str, names: list[str]) -> None:
+    assert formula_names(parse_formula(text)) == names
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "a b", "a; b", "a if b else c", "a.b", "a[0]", "f(a)", "sqrt(a, b)", "a ** b", "'x'", "True",
+     "lambda: 1", "__import__('os')", "a < b", "a // b", "(" * 500 + "a" + ")" * 500, "-" * 5000 + "a", "\0"],
+)  # fmt: skip
+def test_everything_else_is_refused(text: str) -> None:
+    with pytest.raises(LayoutError, match="formula") as caught:
+        parse_formula(text)
+    assert "\n" not in str(caught.value)

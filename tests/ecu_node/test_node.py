@@ -1,0 +1,149 @@
+"""The node on python-can's virtual bus: a real bus object, the node in a thread of its own."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import can
+import pytest
+from can.interfaces.virtual import VirtualBus
+from e2e.p01 import e2e_p01_check
+
+from ecu_node.corrector import Corrector
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import BusError
+from ecu_node.node import open_bus, receive_filters, serve
+from ecu_node.wiring import InForce, wire
+from tests.ecu_node.vehicles import SMALL_DBC, decoded, parameters_for, protected
+
+LONGEST_WAIT_S = 10.0
+
+
+@contextmanager
+def node_on(database: VehicleDatabase, channel: str, bus: can.BusABC | None = None) -> Iterator[Corrector]:
+    corrector = wire(database, InForce(parameters=parameters_for(database, battery=(0.25, 5.0))), time.monotonic())
+    stop = threading.Event()
+    with bus or open_bus(database, interface="virtual", channel=channel, fd=False) as own:
+        thread = threading.Thread(
+            target=serve, args=(own, corrector), kwargs={"stop": stop.is_set, "status_period_s": 0.02}
+        )
+        thread.start()
+        try:
+            yield corrector
+        finally:
+            stop.set()
+            thread.join(LONGEST_WAIT_S)
+            assert not thread.is_alive()
+
+
+def receive(bus: can.BusABC, identifier: int, count: int) -> list[can.Message]:
+    """The first frames of one identifier."""
+    found: list[can.Message] = []
+    give_up = time.monotonic() + LONGEST_WAIT_S
+    while len(found) < count:
+        message = bus.recv(1.0)
+        assert time.monotonic() < give_up, f"{len(found)} of {count} frames came"
+        if message is not None and message.arbitration_id == identifier:
+            found.append(message)
+    return found
+
+
+@pytest.fixture
+def peer(request: pytest.FixtureRequest) -> Iterator[can.BusABC]:
+    """The rest of the vehicle, on a channel named after the test."""
+    with can.Bus(interface="virtual", channel=request.node.name) as bus:
+        yield bus
+
+
+def test_frames_are_corrected_on_the_bus_and_others_left_alone(
+    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
+) -> None:
+    with node_on(database, request.node.name) as corrector:
+        for k in range(100):
+            data = protected(database, "HV_Battery", k % 15, BatteryCurrent=float(k))
+            peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
+            peer.send(can.Message(arbitration_id=0x111, is_extended_id=False, data=data))
+            peer.send(can.Message(arbitration_id=0x110, is_extended_id=True, data=data))
+            peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, is_remote_frame=True, dlc=8))
+            peer.send(can.Message(arbitration_id=0x110, is_error_frame=True, is_extended_id=False))
+        answers = receive(peer, 0x510, 100)
+    currents = [
+        decoded(database, "HV_BatteryCorrected", bytes(item.data))["BatteryCurrentCorrected"] for item in answers
+    ]
+    assert currents == pytest.approx([(k - 5.0) / 1.25 for k in range(100)], abs=0.0101)
+    assert (corrector.counters.frames_in, corrector.counters.corrected) == (100, 100)
+
+
+def test_the_status_comes_again_and_again_without_any_frame(
+    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
+) -> None:
+    with node_on(database, request.node.name):
+        frames = receive(peer, 0x5F0, 5)
+    assert [frame.data[1] & 15 for frame in frames] == list(range(5))
+    assert all(e2e_p01_check(frame.data, 0x5F0) for frame in frames)
+
+
+def test_own_output_comes_back_from_another_and_is_ignored(
+    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
+) -> None:
+    with node_on(database, request.node.name) as corrector:
+        peer.send(can.Message(arbitration_id=0x510, is_extended_id=False, data=bytes(8)))
+        peer.send(can.Message(arbitration_id=0x5F0, is_extended_id=False, data=bytes(8)))
+        receive(peer, 0x5F0, 3)
+    assert corrector.counters.frames_in == 0
+
+
+class FullBus(VirtualBus):
+    """A bus whose queue is full."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise can.CanOperationError("Transmit buffer full")
+
+
+class BrokenBus(VirtualBus):
+    """A bus that is gone."""
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        raise can.CanOperationError("Network is down")
+
+
+def test_frames_that_the_bus_does_not_take_are_dropped_and_counted(
+    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
+) -> None:
+    with node_on(database, "", FullBus(request.node.name)) as corrector:
+        peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=protected(database, "HV_Battery", 0)))
+        give_up = time.monotonic() + LONGEST_WAIT_S
+        while corrector.counters.corrected == 0 or corrector.counters.send_errors < 3:
+            assert time.monotonic() < give_up
+            time.sleep(0.01)
+
+
+def test_a_bus_that_fails_ends_the_work_with_one_line(database: VehicleDatabase) -> None:
+    corrector = wire(database, InForce(parameters=None), 0.0)
+    with BrokenBus("broken") as bus, pytest.raises(BusError, match=r"^Virtual bus.*the bus failed: Network is down"):
+        serve(bus, corrector, stop=lambda: False, status_period_s=0.1)
+
+
+def test_the_kernel_is_asked_for_the_branches_only(
+    database: VehicleDatabase, make_database: Callable[..., VehicleDatabase]
+) -> None:
+    assert sorted(item["can_id"] for item in receive_filters(database)) == [0x110, 0x120, 0x128, 0x130, 0x140]
+    assert {(item["can_id"], item["can_mask"], item["extended"]) for item in receive_filters(make_database())} == {
+        (256, 0x7FF, False),
+        (512, 0x1FFFFFFF, True),
+        (258, 0x7FF, False),
+    }
+
+
+def test_an_unknown_interface_is_one_line(database: VehicleDatabase) -> None:
+    with pytest.raises(BusError, match=r"^carrier_pigeon c0: cannot open the bus: .*carrier_pigeon"):
+        open_bus(database, interface="carrier_pigeon", channel="c0", fd=False)
+
+
+def test_a_can_fd_database_needs_fd(make_database: Callable[..., VehicleDatabase]) -> None:
+    database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 16"))
+    with pytest.raises(BusError, match=r"CAN FD messages \(PairOut\); start with --fd"):
+        open_bus(database, interface="virtual", channel="c0", fd=False)
+    with open_bus(database, interface="virtual", channel="c0", fd=True):
+        pass

@@ -1,0 +1,196 @@
+"""The parameter file: schema and reader agree, and whatever is wrong is one line with a reason."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import ecu_node
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import ParameterError
+from ecu_node.parameters import (
+    MAX_FILE_BYTES,
+    UnfitError,
+    check_fit,
+    parameter_schema,
+    read_parameters,
+    write_parameters,
+)
+from ecu_node.status import Reason
+from tests.ecu_node.vehicles import as_document, parameters_for
+
+SCHEMA_FILE = Path(ecu_node.__file__).parent / "parameters.schema.json"
+VALIDATOR = jsonschema.Draft202012Validator(parameter_schema())
+
+Change = Callable[[dict[str, Any]], object]
+
+
+def is_readable(path: Path, document: Any) -> bool:
+    path.write_text(json.dumps(document))
+    try:
+        read_parameters(path)
+    except UnfitError:
+        return False
+    return True
+
+
+def test_the_published_schema_is_that_of_the_structures() -> None:
+    assert json.loads(SCHEMA_FILE.read_text()) == parameter_schema()
+
+
+def test_written_parameters_are_read_back_and_match_the_schema(database: VehicleDatabase, tmp_path: Path) -> None:
+    parameters = parameters_for(database, battery=(0.1, -2.5))
+    write_parameters(parameters, tmp_path / "p.json")
+    assert read_parameters(tmp_path / "p.json") == parameters
+    VALIDATOR.validate(json.loads((tmp_path / "p.json").read_text()))
+    assert [path.name for path in tmp_path.iterdir()] == ["p.json"]
+
+
+def test_numbers_that_json_lacks_are_not_written(database: VehicleDatabase, tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="branch battery is not finite; nothing was written"):
+        write_parameters(parameters_for(database, battery=(0.1, float("nan"))), tmp_path / "p.json")
+    assert not list(tmp_path.iterdir())
+
+
+CHANGES: dict[str, Change] = {
+    "nothing": lambda d: None,
+    "unknown key": lambda d: d.update(extra=1),
+    "vehicle missing": lambda d: d.pop("vehicle"),
+    "vehicle empty": lambda d: d.update(vehicle=""),
+    "vehicle too long": lambda d: d.update(vehicle="x" * 65),
+    "vehicle a number": lambda d: d.update(vehicle=5),
+    "another schema version": lambda d: d.update(schema_version=2),
+    "schema version a text": lambda d: d.update(schema_version="1"),
+    "number 0": lambda d: d.update(number=0),
+    "number with a fraction": lambda d: d.update(number=1.5),
+    "number left out": lambda d: d.pop("number"),
+    "no branches": lambda d: d.update(branches={}),
+    "branches a list": lambda d: d.update(branches=[]),
+    "17 branches": lambda d: d.update(branches={f"b{k}": d["branches"]["battery"] for k in range(17)}),
+    "drift -1": lambda d: d["branches"]["battery"].update(drift=-1),
+    "drift whole": lambda d: d["branches"]["battery"].update(drift=0),
+    "drift a text": lambda d: d["branches"]["battery"].update(drift="0.1"),
+    "drift true": lambda d: d["branches"]["battery"].update(drift=True),
+    "drift null": lambda d: d["branches"]["battery"].update(drift=None),
+    "deviation null": lambda d: d["branches"]["battery"].update(drift_sd=None),
+    "deviation negative": lambda d: d["branches"]["battery"].update(drift_sd=-0.1),
+    "offset missing": lambda d: d["branches"]["battery"].pop("offset_a"),
+    "apply a number": lambda d: d["branches"]["battery"].update(apply=1),
+    "unknown verdict": lambda d: d.update(verdict="fine"),
+    "confidence above 1": lambda d: d.update(confidence=1.01),
+    "digest too short": lambda d: d["dbc"].update(sha256="ab"),
+    "digest with more behind": lambda d: d["dbc"].update(sha256="a" * 64 + "b"),
+    "fleet size 0": lambda d: d["provenance"].update(fleet_size=0),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_schema_and_reader_agree(database: VehicleDatabase, tmp_path: Path, name: str) -> None:
+    document = as_document(parameters_for(database, battery=(0.1, -2.5)))
+    CHANGES[name](document)
+    assert is_readable(tmp_path / "p.json", document) == VALIDATOR.is_valid(document)
+
+
+def _paths(value: Any, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    below = value.items() if isinstance(value, dict) else ()
+    return [path, *(deeper for key, item in below for deeper in _paths(item, (*path, key)))]
+
+
+values = st.one_of(
+    st.none(), st.booleans(), st.integers(-3, 300), st.floats(-2, 2).filter(lambda x: x != int(x)), st.text(max_size=3),
+    st.just([]), st.just({}), st.just({"a": 1}), st.just("a" * 64),
+)  # fmt: skip
+
+
+@given(data=st.data())
+def test_schema_and_reader_agree_wherever_any_value_is_put(
+    database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    document = as_document(parameters_for(database, battery=(0.1, -2.5)))
+    path = data.draw(st.sampled_from(_paths(document)[1:]))
+    place = document
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = data.draw(values)
+    assert is_readable(tmp_path_factory.getbasetemp() / "p.json", document) == VALIDATOR.is_valid(document)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"null",
+        b"\xff\xfe{}",
+        b'\xef\xbb\xbf{"vehicle": "v1"}',
+        b'{"vehicle": "\xff"}',
+        b"[" * 100_000,
+        b'{"vehicle": ' + b"[" * 100_000,
+        b'{"branches": ' + b'{"a":' * 100_000,
+        b"not json at all\nsecond line",
+        b" " * (MAX_FILE_BYTES + 1),
+    ],
+    ids=lambda content: repr(content[:12]),
+)
+def test_what_is_no_parameter_file_is_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "p.json"
+    path.write_bytes(content)
+    with pytest.raises(UnfitError, match=r"p\.json: ") as caught:
+        read_parameters(path)
+    assert caught.value.reason is Reason.MALFORMED_PARAMETERS
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "9" * 400])
+def test_numbers_beyond_all_bounds_are_refused(database: VehicleDatabase, tmp_path: Path, number: str) -> None:
+    text = json.dumps(as_document(parameters_for(database, battery=(0.1, -2.5)))).replace("-2.5", number)
+    (tmp_path / "p.json").write_text(text)
+    with pytest.raises(UnfitError, match=r"not a parameter file"):
+        read_parameters(tmp_path / "p.json")
+
+
+@pytest.mark.parametrize("name", ["missing.json", "."])
+def test_a_file_that_is_not_there_is_no_parameters(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UnfitError, match="no such parameter file") as caught:
+        read_parameters(tmp_path / name)
+    assert caught.value.reason is Reason.NO_PARAMETERS
+
+
+@pytest.mark.parametrize(
+    ("faults", "change", "vehicle", "reason", "words"),
+    [
+        ({"battery": (0.1, 1.0)}, {}, "v2", Reason.WRONG_VEHICLE, "are for vehicle 'v1', this is 'v2'"),
+        ({"battery": (0.1, 1.0)}, {"layout": "0" * 64}, None, Reason.WRONG_LAYOUT, "layout .*000000000000.*calibrate"),
+        ({"battery": (0.1, 1.0)}, {"dbc": "0" * 64}, None, Reason.WRONG_DBC, "DBC .*000000000000"),
+        ({"fridge": (0.1, 1.0)}, {}, None, Reason.WRONG_LAYOUT, "branch 'fridge', which .* does not have"),
+        ({"battery": (0.41, 1.0)}, {}, None, Reason.IMPLAUSIBLE_PARAMETERS, r"drift \+0.41 is beyond .* 0.4"),
+        ({"motor": (0.1, -151.0)}, {}, None, Reason.IMPLAUSIBLE_PARAMETERS, "offset -151 A is beyond .* 150 A"),
+    ],
+)
+def test_parameters_that_do_not_belong_here_are_unfit(
+    database: VehicleDatabase,
+    tmp_path: Path,
+    faults: dict[str, tuple[float, float]],
+    change: dict[str, str],
+    vehicle: str | None,
+    reason: Reason,
+    words: str,
+) -> None:
+    document = as_document(parameters_for(database, **faults))
+    for key, digest in change.items():
+        document[key]["sha256"] = digest
+    (tmp_path / "p.json").write_text(json.dumps(document))
+    with pytest.raises(UnfitError, match=words) as caught:
+        check_fit(read_parameters(tmp_path / "p.json"), database, vehicle)
+    assert caught.value.reason is reason
+
+
+def test_parameters_made_for_this_vehicle_fit(database: VehicleDatabase) -> None:
+    for vehicle in ("v1", None):
+        check_fit(parameters_for(database, battery=(0.4, -150.0)), database, vehicle)
