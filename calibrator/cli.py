@@ -175,6 +175,7 @@ def calibrate(
         tuple[float, float],
         typer.Option("--magnitude", help="Of the tree's training fleet; drifts, offsets / full scale."),
     ] = (0.05, 0.25),
+    symmetric: Annotated[bool, typer.Option("--symmetric", help="The fleet's mean is the ideal vehicle (22).")] = False,
     branches: Annotated[str | None, typer.Option("--branches", help="Branches to use, with commas.")] = None,
     hold_out: Annotated[
         list[str] | None,
@@ -199,6 +200,7 @@ def calibrate(
         truth=read_truth(truth) if truth is not None else None,
         sparsity=sparsity,
         magnitude=magnitude,
+        symmetric=symmetric,
         branches=tuple(branches.split(",")) if branches else None,
         hold_out=frozenset(hold_out or ()),
         unity=unity,

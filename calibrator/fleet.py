@@ -31,6 +31,9 @@ from ecu_node.parameters import VehicleParameters
 
 __all__ = ["CalibrationReport", "CalibrationSettings", "calibrate_fleet"]
 
+MISFIT = 5.0
+"""Simulation error over the fleet's median from which on a model is not one of the fleet. [1]"""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationSettings:
@@ -48,6 +51,8 @@ class CalibrationSettings:
         Of the artificial fleet that the tree is trained on. [%]
     magnitude : tuple of float
         Of the same: range of drifts [1] and of offsets in fractions of full scale.
+    symmetric : bool
+        Whether the fleet is symmetric as in the paper, so that its mean has no error of its own.
     branches : tuple of str or None
         Branches to use; None: those that the fleet has.
     hold_out : frozenset of str
@@ -63,6 +68,7 @@ class CalibrationSettings:
     truth: FleetTruth | None = None
     sparsity: float = 60.0
     magnitude: tuple[float, float] = (0.05, 0.25)
+    symmetric: bool = False
     branches: tuple[str, ...] | None = None
     hold_out: frozenset[str] = field(default_factory=frozenset)
     unity: str | None = None
@@ -146,6 +152,7 @@ def calibrate_fleet(
     if not vehicles:
         reason = next(iter(left_out.values()), "")
         raise FleetError(f"{path}: no vehicle has enough usable data; the first says: {reason}")
+    vehicles = _without_misfits(vehicles, equipment, left_out)
     unity = _unity_vehicle(vehicles, settings.unity)
     recovery = _recover(vehicles, unity, equipment, database, settings)
     left_out |= {vehicles[j].vehicle: reason for j, reason in recovery.failed.items()}
@@ -212,6 +219,21 @@ def _read_one(entries: Sequence[DriveEntry], equipment: Equipment, database: Veh
             return str(error)
 
 
+def _without_misfits(
+    vehicles: Sequence[VehicleModel], equipment: Equipment, left_out: dict[str, str]
+) -> list[VehicleModel]:
+    """Vehicles whose models hold on their own last 20 % about as well as the fleet's do; the others are named."""
+    errors = np.array([vehicle.simulation_error_a for vehicle in vehicles])
+    ratios = errors / np.maximum(np.median(errors, axis=0), np.finfo(float).tiny)
+    for vehicle, ratio in zip(vehicles, ratios, strict=True):
+        if ratio.max() > MISFIT:
+            left_out[vehicle.vehicle] = (
+                f"its model misses the {equipment.branches[int(ratio.argmax())]} current of its own last 20 % "
+                f"{ratio.max():.0f} times as far as the fleet's models do; record a drive with more varied use"
+            )
+    return [vehicle for vehicle, ratio in zip(vehicles, ratios, strict=True) if ratio.max() <= MISFIT]
+
+
 def _unity_vehicle(vehicles: Sequence[VehicleModel], wanted: str | None) -> VehicleModel:
     """The vehicle whose held-out inputs become the unity drive: the one asked for, or the one with the longest."""
     if wanted is None:
@@ -245,7 +267,12 @@ def _recover(
         simulation_error_a=error_a,
         full_scale_a=database.layout.full_scale_a,
         classifier=settings.classifier,
-        expected=ExpectedFaults(sparsity=settings.sparsity, magnitude=settings.magnitude, seed=settings.seed),
+        expected=ExpectedFaults(
+            sparsity=settings.sparsity,
+            magnitude=settings.magnitude,
+            symmetric=settings.symmetric,
+            seed=settings.seed,
+        ),
         truth=truth,
     )
 

@@ -1,5 +1,6 @@
 """Progress on stderr: a bar with rate and time left on a terminal, a line now and then elsewhere."""
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -44,8 +45,9 @@ def progress_bar(label: str, total: int, unit: str) -> Iterator[Callable[[int], 
     def report(done: int) -> None:
         nonlocal printed
         now = time.monotonic()
-        if done >= total or now - printed >= LINE_EVERY_S:
-            printed = now
+        finished = done >= total
+        if printed < math.inf and (finished or now - printed >= LINE_EVERY_S):
+            printed = math.inf if finished else now
             left_s = (now - started) / max(done, 1) * (total - done)
             print(f"{label}: {done} of {total} {unit}, {now - started:.0f} s, {left_s:.0f} s left", file=sys.stderr)
 

@@ -7,7 +7,7 @@ unity drive. Equations are those of [1]_.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,8 @@ LEAD_IN_S = 60.0
 """Inputs before the held-out part by which the states of the models settle. [s]"""
 LEAST_DURATION_S = 60.0
 """Valid data below which a vehicle is left out: a few changes of speed and load. [s]"""
+QUIET = 0.03
+"""Standard deviation over mean below which an input counts as constant: a constant power over a varying voltage. [1]"""
 GAP_S = 60.0
 """Invalid time put between two drives of a vehicle, so that no state carries over. [s]"""
 
@@ -106,7 +108,7 @@ def read_vehicle_model(entries: Sequence[DriveEntry], equipment: Equipment, data
     inputs, currents, training, held_out = _joined(drives, int(GAP_S / period_s))
     valid = training | held_out
     stop = int(np.flatnonzero(training)[-1]) + 1
-    model = identify(inputs[:stop], currents[:stop], valid=training[:stop])
+    model = _identify_excited(inputs[:stop], currents[:stop], training[:stop])
     simulated = model.simulate(_bridged(inputs, valid), initial_state=model.x0)
     longest = max(drives, key=lambda drive: int(drive.valid.sum()))
     start = max(0, int(TRAIN_SHARE * len(longest.valid)) - int(LEAD_IN_S / period_s))
@@ -143,6 +145,16 @@ def junction_rms_a(vehicle: VehicleModel, *, drift: Array, offset_a: Array) -> f
     constant = float(weight @ offset_a)
     mean_square = weight @ vehicle.moment_a2 @ weight - 2.0 * constant * float(weight @ vehicle.mean_a) + constant**2
     return float(np.sqrt(max(float(mean_square), 0.0)))
+
+
+def _identify_excited(inputs: Array, currents: Array, valid: Mask) -> StateSpaceModel:
+    """Identify from the inputs that vary; what the others do cannot be learnt from this vehicle, so it is zero."""
+    excited = inputs[valid].std(axis=0) > QUIET * np.abs(inputs[valid].mean(axis=0))
+    model = identify(inputs[:, excited], currents, valid=valid)
+    B = np.zeros((model.order, inputs.shape[1]))
+    D = np.zeros((currents.shape[1], inputs.shape[1]))
+    B[:, excited], D[:, excited] = model.B, model.D
+    return replace(model, B=B, D=D)
 
 
 def _joined(drives: Sequence[Samples], gap: int) -> tuple[Array, Array, Mask, Mask]:

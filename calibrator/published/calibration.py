@@ -1,8 +1,8 @@
 """The published method on the simulations of a real fleet, where nobody knows the truth.
 
 The trees of section III-B of [1]_ need an artificial fleet to learn from. It is made on the fleet's own reference, with
-the sparsity and magnitudes that the user expects, and with the simulation error that the fleet's models show on
-held-out data.
+the sparsity and magnitudes that the user expects, with the simulation error that the fleet's models show on held-out
+data, and with the error that the mean of as many vehicles has when the fleet is not symmetric.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -36,12 +36,15 @@ class ExpectedFaults:
         Sparsity level S. [%]
     magnitude : tuple of float
         Range of drifts [1] and of offsets in fractions of full scale.
+    symmetric : bool
+        Whether the mean of the fleet is the ideal vehicle (22).
     seed : int
         Seed of the training fleet.
     """
 
     sparsity: float
     magnitude: tuple[float, float]
+    symmetric: bool
     seed: int
 
 
@@ -90,11 +93,20 @@ def calibrate_published(
     elif classifier is Classifier.THRESHOLD:
         classification = classify_by_threshold(evidence.features)
     else:
-        classification = _classify_by_tree(evidence, reference, simulation_error_a, full_scale_a, expected)
+        classification = _classify_by_tree(
+            evidence,
+            reference,
+            simulation_error_a,
+            full_scale_a=full_scale_a,
+            expected=expected,
+            reference_vehicles=int(in_reference.sum()),
+        )
     return recover_fleet(evidence, classification, full_scale_a=full_scale_a)
 
 
-def expected_features(faults: Faults, i_s: Array, simulation_error_a: Array) -> Array:
+def expected_features(
+    faults: Faults, i_s: Array, simulation_error_a: Array, *, reference_vehicles: int | None
+) -> Array:
     """Features (5) and (6) that vehicles with given faults have, from the moments of the ideal currents.
 
     Parameters
@@ -105,6 +117,8 @@ def expected_features(faults: Faults, i_s: Array, simulation_error_a: Array) -> 
         Ideal currents on the unity drive. [A]
     simulation_error_a : ndarray of shape (K,)
         Standard deviation of the simulation error. [A]
+    reference_vehicles : int or None
+        So many vehicles in a row share their mean as their reference (3); None: the reference is the ideal current.
 
     Returns
     -------
@@ -113,14 +127,30 @@ def expected_features(faults: Faults, i_s: Array, simulation_error_a: Array) -> 
     """
     a, b = slopes_and_intercepts(faults)
     mean, moment = np.mean(i_s, axis=0), i_s.T @ i_s / len(i_s)
-    deviation = (a - 1.0) ** 2 * np.diag(moment) + 2.0 * (a - 1.0) * b * mean + b**2 + simulation_error_a**2
     constant = b.sum(axis=1)
     junction = np.einsum("nk,kl,nl->n", a, moment, a) + 2.0 * constant * (a @ mean) + constant**2
+    if reference_vehicles is None:
+        slope, intercept = a - 1.0, b
+    else:
+        slope, intercept = a - _mean_of_groups(a, reference_vehicles), b - _mean_of_groups(b, reference_vehicles)
+    deviation = slope**2 * np.diag(moment) + 2.0 * slope * intercept * mean + intercept**2 + simulation_error_a**2
     return np.column_stack([deviation, junction])
 
 
+def _mean_of_groups(values: Array, size: int) -> Array:
+    """Mean over each group of rows in a row, repeated for its rows; what is left over belongs to the last group."""
+    group = np.minimum(np.arange(len(values)) // size, max(len(values) // size - 1, 0))
+    return np.stack([values[group == number].mean(axis=0) for number in range(group[-1] + 1)])[group]
+
+
 def _classify_by_tree(
-    evidence: FleetEvidence, reference: Array, simulation_error_a: Array, full_scale_a: float, expected: ExpectedFaults
+    evidence: FleetEvidence,
+    reference: Array,
+    simulation_error_a: Array,
+    *,
+    full_scale_a: float,
+    expected: ExpectedFaults,
+    reference_vehicles: int,
 ) -> Classification:
     i_s = reference - reference.mean(axis=1, keepdims=True)
     faults = draw_faults(
@@ -132,5 +162,7 @@ def _classify_by_tree(
         full_scale_a=full_scale_a,
         balanced=True,
     )
-    trees = FaultTrees(expected_features(faults, i_s, simulation_error_a), faults)
-    return trees.classify(evidence.features)
+    features = expected_features(
+        faults, i_s, simulation_error_a, reference_vehicles=None if expected.symmetric else reference_vehicles
+    )
+    return FaultTrees(features, faults).classify(evidence.features)

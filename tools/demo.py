@@ -1,0 +1,215 @@
+#!/usr/bin/env python3
+"""The whole path on one screen: a fleet, its calibration, and one vehicle corrected live on a CAN bus.
+
+Every step is a command that a user could type; it is printed before it runs. The vehicle that drives at the end is
+calibrated, but the fleet learns nothing from it, and its drive is not among those that were calibrated on.
+"""
+
+import shlex
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import chain, takewhile
+from pathlib import Path
+from typing import Annotated
+
+import can
+import typer
+
+from calibrator.errors import FleetError
+from calibrator.progress import progress_bar
+from calibrator.truth import FleetTruth, read_truth
+from ecu_node.database import read_database
+from ecu_node.errors import UserError
+from ecu_node.layout import read_layout
+from ecu_node.node import choose_parameters, open_bus, serve
+from ecu_node.wiring import wire
+from replay import read_log, replay
+
+ROOT = Path(__file__).resolve().parent.parent
+LAYOUT = "dbc/hv_powertrain.toml"
+VEHICLES = 44
+SECONDS = 40.0
+"""Length of the live drive. [s]"""
+START_S = 1.0
+"""Time the node's process is given to start. [s]"""
+
+
+def main(
+    drives: Annotated[
+        str, typer.Option(help="'builtin', or a folder of BMW i3 recordings (.csv, .csv.gz).")
+    ] = "builtin",
+    out: Annotated[Path, typer.Option(help="Folder for everything the demo makes; it is emptied first.")] = Path(
+        "build/demo"
+    ),
+) -> None:
+    """Simulate a fleet, calibrate it, drive one vehicle through the node, and show the Kirchhoff sum."""
+    started = time.monotonic()
+    try:
+        show(drives, out)
+    except UserError as error:
+        fail(str(error))
+    say(f"done in {time.monotonic() - started:.0f} s; everything is in {out}")
+
+
+def show(drives: str, out: Path) -> None:
+    """Run all steps."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    fleet, result = out / "fleet", out / "result"
+    source = import_recordings(drives, out) if drives != "builtin" else "builtin"
+    step(1, f"{VEHICLES} identical vehicles with faulty sensors drive, and log their CAN buses")
+    run(
+        *("calibrator", "simulate", "--drives", source, "--vehicles", VEHICLES, "--currents", 3, "--sparsity", 80),
+        *("--balanced", "--symmetric", "--minutes", 8, "--unseen-minutes", 2, "--layout", LAYOUT, "--out", fleet),
+    )
+    truth = read_truth(fleet / "truth.json")
+    vehicle = faulty_vehicle(truth)
+    step(2, f"the calibrator learns each vehicle's sensors from these logs ({vehicle} is held out of the learning)")
+    run(
+        *("calibrator", "calibrate", fleet, "--layout", LAYOUT, "--method", "published", "--sparsity", 80),
+        *("--hold-out", vehicle, "--out", result),
+    )
+    step(3, "because this fleet is artificial, the truth is known")
+    run("calibrator", "score", result, "--truth", fleet / "truth.json")
+    step(4, f"vehicle {vehicle} drives a trip that nobody has seen, with its node on the bus")
+    parameters = result / "params" / f"{vehicle}.json"
+    run("ecu-node", "check", "--params", parameters, "--layout", LAYOUT, "--vehicle", vehicle)
+    record_live_drive(parameters, vehicle, log=fleet / "unseen" / vehicle / "drive.log.gz", recording=out / "live.log")
+    step(5, "the Kirchhoff sum of its currents, before and after")
+    run(
+        *(sys.executable, "tools/compare_kirchhoff.py", out / "live.log"),
+        *("--layout", LAYOUT, "--plot", out / "kirchhoff.png"),
+    )
+    say(f"picture: {out / 'kirchhoff.png'}")
+    tell_the_truth(truth, vehicle)
+
+
+def import_recordings(folder: str, out: Path) -> str:
+    """Import BMW i3 recordings into a store and return its path."""
+    files = sorted([*Path(folder).glob("*.csv"), *Path(folder).glob("*.csv.gz")])
+    if not files:
+        fail(f"{folder}: no .csv or .csv.gz in it; give the folder of the BMW i3 recordings, or leave DRIVES out")
+    step(0, f"{len(files)} recorded trips of a BMW i3 become drives")
+    run(
+        *(sys.executable, "tools/import_bmw_i3.py", *files, "--layout", LAYOUT, "--out", out / "store"),
+        shown=f"python tools/import_bmw_i3.py {folder}/*.csv.gz --layout {LAYOUT} --out {out / 'store'}",
+        may_fail=True,
+    )
+    return str(out / "store")
+
+
+def faulty_vehicle(truth: FleetTruth) -> str:
+    """First vehicle with a faulty sensor and no hardware fault."""
+    for name, vehicle in truth.vehicles.items():
+        sound = not vehicle.hardware_drift and not any(vehicle.hardware_offset_a.values())
+        if sound and (any(vehicle.drift.values()) or any(vehicle.offset_a.values())):
+            return name
+    raise FleetError("no vehicle of the fleet has only sensor faults; choose another seed")
+
+
+def record_live_drive(parameters: Path, vehicle: str, *, log: Path, recording: Path) -> None:
+    """Play a log onto a bus in real time with the node on it, and record what passes."""
+    interface, channel = choose_bus()
+    say(f"bus: {interface} {channel}; {SECONDS:.0f} s in real time")
+    with running_node(parameters, vehicle, interface, channel), can.Bus(channel=channel, interface=interface) as ears:
+        notifier = can.Notifier(ears, [can.Logger(recording)], timeout=0.1)
+        try:
+            with can.Bus(channel=channel, interface=interface) as mouth:
+                play(log, mouth)
+            time.sleep(0.3)
+        finally:
+            notifier.stop()
+
+
+def choose_bus() -> tuple[str, str]:
+    """vcan0 where the kernel has SocketCAN, else python-can's virtual bus."""
+    try:
+        can.Bus(channel="vcan0", interface="socketcan").shutdown()
+    except (OSError, can.CanError):
+        return "virtual", "demo"
+    return "socketcan", "vcan0"
+
+
+@contextmanager
+def running_node(parameters: Path, vehicle: str, interface: str, channel: str) -> Iterator[None]:
+    """The node: a process of its own on SocketCAN; a thread on the virtual bus, which lives in one process."""
+    if interface == "socketcan":
+        command = ["ecu-node", "run", "--params", parameters, "--layout", LAYOUT, "--vehicle", vehicle]
+        with subprocess.Popen([*words(*command), "--interface", interface, "--channel", channel]) as process:
+            time.sleep(START_S)
+            yield
+            process.terminate()
+        return
+    database = read_database(read_layout(ROOT / LAYOUT))
+    in_force, why_not = choose_parameters(parameters, database, vehicle)
+    if why_not is not None:
+        fail(why_not)
+    stop = threading.Event()
+    with open_bus(database, interface=interface, channel=channel, fd=False) as bus:
+        node = threading.Thread(
+            target=serve,
+            args=(bus, wire(database, in_force, time.monotonic())),
+            kwargs={"stop": stop.is_set, "status_period_s": 0.1},
+        )
+        node.start()
+        yield
+        stop.set()
+        node.join()
+
+
+def play(log: Path, bus: can.BusABC) -> None:
+    """Send the first seconds of a log with its timing."""
+    messages = read_log(log)
+    first = next(messages)
+    frames = chain([first], takewhile(lambda message: message.timestamp < first.timestamp + SECONDS, messages))
+    with progress_bar("drive", int(SECONDS), "s") as progress:
+        replay(frames, bus, progress=lambda _, age_s: progress(int(age_s) + 1))
+
+
+def tell_the_truth(truth: FleetTruth, vehicle: str) -> None:
+    """Print what had been put into the vehicle."""
+    put_in = truth.vehicles[vehicle]
+    faults = [f"{name} drift {value:+.3f}" for name, value in put_in.drift.items() if value]
+    faults += [f"{name} offset {value:+.1f} A" for name, value in put_in.offset_a.items() if value]
+    say(f"put into {vehicle}: {', '.join(faults)}")
+
+
+def run(*command: object, shown: str | None = None, may_fail: bool = False) -> None:
+    """Run a command of the project and show it; stop the demo if it fails."""
+    text = shown or shlex.join(["python" if word == sys.executable else str(word) for word in command])
+    print(f"\n$ {text}", flush=True)
+    code = subprocess.run(words(*command), cwd=ROOT, check=False).returncode
+    if code and not may_fail:
+        raise SystemExit(code)
+
+
+def words(*command: object) -> list[str]:
+    """Command line with the project's commands taken from this environment."""
+    first, *rest = map(str, command)
+    own = Path(sys.executable).parent / first
+    return [str(own) if own.exists() else first, *rest]
+
+
+def step(number: int, text: str) -> None:
+    """Announce a step."""
+    print(f"\n=== {number}. {text}", flush=True)
+
+
+def say(text: str) -> None:
+    """Print a line."""
+    print(text, flush=True)
+
+
+def fail(text: str) -> None:
+    """Print one line and stop."""
+    print(f"demo: {text}", file=sys.stderr)
+    raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    typer.run(main)
