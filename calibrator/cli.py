@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
+from rich.console import Console
 
-from calibrator.options import Classifier, Method
+from calibrator.options import Classifier, ExperimentName, Method
 from calibrator.progress import progress_bar
 from calibrator.report_text import dumps
 from ecu_node import __version__
@@ -221,6 +222,34 @@ def score(
 
     figures = score_result(result, truth)
     _print_report(figures.as_json() if json else figures.as_text())
+
+
+@app.command()
+def experiment(
+    name: Annotated[ExperimentName, typer.Argument(help="Which of the paper's experiments.")],
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Small and fast: shows that it runs, not the figures.")
+    ] = False,
+    repetitions: Annotated[int | None, typer.Option("--repetitions", min=1, help="Trials per setting.")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the first trial.")] = 0,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for NAME.json and NAME.png.")] = None,
+    workers: WorkersOption = 2,
+    json: JsonOption = False,
+) -> None:
+    """Repeat an experiment of the paper and print its figures beside the paper's."""
+    from calibrator.experiments.run import run_experiment
+
+    result = run_experiment(
+        name.value,
+        quick=quick,
+        seed=seed,
+        repetitions=repetitions,
+        out=out,
+        console=None if json else Console(),
+        jobs=workers,
+    )
+    if json:
+        _print_report(result.to_json().decode())
 
 
 def _database(layout: Path) -> VehicleDatabase:

@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 
-__all__ = ["Classifier", "Method"]
+__all__ = ["Classifier", "ExperimentName", "Method"]
 
 
 class Method(StrEnum):
@@ -17,3 +17,12 @@ class Classifier(StrEnum):
     THRESHOLD = "threshold"
     TREE = "tree"
     PERFECT = "perfect"
+
+
+class ExperimentName(StrEnum):
+    """Experiments of the paper: table 1, figure 7, figure 8 and table 2."""
+
+    CLASSIFIER = "classifier"
+    SNR = "snr"
+    SPARSITY = "sparsity"
+    STATESPACE = "statespace"
