@@ -1,5 +1,6 @@
 """Results of experiments as rich tables."""
 
+from rich.markup import escape
 from rich.table import Table
 
 from calibrator.experiments.result import ExperimentResult, Figure
@@ -34,7 +35,7 @@ def result_table(result: ExperimentResult) -> Table:
         caption=f"{settings['vehicles']} vehicles, {settings['repetitions']} repetitions, seed {settings['seed']}, "
         f"drive {settings['drive']}; in brackets the paper",
     )
-    table.add_column(result.x_label, justify="right")
+    table.add_column(escape(result.x_label), justify="right")
     table.add_column("method")
     for heading in HEADINGS.values():
         table.add_column(heading, justify="right")

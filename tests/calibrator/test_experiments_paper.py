@@ -105,11 +105,12 @@ def test_result_survives_json() -> None:
 
 
 def test_table_shows_the_papers_figure_beside_ours() -> None:
-    result = classifier_experiment(drive=smooth_drive(), law=LAW, methods=(PERFECT,), repetitions=1)
+    result = snr_experiment(drive=smooth_drive(), law=LAW, snrs_db=(20.0,), repetitions=1)
     console = Console(width=160)
     with console.capture() as capture:
         console.print(result_table(result))
     assert "(0.91)" in capture.get()
+    assert "SNR [dB]" in capture.get()
 
 
 @pytest.mark.parametrize("name", ["classifier", "snr"])
