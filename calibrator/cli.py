@@ -237,7 +237,7 @@ def experiment(
     json: JsonOption = False,
 ) -> None:
     """Repeat an experiment of the paper and print its figures beside the paper's."""
-    from calibrator.experiments.run import run_experiment
+    from calibrator.experiments.runner import run_experiment
 
     result = run_experiment(
         name.value,
