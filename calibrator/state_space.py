@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 from calibrator.drive import Array, Mask
 from calibrator.errors import DriveError
 
-__all__ = ["StateSpaceModel", "simulation_snr_db"]
+__all__ = ["Complex", "StateSpaceModel", "simulation_snr_db", "snr_from_power", "valid_or_all"]
 
 WORST_EIGENVECTORS = 1e8
 """Condition number of the eigenvectors of A from which on modes are not separated any more: 8 digits remain. [1]"""

@@ -13,7 +13,7 @@ from calibrator.experiments.trial import FleetLaw, Trial
 from calibrator.published.recovery import Recovery
 from calibrator.score import f2_score, recovery_rate
 
-__all__ = ["PaperFigures", "judge", "law_settings", "run_laws"]
+__all__ = ["PaperFigures", "judge", "law_settings", "run_laws", "with_sparsity"]
 
 PaperFigures = Mapping[tuple[float, str], Mapping[str, float]]
 """Figures of the paper by (x, method) and name."""
