@@ -47,9 +47,12 @@ def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None
     """
     try:
         parameters = read_parameters(path)
-        check_fit(parameters, database, vehicle)
     except UnfitError as error:
         return InForce(parameters=None, reason=error.reason), str(error)
+    try:
+        check_fit(parameters, database, vehicle)
+    except UnfitError as error:
+        return InForce(parameters=None, reason=error.reason), f"{path}: {error}"
     return InForce(parameters=parameters), None
 
 

@@ -51,7 +51,7 @@ def test_unfit_parameters_end_in_1_and_say_why(params: Path, capsys: pytest.Capt
     assert main(check(params, "--vehicle", "v2", "--json")) == 1
     report = json.loads(capsys.readouterr().out)
     assert (report["fit"], report["reason"]) == (False, "WRONG_VEHICLE")
-    assert report["message"] == "parameters are for vehicle 'v1', this is 'v2'"
+    assert report["message"] == f"{params}: parameters are for vehicle 'v1', this is 'v2'"
 
 
 def test_the_vehicle_can_come_from_the_environment(
@@ -59,7 +59,7 @@ def test_the_vehicle_can_come_from_the_environment(
 ) -> None:
     monkeypatch.setenv("ECU_NODE_VEHICLE", "v2")
     assert main(check(params)) == 1
-    assert capsys.readouterr().out.startswith("NOT FIT (WRONG_VEHICLE): parameters are for vehicle 'v1'")
+    assert capsys.readouterr().out.startswith(f"NOT FIT (WRONG_VEHICLE): {params}: parameters are for vehicle 'v1'")
 
 
 def test_the_schema_is_printed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,177 @@
+"""Playing logs onto a bus: formats, order, timing, and logs that cannot be played."""
+
+import gzip
+import re
+import struct
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import can
+import pytest
+from can.interfaces.virtual import VirtualBus
+from replay import main, read_log, replay
+
+from calibrator.errors import LogError
+from ecu_node.errors import BusError
+
+FRAMES = [
+    can.Message(
+        timestamp=1000.0 + 0.001 * k,
+        arbitration_id=0x18FF0000 + k if k % 5 == 0 else 0x100 + k,
+        is_extended_id=k % 5 == 0,
+        data=bytes([k] * (k % 9)),
+        is_rx=False,
+    )
+    for k in range(60)
+]
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return written(tmp_path / "drive.log")
+
+
+def written(path: Path) -> Path:
+    with can.Logger(path) as logger:
+        for frame in FRAMES:
+            logger(frame)
+    return path
+
+
+@pytest.fixture
+def listener(request: pytest.FixtureRequest) -> Iterator[can.BusABC]:
+    with VirtualBus(request.node.name) as bus:
+        yield bus
+
+
+def heard(bus: can.BusABC) -> list[tuple[int, bool, bytes]]:
+    found = []
+    while (message := bus.recv(0.0)) is not None:
+        found.append((message.arbitration_id, message.is_extended_id, bytes(message.data)))
+    return found
+
+
+SENT = [(frame.arbitration_id, frame.is_extended_id, bytes(frame.data)) for frame in FRAMES]
+
+
+@pytest.mark.parametrize("name", ["x.log", "x.asc", "x.blf", "x.trc", "x.csv", "x.log.gz", "x.asc.gz", "X.BLF"])
+def test_every_frame_of_every_format_comes_in_order(
+    tmp_path: Path, listener: can.BusABC, name: str, request: pytest.FixtureRequest
+) -> None:
+    path = written(tmp_path / name)
+    with VirtualBus(request.node.name) as bus:
+        assert replay(read_log(path), bus, speed=0.0) == len(FRAMES)
+    assert heard(listener) == SENT
+
+
+def test_a_zipped_blf_is_played(tmp_path: Path) -> None:
+    path = tmp_path / "x.blf.gz"
+    path.write_bytes(gzip.compress(written(tmp_path / "x.blf").read_bytes()))
+    assert len(list(read_log(path))) == len(FRAMES)
+
+
+@pytest.mark.parametrize("speed", [1.0, 4.0])
+def test_frames_never_come_before_their_instant(speed: float) -> None:
+    class Clocked(VirtualBus):
+        times: list[float]
+
+        def send(self, msg: can.Message, timeout: float | None = None) -> None:
+            self.times.append(time.monotonic())
+
+    with Clocked("clocked") as bus:
+        bus.times = []
+        begin = time.monotonic()
+        replay(FRAMES, bus, speed=speed)
+        for frame, instant in zip(FRAMES, bus.times, strict=True):
+            assert instant - begin >= (frame.timestamp - FRAMES[0].timestamp) / speed
+
+
+def test_a_log_that_goes_back_in_time_is_not_waited_for(listener: can.BusABC, request: pytest.FixtureRequest) -> None:
+    frames = [can.Message(timestamp=stamp, arbitration_id=1) for stamp in (1e6, 1.0, 2.0)]
+    with VirtualBus(request.node.name) as bus:
+        assert replay(frames, bus) == 3
+
+
+def test_error_frames_are_left_out(listener: can.BusABC, request: pytest.FixtureRequest) -> None:
+    frames = [can.Message(is_error_frame=True), can.Message(arbitration_id=1)]
+    with VirtualBus(request.node.name) as bus:
+        assert replay(frames, bus, speed=0.0) == 1
+    assert len(heard(listener)) == 1
+
+
+def test_a_bus_that_takes_nothing_ends_the_replay(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full(VirtualBus):
+        def send(self, msg: can.Message, timeout: float | None = None) -> None:
+            raise can.CanOperationError("Transmit buffer full")
+
+    monkeypatch.setattr("replay._SEND_LIMIT_S", 0.01)
+    with Full("full") as bus, pytest.raises(BusError, match="the bus takes no frame: Transmit buffer full"):
+        replay(FRAMES, bus, speed=0.0)
+
+
+def cut(path: Path, size: int) -> Path:
+    path.write_bytes(path.read_bytes()[:size])
+    return path
+
+
+def looping_blf(path: Path) -> Path:
+    """A BLF whose object has size 0: python-can's reader goes round for ever."""
+    inner = zlib.compress(struct.pack("<4sHHLL", b"LOBJ", 16, 1, 0, 99) + bytes(64))
+    body = struct.pack("<4sHHLLHxxxxxxLxxxx", b"LOBJ", 16, 1, 32 + len(inner), 10, 2, 80) + inner
+    head = written(path).read_bytes()[:144]
+    path.write_bytes(head + body + bytes(len(body) % 4))
+    return path
+
+
+def test_logs_that_cannot_be_played_are_named_with_the_reason(tmp_path: Path) -> None:
+    cases: dict[str, tuple[Callable[[Path], object], str]] = {
+        "missing.log": (lambda path: path, "no such log file"),
+        "x.xyz": (written_text, r"not a known log format; expected \.log"),
+        "empty.log": (lambda path: path.write_bytes(b""), "the log is empty"),
+        "torn.log": (written_text, "damaged after 0 frames"),
+        "binary.asc": (lambda path: path.write_bytes(b"\xff\xfe\x00" * 50), "damaged after 0 frames|empty"),
+        "empty.blf": (lambda path: path.write_bytes(b""), "truncated or damaged BLF"),
+        "cut.blf": (lambda path: cut(written(path), 200), "truncated or damaged BLF"),
+        "loop.blf": (looping_blf, "object of 0 bytes"),
+        "notzip.log.gz": (written_text, "damaged after 0 frames"),
+        "cut.log.gz": (lambda path: cut(written(path), 150), "damaged after"),
+    }
+    for name, (make, words) in cases.items():
+        make(tmp_path / name)
+        with pytest.raises(LogError, match=words) as caught:
+            list(read_log(tmp_path / name))
+        assert name in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def written_text(path: Path) -> None:
+    path.write_text("(1.0) can0 this is no frame\n")
+
+
+def test_the_command_plays_a_log_and_counts(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with VirtualBus("command") as bus:
+        assert main([str(log), "--interface", "virtual", "--channel", "command", "--speed", "0"]) == 0
+        assert heard(bus) == SENT
+    assert capsys.readouterr().out.startswith("60 frames in ")
+
+
+@pytest.mark.parametrize(
+    ("name", "interface", "words"),
+    [("missing.log", "virtual", "replay: .*no such log"), ("drive.log", "pigeon", "replay: pigeon c: cannot open")],
+)
+def test_a_replay_that_fails_ends_in_1(
+    log: Path, capsys: pytest.CaptureFixture[str], name: str, interface: str, words: str
+) -> None:
+    assert main([str(log.parent / name), "--interface", interface, "--channel", "c"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert re.match(words, captured.err)
+
+
+@pytest.mark.parametrize("more", [[], ["--channel"], ["--channel=c", "--speed=-1"], ["--channel=c", "--speed=nan"]])
+def test_wrong_use_of_replay_ends_in_2(log: Path, more: list[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([str(log), *more])
+    assert caught.value.code == 2

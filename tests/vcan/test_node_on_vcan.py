@@ -1,0 +1,147 @@
+"""The node as a process on a real SocketCAN bus, with can-utils playing and recording."""
+
+import math
+import signal
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+from e2e.p01 import e2e_p01_check
+
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import write_parameters
+from ecu_node.status import Quality, Reason, State
+from tests.vcan.conftest import StartNode
+from tests.vcan.processes import Recording, frames_of, play, send
+from tests.vcan.small_drive import BRANCHES, VEHICLE, protected, true_parameters, write_drive
+
+INSTANTS = 250
+STATUS = 0x5F0
+CORRECTED = {"battery": 0x510, "motor": 0x520, "auxiliary": 0x530}
+
+
+@pytest.fixture
+def params(database: VehicleDatabase, tmp_path: Path) -> Path:
+    path = tmp_path / "params.json"
+    write_parameters(true_parameters(database), path)
+    return path
+
+
+def expected_frame(database: VehicleDatabase, name: str, k: int, code: int, quality: Quality) -> bytes:
+    signal_name = BRANCHES[name].signal
+    return protected(
+        database,
+        f"{BRANCHES[name].message}Corrected",
+        k,
+        **{f"{signal_name}Corrected": code, f"{signal_name}Quality": int(quality)},
+    )
+
+
+def decoded(database: VehicleDatabase, message: str, data: bytes) -> dict[str, Any]:
+    return cast("dict[str, Any]", database.message(message).decode(data, decode_choices=False))
+
+
+def state_and_reason(database: VehicleDatabase, data: bytes) -> tuple[int, int]:
+    values = decoded(database, "HV_CorrectionStatus", data)
+    return values["State"], values["Reason"]
+
+
+def kirchhoff_rmse(database: VehicleDatabase, recording: Recording, *, corrected: bool) -> float:
+    """Root mean square of the sum of the recorded branch currents over all instants. [A]"""
+    suffix = "Corrected" if corrected else ""
+    sums = [0.0] * INSTANTS
+    for branch in BRANCHES.values():
+        message = database.message(branch.message + suffix)
+        intact = [
+            data for data in recording.data_of(message.frame_id) if e2e_p01_check(bytearray(data), message.frame_id)
+        ]
+        for k, data in enumerate(intact):
+            sums[k] += branch.sign * decoded(database, message.name, data)[branch.signal + suffix]
+    return math.sqrt(sum(value * value for value in sums) / INSTANTS)
+
+
+def test_a_drive_is_corrected_bit_by_bit_and_everything_else_left_alone(
+    database: VehicleDatabase, params: Path, tmp_path: Path, start_node: StartNode, recording: Recording
+) -> None:
+    drive = tmp_path / "drive.log"
+    measured = write_drive(drive, database, INSTANTS)
+    with start_node(params, "--vehicle", VEHICLE) as node:
+        play(drive)
+        recorded = {name: recording.wait_for(CORRECTED[name], INSTANTS) for name in BRANCHES}
+        status = recording.wait_for(STATUS, 10)
+        assert node.stop() == 0
+    corrected = {name: [BRANCHES[name].corrected_code(code) for code in codes] for name, codes in measured.items()}
+    for name in BRANCHES:
+        assert recorded[name] == [
+            expected_frame(database, name, k, code, Quality.CORRECTED) for k, code in enumerate(corrected[name])
+        ]
+    own = {f"{identifier:03X}" for identifier in (*CORRECTED.values(), STATUS)}
+    assert [frame for frame in recording.frames if frame.identifier not in own] == frames_of(drive)
+    assert state_and_reason(database, status[-1]) == (State.CORRECTING, Reason.NONE)
+    assert [data[1] & 15 for data in status] == [k % 15 for k in range(len(status))]
+    assert f"corrected {3 * INSTANTS}, corrupt {INSTANTS // 10}, repeated 0, gaps 0, send errors 0" in node.messages
+    before, after = (kirchhoff_rmse(database, recording, corrected=which) for which in (False, True))
+    assert before >= 10.0 * after
+
+
+@pytest.mark.parametrize(
+    ("content", "vehicle", "reason", "words"),
+    [
+        (None, "v9999", Reason.WRONG_VEHICLE, "parameters are for vehicle 'v0007', this is 'v9999'"),
+        ("{", VEHICLE, Reason.MALFORMED_PARAMETERS, "not a parameter file"),
+        ("", VEHICLE, Reason.NO_PARAMETERS, "no such parameter file"),
+    ],
+)
+def test_with_unfit_parameters_the_measured_values_pass_through(
+    database: VehicleDatabase,
+    params: Path,
+    tmp_path: Path,
+    start_node: StartNode,
+    recording: Recording,
+    content: str | None,
+    vehicle: str,
+    reason: Reason,
+    words: str,
+) -> None:
+    if content is not None:
+        params.unlink()
+    if content:
+        params.write_text(content)
+    measured = write_drive(tmp_path / "drive.log", database, 20)
+    with start_node(params, "--vehicle", vehicle) as node:
+        play(tmp_path / "drive.log")
+        for name, codes in measured.items():
+            assert recording.wait_for(CORRECTED[name], 20) == [
+                expected_frame(database, name, k, code, Quality.PASSED_THROUGH) for k, code in enumerate(codes)
+            ]
+        (status, *_) = recording.wait_for(STATUS, 1)
+        assert node.stop() == 0
+    assert state_and_reason(database, status) == (State.PASSING_THROUGH, reason)
+    assert f"passing measured values through: {params}: {words}" in node.messages
+
+
+def test_the_node_does_not_correct_its_own_output(
+    database: VehicleDatabase, params: Path, start_node: StartNode, recording: Recording
+) -> None:
+    own = expected_frame(database, "battery", 0, 1000, Quality.CORRECTED)
+    with start_node(params) as node:
+        send(f"510#{own.hex()}")
+        recording.wait_for(STATUS, len(recording.data_of(STATUS)) + 5)
+        assert node.stop() == 0
+    assert recording.data_of(0x510) == [own]
+    assert {frame.identifier for frame in recording.frames} == {"510", "5F0"}
+    assert "frames in 0" in node.messages
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_node_within_a_second(params: Path, start_node: StartNode, how: signal.Signals) -> None:
+    with start_node(params) as node:
+        assert node.stop(how) == 0
+    assert node.messages.splitlines()[-1].startswith("ecu-node: ended: frames in 0, ")
+
+
+def test_an_interface_that_does_not_exist_is_one_line(params: Path, tmp_path: Path, start_node: StartNode) -> None:
+    with pytest.raises(AssertionError, match="nocan0: cannot open the bus: no such interface"):  # noqa: SIM117
+        with start_node(params, "--channel", "nocan0"):
+            pass
+    assert (tmp_path / "node.err").read_text().count("\n") == 1
