@@ -1,0 +1,25 @@
+"""How tools/with_vcan is used; what it does on its kernel is seen by the tests in tests/vcan."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).parents[2] / "tools" / "with_vcan"
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([str(SCRIPT), *arguments], capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.parametrize("arguments", [[], ["--or-skip"], ["--nonsense", "true"], ["--or-skip", "--nonsense"]])
+def test_wrong_use_ends_in_2(arguments: list[str]) -> None:
+    result = run(*arguments)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.startswith("usage: tools/with_vcan [--or-skip] COMMAND")
+
+
+def test_help_is_given() -> None:
+    result = run("--help")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "HV_REQUIRE_ALL=1" in result.stdout
