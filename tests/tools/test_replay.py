@@ -11,10 +11,10 @@ from pathlib import Path
 import can
 import pytest
 from can.interfaces.virtual import VirtualBus
-from replay import main, read_log, replay
 
 from calibrator.errors import LogError
 from ecu_node.errors import BusError
+from replay import main, read_log, replay
 
 FRAMES = [
     can.Message(
