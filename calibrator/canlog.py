@@ -155,7 +155,7 @@ def _bit_positions(signal: Signal) -> list[int]:
 
 def _protect(data: NDArray[np.uint8], data_id: int) -> None:
     """Fill counter and CRC of AUTOSAR E2E profile 1A in place."""
-    counter = np.arange(len(data), dtype=np.uint8) % COUNTER_MODULUS
+    counter = (np.arange(len(data)) % COUNTER_MODULUS).astype(np.uint8)
     data[:, 1] = (data[:, 1] & 0xF0) | counter
     length = data.shape[1]
     for row in data:

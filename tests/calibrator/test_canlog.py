@@ -34,6 +34,12 @@ def test_frames_decode_with_cantools_to_the_nearest_code(database: VehicleDataba
     assert [d["AliveCounter"] for d in decoded] == [k % 15 for k in range(50)]
 
 
+def test_counter_never_repeats_or_jumps(database: VehicleDatabase) -> None:
+    series = encode_message(database, "HV_Battery", np.arange(600.0), {})
+    counters = series.data[:, 1] & 15
+    assert set((np.diff(counters.astype(int)) % 15).tolist()) == {1}
+
+
 def test_protected_frames_pass_the_check_of_the_library(database: VehicleDatabase) -> None:
     series = encode_message(database, "HV_Battery", np.arange(20.0), {"BatteryCurrent": np.arange(20.0)})
     assert all(e2e_p01_check(bytearray(row.tobytes()), 272, length=8) for row in series.data)

@@ -1,0 +1,96 @@
+"""From a fleet's logs to corrected frames on a real bus: the calibrator's own parameters, on an unseen drive."""
+
+import gzip
+import json
+import math
+import subprocess
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import VehicleParameters, read_parameters
+from ecu_node.status import Quality
+from tests.vcan.conftest import LAYOUT, StartNode
+from tests.vcan.processes import Recording, play
+
+SECONDS = 8.0
+BRANCHES = {"battery": ("HV_Battery", "BatteryCurrent", 1), "motor": ("HV_Motor", "MotorCurrent", -1)}
+STEP_A = Fraction(1, 50)
+LARGEST_CODE = 32500
+
+
+def run(*command: object) -> None:
+    subprocess.run([sys.executable, "-m", *map(str, command)], check=True, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four vehicles on a common trip, calibrated with the perfect classifier."""
+    fleet = tmp_path_factory.mktemp("calibrated") / "fleet"
+    run(
+        *("calibrator", "simulate", "--vehicles", 4, "--sparsity", 60, "--common-drive", "--symmetric", "--balanced"),
+        *("--minutes", 3, "--unseen-minutes", 1, "--seed", 5, "--layout", LAYOUT, "--out", fleet, "--workers", 1),
+    )
+    run(
+        *("calibrator", "calibrate", fleet, "--layout", LAYOUT, "--out", fleet.parent / "result", "--workers", 1),
+        *("--classifier", "perfect", "--truth", fleet / "truth.json"),
+    )
+    return fleet
+
+
+def faulty_vehicle(fleet: Path) -> tuple[str, VehicleParameters]:
+    """The first vehicle whose sensors were found to be faulty."""
+    for path in sorted((fleet.parent / "result" / "params").glob("*.json")):
+        parameters = read_parameters(path)
+        if parameters.verdict == "corrected":
+            return path.stem, parameters
+    raise AssertionError("no vehicle was corrected")
+
+
+def write_start_of_unseen_drive(fleet: Path, vehicle: str, target: Path) -> None:
+    lines = gzip.decompress((fleet / "unseen" / vehicle / "drive.log.gz").read_bytes()).decode().splitlines()
+    target.write_text("\n".join(line for line in lines if float(line[1 : line.index(")")]) < SECONDS) + "\n")
+
+
+def corrected_code(code: int, sign: int, *, drift: float, offset_a: float) -> int:
+    """(25) in exact fractions, rounded half up to the DBC's step, kept in the DBC's range."""
+    i = (sign * code * STEP_A - Fraction(offset_a)) / (1 + Fraction(drift))
+    return min(max(math.floor(sign * i / STEP_A + Fraction(1, 2)), -LARGEST_CODE), LARGEST_CODE)
+
+
+def test_kirchhoff_sum_of_a_calibrated_vehicle_falls_tenfold_on_an_unseen_drive(
+    fleet: Path, database: VehicleDatabase, tmp_path: Path, start_node: StartNode, recording: Recording
+) -> None:
+    vehicle, parameters = faulty_vehicle(fleet)
+    drive = tmp_path / "drive.log"
+    write_start_of_unseen_drive(fleet, vehicle, drive)
+    with start_node(fleet.parent / "result" / "params" / f"{vehicle}.json", "--vehicle", vehicle) as node:
+        play(drive)
+        for name, (message, signal, sign) in BRANCHES.items():
+            measured = recording.data_of(database.message(message).frame_id)
+            corrected = recording.wait_for(database.message(f"{message}Corrected").frame_id, len(measured))
+            branch = parameters.branches[name]
+            for before, after in zip(measured, corrected, strict=True):
+                code = int.from_bytes(before[2:4], "little", signed=True)
+                expected = corrected_code(code, sign, drift=branch.drift, offset_a=branch.offset_a)
+                decoded = database.message(f"{message}Corrected").decode_simple(
+                    after, scaling=False, decode_choices=False
+                )
+                assert decoded[f"{signal}Corrected"] == expected
+                assert decoded[f"{signal}Quality"] == Quality.CORRECTED
+        assert node.stop() == 0
+    figures = compare(recording.log)
+    assert figures["before"]["sum"]["rmse_a"] >= 10.0 * figures["after"]["sum"]["rmse_a"], msgspec.json.encode(figures)
+
+
+def compare(log: Path) -> dict[str, dict[str, dict[str, float]]]:
+    """What tools/compare_kirchhoff.py says of a log."""
+    tool = LAYOUT.parents[1] / "tools" / "compare_kirchhoff.py"
+    command = [sys.executable, str(tool), str(log), "--layout", str(LAYOUT), "--json"]
+    done = subprocess.run(command, check=True, capture_output=True, timeout=120)
+    result: dict[str, dict[str, dict[str, float]]] = json.loads(done.stdout)
+    return result
