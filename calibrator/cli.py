@@ -8,8 +8,8 @@ import typer
 from rich.console import Console
 
 from calibrator.options import Classifier, ExperimentName, Method
-from calibrator.progress import progress_bar
-from calibrator.report_text import dumps
+from calibrator.report.progress import progress_bar
+from calibrator.report.text import dumps
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import UserError
@@ -78,7 +78,7 @@ def import_(
     json: JsonOption = False,
 ) -> None:
     """Turn CAN logs of one or many vehicles into drives."""
-    from calibrator.import_logs import import_logs
+    from calibrator.recordings.import_logs import import_logs
 
     report = import_logs(logs, _database(layout), out, workers=workers)
     _print_report(report.as_json() if json else report.as_text())
@@ -121,8 +121,8 @@ def simulate(
     json: JsonOption = False,
 ) -> None:
     """Write an artificial fleet: CAN logs of vehicles with known faults, and truth.json."""
-    from calibrator.simulate import FleetPlan, simulate_fleet
-    from calibrator.trips import choose_trips
+    from calibrator.artificial.simulate import FleetPlan, simulate_fleet
+    from calibrator.artificial.trips import choose_trips
 
     if not 0 <= magnitude[0] <= magnitude[1] < 1:
         raise typer.BadParameter(
@@ -190,8 +190,8 @@ def calibrate(
     json: JsonOption = False,
 ) -> None:
     """Estimate the sensor faults of every vehicle and write its parameter file."""
+    from calibrator.artificial.truth import read_truth
     from calibrator.fleet import CalibrationSettings, calibrate_fleet
-    from calibrator.truth import read_truth
 
     if (classifier is Classifier.PERFECT) != (truth is not None):
         raise typer.BadParameter("--classifier perfect and --truth FILE belong together", param_hint="--classifier")
@@ -218,7 +218,7 @@ def score(
     json: JsonOption = False,
 ) -> None:
     """Compare a result with the truth of its artificial fleet."""
-    from calibrator.scoring import score_result
+    from calibrator.result_score import score_result
 
     figures = score_result(result, truth)
     _print_report(figures.as_json() if json else figures.as_text())

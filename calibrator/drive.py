@@ -1,7 +1,7 @@
 """Drive: one recording of one vehicle, every signal at its own instants.
 
-A drive keeps the times of its frames; :mod:`calibrator.align` puts them on one time base. Bad samples stay in place
-and are labelled, so that what was left out can always be counted.
+A drive keeps the times of its frames; :mod:`calibrator.drives.align` puts them on one time base. Bad samples stay
+in place and are labelled, so that what was left out can always be counted.
 """
 
 from collections.abc import Mapping

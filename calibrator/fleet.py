@@ -13,17 +13,17 @@ import numpy as np
 from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
+from calibrator.artificial.truth import FleetTruth, faults_of
+from calibrator.drives.fleet_source import DriveEntry, Equipment, FleetSource, find_fleet, probe_equipment
 from calibrator.errors import FleetError
-from calibrator.fleet_source import DriveEntry, Equipment, FleetSource, find_fleet, probe_equipment
+from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_model
 from calibrator.options import Classifier, Method
 from calibrator.parameter_files import parameters_of
-from calibrator.progress import progress_bar
 from calibrator.published.calibration import ExpectedFaults, calibrate_published
 from calibrator.published.recovery import Recovery
-from calibrator.report_text import dumps, left_out_text, table
+from calibrator.report.progress import progress_bar
+from calibrator.report.text import dumps, left_out_text, table
 from calibrator.results import LeftOut, RunRecord, require_new_folder, write_results
-from calibrator.truth import FleetTruth, faults_of
-from calibrator.vehicle_model import VehicleModel, read_vehicle_model
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
@@ -122,7 +122,7 @@ def calibrate_fleet(
     Parameters
     ----------
     path : Path
-        The fleet, see :func:`calibrator.fleet_source.find_fleet`.
+        The fleet, see :func:`calibrator.drives.fleet_source.find_fleet`.
     database : VehicleDatabase
         DBC and layout.
     out : Path

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from calibrator.drive import Array
+from calibrator.identification.vehicle_model import VehicleModel, junction_rms_a
 from calibrator.options import Method
 from calibrator.published.recovery import Recovery
-from calibrator.vehicle_model import VehicleModel, junction_rms_a
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import (

@@ -12,10 +12,10 @@ import msgspec
 import typer
 from rich.console import Console
 
-from calibrator.frames import FrameCollector, Frames, read_frames
-from calibrator.kirchhoff import compare_kirchhoff
-from calibrator.kirchhoff_report import kirchhoff_table, plot_kirchhoff
-from calibrator.readers import drive_from_frames
+from calibrator.recordings.frames import FrameCollector, Frames, read_frames
+from calibrator.recordings.readers import drive_from_frames
+from calibrator.report.kirchhoff import compare_kirchhoff
+from calibrator.report.kirchhoff_view import kirchhoff_table, plot_kirchhoff
 from ecu_node.database import read_database
 from ecu_node.errors import UserError
 from ecu_node.layout import read_layout

@@ -20,9 +20,9 @@ from typing import Annotated
 import can
 import typer
 
+from calibrator.artificial.truth import FleetTruth, read_truth
 from calibrator.errors import FleetError
-from calibrator.progress import progress_bar
-from calibrator.truth import FleetTruth, read_truth
+from calibrator.report.progress import progress_bar
 from ecu_node.database import read_database
 from ecu_node.errors import UserError
 from ecu_node.layout import read_layout

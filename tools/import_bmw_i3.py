@@ -9,11 +9,11 @@ from typing import Annotated
 
 import typer
 
-from calibrator.bmw_i3 import BRANCHES, INPUTS, ImportedTrip, trip_from_table
-from calibrator.csv_table import read_csv_table
-from calibrator.drive_log import write_drive_log
+from calibrator.drives.store import require_plain_name, write_drive
 from calibrator.errors import LogError
-from calibrator.store import require_plain_name, write_drive
+from calibrator.recordings.bmw_i3 import BRANCHES, INPUTS, ImportedTrip, trip_from_table
+from calibrator.recordings.csv_table import read_csv_table
+from calibrator.recordings.drive_log import write_drive_log
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.layout import read_layout

@@ -18,8 +18,8 @@ from typing import BinaryIO, cast
 
 import can
 
-from calibrator.blf import check_blf
 from calibrator.errors import LogError
+from calibrator.recordings.blf import check_blf
 from ecu_node.errors import BusError, UserError
 from ecu_node.node import connect
 

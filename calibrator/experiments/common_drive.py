@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrator.builtin_drives import builtin_trip
+from calibrator.artificial.builtin_drives import builtin_trip
+from calibrator.artificial.ground_truth import with_branches
 from calibrator.drive import Array
 from calibrator.errors import DriveError
-from calibrator.ground_truth import with_branches
 
 __all__ = ["CommonDrive", "builtin_common_drive"]
 

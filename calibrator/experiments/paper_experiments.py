@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from calibrator.experiments.common_drive import CommonDrive
+from calibrator.experiments.judging import PaperFigures, law_settings, run_laws, with_sparsity
 from calibrator.experiments.methods import PERFECT, THRESHOLD, TREE, Method
 from calibrator.experiments.result import ExperimentResult
-from calibrator.experiments.run import PaperFigures, law_settings, run_laws, with_sparsity
 from calibrator.experiments.trial import FleetLaw, Trial, artificial_trial, state_space_trial
 
 __all__ = ["classifier_experiment", "snr_experiment", "sparsity_experiment", "statespace_experiment"]

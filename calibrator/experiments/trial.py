@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.experiments.common_drive import CommonDrive
 from calibrator.faults import Faults, slopes_and_intercepts
-from calibrator.identify import choose_order, identify
+from calibrator.identification.identify import choose_order, identify
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean, junction_mean_square
-from calibrator.random_fleet import draw_faults
 
 __all__ = ["FleetLaw", "Trial", "artificial_trial", "noise_sd_a", "state_space_trial"]
 
@@ -38,7 +38,7 @@ class FleetLaw:
     snr_db : float
         Of the artificial simulation (26). [dB]
     balanced, symmetric : bool
-        See :func:`~calibrator.random_fleet.draw_faults`.
+        See :func:`~calibrator.artificial.random_fleet.draw_faults`.
     """
 
     vehicles: int = 1000

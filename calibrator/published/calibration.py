@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array, Mask
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.options import Classifier
 from calibrator.published.classify import Classification, FaultTrees, classify_by_threshold, classify_by_truth
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.published.recovery import Recovery, recover_fleet
-from calibrator.random_fleet import draw_faults
 
 __all__ = ["ExpectedFaults", "calibrate_published", "expected_features"]
 

@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 from calibrator.drive import Array
 from calibrator.errors import DriveError, FleetError
 from calibrator.experiments.common_drive import CommonDrive, builtin_common_drive
+from calibrator.experiments.judging import judge
 from calibrator.experiments.methods import PERFECT, THRESHOLD, TREE
 from calibrator.experiments.paper_experiments import (
     classifier_experiment,
@@ -17,7 +18,6 @@ from calibrator.experiments.paper_experiments import (
     sparsity_experiment,
     statespace_experiment,
 )
-from calibrator.experiments.run import judge
 from calibrator.experiments.runner import run_experiment
 from calibrator.experiments.table import result_table
 from calibrator.experiments.trial import FleetLaw, artificial_trial, noise_sd_a, state_space_trial

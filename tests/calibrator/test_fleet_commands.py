@@ -11,8 +11,8 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from calibrator.artificial.truth import read_truth
 from calibrator.results import read_results
-from calibrator.truth import read_truth
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import check_fit, read_parameters

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrator.align import align, choose_inputs
-from calibrator.store import iterate_drives
+from calibrator.drives.align import align, choose_inputs
+from calibrator.drives.store import iterate_drives
 from ecu_node.layout import read_layout
 
 ROOT = Path(__file__).parents[2]

@@ -10,9 +10,9 @@ import can
 import numpy as np
 import pytest
 
-from calibrator.canlog import encode_message, write_candump
 from calibrator.drive import Channel, Drive
-from calibrator.drive_log import drive_series
+from calibrator.recordings.canlog import encode_message, write_candump
+from calibrator.recordings.drive_log import drive_series
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 

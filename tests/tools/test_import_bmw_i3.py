@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrator.bmw_i3 import COLUMNS, ImportedTrip, trip_from_table
-from calibrator.csv_table import read_csv_table
 from calibrator.drive import Array
+from calibrator.drives.store import list_drives, read_drive_file
 from calibrator.errors import DriveError, LogError
-from calibrator.readers import read_drive
-from calibrator.store import list_drives, read_drive_file
+from calibrator.recordings.bmw_i3 import COLUMNS, ImportedTrip, trip_from_table
+from calibrator.recordings.csv_table import read_csv_table
+from calibrator.recordings.readers import read_drive
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
+from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.errors import DriveError, FleetError
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.published.evidence import collect_evidence, fleet_mean, junction_mean_square
-from calibrator.random_fleet import draw_faults
 
 
 def ideal_currents(samples: int = 600) -> Array:

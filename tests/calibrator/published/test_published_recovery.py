@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.faults import Faults, slopes_and_intercepts
@@ -9,7 +10,6 @@ from calibrator.published.classify import Classification, classify_by_truth
 from calibrator.published.evidence import FleetEvidence
 from calibrator.published.recovery import recover_fleet
 from calibrator.published.refit import refit_support, support_of
-from calibrator.random_fleet import draw_faults
 from calibrator.score import recovered
 
 FULL_SCALE_A = 400.0

@@ -1,0 +1,183 @@
+"""Drives without any recording: a fastsim vehicle on its own cycles, cut and joined into different trips.
+
+fastsim (NREL) gives speed and mechanical and electrical motor power at 1 Hz for a battery-electric car on the UDDS and
+HWFET cycles. This module adds what the junction of such a car carries besides: heater, air conditioning, the converter
+to the low-voltage net, a rear motor that takes a share of the torque, and the battery that carries the sum.
+
+Currents are positive into the junction.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from types import ModuleType
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.signal import lfilter
+
+from calibrator.artificial.ground_truth import GroundTruth
+from calibrator.drive import Array
+from calibrator.errors import FleetError
+
+__all__ = ["builtin_trip"]
+
+VEHICLE = "2022_Renault_Zoe_ZE50_R135.yaml"
+CYCLES = ("udds.csv", "hwfet.csv")
+STYLE = (1.0, 1.5)
+"""Range of factors by which a driver hurries a cycle's time: accelerations grow with it. [1]"""
+
+PERIOD_S = 0.1
+OPEN_CIRCUIT_V = (330.0, 400.0)
+"""Open-circuit voltage of the battery at 0 and 100 % charge. [V]"""
+RESISTANCE_OHM = 0.08
+GEAR_RAD_PER_M = 9.3 / 0.31
+"""Motor angle per distance: gear ratio over tyre radius. [rad/m]"""
+SLOWEST_RAD_S = 5.0
+"""Motor speed below which power is not divided by speed to give torque. [rad/s]"""
+MOTOR_W = 100e3
+HEATER_LAG_S, AIRCON_LAG_S, DCDC_LAG_S = 8.0, 4.0, 0.4
+DCDC_EFFICIENCY = 0.93
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Motion:
+    """What fastsim knows of a trip, at the sample period."""
+
+    speed_ms: Array
+    mechanical_w: Array
+    electrical_w: Array
+    charge: Array
+
+
+def builtin_trip(rng: np.random.Generator, *, duration_s: float, name: str) -> GroundTruth:
+    """Drive one random trip with the built-in vehicle.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of chance: which parts of the cycles, in which style, and how the auxiliaries are used.
+    duration_s : float
+        Least duration. [s]
+    name : str
+        Name of the trip.
+
+    Returns
+    -------
+    GroundTruth
+        Branches battery, motor, auxiliary, dcdc, motor_rear, and all inputs of ``dbc/hv_powertrain.toml``.
+
+    Raises
+    ------
+    FleetError
+        If fastsim is not installed.
+    """
+    motion = _drive(_speed_trace(rng, duration_s))
+    samples = len(motion.speed_ms)
+    heater_demand = _random_steps(rng, samples, mean_s=90.0, levels=(0.0, 0.0, 800.0, 2000.0, 4000.0, 5500.0))
+    aircon_demand = _random_steps(rng, samples, mean_s=60.0, levels=(0.0, 300.0, 700.0, 1500.0, 2500.0))
+    low_voltage_demand = _random_steps(rng, samples, mean_s=30.0, levels=(250.0, 350.0, 450.0, 700.0, 1100.0))
+    auxiliary_w = _lag(heater_demand, HEATER_LAG_S) + _lag(aircon_demand, AIRCON_LAG_S)
+    dcdc_w = _lag(low_voltage_demand, DCDC_LAG_S) / DCDC_EFFICIENCY
+    battery_a, voltage = _battery(motion.electrical_w + auxiliary_w + dcdc_w, motion.charge)
+    torque = motion.mechanical_w / np.maximum(GEAR_RAD_PER_M * motion.speed_ms, SLOWEST_RAD_S)
+    rear_share = 0.2 + 0.3 * np.minimum(np.abs(torque) / 200.0, 1.0)
+    motor_a = motion.electrical_w / voltage
+    return GroundTruth(
+        name=name,
+        period_s=PERIOD_S,
+        currents_a={
+            "battery": battery_a,
+            "motor": -(1.0 - rear_share) * motor_a,
+            "auxiliary": -auxiliary_w / voltage,
+            "dcdc": -dcdc_w / voltage,
+            "motor_rear": -rear_share * motor_a,
+        },
+        inputs={
+            "voltage": voltage,
+            "torque": torque,
+            "speed": 3.6 * motion.speed_ms,
+            "acceleration": np.gradient(motion.speed_ms, PERIOD_S),
+            "accelerator": np.clip(100.0 * motion.mechanical_w / MOTOR_W, 0.0, 100.0),
+            "heater_demand": heater_demand,
+            "aircon_demand": aircon_demand,
+            "low_voltage_demand": low_voltage_demand,
+        },
+    )
+
+
+def _speed_trace(rng: np.random.Generator, duration_s: float) -> Array:
+    """Random micro-trips of the cycles at 1 Hz, each driven in its own style. [m/s]"""
+    pieces = _microtrips()
+    parts: list[Array] = [np.zeros(3)]
+    while sum(map(len, parts)) < duration_s:
+        piece = pieces[rng.integers(len(pieces))]
+        style = rng.uniform(*STYLE)
+        hurried = np.interp(np.arange(0.0, len(piece) - 1, style), np.arange(len(piece)), piece)
+        parts += [hurried, np.zeros(rng.integers(4, 20))]
+    return np.concatenate(parts)
+
+
+def _microtrips() -> list[Array]:
+    """Parts of the cycles between two standstills, at 1 Hz. [m/s]"""
+    fastsim = _fastsim()
+    pieces: list[Array] = []
+    for name in CYCLES:
+        speed = np.asarray(fastsim.Cycle.from_resource(name).to_dict()["speed_meters_per_second"])
+        stops = np.flatnonzero(speed < 0.05)
+        pieces += [speed[a : b + 1] for a, b in pairwise(stops) if b - a > 1]
+    return pieces
+
+
+def _drive(speed_ms: Array) -> _Motion:
+    """Let fastsim drive a speed trace of 1 Hz and bring the result to the sample period."""
+    fastsim = _fastsim()
+    seconds = np.arange(float(len(speed_ms)))
+    vehicle = fastsim.Vehicle.from_resource(VEHICLE)
+    vehicle.set_save_interval(1)
+    cycle = fastsim.Cycle.from_dict({"time_seconds": seconds.tolist(), "speed_meters_per_second": speed_ms.tolist()})
+    run = fastsim.SimDrive(vehicle, cycle)
+    run.walk()
+    table = run.to_dataframe()
+    fine = np.arange(0.0, seconds[-1], PERIOD_S)
+
+    def column(name: str) -> Array:
+        return np.asarray(PchipInterpolator(seconds, table[name].to_numpy())(fine))
+
+    motor = "veh.pt_type.BEV.em.history."
+    return _Motion(
+        speed_ms=np.maximum(column("veh.history.speed_ach_meters_per_second"), 0.0),
+        mechanical_w=column(f"{motor}pwr_mech_prop_out_watts"),
+        electrical_w=column(f"{motor}pwr_elec_prop_in_watts"),
+        charge=column("veh.pt_type.BEV.res.history.soc"),
+    )
+
+
+def _battery(power_w: Array, charge: Array) -> tuple[Array, Array]:
+    """Current [A] and terminal voltage [V] of a battery with a series resistance that gives this power."""
+    open_v = OPEN_CIRCUIT_V[0] + (OPEN_CIRCUIT_V[1] - OPEN_CIRCUIT_V[0]) * charge
+    current = (open_v - np.sqrt(open_v**2 - 4.0 * RESISTANCE_OHM * power_w)) / (2.0 * RESISTANCE_OHM)
+    return current, open_v - RESISTANCE_OHM * current
+
+
+def _random_steps(rng: np.random.Generator, samples: int, *, mean_s: float, levels: tuple[float, ...]) -> Array:
+    """Demand that jumps between levels at random instants, mean_s apart. [W]"""
+    jumps = rng.random(samples) < PERIOD_S / mean_s
+    return np.asarray(rng.choice(levels, size=int(jumps.sum()) + 1)[np.cumsum(jumps)])
+
+
+def _lag(demand: Array, time_constant_s: float) -> Array:
+    """First-order lag, at rest in the first demand."""
+    pole = np.exp(-PERIOD_S / time_constant_s)
+    return np.asarray(lfilter([1.0 - pole], [1.0, -pole], demand, zi=[pole * demand[0]])[0])
+
+
+def _fastsim() -> ModuleType:
+    """The fastsim package, or one line that says how to get it."""
+    try:
+        import fastsim  # noqa: PLC0415
+    except ImportError:
+        raise FleetError(
+            "builtin drives need fastsim; install the extra: pip install 'hv-current-correction[demo]'"
+        ) from None
+    module: ModuleType = fastsim
+    return module

@@ -1,0 +1,172 @@
+"""Where the trips of an artificial fleet come from: the built-in vehicle, or recorded drives."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+
+from calibrator.artificial.builtin_drives import builtin_trip
+from calibrator.artificial.ground_truth import GroundTruth, cut_and_rejoin, ground_truth_from_drive
+from calibrator.drives.store import iterate_drives
+from calibrator.errors import FleetError
+from ecu_node.layout import Layout
+
+__all__ = [
+    "BuiltinTrips",
+    "CommonTrips",
+    "Purpose",
+    "RecordedTrips",
+    "TripSource",
+    "choose_trips",
+    "read_recorded_trips",
+]
+
+Purpose = Literal["calibration", "unseen"]
+"""A trip to learn from, or one to test on."""
+
+_PURPOSE_NUMBER: dict[Purpose, int] = {"calibration": 0, "unseen": 1}
+
+
+class TripSource(Protocol):
+    """Gives every vehicle its trips; the same number and purpose give the same trip."""
+
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """Branches that the trips have."""
+        ...
+
+    def trip(self, number: int, purpose: Purpose) -> GroundTruth:
+        """Trip of vehicle ``number``."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuiltinTrips:
+    """A different trip of the built-in vehicle for every vehicle and purpose."""
+
+    seed: int
+    duration_s: float
+    unseen_s: float
+    branches: tuple[str, ...] = ("battery", "motor", "auxiliary", "dcdc", "motor_rear")
+
+    def trip(self, number: int, purpose: Purpose) -> GroundTruth:
+        """Trip of vehicle ``number``."""
+        rng = np.random.default_rng([self.seed, number, _PURPOSE_NUMBER[purpose]])
+        duration_s = self.duration_s if purpose == "calibration" else self.unseen_s
+        return builtin_trip(rng, duration_s=duration_s, name=f"builtin-{number}-{purpose}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedTrips:
+    """Recorded trips: one each while they last, then pieces of them joined anew; unseen trips are joined anew.
+
+    The unseen trip of a vehicle contains nothing of its own recorded trip.
+    """
+
+    seed: int
+    recorded: Sequence[GroundTruth]
+    vehicles: int
+    unseen_s: float
+
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """Branches that all recordings have."""
+        return tuple(b for b in self.recorded[0].currents_a if all(b in trip.currents_a for trip in self.recorded))
+
+    def trip(self, number: int, purpose: Purpose) -> GroundTruth:
+        """Trip of vehicle ``number``."""
+        one_each = self.vehicles <= len(self.recorded)
+        if purpose == "calibration" and one_each:
+            return self.recorded[number]
+        rng = np.random.default_rng([self.seed, number, _PURPOSE_NUMBER[purpose]])
+        half = len(self.recorded) // 2
+        if one_each:
+            pool = [trip for k, trip in enumerate(self.recorded) if k != number] or list(self.recorded)
+        elif half:
+            pool = list(self.recorded[:-half] if purpose == "calibration" else self.recorded[-half:])
+        else:
+            pool = list(self.recorded)
+        duration_s = self.unseen_s
+        if purpose == "calibration":
+            duration_s = float(np.median([len(trip) * trip.period_s for trip in self.recorded]))
+        joined = cut_and_rejoin(rng, pool, duration_s=duration_s, name=f"recorded-{number}-{purpose}")
+        return joined.part(0, int(duration_s / joined.period_s))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommonTrips:
+    """Every vehicle drives the trips of vehicle 0, as in the experiments of the paper."""
+
+    source: TripSource
+
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """Branches that the trips have."""
+        return self.source.branches
+
+    def trip(self, number: int, purpose: Purpose) -> GroundTruth:  # noqa: ARG002
+        """Trip of every vehicle."""
+        return replace(self.source.trip(0, purpose), name=f"common-{purpose}")
+
+
+def read_recorded_trips(store: Path, layout: Layout) -> list[GroundTruth]:
+    """Read the drives of a store as trips of the ideal vehicle.
+
+    Parameters
+    ----------
+    store : Path
+        A drive store.
+    layout : Layout
+        The layout it was made with.
+
+    Returns
+    -------
+    list of GroundTruth
+        In the order of the store; drives without usable samples are left out.
+
+    Raises
+    ------
+    FleetError
+        If no drive is usable.
+    """
+    trips = [ground_truth_from_drive(drive, layout.period_s) for drive in iterate_drives(store, layout)]
+    usable = [trip for trip in trips if trip is not None]
+    if not usable:
+        raise FleetError(f"{store}: no drive with usable samples; import drives with 'calibrator import'")
+    return usable
+
+
+def choose_trips(
+    drives: str, layout: Layout, *, vehicles: int, seed: int, duration_s: float, unseen_s: float, common: bool
+) -> TripSource:
+    """Choose where trips come from.
+
+    Parameters
+    ----------
+    drives : str
+        ``builtin``, or the path of a drive store.
+    layout : Layout
+        The layout.
+    vehicles : int
+        Fleet size.
+    seed : int
+        Seed of the trips.
+    duration_s, unseen_s : float
+        Length of each built-in trip to learn from, and of each trip to test on. [s]
+    common : bool
+        One trip for all vehicles.
+
+    Returns
+    -------
+    TripSource
+        The trips.
+    """
+    source: TripSource
+    if drives == "builtin":
+        source = BuiltinTrips(seed=seed, duration_s=duration_s, unseen_s=unseen_s)
+    else:
+        recorded = read_recorded_trips(Path(drives), layout)
+        source = RecordedTrips(seed=seed, recorded=recorded, vehicles=1 if common else vehicles, unseen_s=unseen_s)
+    return CommonTrips(source=source) if common else source

@@ -1,0 +1,182 @@
+"""The drives of a fleet, wherever they are: a drive store, or folders of CAN logs."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+from calibrator.drive import Drive
+from calibrator.drives.align import choose_inputs
+from calibrator.drives.store import list_drives, read_drive_file
+from calibrator.errors import FleetError
+from calibrator.recordings.readers import read_drive
+from calibrator.recordings.sources import find_logs
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import UserError
+
+__all__ = ["DriveEntry", "Equipment", "FleetSource", "find_fleet", "load_drive", "probe_equipment"]
+
+STORE_FOLDER, LOGS_FOLDER = "drives", "logs"
+PROBED_VEHICLES = 7
+"""How many vehicles are looked at to learn which branches and inputs the fleet has."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveEntry:
+    """One drive that can be loaded."""
+
+    vehicle: str
+    name: str
+    path: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetSource:
+    """A fleet that can be loaded.
+
+    Attributes
+    ----------
+    path : Path
+        Folder of the fleet.
+    vehicles : mapping of str to tuple of DriveEntry
+        Drives by vehicle, sorted.
+    left_out : mapping of str to str
+        Why a vehicle, or a file where its vehicle is unclear, was left out.
+    """
+
+    path: Path
+    vehicles: Mapping[str, tuple[DriveEntry, ...]]
+    left_out: Mapping[str, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Equipment:
+    """Which branches and model inputs a fleet has, and what it lacks of the layout's."""
+
+    branches: tuple[str, ...]
+    inputs: tuple[str, ...]
+    notices: tuple[str, ...]
+
+
+def find_fleet(path: Path) -> FleetSource:
+    """Find the drives of a fleet; nothing is opened.
+
+    Parameters
+    ----------
+    path : Path
+        A drive store, a fleet of ``calibrator simulate``, or a folder with a folder of logs per vehicle.
+
+    Returns
+    -------
+    FleetSource
+        At least one vehicle.
+
+    Raises
+    ------
+    FleetError
+        If there is no drive at all.
+    """
+    if not path.is_dir():
+        raise FleetError(f"{path}: no such folder; give a drive store or a folder with one folder of logs per vehicle")
+    left_out: dict[str, str] = {}
+    if (path / STORE_FOLDER).is_dir():
+        entries = [DriveEntry(vehicle=d.vehicle, name=d.name, path=d.path) for d in list_drives(path)]
+    else:
+        found = find_logs([path / LOGS_FOLDER if (path / LOGS_FOLDER).is_dir() else path])
+        entries = [DriveEntry(vehicle=log.vehicle, name=log.name, path=log.path) for log in found.logs]
+        left_out = {f"problem {k + 1}": str(problem) for k, problem in enumerate(found.problems)}
+    if not entries:
+        reasons = "".join(f"; {reason}" for reason in left_out.values())
+        raise FleetError(f"{path}: no drive in it{reasons}")
+    entries.sort(key=lambda entry: (entry.vehicle, entry.name))
+    vehicles = {vehicle: tuple(group) for vehicle, group in groupby(entries, key=lambda entry: entry.vehicle)}
+    return FleetSource(path=path, vehicles=vehicles, left_out=left_out)
+
+
+def load_drive(entry: DriveEntry, database: VehicleDatabase) -> Drive:
+    """Load one drive from its store file or its log.
+
+    Parameters
+    ----------
+    entry : DriveEntry
+        Which.
+    database : VehicleDatabase
+        DBC and layout.
+
+    Returns
+    -------
+    Drive
+        The drive.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be used; the message names it.
+    """
+    if entry.path.suffix == ".parquet":
+        return read_drive_file(entry.path, database.layout)
+    return read_drive(entry.path, database, vehicle=entry.vehicle, name=entry.name)
+
+
+def probe_equipment(fleet: FleetSource, database: VehicleDatabase, branches: Sequence[str] | None) -> Equipment:
+    """Learn from some vehicles which branches and inputs the fleet has.
+
+    A branch counts if more than half of the vehicles looked at have it; later, a vehicle that lacks it is left out.
+
+    Parameters
+    ----------
+    fleet : FleetSource
+        The fleet.
+    database : VehicleDatabase
+        DBC and layout.
+    branches : sequence of str, optional
+        Branches to use instead of those found.
+
+    Returns
+    -------
+    Equipment
+        At least two branches and one input.
+
+    Raises
+    ------
+    FleetError
+        If no vehicle can be read or too little is there.
+    """
+    layout = database.layout
+    drives, errors = _some_drives(fleet, database)
+    if not drives:
+        raise FleetError(
+            f"{fleet.path}: none of the first {len(errors)} vehicles can be read; the first says: {errors[0]}"
+        )
+    seen = Counter(name for drive in drives for name in drive.branches)
+    found = [name for name in layout.branch_names if 2 * seen[name] > len(drives)]
+    chosen = tuple(branches) if branches is not None else tuple(found)
+    for name in chosen:
+        layout.find_branch(name)
+    inputs, missing_inputs = choose_inputs(layout, {name for drive in drives for name in drive.inputs})
+    if len(chosen) < 2:
+        raise FleetError(f"{fleet.path}: branches found: {', '.join(chosen) or 'none'}; a junction needs two or more")
+    if not inputs:
+        raise FleetError(f"{fleet.path}: none of the model inputs of {layout.path} was recorded")
+    notices = []
+    missing_branches = [name for name in layout.branch_names if name not in chosen]
+    if missing_branches:
+        notices.append(f"branches not recorded, taken as not fitted: {', '.join(missing_branches)}")
+    if missing_inputs:
+        notices.append(f"model inputs not recorded, left out: {', '.join(missing_inputs)}")
+    return Equipment(branches=chosen, inputs=inputs, notices=tuple(notices))
+
+
+def _some_drives(fleet: FleetSource, database: VehicleDatabase) -> tuple[list[Drive], list[UserError]]:
+    """First drive of the first vehicles that can be read, and the errors met before."""
+    drives: list[Drive] = []
+    errors: list[UserError] = []
+    for entries in fleet.vehicles.values():
+        if len(drives) == PROBED_VEHICLES:
+            break
+        try:
+            drives.append(load_drive(entries[0], database))
+        except UserError as error:
+            errors.append(error)
+    return drives, errors

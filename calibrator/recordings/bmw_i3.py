@@ -1,0 +1,195 @@
+"""Recordings of one BMW i3 (CSV, 10 Hz) as drives.
+
+Source: Steinstraeter, Buberger, Trifonov, "Battery and Heating Data in Real Driving Cycles", IEEE DataPort,
+DOI 10.21227/6jr9-5235. The car measures the battery current and the powers of heater and air conditioning; there is no
+inverter and no DC/DC current. Into the junction, with V the battery voltage and (19) of the paper:
+
+    i_battery   = -(Battery Current)                          discharge is negative in the file
+    i_auxiliary = -(heater power + air conditioning power) / V
+    i_motor     = -(i_battery + i_auxiliary)                  the DC/DC converter's 1 to 2 A included
+
+So the motor's current is not independent of the battery's sensor. For the air conditioning the file has no request, and
+the heater's request is often set while the heater is off; both demand inputs are therefore the powers themselves.
+
+Known faults of the recordings, found in the data and labelled:
+
+* heater power reads exactly 5.52 kW for single seconds (a default of the signal), often at the end of a straight
+  line of up to ten seconds that comes from interpolation over a gap;
+* heater power that does not flow: with the inverter idle, battery power minus heater minus air conditioning is what the
+  DC/DC converter takes; in sound trips its median is 330 W or more, in trips with a stuck heater signal below 100 W.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrator.drive import Array, Channel, Drive, Mask
+from calibrator.errors import DriveError
+from calibrator.recordings.csv_table import CsvTable
+
+__all__ = ["BRANCHES", "COLUMNS", "INPUTS", "ImportedTrip", "trip_from_table"]
+
+COLUMNS = {
+    "time": "Time [s]",
+    "speed": "Velocity [km/h]",
+    "accelerator": "Throttle [%]",
+    "torque": "Motor Torque [Nm]",
+    "acceleration": "Longitudinal Acceleration [m/s^2]",
+    "voltage": "Battery Voltage [V]",
+    "current": "Battery Current [A]",
+    "heater": "Heating Power CAN [kW]",
+    "aircon": "AirCon Power [kW]",
+}
+"""Columns that every file must have."""
+BRANCHES = ("battery", "motor", "auxiliary")
+INPUTS = ("voltage", "torque", "speed", "acceleration", "accelerator", "heater_demand", "aircon_demand")
+
+SHORTEST_S = 10.0
+"""A shorter piece holds no change of load to learn from. [s]"""
+HEATER_DEFAULT_KW = 5.52
+HEATER_RESOLUTION_KW = 0.005
+"""Half a step of the heater signal, which the file gives to 0.01 kW."""
+IDLE_TORQUE_NM = 1.0
+"""Below this the inverter takes next to nothing."""
+LEAST_DCDC_W = 200.0
+"""The control units of a running car take more than this; sound trips have 330 W or more."""
+IMPOSSIBLE_JUMP_KW = 3.0
+"""No heater does this within one sample."""
+NEAR_DEFAULT_KW = 0.6
+"""One sample of an interpolation over one second, from the default to zero."""
+_HEATER_CHANNELS = "auxiliary, motor and heater_demand"
+_JUDGED_SAMPLES = 100
+"""10 s with the inverter idle suffice to judge the heater signal."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedTrip:
+    """A trip as a drive, and what of the file could not be used.
+
+    Attributes
+    ----------
+    drive : Drive
+        The drive; samples that cannot be used are labelled.
+    notices : tuple of str
+        What could not be used and why, one text each.
+    """
+
+    drive: Drive
+    notices: tuple[str, ...]
+
+
+def trip_from_table(table: CsvTable, *, vehicle: str, name: str) -> ImportedTrip:
+    """Turn one file into a drive.
+
+    Parameters
+    ----------
+    table : CsvTable
+        The file.
+    vehicle, name : str
+        Identity of vehicle and drive.
+
+    Returns
+    -------
+    ImportedTrip
+        Drive with the branches of :data:`BRANCHES` and the inputs of :data:`INPUTS`.
+
+    Raises
+    ------
+    LogError
+        If a column is missing, a cell is not a number, or time does not increase.
+    DriveError
+        If the file is too short.
+    """
+    columns = {key: table.numbers(header) for key, header in COLUMNS.items()}
+    table.require_increasing(COLUMNS["time"])
+    time_s = columns["time"] - columns["time"][0]
+    if time_s[-1] < SHORTEST_S:
+        raise DriveError(f"{table.where}: only {time_s[-1]:.1f} s long; at least {SHORTEST_S:g} s are needed")
+    notices = [
+        f"column '{COLUMNS[key]}': {np.sum(bad)} cells without a number, the first at line "
+        f"{table.line(int(np.argmax(bad)))}; labelled as not good"
+        for key, values in columns.items()
+        if (bad := ~np.isfinite(values)).any()
+    ]
+    heater_good = _heater_good(columns, notices)
+    values = _values(columns)
+    good = {key: np.isfinite(value) for key, value in values.items()}
+    for key in ("auxiliary", "motor", "heater_demand"):
+        good[key] &= heater_good
+    channels = {key: Channel(time_s=time_s, value=value, good=good[key]) for key, value in values.items()}
+    drive = Drive(
+        vehicle=vehicle,
+        name=name,
+        branches={key: channels[key] for key in BRANCHES},
+        inputs={key: channels[key] for key in INPUTS},
+    )
+    return ImportedTrip(drive=drive, notices=tuple(notices))
+
+
+def _values(columns: Mapping[str, Array]) -> dict[str, Array]:
+    """Branch currents and inputs from the columns of the file."""
+    voltage = np.where(columns["voltage"] > 0.0, columns["voltage"], np.nan)
+    heater_w, aircon_w = 1e3 * columns["heater"], 1e3 * columns["aircon"]
+    battery = -columns["current"]
+    auxiliary = -(heater_w + aircon_w) / voltage
+    return {
+        "battery": battery,
+        "auxiliary": auxiliary,
+        "motor": -(battery + auxiliary),
+        "voltage": voltage,
+        "heater_demand": heater_w,
+        "aircon_demand": aircon_w,
+        **{key: columns[key] for key in ("torque", "speed", "acceleration", "accelerator")},
+    }
+
+
+def _heater_good(columns: Mapping[str, Array], notices: list[str]) -> Mask:
+    """Where the heater's power can be believed; adds to the notices why not."""
+    default = _defaults(columns["heater"])
+    spoilt = _with_ramps(default, columns["heater"])
+    if default.any():
+        notices.append(
+            f"heater power reads its default of {HEATER_DEFAULT_KW} kW {_runs(default)} times: "
+            f"{np.sum(spoilt)} samples of {_HEATER_CHANNELS} not good"
+        )
+    power_w = -columns["voltage"] * columns["current"] - 1e3 * (columns["heater"] + columns["aircon"])
+    idle = ~spoilt & (np.abs(columns["torque"]) < IDLE_TORQUE_NM) & np.isfinite(power_w)
+    if np.sum(idle) < _JUDGED_SAMPLES:
+        notices.append("heater power not judged: the inverter is never idle for long")
+        return ~spoilt
+    rest_w = float(np.median(power_w[idle]))
+    if rest_w >= LEAST_DCDC_W:
+        return ~spoilt
+    notices.append(
+        f"heater power is implausible over the whole trip: with the inverter idle it leaves {rest_w:.0f} W for the "
+        f"DC/DC converter, at least {LEAST_DCDC_W:.0f} W expected; no sample of {_HEATER_CHANNELS} is good"
+    )
+    return np.zeros_like(spoilt)
+
+
+def _defaults(heater_kw: Array) -> Mask:
+    """Where the heater's power is its default, or a jump to nearly the default: interpolation cut it short."""
+    exact = np.abs(heater_kw - HEATER_DEFAULT_KW) < HEATER_RESOLUTION_KW
+    jump = np.abs(np.diff(heater_kw)) > IMPOSSIBLE_JUMP_KW
+    beside_jump = np.concatenate([jump, [False]]) | np.concatenate([[False], jump])
+    near = np.abs(heater_kw - HEATER_DEFAULT_KW) < NEAR_DEFAULT_KW
+    return np.asarray(exact | (beside_jump & near))
+
+
+def _with_ramps(default: Mask, heater_kw: Array) -> Mask:
+    """Defaults together with the straight lines that lead to or from them."""
+    step = np.diff(heater_kw)
+    bend = np.abs(np.diff(step, prepend=0.0)) > 4.2 * HEATER_RESOLUTION_KW
+    line = np.cumsum(bend)
+    edge = default[1:] != default[:-1]
+    touching = np.convolve(edge, np.ones(3), mode="same") > 0.0  # a line may end between two samples
+    ramp = np.isin(line, line[touching & (step != 0.0)]) & (step != 0.0)
+    spoilt = default.copy()
+    spoilt[1:] |= ramp
+    spoilt[:-1] |= ramp
+    return spoilt
+
+
+def _runs(mask: Mask) -> int:
+    return int(np.sum(np.diff(mask.astype(np.int8), prepend=0) == 1))

@@ -1,0 +1,111 @@
+"""CAN logs of one or many vehicles into a drive store. One bad log never stops the others."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from joblib import Parallel, delayed
+
+from calibrator.drives.store import list_drives, write_drive
+from calibrator.errors import LogError
+from calibrator.recordings.readers import read_recording
+from calibrator.recordings.sources import LogSource, find_logs
+from calibrator.report.progress import progress_bar
+from calibrator.report.text import dumps, left_out_text, table
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import UserError
+
+__all__ = ["ImportReport", "ImportedDrive", "import_logs"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedDrive:
+    """One drive that was written."""
+
+    vehicle: str
+    name: str
+    duration_s: float
+    branches: tuple[str, ...]
+    notices: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportReport:
+    """What an import did."""
+
+    store: str
+    drives: tuple[ImportedDrive, ...]
+    left_out: dict[str, str]
+
+    def as_json(self) -> str:
+        """The report as JSON."""
+        return dumps(asdict(self))
+
+    def as_text(self) -> str:
+        """The report for people."""
+        rows = [(d.vehicle, d.name, f"{d.duration_s:.1f}", ", ".join(d.branches)) for d in self.drives]
+        notices = [f"  {d.vehicle}/{d.name}: {notice}" for d in self.drives for notice in d.notices]
+        parts = [
+            table(("vehicle", "drive", "duration [s]", "branches"), rows) if rows else "",
+            "\n".join(["notices:", *notices]) if notices else "",
+            left_out_text(self.left_out),
+            f"{len(self.drives)} drives written to {self.store}, {len(self.left_out)} left out",
+        ]
+        return "\n\n".join(part for part in parts if part)
+
+
+def import_logs(logs: Sequence[Path], database: VehicleDatabase, store: Path, *, workers: int) -> ImportReport:
+    """Read logs and add their drives to a store.
+
+    Parameters
+    ----------
+    logs : sequence of Path
+        Log files, or folders to search; see :mod:`calibrator.recordings.sources` for which vehicle a log belongs to.
+    database : VehicleDatabase
+        DBC and layout.
+    store : Path
+        Folder of the store; made if there is none.
+    workers : int
+        Number of processes.
+
+    Returns
+    -------
+    ImportReport
+        What was written, and what was left out and why.
+    """
+    found = find_logs(logs)
+    present = {(d.vehicle, d.name) for d in list_drives(store)} if (store / "drives").is_dir() else set()
+    left_out = {f"problem {k + 1}": str(problem) for k, problem in enumerate(found.problems)}
+    drives: list[ImportedDrive] = []
+    runs = Parallel(n_jobs=workers, return_as="generator")(
+        delayed(_import_one)(log, database, store, (log.vehicle, log.name) in present) for log in found.logs
+    )
+    with progress_bar("import", len(found.logs), "logs") as progress:
+        for done, (log, outcome) in enumerate(zip(found.logs, runs, strict=True), start=1):
+            if isinstance(outcome, ImportedDrive):
+                drives.append(outcome)
+            else:
+                left_out[f"{log.vehicle}/{log.name}"] = outcome
+            progress(done)
+    return ImportReport(store=str(store), drives=tuple(drives), left_out=left_out)
+
+
+def _import_one(log: LogSource, database: VehicleDatabase, store: Path, present: bool) -> ImportedDrive | str:
+    """Import one log; the text of the error if it cannot be used."""
+    try:
+        if present:
+            raise LogError(
+                f"{log.path}: the store already has drive {log.name} of vehicle {log.vehicle}; it stays as it is"
+            )
+        recording = read_recording(log.path, database, vehicle=log.vehicle, name=log.name)
+        write_drive(store, recording.drive, database.layout)
+    except UserError as error:
+        return str(error)
+    drive = recording.drive
+    return ImportedDrive(
+        vehicle=drive.vehicle,
+        name=drive.name,
+        duration_s=drive.duration_s,
+        branches=tuple(drive.branches),
+        notices=tuple(recording.report.notices()),
+    )

@@ -1,0 +1,117 @@
+"""Which log belongs to which vehicle.
+
+The rule: a log belongs to the vehicle that its folder is named after, and the drive has the name of the file without
+its suffixes: ``FLEET/logs/V0001/monday.log.gz`` is drive ``monday`` of vehicle ``V0001``. Folders are searched for logs
+at any depth. Vehicles whose name stands for two folders, and drives that two files claim, are left out and named.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from calibrator.drives.store import require_plain_name
+from calibrator.errors import LogError
+from calibrator.recordings.frames import LOG_SUFFIXES, is_log
+from ecu_node.errors import UserError
+
+__all__ = ["LogSource", "LogSources", "find_logs"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogSource:
+    """One log file and whose it is."""
+
+    vehicle: str
+    name: str
+    path: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogSources:
+    """Logs that can be read, sorted by vehicle and drive, and why others are left out.
+
+    Attributes
+    ----------
+    logs : tuple of LogSource
+        No two have the same vehicle and name.
+    problems : tuple of UserError
+        One per file, vehicle or argument that is left out.
+    """
+
+    logs: tuple[LogSource, ...]
+    problems: tuple[UserError, ...]
+
+
+def find_logs(arguments: Iterable[Path]) -> LogSources:
+    """Find logs and the vehicles they belong to.
+
+    Parameters
+    ----------
+    arguments : iterable of Path
+        Log files, or folders to search.
+
+    Returns
+    -------
+    LogSources
+        The logs, and what is left out; nothing is opened.
+    """
+    found: dict[Path, LogSource] = {}
+    problems: list[UserError] = []
+    for argument in arguments:
+        try:
+            for path in _logs_of(argument):
+                found.setdefault(path.resolve(), _source(path))
+        except UserError as error:
+            problems.append(error)
+    logs = sorted(found.values(), key=lambda log: (log.vehicle, log.name, str(log.path)))
+    refused = _refused_vehicles(logs, problems)
+    logs = [log for log in logs if log.vehicle not in refused]
+    return LogSources(logs=tuple(_without_twins(logs, problems)), problems=tuple(problems))
+
+
+def _logs_of(argument: Path) -> list[Path]:
+    if argument.is_file():
+        return [argument]
+    if not argument.is_dir():
+        raise LogError(f"{argument}: no such file or folder")
+    paths = sorted(path for path in argument.rglob("*") if path.is_file() and is_log(path))
+    if not paths:
+        raise LogError(f"{argument}: no logs in this folder; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
+    return paths
+
+
+def _source(path: Path) -> LogSource:
+    name = path.name.removesuffix(".gz")
+    vehicle = path.resolve().parent.name
+    require_plain_name(vehicle, f"{path}: the folder's name, which names the vehicle,")
+    require_plain_name(Path(name).stem, f"{path}: the file's name, which names the drive,")
+    return LogSource(vehicle=vehicle, name=Path(name).stem, path=path)
+
+
+def _refused_vehicles(logs: Sequence[LogSource], problems: list[UserError]) -> set[str]:
+    """Vehicles of one name in two folders."""
+    refused: set[str] = set()
+    folders: dict[str, dict[Path, Path]] = {}
+    for log in logs:
+        folders.setdefault(log.vehicle, {})[log.path.resolve().parent] = log.path.parent
+    for vehicle, places in folders.items():
+        if len(places) > 1:
+            refused.add(vehicle)
+            problems.append(
+                LogError(
+                    f"two vehicles with one name: {vehicle} is in {' and in '.join(map(str, places.values()))}; "
+                    f"rename one folder, or move the logs into one if it is the same vehicle"
+                )
+            )
+    return refused
+
+
+def _without_twins(logs: Sequence[LogSource], problems: list[UserError]) -> list[LogSource]:
+    groups: dict[tuple[str, str], list[LogSource]] = {}
+    for log in logs:
+        groups.setdefault((log.vehicle, log.name), []).append(log)
+    for (vehicle, name), twins in groups.items():
+        if len(twins) > 1:
+            paths = " and ".join(str(log.path) for log in twins)
+            problems.append(LogError(f"vehicle {vehicle}: drive {name} is in {paths}; remove or rename one"))
+    return [twins[0] for twins in groups.values() if len(twins) == 1]

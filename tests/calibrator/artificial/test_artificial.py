@@ -1,0 +1,110 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrator.artificial.ground_truth import GroundTruth
+from calibrator.artificial.vehicle import Disturbances, Vehicle, draw_disturbances, vehicle_frames, write_vehicle
+from calibrator.faults import Faults
+from calibrator.recordings.canlog import FrameSeries
+from ecu_node.database import VehicleDatabase
+
+NONE = Disturbances(noise_a=0.0, delay_s=np.zeros(2), unmeasured_a=0.0)
+
+
+def faults(drift: float = 0.0, offset_a: float = 0.0, hardware_drift: float = 0.0) -> Faults:
+    return Faults(
+        hardware_drift=np.float64(hardware_drift),  # type: ignore[arg-type]
+        hardware_offset_a=np.zeros(2),
+        drift=np.array([0.0, drift]),
+        offset_a=np.array([0.0, offset_a]),
+    )
+
+
+def trip() -> GroundTruth:
+    time_s = np.arange(600) * 0.1
+    battery = 50.0 * np.sin(time_s / 3.0)
+    return GroundTruth(
+        name="t", period_s=0.1, currents_a={"battery": battery, "motor": -battery}, inputs={"speed": np.full(600, 50.0)}
+    )
+
+
+def vehicle(faults_: Faults, disturbances: Disturbances = NONE) -> Vehicle:
+    return Vehicle(name="V1", branches=("battery", "motor"), faults=faults_, disturbances=disturbances)
+
+
+def decoded(
+    database: VehicleDatabase, series: list[FrameSeries], message: str, signal: str
+) -> tuple[np.ndarray, np.ndarray]:
+    item = next(s for s in series if s.arbitration_id == database.message(message).frame_id)
+    values = [database.message(message).decode_simple(r.tobytes(), decode_choices=False)[signal] for r in item.data]
+    return item.time_s, np.array(values, dtype=float)
+
+
+def frames(database: VehicleDatabase, v: Vehicle) -> list[FrameSeries]:
+    return vehicle_frames(np.random.default_rng(3), database, v, trip())
+
+
+def test_healthy_vehicle_shows_the_ideal_currents_in_the_sign_of_its_sensors(database: VehicleDatabase) -> None:
+    series = frames(database, vehicle(faults()))
+    for message, signal in (("HV_Battery", "BatteryCurrent"), ("HV_Motor", "MotorCurrent")):
+        time_s, value = decoded(database, series, message, signal)
+        expected = np.interp(time_s, trip().time_s, trip().currents_a["battery"])
+        np.testing.assert_allclose(value, expected, atol=0.0101)
+
+
+def test_faulty_sensor_shows_drift_and_offset(database: VehicleDatabase) -> None:
+    time_s, value = decoded(database, frames(database, vehicle(faults(0.2, 10.0))), "HV_Motor", "MotorCurrent")
+    into_junction = -value
+    motor = np.interp(time_s, trip().time_s, trip().currents_a["motor"])
+    np.testing.assert_allclose(into_junction, 1.2 * motor + 10.0, atol=0.0101)
+
+
+def test_delayed_branch_shows_the_past(database: VehicleDatabase) -> None:
+    late = Disturbances(noise_a=0.0, delay_s=np.array([0.0, 0.3]), unmeasured_a=0.0)
+    time_s, value = decoded(database, frames(database, vehicle(faults(), late)), "HV_Motor", "MotorCurrent")
+    np.testing.assert_allclose(value, np.interp(time_s - 0.3, trip().time_s, trip().currents_a["battery"]), atol=0.0101)
+
+
+def test_unmeasured_load_is_carried_by_the_battery_alone(database: VehicleDatabase) -> None:
+    loaded = Disturbances(noise_a=0.0, delay_s=np.zeros(2), unmeasured_a=3.0)
+    for message, signal, extra in (("HV_Battery", "BatteryCurrent", 3.0), ("HV_Motor", "MotorCurrent", 0.0)):
+        _, with_load = decoded(database, frames(database, vehicle(faults(), loaded)), message, signal)
+        _, without = decoded(database, frames(database, vehicle(faults())), message, signal)
+        np.testing.assert_allclose(with_load - without, extra, atol=0.0201)
+
+
+def test_noise_has_the_size_asked_for(database: VehicleDatabase) -> None:
+    noisy = Disturbances(noise_a=0.4, delay_s=np.zeros(2), unmeasured_a=0.0)
+    _, with_noise = decoded(database, frames(database, vehicle(faults(), noisy)), "HV_Motor", "MotorCurrent")
+    _, without = decoded(database, frames(database, vehicle(faults())), "HV_Motor", "MotorCurrent")
+    assert np.std(with_noise - without) == pytest.approx(0.4, rel=0.05)
+
+
+def test_messages_keep_their_cycle_time_and_their_own_instants(database: VehicleDatabase) -> None:
+    series = {s.arbitration_id: s.time_s for s in frames(database, vehicle(faults()))}
+    assert np.mean(np.diff(series[272])) == pytest.approx(0.020, rel=0.01)
+    assert np.mean(np.diff(series[288])) == pytest.approx(0.010, rel=0.01)
+    assert not np.intersect1d(series[272], series[288]).size
+    assert all(np.all(np.diff(time_s) > 0.0) for time_s in series.values())
+
+
+def test_disturbances_stay_in_their_ranges() -> None:
+    rng = np.random.default_rng(0)
+    drawn = [
+        draw_disturbances(rng, branches=3, noise_a=0.1, delay_max_s=0.3, unmeasured_a=(3.0, 5.0)) for _ in range(200)
+    ]
+    delays = np.array([d.delay_s for d in drawn])
+    assert 0.0 <= delays.min() < 0.02 < 0.28 < delays.max() <= 0.3
+    assert min(d.unmeasured_a for d in drawn) == 0.0
+
+
+def test_truth_holds_the_moments_of_the_true_currents(database: VehicleDatabase, tmp_path: Path) -> None:
+    v = vehicle(faults(0.2, 10.0, hardware_drift=0.1))
+    truth = write_vehicle(tmp_path, database, v, calibration=trip(), unseen=trip(), seed=(1, 2))
+    expected = 1.1 * trip().currents_a["battery"]
+    assert truth.unseen_mean_a["battery"] == pytest.approx(np.mean(expected))
+    assert truth.unseen_mean_square_a2["motor"] == pytest.approx(np.mean(expected**2))
+    assert truth.drift == {"battery": 0.0, "motor": 0.2}
+    assert (tmp_path / "logs" / "V1" / "drive.log.gz").is_file()
+    assert (tmp_path / "unseen" / "V1" / "drive.log.gz").is_file()

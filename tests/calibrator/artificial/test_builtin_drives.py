@@ -1,0 +1,48 @@
+import numpy as np
+import pytest
+
+from calibrator.artificial.builtin_drives import builtin_trip
+from calibrator.artificial.ground_truth import GroundTruth
+from ecu_node.database import VehicleDatabase
+
+
+@pytest.fixture(scope="module")
+def trip() -> GroundTruth:
+    return builtin_trip(np.random.default_rng(7), duration_s=300.0, name="trip")
+
+
+def test_currents_obey_the_junction_law(trip: GroundTruth) -> None:
+    np.testing.assert_allclose(trip.matrix_a().sum(axis=1), 0.0, atol=1e-9)
+
+
+def test_trip_has_the_branches_and_inputs_of_the_layout(trip: GroundTruth, database: VehicleDatabase) -> None:
+    assert set(trip.currents_a) == set(database.layout.branch_names)
+    assert set(trip.inputs) == {item.name for item in database.layout.input}
+
+
+def test_trip_is_as_long_as_asked_and_drives(trip: GroundTruth) -> None:
+    assert 300.0 <= len(trip) * trip.period_s < 1500.0
+    assert 20.0 < trip.inputs["speed"].max() < 200.0
+    assert trip.currents_a["battery"].max() > 20.0
+    assert trip.currents_a["battery"].min() < -5.0
+
+
+def test_values_fit_the_dbc(trip: GroundTruth, database: VehicleDatabase) -> None:
+    for item in database.layout.input:
+        _, signal = database.signal(item.signal)
+        assert signal.minimum is not None
+        assert signal.maximum is not None
+        assert signal.minimum <= trip.inputs[item.name].min()
+        assert trip.inputs[item.name].max() <= signal.maximum
+
+
+def test_battery_power_is_the_power_of_the_loads(trip: GroundTruth) -> None:
+    voltage = trip.inputs["voltage"]
+    loads_w = -voltage * (trip.matrix_a()[:, 1:].sum(axis=1))
+    np.testing.assert_allclose(voltage * trip.currents_a["battery"], loads_w, rtol=1e-9, atol=1e-6)
+
+
+def test_seed_decides_the_trip() -> None:
+    same = [builtin_trip(np.random.default_rng(s), duration_s=60.0, name="t") for s in (1, 1, 2)]
+    np.testing.assert_array_equal(same[0].currents_a["battery"], same[1].currents_a["battery"])
+    assert len(same[0]) != len(same[2]) or not np.array_equal(same[0].inputs["speed"], same[2].inputs["speed"])

@@ -1,0 +1,86 @@
+import numpy as np
+import pytest
+
+from calibrator.artificial.ground_truth import (
+    GroundTruth,
+    choose_branches,
+    cut_and_rejoin,
+    ground_truth_from_drive,
+    with_branches,
+)
+from calibrator.drive import Channel, Drive
+from calibrator.errors import FleetError
+from ecu_node.database import VehicleDatabase
+
+
+def trip(samples: int = 100, name: str = "trip", level: float = 10.0) -> GroundTruth:
+    speed = np.where(np.arange(samples) % 20 < 5, 0.0, 30.0)
+    battery = level + np.arange(samples, dtype=float)
+    auxiliary = np.full(samples, -2.0)
+    return GroundTruth(
+        name=name,
+        period_s=0.1,
+        currents_a={"battery": battery, "motor": -battery - auxiliary, "auxiliary": auxiliary},
+        inputs={"speed": speed},
+    )
+
+
+def test_balancing_branch_is_minus_the_sum_of_the_others() -> None:
+    two = with_branches(trip(), ("battery", "motor"), "motor")
+    np.testing.assert_array_equal(two.currents_a["motor"], -trip().currents_a["battery"])
+    np.testing.assert_allclose(two.matrix_a().sum(axis=1), 0.0)
+
+
+def test_branches_are_chosen_in_the_order_of_the_layout(database: VehicleDatabase) -> None:
+    available = ("auxiliary", "motor", "battery")
+    assert choose_branches(database.layout, available, 2) == ("battery", "motor")
+    assert choose_branches(database.layout, available, 3) == ("battery", "motor", "auxiliary")
+
+
+def test_more_currents_than_recorded_are_refused(database: VehicleDatabase) -> None:
+    with pytest.raises(FleetError, match=r"4 currents asked for; these drives have 3 .* 2 to 3 are possible"):
+        choose_branches(database.layout, ("auxiliary", "motor", "battery"), 4)
+
+
+def test_rejoined_trip_is_made_of_pieces_between_standstills() -> None:
+    source = trip(200)
+    joined = cut_and_rejoin(np.random.default_rng(0), [source], duration_s=10.0, name="new")
+    assert len(joined) >= 100
+    current = joined.currents_a["battery"]
+    jumps = np.flatnonzero(np.abs(np.diff(current)) > 1.0)
+    assert jumps.size > 0
+    assert np.all(joined.inputs["speed"][jumps] == 0.0)
+    assert set(current) <= set(source.currents_a["battery"])
+    np.testing.assert_allclose(joined.matrix_a().sum(axis=1), 0.0, atol=1e-12)
+
+
+def test_rejoined_trips_of_two_seeds_differ() -> None:
+    a = cut_and_rejoin(np.random.default_rng(0), [trip(400)], duration_s=20.0, name="a")
+    b = cut_and_rejoin(np.random.default_rng(1), [trip(400)], duration_s=20.0, name="b")
+    assert not np.array_equal(a.currents_a["battery"][:200], b.currents_a["battery"][:200])
+
+
+def test_trip_without_standstill_stays_whole() -> None:
+    source = trip(50)
+    moving = GroundTruth(name="x", period_s=0.1, currents_a=source.currents_a, inputs={"speed": np.full(50, 30.0)})
+    joined = cut_and_rejoin(np.random.default_rng(0), [moving], duration_s=5.0, name="new")
+    np.testing.assert_array_equal(joined.currents_a["battery"], source.currents_a["battery"])
+
+
+def test_recorded_drive_becomes_a_trip_over_the_span_of_all_channels() -> None:
+    def channel(start: float) -> Channel:
+        time_s = start + np.arange(100) * 0.1
+        good = np.ones(100, dtype=bool)
+        good[50] = False
+        return Channel(time_s=time_s, value=np.where(good, 2.0 * time_s, 1e9), good=good)
+
+    drive = Drive(vehicle="V", name="d", branches={"battery": channel(0.0)}, inputs={"speed": channel(0.5)})
+    made = ground_truth_from_drive(drive, 0.1)
+    assert made is not None
+    np.testing.assert_allclose(made.currents_a["battery"], 2.0 * (0.5 + made.time_s))
+    assert len(made) == pytest.approx(94, abs=1)
+
+
+def test_drive_without_good_samples_is_no_trip() -> None:
+    bad = Channel(time_s=np.arange(3.0), value=np.zeros(3), good=np.zeros(3, dtype=bool))
+    assert ground_truth_from_drive(Drive(vehicle="V", name="d", branches={"battery": bad}, inputs={}), 0.1) is None

@@ -1,0 +1,79 @@
+import numpy as np
+import pytest
+
+from calibrator.artificial.random_fleet import draw_faults, nonzero_count
+from calibrator.drive import Array
+from calibrator.errors import FleetError
+from calibrator.faults import Faults, measured_currents, true_currents
+
+
+def draw(seed: int = 0, **changes: object) -> Faults:
+    settings: dict[str, object] = {
+        "vehicles": 2000,
+        "branches": 2,
+        "sparsity": 60.0,
+        "magnitude": (0.05, 0.25),
+        "full_scale_a": 400.0,
+    }
+    return draw_faults(np.random.default_rng(seed), **(settings | changes))  # type: ignore[arg-type]
+
+
+def free_parameters(faults: Faults) -> Array:
+    """The 3K parameters of footnote 1, offsets in fractions of full scale."""
+    return np.concatenate(
+        [
+            faults.hardware_drift[:, None],
+            faults.hardware_offset_a[:, :-1] / 400.0,
+            faults.drift,
+            faults.offset_a / 400.0,
+        ],
+        axis=1,
+    )
+
+
+@pytest.mark.parametrize(("branches", "sparsity", "count"), [(3, 60.0, 4), (2, 60.0, 2), (2, 80.0, 1), (2, 20.0, 5)])
+def test_count_of_nonzero_parameters_is_the_papers(branches: int, sparsity: float, count: int) -> None:
+    assert nonzero_count(branches, sparsity) == count
+
+
+@pytest.mark.parametrize("branches", [2, 3, 4, 5])
+def test_every_vehicle_has_as_many_faults_as_the_sparsity_says(branches: int) -> None:
+    faults = draw(branches=branches)
+    assert np.all(np.count_nonzero(free_parameters(faults), axis=1) == nonzero_count(branches, 60.0))
+
+
+def test_magnitudes_lie_in_their_range_and_signs_are_even() -> None:
+    values = free_parameters(draw())
+    values = values[values != 0.0]
+    assert np.abs(values).min() >= 0.05
+    assert np.abs(values).max() <= 0.25
+    assert np.mean(values > 0.0) == pytest.approx(0.5, abs=0.02)
+    assert np.mean(np.abs(values)) == pytest.approx(0.15, abs=0.002)
+
+
+def test_hardware_offsets_sum_to_zero() -> None:
+    np.testing.assert_allclose(draw(branches=4).hardware_offset_a.sum(axis=1), 0.0, atol=1e-12)
+
+
+def test_balanced_fleet_has_hardware_faults_in_half_of_those_that_drew_any() -> None:
+    assert np.mean(draw(balanced=True, vehicles=20_000).has_hardware_fault) == pytest.approx(0.30, abs=0.01)
+
+
+def test_unbalanced_fleet_has_the_share_that_chance_gives() -> None:
+    assert np.mean(draw(vehicles=20_000).has_hardware_fault) == pytest.approx(1.0 - 6.0 / 15.0, abs=0.01)
+
+
+def test_mean_of_a_symmetric_fleet_is_the_ideal_current() -> None:
+    faults = draw(symmetric=True, balanced=True, vehicles=400)
+    i_s = np.array([[100.0, -100.0], [3.0, -3.0]])
+    measured = [measured_currents(true_currents(i_s, faults.take(j)), faults.take(j)) for j in range(len(faults))]
+    np.testing.assert_allclose(np.mean(measured, axis=0), i_s, atol=1e-10)
+
+
+def test_sparsity_100_means_no_fault() -> None:
+    assert not np.any(free_parameters(draw(sparsity=100.0)))
+
+
+def test_symmetric_fleet_of_odd_size_is_refused() -> None:
+    with pytest.raises(FleetError, match="multiple of 4 vehicles, not 42"):
+        draw(symmetric=True, vehicles=42)

@@ -1,0 +1,168 @@
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibrator.drive import Array, Channel, Drive
+from calibrator.drives.align import Samples, align, align_channels, base_inputs, choose_inputs
+from calibrator.errors import DriveError
+from ecu_node.database import VehicleDatabase
+from ecu_node.layout import Layout
+
+PERIOD_S = 0.1
+
+
+@pytest.fixture
+def layout(database: VehicleDatabase) -> Layout:
+    return database.layout
+
+
+def channel(time_s: Array, value: Array, bad: list[int] | None = None) -> Channel:
+    good = np.ones(len(time_s), np.bool_)
+    good[bad or []] = False
+    return Channel(time_s=time_s, value=value, good=good)
+
+
+def ramp(start_s: float, stop_s: float, period_s: float, slope: float = 1.0) -> Channel:
+    time_s = np.arange(start_s, stop_s, period_s)
+    return channel(time_s, slope * time_s)
+
+
+def drive_of(branches: dict[str, Channel], inputs: dict[str, Channel] | None = None) -> Drive:
+    return Drive(vehicle="V1", name="d", branches=branches, inputs=inputs or {})
+
+
+def aligned(layout: Layout, branches: dict[str, Channel], inputs: dict[str, Channel] | None = None) -> Samples:
+    return align(drive_of(branches, inputs), layout, tuple(branches), inputs=tuple(inputs or {}))
+
+
+def test_a_line_sampled_at_any_instants_is_found_exactly(layout: Layout) -> None:
+    samples = aligned(layout, {"battery": ramp(0.013, 5.0, 0.02), "dcdc": ramp(0.031, 5.0, 0.1, -2.0)})
+    assert samples.valid.all()
+    np.testing.assert_allclose(samples.currents_a[:, 0], samples.time_s, atol=1e-12)
+    np.testing.assert_allclose(samples.currents_a[:, 1], -2.0 * samples.time_s, atol=1e-12)
+    assert samples.time_s[0] == pytest.approx(0.1)
+    assert samples.time_s[-1] == pytest.approx(4.9)
+
+
+@given(st.lists(st.floats(0.0, 30.0), min_size=2, max_size=60), st.floats(0.05, 3.0))
+def test_no_value_is_extrapolated_and_none_is_valid_across_a_longer_gap_than_the_limit(
+    times: list[float], limit_s: float
+) -> None:
+    known_s = np.array(sorted(times))
+    value = np.sin(known_s)
+    try:
+        time_s, values, reasons = align_channels(
+            {"x": channel(known_s, value)}, {"x": limit_s}, period_s=PERIOD_S, where="test"
+        )
+    except DriveError:
+        assert np.floor(known_s[-1] / PERIOD_S + 1e-3) < np.ceil(known_s[0] / PERIOD_S - 1e-3)
+        return
+    assert np.all(time_s >= known_s[0] - 1e-3)
+    assert np.all(time_s <= known_s[-1] + 1e-3)
+    np.testing.assert_allclose(time_s / PERIOD_S, np.round(time_s / PERIOD_S), atol=1e-9)
+    assert np.all(np.abs(values["x"]) <= np.max(np.abs(value)) + 1e-12)
+    for instant, stale in zip(time_s, reasons["stale"], strict=True):
+        before, after = known_s[known_s <= instant], known_s[known_s >= instant]
+        gap_s = after[0] - before[-1] if before.size and after.size else 0.0
+        if abs(gap_s - limit_s) > 2e-3:
+            assert stale == (gap_s > limit_s)
+
+
+def test_samples_one_time_out_apart_are_valid_and_farther_apart_stale(layout: Layout) -> None:
+    assert layout.find_branch("battery").timeout_s == pytest.approx(0.1)
+    close = aligned(layout, {"battery": ramp(0.05, 3.0, 0.1)})
+    far = aligned(layout, {"battery": ramp(0.05, 3.0, 0.15)})
+    assert close.valid.all()
+    assert far.masked["stale"] > 0
+    assert np.isnan(far.currents_a[~far.valid]).all()
+
+
+def test_an_instant_on_a_frame_is_valid_however_far_the_next_one_is(layout: Layout) -> None:
+    samples = aligned(layout, {"battery": channel(np.array([0.0, 10.0]), np.array([1.0, 2.0]))})
+    assert np.flatnonzero(samples.valid).tolist() == [0, 100]
+    np.testing.assert_allclose(samples.currents_a[[0, 100], 0], [1.0, 2.0])
+
+
+def test_bad_samples_are_masked_in_place_with_their_reason(layout: Layout) -> None:
+    time_s = np.arange(0.0, 2.0, 0.1)
+    samples = aligned(layout, {"battery": channel(time_s, time_s, bad=[5, 6])})
+    assert np.flatnonzero(~samples.valid).tolist() == [5, 6]
+    assert samples.masked == {"stale": 0, "not good": 2, "undefined": 0, "uncovered": 0}
+
+
+def test_of_several_frames_at_one_instant_the_last_counts(layout: Layout) -> None:
+    samples = aligned(layout, {"battery": channel(np.array([0.0, 0.1, 0.1, 0.2]), np.array([0.0, 1.0, 3.0, 0.0]))})
+    np.testing.assert_allclose(samples.currents_a[:, 0], [0.0, 3.0, 0.0])
+
+
+def test_time_outside_the_common_span_is_counted_not_filled(layout: Layout) -> None:
+    samples = aligned(layout, {"battery": ramp(0.0, 10.0, 0.02), "dcdc": ramp(4.0, 8.05, 0.1)})
+    assert samples.time_s[0] == pytest.approx(4.0)
+    assert samples.time_s[-1] == pytest.approx(8.0)
+    assert samples.masked["uncovered"] == 100 - 41
+
+
+def test_a_derived_input_without_value_masks_the_instant(layout: Layout) -> None:
+    time_s = np.arange(0.0, 2.0, 0.1)
+    voltage = np.where(np.arange(20) == 7, 0.0, 400.0)
+    inputs = {"voltage": channel(time_s, voltage), "aircon_demand": channel(time_s, 800.0 + 0.0 * time_s)}
+    drive = drive_of({"battery": channel(time_s, time_s)}, inputs)
+    samples = align(drive, layout, ["battery"], inputs=["aircon_current"])
+    assert np.flatnonzero(~samples.valid).tolist() == [7]
+    assert samples.masked["undefined"] == 1
+    np.testing.assert_allclose(samples.inputs[samples.valid], 2.0)
+    assert np.isnan(samples.inputs[7, 0])
+
+
+def test_all_model_inputs_are_given_in_the_order_of_the_layout(layout: Layout) -> None:
+    inputs = {item.name: ramp(0.0, 2.0, 0.1) for item in layout.input}
+    samples = align(drive_of({"battery": ramp(0.0, 2.0, 0.02)}, inputs), layout, ["battery"])
+    assert samples.input_names == tuple(layout.model_inputs)
+    assert samples.inputs.shape == (len(samples.time_s), len(layout.model_inputs))
+
+
+def test_shifting_a_drive_by_whole_periods_shifts_the_samples(layout: Layout) -> None:
+    rng = np.random.default_rng(0)
+    time_s = np.sort(rng.uniform(0.0, 20.0, 1000))
+    value = rng.normal(size=1000)
+    one = aligned(layout, {"battery": channel(time_s, value)})
+    other = aligned(layout, {"battery": channel(time_s + 30 * PERIOD_S, value)})
+    np.testing.assert_allclose(other.time_s, one.time_s + 3.0)
+    np.testing.assert_allclose(other.currents_a, one.currents_a, atol=1e-9)
+
+
+def test_a_missing_channel_is_named_with_those_there_are(layout: Layout) -> None:
+    with pytest.raises(DriveError, match="vehicle V1, drive d: no motor, voltage; it has battery"):
+        align(drive_of({"battery": ramp(0.0, 1.0, 0.1)}), layout, ["battery", "motor"], inputs=["voltage"])
+
+
+def test_a_channel_without_good_sample_is_named(layout: Layout) -> None:
+    with pytest.raises(DriveError, match="drive d: no good sample of dcdc"):
+        aligned(layout, {"battery": ramp(0, 1, 0.1), "dcdc": channel(np.array([0.0]), np.array([1.0]), bad=[0])})
+
+
+def test_channels_that_never_overlap_are_refused(layout: Layout) -> None:
+    with pytest.raises(DriveError, match="no instant in common"):
+        aligned(layout, {"battery": ramp(0.0, 1.0, 0.1), "dcdc": ramp(2.0, 3.0, 0.1)})
+
+
+def test_a_drive_of_years_is_refused(layout: Layout) -> None:
+    with pytest.raises(DriveError, match="the time stamps are wrong"):
+        aligned(layout, {"battery": channel(np.array([0.0, 1e9]), np.zeros(2))})
+
+
+def test_model_inputs_that_no_drive_has_are_left_out_and_named(layout: Layout) -> None:
+    available = {item.name for item in layout.input} - {"low_voltage_demand"}
+    kept, left_out = choose_inputs(layout, available)
+    assert left_out == ("low_voltage_current",)
+    assert kept + left_out == tuple(layout.model_inputs)
+    assert choose_inputs(layout, set()) == ((), tuple(layout.model_inputs))
+
+
+def test_base_inputs_are_found_through_derived_ones(layout: Layout) -> None:
+    assert base_inputs(layout, ["copper_loss", "accelerator"]) == {"torque", "voltage", "accelerator"}
+    doubled = msgspec.structs.replace(layout.derived[0], name="doubled", formula="2 * copper_loss + speed")
+    nested = msgspec.structs.replace(layout, derived=[*layout.derived, doubled])
+    assert base_inputs(nested, ["doubled"]) == {"torque", "speed", "voltage"}

@@ -1,0 +1,126 @@
+import json
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from calibrator.drive import Channel, Drive
+from calibrator.drives.store import iterate_drives, list_drives, read_drive_file, write_drive
+from calibrator.errors import DriveError
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import UserError
+from ecu_node.layout import Layout
+
+
+@pytest.fixture
+def layout(database: VehicleDatabase) -> Layout:
+    return database.layout
+
+
+def some_drive(vehicle: str = "V1", name: str = "monday") -> Drive:
+    channel = Channel(
+        time_s=np.array([0.0, 0.1, 0.3]), value=np.array([1.5, np.nan, -2.0]), good=np.array([True, False, True])
+    )
+    empty = Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_))
+    return Drive(vehicle=vehicle, name=name, branches={"battery": channel, "motor": empty}, inputs={"voltage": channel})
+
+
+def test_a_drive_comes_back_to_the_bit(tmp_path: Path, layout: Layout) -> None:
+    drive = some_drive()
+    read = read_drive_file(write_drive(tmp_path, drive, layout), layout)
+    assert (read.vehicle, read.name) == ("V1", "monday")
+    assert list(read.branches) == ["battery", "motor"]
+    for one, other in zip(
+        (*drive.branches.values(), *drive.inputs.values()),
+        (*read.branches.values(), *read.inputs.values()),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one.time_s, other.time_s)
+        np.testing.assert_array_equal(one.value, other.value)
+        np.testing.assert_array_equal(one.good, other.good)
+
+
+def test_drives_are_listed_and_read_in_order(tmp_path: Path, layout: Layout) -> None:
+    for vehicle, name in (("V2", "a"), ("V1", "b"), ("V1", "a.2")):
+        write_drive(tmp_path, some_drive(vehicle, name), layout)
+    expected = [("V1", "a.2"), ("V1", "b"), ("V2", "a")]
+    assert [(entry.vehicle, entry.name) for entry in list_drives(tmp_path)] == expected
+    assert [(drive.vehicle, drive.name) for drive in iterate_drives(tmp_path, layout)] == expected
+
+
+def test_writing_again_replaces_the_drive_and_leaves_nothing_behind(tmp_path: Path, layout: Layout) -> None:
+    write_drive(tmp_path, some_drive(), layout)
+    path = write_drive(tmp_path, some_drive(), layout)
+    assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", ["", "..", "../x", "/etc/x", "a/b", "a\\b", ".hidden", "x" * 65, "a\nb", "a.", "ä"])
+def test_a_name_that_is_no_file_name_is_refused(tmp_path: Path, layout: Layout, name: str) -> None:
+    for drive in (some_drive(vehicle=name), some_drive(name=name)):
+        with pytest.raises(DriveError, match="cannot be used; expected 1 to 64 letters"):
+            write_drive(tmp_path / "store", drive, layout)
+    assert not (tmp_path / "store").exists()
+
+
+def test_a_store_made_with_another_layout_is_refused(tmp_path: Path, layout: Layout) -> None:
+    path = write_drive(tmp_path, some_drive(), layout)
+    other = msgspec.structs.replace(layout, digest="0" * 64)
+    with pytest.raises(DriveError, match=r"monday\.parquet: made with layout hv_powertrain .*000000.*import the logs"):
+        read_drive_file(path, other)
+
+
+@pytest.mark.parametrize("size", [0, 3, 100, -10])
+def test_a_cut_file_is_refused(tmp_path: Path, layout: Layout, size: int) -> None:
+    path = write_drive(tmp_path, some_drive(), layout)
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(DriveError, match=r"monday\.parquet: (not a drive|cannot read the drive): .*import it again"):
+        read_drive_file(path, layout)
+
+
+def test_another_parquet_file_is_refused(tmp_path: Path, layout: Layout) -> None:
+    path = tmp_path / "x.parquet"
+    pq.write_table(pa.table({"a": [1]}), path)
+    with pytest.raises(DriveError, match="not a drive"):
+        read_drive_file(path, layout)
+
+
+def test_another_schema_version_is_refused(tmp_path: Path, layout: Layout) -> None:
+    path = write_drive(tmp_path, some_drive(), layout)
+    table = pq.read_table(path)
+    about = json.loads(table.schema.metadata[b"calibrator.drive"]) | {"schema_version": 99}
+    pq.write_table(table.replace_schema_metadata({b"calibrator.drive": json.dumps(about)}), path)
+    with pytest.raises(DriveError, match="schema version 99, expected 1"):
+        read_drive_file(path, layout)
+
+
+def test_columns_of_different_lengths_are_refused(tmp_path: Path, layout: Layout) -> None:
+    path = write_drive(tmp_path, some_drive(), layout)
+    table = pq.read_table(path)
+    short = pa.array([[1.0]] * table.num_rows, pa.list_(pa.float64()))
+    pq.write_table(table.set_column(3, "value", short), path)
+    with pytest.raises(DriveError, match="different lengths"):
+        read_drive_file(path, layout)
+
+
+def test_one_bad_file_does_not_stop_the_others(tmp_path: Path, layout: Layout) -> None:
+    write_drive(tmp_path, some_drive("V1"), layout).write_bytes(b"")
+    write_drive(tmp_path, some_drive("V2"), layout)
+    errors: list[UserError] = []
+    assert [drive.vehicle for drive in iterate_drives(tmp_path, layout, on_error=errors.append)] == ["V2"]
+    assert len(errors) == 1
+    with pytest.raises(DriveError, match="not a drive"):
+        list(iterate_drives(tmp_path, layout))
+
+
+def test_a_folder_that_is_no_store_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DriveError, match="not a drive store"):
+        list_drives(tmp_path)
+
+
+def test_a_store_that_cannot_be_written_is_named(tmp_path: Path, layout: Layout) -> None:
+    (tmp_path / "store").write_text("a file")
+    with pytest.raises(DriveError, match="cannot write the drive"):
+        write_drive(tmp_path / "store", some_drive(), layout)

@@ -1,0 +1,110 @@
+import gzip
+from pathlib import Path
+
+import can
+import cantools
+import numpy as np
+import pytest
+from e2e.p01 import e2e_p01_check
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibrator.recordings.canlog import encode_message, write_candump
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.layout import read_layout
+
+BIG_ENDIAN_DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: X
+BO_ 100 M: 8 X
+ SG_ A : 7|16@0- (0.5,10) [0|0] "A" X
+ SG_ B : 26|11@0+ (1,0) [0|0] "A" X
+ SG_ C : 40|9@1- (-0.25,0) [0|0] "A" X
+"""
+
+
+def test_frames_decode_with_cantools_to_the_nearest_code(database: VehicleDatabase) -> None:
+    time_s = np.arange(50) * 0.01
+    current = 300.0 * np.sin(time_s * 30.0)
+    series = encode_message(database, "HV_Motor", time_s, {"MotorCurrent": current})
+    message = database.message("HV_Motor")
+    decoded = [message.decode_simple(row.tobytes(), decode_choices=False) for row in series.data]
+    np.testing.assert_allclose([float(str(d["MotorCurrent"])) for d in decoded], current, atol=0.01 + 1e-9)
+    assert [d["AliveCounter"] for d in decoded] == [k % 15 for k in range(50)]
+
+
+def test_counter_never_repeats_or_jumps(database: VehicleDatabase) -> None:
+    series = encode_message(database, "HV_Battery", np.arange(600.0), {})
+    counters = series.data[:, 1] & 15
+    assert set((np.diff(counters.astype(int)) % 15).tolist()) == {1}
+
+
+def test_protected_frames_pass_the_check_of_the_library(database: VehicleDatabase) -> None:
+    series = encode_message(database, "HV_Battery", np.arange(20.0), {"BatteryCurrent": np.arange(20.0)})
+    assert all(e2e_p01_check(bytearray(row.tobytes()), 272, length=8) for row in series.data)
+    assert not any(e2e_p01_check(bytearray(row.tobytes()), 273, length=8) for row in series.data)
+
+
+def test_missing_values_become_the_code_for_not_available(database: VehicleDatabase) -> None:
+    series = encode_message(database, "HV_Motor", np.zeros(1), {"MotorCurrent": np.array([np.nan])})
+    decoded = database.message("HV_Motor").decode_simple(series.data[0].tobytes())
+    assert decoded["MotorCurrent"] == "SNA"
+    assert decoded["MotorTorque"] == "SNA"
+
+
+def test_values_beyond_the_range_saturate(database: VehicleDatabase) -> None:
+    series = encode_message(database, "HV_Motor", np.zeros(2), {"MotorCurrent": np.array([1e6, -1e6])})
+    decoded = [database.message("HV_Motor").decode_simple(row.tobytes())["MotorCurrent"] for row in series.data]
+    assert decoded == pytest.approx([650.0, -650.0])
+
+
+@settings(max_examples=60)
+@given(st.integers(-32768, 32767), st.integers(0, 2047), st.integers(-256, 255))
+def test_both_byte_orders_agree_with_cantools(a: int, b: int, c: int) -> None:
+    expected = big_endian_database().message("M").encode({"A": a * 0.5 + 10, "B": b, "C": c * -0.25}, strict=False)
+    series = encode_message(
+        big_endian_database(),
+        "M",
+        np.zeros(1),
+        {"A": np.array([a * 0.5 + 10]), "B": np.array([float(b)]), "C": np.array([c * -0.25])},
+    )
+    assert series.data[0].tobytes() == expected
+
+
+def big_endian_database() -> VehicleDatabase:
+    layout = read_layout(Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml")
+    database = cantools.database.load_string(BIG_ENDIAN_DBC)
+    assert isinstance(database, cantools.database.can.Database)
+    return VehicleDatabase(layout=layout, database=database, digest="0" * 64)
+
+
+@pytest.mark.parametrize("suffix", [".log", ".log.gz"])
+def test_log_reads_back_in_order_of_time(database: VehicleDatabase, tmp_path: Path, suffix: str) -> None:
+    slow = encode_message(database, "HV_Dcdc", np.array([0.05, 0.15]), {"DcdcCurrent": np.ones(2)})
+    fast = encode_message(database, "HV_Motor", np.array([0.0, 0.1, 0.2]), {"MotorCurrent": np.ones(3)})
+    path = tmp_path / f"drive{suffix}"
+    assert write_candump(path, [slow, fast], start_s=1000.0) == 5
+    with can.LogReader(path) as reader:
+        frames = list(reader)
+    assert [f.arbitration_id for f in frames] == [288, 320, 288, 320, 288]
+    assert [f.timestamp for f in frames] == pytest.approx([1000.0, 1000.05, 1000.1, 1000.15, 1000.2])
+    assert frames[1].data == slow.data[0].tobytes()
+
+
+def test_same_frames_give_the_same_bytes(database: VehicleDatabase, tmp_path: Path) -> None:
+    series = encode_message(database, "HV_Dcdc", np.arange(5.0), {"DcdcCurrent": np.ones(5)})
+    for name in ("a.log.gz", "b.log.gz"):
+        write_candump(tmp_path / name, [series])
+    assert (tmp_path / "a.log.gz").read_bytes() == (tmp_path / "b.log.gz").read_bytes()
+    assert gzip.decompress((tmp_path / "a.log.gz").read_bytes()).count(b"\n") == 5
+
+
+def test_log_of_no_frames_is_empty(tmp_path: Path) -> None:
+    assert write_candump(tmp_path / "x.log", []) == 0
+    assert (tmp_path / "x.log").read_bytes() == b""
+
+
+def test_database_of_the_project_is_complete() -> None:
+    layout = read_layout(Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml")
+    assert read_database(layout).digest

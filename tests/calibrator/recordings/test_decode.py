@@ -1,0 +1,212 @@
+from typing import Literal
+
+import cantools
+import numpy as np
+import pytest
+from cantools.database.can import Database, Message, Signal
+from cantools.database.conversion import BaseConversion
+from e2e.p01 import e2e_p01_check, e2e_p01_protect
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from calibrator.recordings.decode import decode_signal, means_not_available, raw_values
+from calibrator.recordings.e2e_profile import p01_is_sound
+from ecu_node.errors import DatabaseError
+
+MULTIPLEXED = """VERSION ""
+BU_: A
+BO_ 100 Mux: 8 A
+ SG_ Page M : 0|4@1+ (1,0) [0|0] "" A
+ SG_ Always : 4|4@1+ (1,0) [0|0] "" A
+ SG_ First m0 : 8|16@1+ (0.1,0) [0|0] "A" A
+ SG_ Second m1 : 8|16@1- (0.5,-3) [0|0] "A" A
+"""
+
+
+def payloads(rows: list[bytes], width: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    data = np.frombuffer(b"".join(row.ljust(width, b"\0") for row in rows), np.uint8).reshape(-1, width)
+    return data, np.array([len(row) for row in rows], np.uint8)
+
+
+def one_signal(
+    start: int,
+    length: int,
+    *,
+    byte_order: Literal["little_endian", "big_endian"] = "little_endian",
+    signed: bool = False,
+    is_float: bool = False,
+    scale: float = 1,
+    offset: float = 0,
+    size: int = 8,
+    choices: dict[int, str] | None = None,
+    limits: tuple[float | None, float | None] = (None, None),
+) -> tuple[Message, Signal]:
+    conversion = BaseConversion.factory(scale=scale, offset=offset, choices=choices, is_float=is_float)  # type: ignore[arg-type]
+    signal = Signal(
+        "S",
+        start,
+        length,
+        byte_order=byte_order,
+        is_signed=signed,
+        conversion=conversion,
+        minimum=limits[0],
+        maximum=limits[1],
+    )
+    return Message(1, "M", size, [signal]), signal
+
+
+def decoded_by_cantools(message: Message, row: bytes, *, scaling: bool = True) -> float:
+    values = message.decode(row, decode_choices=False, scaling=scaling)
+    assert isinstance(values, dict)
+    value = values["S"]
+    assert isinstance(value, int | float)
+    return value
+
+
+@st.composite
+def signals(draw: st.DrawFn) -> tuple[Message, Signal]:
+    size = draw(st.sampled_from([1, 2, 7, 8, 12, 48, 64]))
+    is_float = draw(st.booleans()) and size >= 2
+    length = draw(
+        st.sampled_from([b for b in (16, 32, 64) if b <= 8 * size]) if is_float else st.integers(1, min(64, 8 * size))
+    )
+    first = draw(st.integers(0, 8 * size - length))
+    byte_order: Literal["little_endian", "big_endian"] = draw(st.sampled_from(["little_endian", "big_endian"]))
+    start = first if byte_order == "little_endian" else 8 * (first // 8) + 7 - first % 8
+    signed = not is_float and draw(st.booleans())
+    scale, offset = draw(st.sampled_from([(1, 0), (0.02, 0), (-0.1, 500.0), (4, -1000)]))
+    return one_signal(
+        start, length, byte_order=byte_order, signed=signed, is_float=is_float, scale=scale, offset=offset, size=size
+    )
+
+
+@given(signals(), st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=5))
+def test_every_signal_decodes_as_cantools_decodes_it(pair: tuple[Message, Signal], rows: list[bytes]) -> None:
+    message, signal = pair
+    rows = [row[: message.length] for row in rows]
+    decoded = decode_signal(message, signal, *payloads(rows, 64 if message.length > 8 else 8))
+    expected = np.array([decoded_by_cantools(message, row) for row in rows], np.float64)
+    np.testing.assert_allclose(decoded.value, expected, rtol=1e-15)
+    assert decoded.present.all()
+    assert np.array_equal(decoded.good, np.isfinite(expected))
+
+
+@given(signals(), st.binary(min_size=64, max_size=64))
+def test_raw_values_are_those_of_cantools_to_the_bit(pair: tuple[Message, Signal], row: bytes) -> None:
+    message, signal = pair
+    row = row[: message.length]
+    raw, _ = raw_values(signal, *payloads([row], 64))
+    expected = decoded_by_cantools(message, row, scaling=False)
+    assert raw[0] == expected or np.isnan(raw[0])
+
+
+def test_a_frame_too_short_for_the_signal_is_present_but_not_good() -> None:
+    message, signal = one_signal(16, 16, scale=0.1)
+    decoded = decode_signal(message, signal, *payloads([b"\1\1\1\1", b"\1\1\1"], 8))
+    assert decoded.present.tolist() == [True, True]
+    assert decoded.good.tolist() == [True, False]
+    assert np.isnan(decoded.value[1])
+
+
+def test_a_signal_beyond_eight_bytes_is_not_good_in_classic_frames() -> None:
+    message, signal = one_signal(128, 16, size=64)
+    decoded = decode_signal(message, signal, *payloads([bytes(8)], 8))
+    assert not decoded.good.any()
+
+
+@pytest.mark.parametrize("code", [-32768, 0x8000])
+def test_the_code_for_not_available_is_not_good_however_the_dbc_writes_it(code: int) -> None:
+    message, signal = one_signal(0, 16, signed=True, scale=0.02, choices={code: "SNA", 1: "Standby"})
+    decoded = decode_signal(message, signal, *payloads([b"\x00\x80", b"\x01\x00", b"\xff\xff"], 8))
+    assert decoded.good.tolist() == [False, True, True]
+    np.testing.assert_allclose(decoded.value[1:], [0.02, -0.02])
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["SNA", "sna", "Signal not available", "Signal_Not_Available", "SignalNotAvailable", "Invalid", "INVALID_VALUE",
+     "Error", "ErrorIndicator", "Not Defined", "N/A", "Init", "unavailable"],
+)  # fmt: skip
+def test_this_name_means_not_available(name: str) -> None:
+    assert means_not_available(name)
+
+
+@pytest.mark.parametrize("name", ["No error", "Initialised", "Open", "Closed", "Erroneous gear", "Snail mode", "Valid"])
+def test_this_name_is_a_value(name: str) -> None:
+    assert not means_not_available(name)
+
+
+@pytest.mark.parametrize(
+    ("limits", "good"),
+    [
+        ((-1.0, 1.0), [True, True, False]),
+        ((0.0, 0.0), [True, True, True]),
+        ((None, None), [True, True, True]),
+        ((0.5, None), [False, True, True]),
+        ((None, 0.5), [True, False, False]),
+        ((0.0, 1.0), [True, True, False]),
+    ],
+)
+def test_a_value_outside_the_range_of_the_dbc_is_not_good(limits: tuple[float, float], good: list[bool]) -> None:
+    message, signal = one_signal(0, 8, scale=0.1, limits=limits)
+    decoded = decode_signal(message, signal, *payloads([b"\0", b"\x0a", b"\x0b"], 8))
+    assert decoded.good.tolist() == good
+
+
+def test_the_limit_itself_is_good_in_spite_of_rounding() -> None:
+    message, signal = one_signal(0, 16, scale=0.1, limits=(0.0, 6553.3))
+    decoded = decode_signal(message, signal, *payloads([(65533).to_bytes(2, "little")], 8))
+    assert decoded.good.all()
+
+
+def test_a_multiplexed_signal_is_present_only_on_its_page() -> None:
+    database = cantools.database.load_string(MULTIPLEXED)
+    assert isinstance(database, Database)
+    message = database.get_message_by_name("Mux")
+    rows = [bytes([page, 7, 0, 0, 0, 0, 0, 0]) for page in (0, 1, 2, 0x10, 0x11)]
+    first = decode_signal(message, message.get_signal_by_name("First"), *payloads(rows, 8))
+    second = decode_signal(message, message.get_signal_by_name("Second"), *payloads(rows, 8))
+    assert first.present.tolist() == [True, False, False, True, False]
+    assert second.present.tolist() == [False, True, False, False, True]
+    assert first.good.tolist() == first.present.tolist()
+    np.testing.assert_allclose(first.value[first.good], 0.7)
+    np.testing.assert_allclose(second.value[second.good], 0.5)
+
+
+def test_a_frame_too_short_for_its_multiplexer_is_not_good() -> None:
+    database = cantools.database.load_string(MULTIPLEXED)
+    assert isinstance(database, Database)
+    message = database.get_message_by_name("Mux")
+    decoded = decode_signal(message, message.get_signal_by_name("First"), *payloads([b""], 8))
+    assert decoded.present.tolist() == [True]
+    assert decoded.good.tolist() == [False]
+
+
+def test_a_number_of_more_than_64_bits_is_refused() -> None:
+    message, signal = one_signal(0, 65, size=64)
+    with pytest.raises(DatabaseError, match="signal S is a number of 65 bits"):
+        decode_signal(message, signal, *payloads([bytes(64)], 64))
+
+
+@given(st.binary(min_size=2, max_size=64), st.integers(0, 0xFFFF), st.integers(0, 10_000))
+def test_the_crc_of_profile_1_agrees_with_the_e2e_package(content: bytes, data_id: int, flip: int) -> None:
+    right = bytearray(content)
+    right[1] &= 0xF7
+    e2e_p01_protect(right, data_id, length=len(right), increment_counter=False)
+    wrong = bytearray(right)
+    wrong[flip % len(wrong)] ^= 1 << (flip % 8)
+    data, length = payloads([bytes(right), bytes(wrong)], 64)
+    expected = [e2e_p01_check(row, data_id, length=len(row)) for row in (right, wrong)]
+    assert p01_is_sound(data, length, data_id).tolist() == expected == [True, False]
+
+
+def test_a_counter_of_15_is_wrong() -> None:
+    row = bytearray(b"\0\x0f\1\2")
+    e2e_p01_protect(row, 1, length=4, increment_counter=False)
+    assert not p01_is_sound(*payloads([bytes(row)], 8), 1).any()
+    assert not e2e_p01_check(row, 1, length=4)
+
+
+def test_a_frame_without_room_for_crc_and_counter_is_wrong() -> None:
+    assert not p01_is_sound(*payloads([b"", b"\0"], 8), 0).any()

@@ -1,0 +1,295 @@
+import gzip
+import importlib.util
+import io
+import logging
+import struct
+from contextlib import suppress
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibrator.errors import LogError
+from calibrator.recordings import mf4
+from calibrator.recordings.candump import parse_candump
+from calibrator.recordings.frames import BLOCK_BYTES, Frames, is_log, read_frames
+
+PYTHON_CAN_FORMATS = (".log", ".asc", ".blf", ".trc")
+
+
+def some_messages(count: int = 200) -> list[can.Message]:
+    rng = np.random.default_rng(1)
+    return [
+        can.Message(
+            timestamp=1_700_000_000.0 + 0.01 * k,
+            arbitration_id=int(rng.integers(0x800 if k % 3 else 0x1FFFFFFF)),
+            is_extended_id=k % 3 == 0,
+            data=rng.bytes(int(rng.integers(9))),
+            channel=0,
+        )
+        for k in range(count)
+    ]
+
+
+def write_log(path: Path, messages: list[can.Message]) -> Path:
+    with can.Logger(path) as log:
+        for message in messages:
+            log.on_message_received(message)
+    return path
+
+
+def contents(frames: Frames) -> list[tuple[int, bytes]]:
+    return [(int(key), frames.data[k, : frames.length[k]].tobytes()) for k, key in enumerate(frames.key)]
+
+
+def expected_contents(messages: list[can.Message]) -> list[tuple[int, bytes]]:
+    return [(m.arbitration_id | (1 << 31 if m.is_extended_id else 0), bytes(m.data)) for m in messages]
+
+
+@pytest.mark.parametrize("suffix", [*PYTHON_CAN_FORMATS, ".mf4"])
+def test_every_format_gives_the_frames_that_were_logged(tmp_path: Path, suffix: str) -> None:
+    messages = some_messages()
+    frames = read_frames(write_log(tmp_path / f"drive{suffix}", messages))
+    assert contents(frames) == expected_contents(messages)
+    np.testing.assert_allclose(frames.time_s, 0.01 * np.arange(len(messages)), atol=1e-6)
+    assert frames.damaged == 0
+
+
+@pytest.mark.parametrize("suffix", PYTHON_CAN_FORMATS)
+def test_a_gzipped_log_gives_the_same_frames(tmp_path: Path, suffix: str) -> None:
+    path = write_log(tmp_path / f"drive{suffix}", some_messages())
+    packed = tmp_path / f"packed{suffix}.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    assert contents(read_frames(packed)) == contents(read_frames(path))
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf"])
+def test_can_fd_frames_keep_all_their_bytes(tmp_path: Path, suffix: str) -> None:
+    messages = [
+        can.Message(timestamp=1.7e9 + k, arbitration_id=0x123, is_extended_id=False, is_fd=True, data=bytes(range(n)))
+        for k, n in enumerate((3, 8, 12, 64))
+    ]
+    frames = read_frames(write_log(tmp_path / f"fd{suffix}", messages))
+    assert contents(frames) == expected_contents(messages)
+    assert frames.data.shape == (4, 64)
+
+
+def test_remote_and_error_frames_are_counted_but_carry_no_data(tmp_path: Path) -> None:
+    lines = ["(1.000000) can0 123#R8", "(1.100000) can0 123#R", "(1.200000) can0 20000080#0000000000000000"]
+    path = tmp_path / "drive.log"
+    path.write_text("\n".join([*lines, "(1.300000) can0 124#0102\n"]))
+    frames = read_frames(path)
+    assert (len(frames), frames.remote_frames, frames.error_frames, frames.damaged) == (1, 2, 1, 0)
+
+
+candump_lines = st.builds(
+    lambda time, channel, identifier, data, tail: f"({time:.6f}) {channel} {identifier}#{data}{tail}",
+    st.floats(0.0, 2e9),
+    st.sampled_from(["can0", "vcan12", "x"]),
+    st.one_of(st.integers(0, 0x7FF).map(lambda i: f"{i:03X}"), st.integers(0, 0x1FFFFFFF).map(lambda i: f"{i:08x}")),
+    st.one_of(
+        st.binary(max_size=8).map(lambda data: data.hex().upper()),
+        st.sampled_from([3, 12, 48, 64]).map(lambda n: "#1" + bytes(range(n)).hex()),
+        st.just("R4"),
+    ),
+    st.sampled_from(["", " R", " T"]),
+)
+
+
+@given(st.lists(candump_lines, min_size=1, max_size=30), st.sampled_from(["\n", "\r\n", "\n\n"]))
+def test_the_candump_parser_agrees_with_python_can(lines: list[str], line_end: str) -> None:
+    text = line_end.join(lines) + line_end
+    block = parse_candump(text.encode())
+    messages = [m for m in can.CanutilsLogReader(io.StringIO(text)) if not m.is_remote_frame]
+    assert block.first_damaged is None
+    assert contents(block.frames) == expected_contents(messages)
+    np.testing.assert_allclose(block.frames.time_ns * 1e-9, [m.timestamp for m in messages], atol=1e-6, rtol=0)
+    assert [block.frames.channels[c] for c in block.frames.channel] == [str(m.channel) for m in messages]
+
+
+@given(st.text(alphabet="()#0123456789AFGRTcan .\r-", max_size=80))
+def test_a_damaged_line_is_counted_and_its_neighbours_are_read(line: str) -> None:
+    good = "(1.000000) can0 123#01\n"
+    block = parse_candump(f"{good}{line}\n{good}".encode())
+    kept = contents(block.frames)
+    assert kept[0] == kept[-1] == (0x123, b"\x01")
+    assert len(kept) + block.frames.damaged + block.frames.remote_frames + block.frames.error_frames == block.lines
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "(1.000000) can0 123#012",
+        "(1.000000) can0 123#0G",
+        "(1.000000) can0 1234#01",
+        "(1.000000) can0 FFF#01",
+        "(1.0) can0 123#01",
+        "(x.000000) can0 123#01",
+        "(1.000000) can0 123#010203040506070809",
+        "(1.000000) can0 123##",
+        "(1.000000) can0 123##1" + "00" * 65,
+        "1.000000 can0 123#01",
+        "(1.000000) can0",
+        "(1.000000) can0 123#01 X",
+        "garbage",
+    ],
+)
+def test_this_line_is_damaged(line: str) -> None:
+    block = parse_candump(f"(1.000000) can0 123#01\n\n{line}\n".encode())
+    assert (len(block.frames), block.frames.damaged, block.first_damaged) == (1, 1, 2)
+
+
+def test_a_few_damaged_lines_are_left_out_and_counted(tmp_path: Path) -> None:
+    path = tmp_path / "drive.log"
+    path.write_text("(1.000000) can0 123#01\n" * 99 + "(1.0000")
+    frames = read_frames(path)
+    assert (len(frames), frames.damaged) == (99, 1)
+
+
+def test_a_log_with_many_damaged_lines_is_refused_with_the_first_of_them(tmp_path: Path) -> None:
+    path = tmp_path / "drive.log"
+    path.write_text("(1.000000) can0 123#01\n" * 9 + "nonsense\n")
+    with pytest.raises(LogError, match=r"drive\.log: line 10 is damaged, and 1 of 10 lines are; expected .*9 frames"):
+        read_frames(path)
+
+
+def test_a_log_longer_than_one_block_keeps_order_and_line_numbers(tmp_path: Path) -> None:
+    line = "({:.6f}) can0 123#0102030405060708\n"
+    count = BLOCK_BYTES // len(line.format(1.0)) + 1000
+    path = tmp_path / "long.log"
+    path.write_text("".join(line.format(1000.0 + 0.001 * k) for k in range(count)) + "?\n")
+    frames = read_frames(path)
+    assert len(frames) == count
+    assert np.all(np.diff(frames.time_ns) > 0)
+    path.write_text("?\n" * count + "(1.000000) can0 123#01\n")
+    with pytest.raises(LogError, match="line 1 is damaged"):
+        read_frames(path)
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".trc", ".log.gz"])
+def test_an_empty_log_is_refused(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"empty{suffix}"
+    path.write_bytes(gzip.compress(b"") if suffix.endswith(".gz") else b"")
+    with pytest.raises(LogError, match="the log is empty"):
+        read_frames(path)
+
+
+def test_an_unknown_suffix_is_refused_with_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"expected \.log, \.asc, \.blf, \.trc, \.mf4"):
+        read_frames(tmp_path / "drive.csv")
+    assert not is_log(tmp_path / "drive.csv")
+    assert is_log(tmp_path / "drive.LOG.gz")
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"nowhere\.log: no such file"):
+        read_frames(tmp_path / "nowhere.log")
+
+
+def test_a_truncated_gzip_says_how_many_frames_were_readable(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "drive.log", some_messages(5000))
+    cut = tmp_path / "cut.log.gz"
+    packed = gzip.compress(path.read_bytes())
+    cut.write_bytes(packed[: len(packed) // 2])
+    with pytest.raises(LogError, match=r"cut\.log\.gz: truncated or damaged after line \d+: .*\d+ frames before it"):
+        read_frames(cut)
+
+
+def test_a_file_that_is_no_gzip_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "drive.blf.gz"
+    path.write_bytes(b"not gzip")
+    with pytest.raises(LogError, match="cannot be read"):
+        read_frames(path)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.95, 0.999])
+def test_a_truncated_blf_is_refused_wherever_it_is_cut(tmp_path: Path, share: float) -> None:
+    path = write_log(tmp_path / "drive.blf", some_messages(20_000))
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(LogError, match=r"drive\.blf: truncated or damaged BLF: at byte \d+ .*\d+ frames before it"):
+        read_frames(path)
+
+
+def test_a_blf_with_an_object_of_no_size_ends_in_an_error_not_in_a_loop(tmp_path: Path) -> None:
+    path = tmp_path / "loop.blf"
+    inner = struct.pack("<4sHHLL", b"LOBJ", 32, 1, 0, 1) + bytes(64)
+    container = struct.pack("<H6xL4x", 0, len(inner)) + inner
+    header = struct.pack("<4sL", b"LOGG", 144).ljust(144, b"\0")
+    path.write_bytes(header + struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(container), 10) + container)
+    with pytest.raises(LogError, match="a container holds an object of 0 bytes"):
+        read_frames(path)
+
+
+@given(st.binary(max_size=200), st.integers(0, 3000))
+def test_no_blf_content_ends_in_anything_but_frames_or_a_message(
+    tmp_path_factory: pytest.TempPathFactory, junk: bytes, position: int
+) -> None:
+    path = write_log(tmp_path_factory.mktemp("blf") / "drive.blf", some_messages(50))
+    content = bytearray(path.read_bytes())
+    content[position : position + len(junk)] = junk
+    path.write_bytes(content)
+    with suppress(LogError):
+        read_frames(path)
+
+
+def test_a_damaged_asc_line_is_named(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "drive.asc", some_messages(20))
+    lines = path.read_text().splitlines()
+    lines[10] = "0.050000 1  12Z  Rx   d 2 01 02"
+    path.write_text("\n".join(lines))
+    with pytest.raises(LogError, match=r"drive\.asc: damaged at line 11 .*\d+ frames before it are readable"):
+        read_frames(path)
+
+
+def test_a_frame_shorter_than_it_says_is_damaged(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "drive.asc", some_messages(20))
+    path.write_text(path.read_text() + "0.500000 1  123  Rx   d 8 01 02\n")
+    frames = read_frames(path)
+    assert (len(frames), frames.damaged) == (20, 1)
+
+
+def test_an_asc_with_relative_time_stamps_is_refused(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "drive.asc", some_messages(20))
+    path.write_text(path.read_text().replace("timestamps absolute", "timestamps relative"))
+    with pytest.raises(LogError, match="relative to the line before"):
+        read_frames(path)
+
+
+def test_what_python_can_complains_of_is_counted_and_not_printed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_log(tmp_path / "drive.trc", some_messages(20))
+    path.write_text(path.read_text() + "     21 \n")
+    with caplog.at_level(logging.DEBUG):
+        frames = read_frames(path)
+    assert frames.damaged == 1
+    assert not caplog.records
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_damaged_mf4_is_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "drive.mf4"
+    path.write_bytes(b"MDF     4.10    " + bytes(200))
+    with pytest.raises(LogError, match=r"drive\.mf4: not a readable MF4 log: .*") as caught:
+        read_frames(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_reading_mf4_ends_at_its_time_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mf4, "START_S", 0.01)
+    path = tmp_path / "drive.mf4"
+    path.write_bytes(b"MDF")
+    with pytest.raises(LogError, match="was ended"):
+        read_frames(path)
+
+
+def test_mf4_without_asammdf_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    path = tmp_path / "drive.mf4"
+    path.write_bytes(b"MDF")
+    with pytest.raises(LogError, match=r"pip install 'hv-current-correction\[mf4\]'"):
+        read_frames(path)

@@ -1,0 +1,210 @@
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from calibrator.drive import Array, Channel, Drive
+from calibrator.errors import LogError
+from calibrator.recordings.canlog import encode_message, write_candump
+from calibrator.recordings.drive_log import write_drive_log
+from calibrator.recordings.frames import read_frames
+from calibrator.recordings.readers import drive_from_frames, read_drive, read_recording
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.errors import DatabaseError
+from ecu_node.layout import read_layout
+
+POWER_DBC = """VERSION ""
+BU_: A
+BO_ 1 Power: 8 A
+ SG_ Power : 0|16@1- (0.5,0) [-1000|1000] "kW" A
+BO_ 2 Volt: 8 A
+ SG_ Voltage : 0|16@1+ (0.1,0) [0|1000] "V" A
+BO_ 2147483651 Batt: 8 A
+ SG_ Current : 0|16@1- (100,0) [0|0] "mA" A
+"""
+POWER_LAYOUT = """
+schema = 1
+name = "power"
+dbc = "power.dbc"
+full_scale_a = 400
+[[branch]]
+name = "battery"
+signal = "Batt.Current"
+sign = 1
+[[branch]]
+name = "motor"
+power = "Power.Power"
+voltage = "Volt.Voltage"
+sign = -1
+timeout_s = 0.5
+"""
+
+
+@pytest.fixture
+def power_database(tmp_path: Path) -> VehicleDatabase:
+    (tmp_path / "power.dbc").write_text(POWER_DBC)
+    (tmp_path / "power.toml").write_text(POWER_LAYOUT)
+    return read_database(read_layout(tmp_path / "power.toml"))
+
+
+def log_of(path: Path, lines: list[tuple[float, str]]) -> Path:
+    path.write_text("".join(f"({1e9 + time:.6f}) can0 {text}\n" for time, text in lines))
+    return path
+
+
+def steady(values: list[float], period_s: float = 0.1) -> Channel:
+    value = np.array(values)
+    return Channel(time_s=period_s * np.arange(len(value)), value=value, good=np.isfinite(value))
+
+
+def read_motor(path: Path, database: VehicleDatabase) -> Channel:
+    return read_drive(path, database, vehicle="v", name="d").branches["motor"]
+
+
+def test_a_drive_written_as_a_log_is_read_back(tmp_path: Path, database: VehicleDatabase) -> None:
+    written = Drive(
+        vehicle="v",
+        name="d",
+        branches={"battery": steady([10.0, 11.0, np.nan]), "motor": steady([-9.0, -10.0, -11.0])},
+        inputs={"voltage": steady([390.0, 391.0, 392.0]), "speed": steady([0.0, 50.0, np.nan])},
+    )
+    write_drive_log(tmp_path / "d.log.gz", written, database)
+    read = read_drive(tmp_path / "d.log.gz", database, vehicle="v", name="d")
+    assert set(read.branches) == {"battery", "motor"}
+    for name, channel in (*written.branches.items(), *written.inputs.items()):
+        found = {**read.branches, **read.inputs}[name]
+        np.testing.assert_allclose(found.time_s, channel.time_s, atol=1e-9)
+        assert np.array_equal(found.good, channel.good)
+        np.testing.assert_allclose(found.value[found.good], channel.value[channel.good], atol=0.01)
+
+
+def test_a_current_has_the_sign_of_the_layout_and_the_unit_of_the_dbc_is_turned_into_ampere(
+    tmp_path: Path, power_database: VehicleDatabase
+) -> None:
+    drive = read_drive(log_of(tmp_path / "x.log", [(0.0, "00000003#9CFF")]), power_database, vehicle="v", name="d")
+    np.testing.assert_allclose(drive.branches["battery"].value, [-10.0])
+
+
+def test_an_identifier_of_11_bits_is_not_taken_for_one_of_29(tmp_path: Path, power_database: VehicleDatabase) -> None:
+    with pytest.raises(LogError, match="no branch"):
+        read_drive(log_of(tmp_path / "x.log", [(0.0, "003#9CFF")]), power_database, vehicle="v", name="d")
+
+
+def test_power_is_divided_by_the_latest_voltage_at_or_before_it(
+    tmp_path: Path, power_database: VehicleDatabase
+) -> None:
+    lines = [(0.0, "001#1400"), (0.1, "002#A00F"), (0.1, "001#1400"), (0.2, "002#D007"), (0.25, "001#1400")]
+    motor = read_motor(log_of(tmp_path / "x.log", lines), power_database)
+    np.testing.assert_allclose(motor.time_s, [0.0, 0.1, 0.25], atol=1e-9)
+    assert motor.good.tolist() == [False, True, True]
+    np.testing.assert_allclose(motor.value[1:], [-10_000 / 400.0, -10_000 / 200.0])
+
+
+def test_a_voltage_older_than_the_timeout_makes_the_current_not_good(
+    tmp_path: Path, power_database: VehicleDatabase
+) -> None:
+    lines = [(0.0, "002#A00F"), (0.5, "001#1400"), (0.6, "001#1400")]
+    motor = read_motor(log_of(tmp_path / "x.log", lines), power_database)
+    assert motor.good.tolist() == [True, False]
+
+
+def test_no_voltage_or_zero_voltage_makes_the_current_not_good(tmp_path: Path, power_database: VehicleDatabase) -> None:
+    zero = log_of(tmp_path / "x.log", [(0.0, "002#0000"), (0.1, "001#1400")])
+    none = log_of(tmp_path / "y.log", [(0.1, "001#1400")])
+    assert not read_motor(zero, power_database).good.any()
+    assert not read_motor(none, power_database).good.any()
+
+
+def test_a_log_without_any_branch_lists_what_it_has_and_what_is_expected(
+    tmp_path: Path, database: VehicleDatabase
+) -> None:
+    path = log_of(tmp_path / "x.log", [(0.0, "7FF#00"), (0.1, "18DAF110#00")])
+    with pytest.raises(LogError, match=r"x\.log: no branch .* 0x7FF, 0x18DAF110; expected HV_Battery \(0x110\)"):
+        read_drive(path, database, vehicle="v", name="d")
+
+
+def test_absent_branches_and_inputs_are_reported(tmp_path: Path, database: VehicleDatabase) -> None:
+    drive = Drive(vehicle="v", name="d", branches={"battery": steady([1.0, 2.0])}, inputs={})
+    write_drive_log(tmp_path / "d.log", drive, database)
+    recording = read_recording(tmp_path / "d.log", database, vehicle="v", name="d")
+    assert set(recording.drive.branches) == {"battery"}
+    assert "no frames of motor, auxiliary, dcdc, motor_rear, torque" in recording.report.notices()[0]
+
+
+def test_an_input_that_is_never_available_is_left_out_and_reported(tmp_path: Path, database: VehicleDatabase) -> None:
+    drive = Drive(vehicle="v", name="d", branches={"battery": steady([1.0, 2.0])}, inputs={})
+    write_drive_log(tmp_path / "d.log", drive, database)
+    recording = read_recording(tmp_path / "d.log", database, vehicle="v", name="d")
+    assert "voltage" not in recording.drive.inputs
+    assert "voltage: 2 of 2 frames not usable" in recording.report.notices()
+
+
+def test_a_frame_with_a_wrong_crc_is_labelled(tmp_path: Path, database: VehicleDatabase) -> None:
+    series = encode_message(database, "HV_Battery", np.array([0.0, 0.1]), {"BatteryCurrent": np.array([1.0, 2.0])})
+    series.data[1, 0] ^= 1
+    write_candump(tmp_path / "d.log", [series])
+    battery = read_drive(tmp_path / "d.log", database, vehicle="v", name="d").branches["battery"]
+    assert battery.good.tolist() == [True, False]
+
+
+def test_corrected_frames_are_read_beside_the_measured_ones(tmp_path: Path, database: VehicleDatabase) -> None:
+    time_s: Array = np.array([0.0, 0.1])
+    measured = encode_message(database, "HV_Motor", time_s, {"MotorCurrent": np.array([10.0, 20.0])})
+    corrected = encode_message(database, "HV_MotorCorrected", time_s, {"MotorCurrentCorrected": np.array([9.0, 18.0])})
+    write_candump(tmp_path / "d.log", [measured, corrected])
+    recording = read_recording(tmp_path / "d.log", database, vehicle="v", name="d")
+    np.testing.assert_allclose(recording.drive.branches["motor"].value, [-10.0, -20.0])
+    np.testing.assert_allclose(recording.corrected["motor"].value, [-9.0, -18.0])
+
+
+def test_one_message_on_two_buses_is_refused(tmp_path: Path, power_database: VehicleDatabase) -> None:
+    path = tmp_path / "x.log"
+    path.write_text("(1.000000) can0 00000003#0100\n(1.100000) can1 00000003#0200\n")
+    with pytest.raises(LogError, match=r"Batt comes on 2 buses \(can0, can1\)"):
+        read_drive(path, power_database, vehicle="v", name="d")
+
+
+def test_another_message_on_another_bus_does_no_harm(tmp_path: Path, power_database: VehicleDatabase) -> None:
+    path = tmp_path / "x.log"
+    path.write_text("(1.000000) can0 00000003#0100\n(1.100000) can1 00000004#0200\n")
+    assert read_drive(path, power_database, vehicle="v", name="d").branches["battery"].good.all()
+
+
+def test_disorder_and_clock_steps_are_reported(tmp_path: Path, power_database: VehicleDatabase) -> None:
+    lines = [(t, "00000003#0100") for t in (0.0, 0.2, 0.1, 5000.0)]
+    report = read_recording(log_of(tmp_path / "x.log", lines), power_database, vehicle="v", name="d").report
+    assert report.notices()[-2:] == [
+        "1 frames out of order, sorted",
+        "the clock was set 1 times, each step became a gap of 60 s",
+    ]
+
+
+def test_a_dbc_without_the_named_signal_is_refused_with_the_signals_it_has(tmp_path: Path) -> None:
+    (tmp_path / "power.dbc").write_text(POWER_DBC.replace("SG_ Current", "SG_ Amperes"))
+    (tmp_path / "power.toml").write_text(POWER_LAYOUT)
+    with pytest.raises(DatabaseError, match=r"message Batt has no signal 'Current', .*it has Amperes"):
+        read_database(read_layout(tmp_path / "power.toml"))
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".blf", ".trc"])
+def test_the_format_of_the_log_does_not_change_the_drive(
+    tmp_path: Path, database: VehicleDatabase, suffix: str
+) -> None:
+    rng = np.random.default_rng(3)
+    written = Drive(vehicle="v", name="d", branches={"battery": steady(rng.normal(0, 100, 50).tolist())}, inputs={})
+    write_drive_log(tmp_path / "d.log", written, database)
+    with can.Logger(tmp_path / f"d{suffix}") as log:
+        for message in can.LogReader(tmp_path / "d.log"):
+            message.channel = 0
+            log.on_message_received(message)
+    one = read_drive(tmp_path / "d.log", database, vehicle="v", name="d").branches["battery"]
+    other = read_drive(tmp_path / f"d{suffix}", database, vehicle="v", name="d").branches["battery"]
+    np.testing.assert_array_equal(one.value, other.value)
+    np.testing.assert_allclose(one.time_s, other.time_s, atol=1e-3)
+
+
+def test_frames_of_a_bus_and_of_a_file_give_the_same_drive(tmp_path: Path, power_database: VehicleDatabase) -> None:
+    path = log_of(tmp_path / "x.log", [(0.0, "002#A00F"), (0.1, "001#1400")])
+    one = drive_from_frames(read_frames(path), power_database, vehicle="v", name="d", where="bus")
+    np.testing.assert_array_equal(one.drive.branches["motor"].value, read_motor(path, power_database).value)
