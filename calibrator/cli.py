@@ -153,10 +153,9 @@ def simulate(
     )
     with progress_bar("simulate", vehicles, "vehicles") as progress:
         truth = simulate_fleet(plan, trips, database, out, workers=workers, progress=progress)
-    figures = {"vehicles": len(truth.vehicles), "branches": truth.branches, "out": str(out)}
-    _print_report(
-        dumps(figures) if json else f"{out}: {len(truth.vehicles)} vehicles with branches {', '.join(truth.branches)}"
-    )
+    figures = {"vehicles": len(truth.vehicles), "branches": truth.branches, "out": str(out), "notices": trips.notices}
+    lines = [f"{out}: {len(truth.vehicles)} vehicles with branches {', '.join(truth.branches)}"]
+    _print_report(dumps(figures) if json else "\n".join([*lines, *(f"notice: {notice}" for notice in trips.notices)]))
 
 
 @app.command()

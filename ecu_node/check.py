@@ -52,15 +52,15 @@ def report_text(report: dict[str, Any]) -> str:
     """Show a report of :func:`check_report` as text."""
     head = f"vehicle {report['vehicle']}, parameter set {report['parameter_set']}: fit"
     lines = [head if report["fit"] else f"NOT FIT ({report['reason']}): {report['message']}"]
-    lines.append(f"{'branch':<16}{'drift':>10}{'offset':>12}  {'(code * gain + bias + half) >> shift':<52}target")
+    lines.append(f"{'branch':<12}{'drift':>11}{'offset':>13}  target: (code * gain + bias + half) >> shift")
     for name, branch in report["branches"].items():
-        plan = branch["plan"]
-        formula = f"gain {plan['gain']}, bias {plan['bias']}, shift {plan['shift']}" if plan else "not republished"
-        mark = "" if branch["applied"] else "  (passed through)"
+        mark = "" if branch["applied"] else " (passed through)"
         lines.append(
-            f"{name:<16}{branch['drift']:>+10.4%}{branch['offset_a']:>+10.3f} A  {formula:<52}"
-            f"{branch['target'] or '-'}{mark}"
+            f"{name:<12}{branch['drift']:>+11.4%}{branch['offset_a']:>+11.3f} A  {branch['target'] or 'none'}{mark}"
         )
+        plan = branch["plan"]
+        if plan is not None and branch["applied"]:
+            lines.append(f"{'':<38}gain {plan['gain']}, bias {plan['bias']}, shift {plan['shift']}")
     return "\n".join(lines)
 
 

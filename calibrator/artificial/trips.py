@@ -37,6 +37,11 @@ class TripSource(Protocol):
         """Branches that the trips have."""
         ...
 
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What a user should know about the trips."""
+        ...
+
     def trip(self, number: int, purpose: Purpose) -> GroundTruth:
         """Trip of vehicle ``number``."""
         ...
@@ -50,6 +55,7 @@ class BuiltinTrips:
     duration_s: float
     unseen_s: float
     branches: tuple[str, ...] = ("battery", "motor", "auxiliary", "dcdc", "motor_rear")
+    notices: tuple[str, ...] = ()
 
     def trip(self, number: int, purpose: Purpose) -> GroundTruth:
         """Trip of vehicle ``number``."""
@@ -69,6 +75,7 @@ class RecordedTrips:
     recorded: Sequence[GroundTruth]
     vehicles: int
     unseen_s: float
+    notices: tuple[str, ...] = ()
 
     @property
     def branches(self) -> tuple[str, ...]:
@@ -106,12 +113,17 @@ class CommonTrips:
         """Branches that the trips have."""
         return self.source.branches
 
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What a user should know about the trips."""
+        return self.source.notices
+
     def trip(self, number: int, purpose: Purpose) -> GroundTruth:  # noqa: ARG002
         """Trip of every vehicle."""
         return replace(self.source.trip(0, purpose), name=f"common-{purpose}")
 
 
-def read_recorded_trips(store: Path, layout: Layout) -> list[GroundTruth]:
+def read_recorded_trips(store: Path, layout: Layout) -> tuple[list[GroundTruth], list[str]]:
     """Read the drives of a store as trips of the ideal vehicle.
 
     Parameters
@@ -123,19 +135,27 @@ def read_recorded_trips(store: Path, layout: Layout) -> list[GroundTruth]:
 
     Returns
     -------
-    list of GroundTruth
-        In the order of the store; drives without usable samples are left out.
+    trips : list of GroundTruth
+        In the order of the store.
+    unusable : list of str
+        Names of the drives that lack good samples of some channel.
 
     Raises
     ------
     FleetError
         If no drive is usable.
     """
-    trips = [ground_truth_from_drive(drive, layout.period_s) for drive in iterate_drives(store, layout)]
-    usable = [trip for trip in trips if trip is not None]
-    if not usable:
+    trips: list[GroundTruth] = []
+    unusable: list[str] = []
+    for drive in iterate_drives(store, layout):
+        trip = ground_truth_from_drive(drive, layout.period_s)
+        if trip is None:
+            unusable.append(f"{drive.vehicle}/{drive.name}")
+        else:
+            trips.append(trip)
+    if not trips:
         raise FleetError(f"{store}: no drive with usable samples; import drives with 'calibrator import'")
-    return usable
+    return trips, unusable
 
 
 def choose_trips(
@@ -167,6 +187,13 @@ def choose_trips(
     if drives == "builtin":
         source = BuiltinTrips(seed=seed, duration_s=duration_s, unseen_s=unseen_s)
     else:
-        recorded = read_recorded_trips(Path(drives), layout)
-        source = RecordedTrips(seed=seed, recorded=recorded, vehicles=1 if common else vehicles, unseen_s=unseen_s)
+        recorded, unusable = read_recorded_trips(Path(drives), layout)
+        notice = f"{len(unusable)} drives lack good samples of some channel and are left out: {', '.join(unusable)}"
+        source = RecordedTrips(
+            seed=seed,
+            recorded=recorded,
+            vehicles=1 if common else vehicles,
+            unseen_s=unseen_s,
+            notices=(notice,) if unusable else (),
+        )
     return CommonTrips(source=source) if common else source

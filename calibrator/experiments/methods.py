@@ -55,6 +55,6 @@ def _by_truth(trial: Trial) -> Classification:
     return classify_by_truth(trial.truth)
 
 
-THRESHOLD = Published(name="published, threshold", classify=_by_threshold)
-TREE = Published(name="published, tree", classify=_by_tree)
-PERFECT = Published(name="published, perfect classifier", classify=_by_truth)
+THRESHOLD = Published(name="published/threshold", classify=_by_threshold)
+TREE = Published(name="published/tree", classify=_by_tree)
+PERFECT = Published(name="published/perfect", classify=_by_truth)

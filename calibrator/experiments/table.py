@@ -7,13 +7,11 @@ from calibrator.experiments.result import ExperimentResult, Figure
 
 __all__ = ["result_table"]
 
-HEADINGS = {
-    "recovery_rate": "recovered (10 %)",
-    "recovery_rate_25": "recovered (25 %)",
-    "f2": "f2",
-    "complexity": "complexity",
-    "failed": "failed",
-}
+HEADINGS = {"recovery_rate": "10 %", "recovery_rate_25": "25 %", "f2": "f2", "complexity": "hardware"}
+LEGEND = (
+    "Share recovered within 10 and 25 %, f2 of the hardware classification, share held to have hardware faults; "
+    "in brackets the paper."
+)
 
 
 def result_table(result: ExperimentResult) -> Table:
@@ -31,14 +29,18 @@ def result_table(result: ExperimentResult) -> Table:
     """
     settings = result.settings
     table = Table(
+        box=None,
+        pad_edge=False,
         title=result.title,
-        caption=f"{settings['vehicles']} vehicles, {settings['repetitions']} repetitions, seed {settings['seed']}, "
-        f"drive {settings['drive']}; in brackets the paper",
+        caption=f"{LEGEND} {settings['vehicles']} vehicles, {settings['repetitions']} repetitions, "
+        f"seed {settings['seed']}, drive {settings['drive']}.{_failures(result)}",
+        caption_justify="left",
+        title_justify="left",
     )
     table.add_column(escape(result.x_label), justify="right")
-    table.add_column("method")
+    table.add_column("method", no_wrap=True)
     for heading in HEADINGS.values():
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", no_wrap=True)
     for row in result.rows:
         table.add_row(f"{row.x:g}", row.method, *(_cell(row.figures[name]) for name in HEADINGS))
     return table
@@ -47,3 +49,10 @@ def result_table(result: ExperimentResult) -> Table:
 def _cell(figure: Figure) -> str:
     paper = "" if figure.paper is None else f" ({figure.paper:.2f})"
     return f"{figure.mean:.3f}{paper}"
+
+
+def _failures(result: ExperimentResult) -> str:
+    """Say where an optimisation failed; empty if none did."""
+    failed = {f"{row.x:g} {row.method}": row.figures["failed"].mean for row in result.rows}
+    named = [f"{name} {share:.3f}" for name, share in failed.items() if share]
+    return f" Optimisation failed for a share of: {', '.join(named)}." if named else ""

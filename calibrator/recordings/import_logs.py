@@ -1,6 +1,6 @@
 """CAN logs of one or many vehicles into a drive store. One bad log never stops the others."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -44,7 +44,7 @@ class ImportReport:
     def as_text(self) -> str:
         """The report for people."""
         rows = [(d.vehicle, d.name, f"{d.duration_s:.1f}", ", ".join(d.branches)) for d in self.drives]
-        notices = [f"  {d.vehicle}/{d.name}: {notice}" for d in self.drives for notice in d.notices]
+        notices = _grouped({f"{d.vehicle}/{d.name}": d.notices for d in self.drives})
         parts = [
             table(("vehicle", "drive", "duration [s]", "branches"), rows) if rows else "",
             "\n".join(["notices:", *notices]) if notices else "",
@@ -88,6 +88,15 @@ def import_logs(logs: Sequence[Path], database: VehicleDatabase, store: Path, *,
                 left_out[f"{log.vehicle}/{log.name}"] = outcome
             progress(done)
     return ImportReport(store=str(store), drives=tuple(drives), left_out=left_out)
+
+
+def _grouped(notices: Mapping[str, Sequence[str]]) -> list[str]:
+    """One line per notice, with the drive or the number of drives it is about."""
+    drives: dict[str, list[str]] = {}
+    for drive, texts in notices.items():
+        for text in texts:
+            drives.setdefault(text, []).append(drive)
+    return [f"  {where[0] if len(where) == 1 else f'{len(where)} drives'}: {text}" for text, where in drives.items()]
 
 
 def _import_one(log: LogSource, database: VehicleDatabase, store: Path, present: bool) -> ImportedDrive | str:

@@ -44,7 +44,9 @@ def test_the_same_as_text(params: Path, capsys: pytest.CaptureFixture[str]) -> N
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "vehicle v1, parameter set 300: fit"
     assert lines[2].split()[:3] == ["battery", "+25.0000%", "+5.000"]
-    assert lines[5].endswith("HV_DcdcCorrected.DcdcCurrentCorrected  (passed through)")
+    assert lines[3].split()[0] == "gain"
+    dcdc = next(line for line in lines if line.startswith("dcdc"))
+    assert dcdc.endswith("HV_DcdcCorrected.DcdcCurrentCorrected (passed through)")
 
 
 def test_unfit_parameters_end_in_1_and_say_why(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
