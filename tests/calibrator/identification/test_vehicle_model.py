@@ -1,0 +1,85 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrator.drive import Array, Channel, Drive
+from calibrator.drives.fleet_source import DriveEntry, Equipment
+from calibrator.drives.store import write_drive
+from calibrator.errors import DriveError
+from calibrator.faults import corrected_currents
+from calibrator.identification.vehicle_model import VehicleModel, junction_rms_a, read_vehicle_model
+from ecu_node.database import VehicleDatabase
+
+EQUIPMENT = Equipment(branches=("battery", "motor"), inputs=("driving_current", "heater_current"), notices=())
+
+
+def channel(value: Array, good: Array | None = None) -> Channel:
+    mask = np.ones(len(value), bool) if good is None else good.astype(bool)
+    return Channel(time_s=np.arange(float(len(value))) * 0.1, value=value, good=mask)
+
+
+def drive(name: str, samples: int, *, heater: bool = True, seed: int = 0) -> Drive:
+    """Battery = 2 driving + heater, motor = -1.9 driving - heater - 3: exact, without dynamics."""
+    rng = np.random.default_rng(seed)
+    torque = np.repeat(rng.uniform(5.0, 100.0, size=samples // 10 + 1), 10)[:samples]
+    power = np.repeat(rng.choice([0.0, 2000.0, 4000.0], size=samples // 50 + 1), 50)[:samples] * float(heater)
+    speed, voltage = np.full(samples, 40.0), np.full(samples, 400.0)
+    driving, heating = torque * speed / voltage, power / voltage
+    return Drive(
+        vehicle="V1",
+        name=name,
+        branches={"battery": channel(2.0 * driving + heating), "motor": channel(-1.9 * driving - heating - 3.0)},
+        inputs={
+            "torque": channel(torque),
+            "speed": channel(speed),
+            "voltage": channel(voltage),
+            "heater_demand": channel(power),
+        },
+    )
+
+
+def model_of(database: VehicleDatabase, store: Path, *drives: Drive) -> VehicleModel:
+    entries = [
+        DriveEntry(vehicle=item.vehicle, name=item.name, path=write_drive(store, item, database.layout))
+        for item in drives
+    ]
+    return read_vehicle_model(entries, EQUIPMENT, database)
+
+
+def test_static_vehicle_is_simulated_exactly_on_held_out_data(database: VehicleDatabase, tmp_path: Path) -> None:
+    vehicle = model_of(database, tmp_path, drive("a", 3000))
+    assert vehicle.snr_db.min() > 80.0
+    assert vehicle.duration_s == pytest.approx(300.0, abs=0.2)
+    assert len(vehicle.held_out_inputs) == pytest.approx(600 + vehicle.lead_in, abs=1)
+
+
+def test_two_drives_of_a_vehicle_are_used_together(database: VehicleDatabase, tmp_path: Path) -> None:
+    vehicle = model_of(database, tmp_path, drive("a", 2000), drive("b", 1000, seed=1))
+    assert vehicle.drives == ("a", "b")
+    assert vehicle.duration_s == pytest.approx(300.0, abs=0.3)
+    assert vehicle.snr_db.min() > 80.0
+
+
+def test_input_that_never_varies_has_no_effect_in_the_model(database: VehicleDatabase, tmp_path: Path) -> None:
+    vehicle = model_of(database, tmp_path, drive("a", 3000, heater=False))
+    np.testing.assert_array_equal(vehicle.model.D[:, 1], 0.0)
+    np.testing.assert_array_equal(vehicle.model.B[:, 1], 0.0)
+    varied = np.column_stack([np.full(100, 5.0), np.linspace(0.0, 10.0, 100)])
+    np.testing.assert_allclose(vehicle.model.simulate(varied)[:, 0], 10.0, atol=1e-6)
+
+
+def test_three_seconds_are_too_little(database: VehicleDatabase, tmp_path: Path) -> None:
+    with pytest.raises(DriveError, match=r"of usable data in 1 drives; at least 60 s are needed"):
+        model_of(database, tmp_path, drive("a", 30))
+
+
+def test_junction_rms_from_moments_equals_that_of_the_samples(database: VehicleDatabase, tmp_path: Path) -> None:
+    recorded = drive("a", 3000)
+    vehicle = model_of(database, tmp_path, recorded)
+    measured = np.column_stack([recorded.branches[name].value for name in EQUIPMENT.branches])
+    drift, offset_a = np.array([0.1, -0.05]), np.array([2.0, -1.0])
+    expected = np.sqrt(np.mean(corrected_currents(measured, drift=drift, offset_a=offset_a).sum(axis=1) ** 2))
+    assert junction_rms_a(vehicle, drift=drift, offset_a=offset_a) == pytest.approx(float(expected), rel=1e-3)
+    raw = np.sqrt(np.mean(measured.sum(axis=1) ** 2))
+    assert junction_rms_a(vehicle, drift=np.zeros(2), offset_a=np.zeros(2)) == pytest.approx(float(raw), rel=1e-3)
