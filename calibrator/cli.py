@@ -231,7 +231,7 @@ def experiment(
     ] = False,
     repetitions: Annotated[int | None, typer.Option("--repetitions", min=1, help="Trials per setting.")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the first trial.")] = 0,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for NAME.json and NAME.png.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for NAME.md, NAME.json and NAME.png.")] = None,
     workers: WorkersOption = 2,
     json: JsonOption = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""Run an experiment by name: table on the console, JSON and picture in a folder."""
+"""Run an experiment by name: table on the console; page, JSON and picture in a folder."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from calibrator.experiments.paper_experiments import (
 )
 from calibrator.experiments.picture import write_picture
 from calibrator.experiments.result import ExperimentResult
-from calibrator.experiments.table import result_table
+from calibrator.experiments.table import result_markdown, result_table
 from calibrator.experiments.trial import FleetLaw
 from ecu_node.parameters import write_atomically
 
@@ -71,7 +71,7 @@ def run_experiment(
     repetitions : int or None
         Trials per setting; None: 10, or 2 if quick.
     out : Path or None
-        Folder for NAME.json and NAME.png, made if missing; None: nothing is written.
+        Folder for NAME.md, NAME.json and NAME.png, made if missing; None: nothing is written.
     console : rich.console.Console or None
         Where the table goes; None: nowhere.
     drive : CommonDrive or None
@@ -104,5 +104,6 @@ def run_experiment(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         write_atomically(out / f"{name}.json", result.to_json())
+        write_atomically(out / f"{name}.md", result_markdown(result).encode())
         write_picture(result, out / f"{name}.png")
     return result

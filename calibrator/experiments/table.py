@@ -5,7 +5,7 @@ from rich.table import Table
 
 from calibrator.experiments.result import ExperimentResult, Figure
 
-__all__ = ["result_table"]
+__all__ = ["result_markdown", "result_table"]
 
 HEADINGS = {"recovery_rate": "10 %", "recovery_rate_25": "25 %", "f2": "f2", "complexity": "hardware"}
 LEGEND = (
@@ -44,6 +44,28 @@ def result_table(result: ExperimentResult) -> Table:
     for row in result.rows:
         table.add_row(f"{row.x:g}", row.method, *(_cell(row.figures[name]) for name in HEADINGS))
     return table
+
+
+def result_markdown(result: ExperimentResult) -> str:
+    """Same table as a page, with what is needed to repeat it."""
+    header = [result.x_label, "method", *HEADINGS.values()]
+    rows = [[f"{row.x:g}", row.method, *(_cell(row.figures[name]) for name in HEADINGS)] for row in result.rows]
+    lines = [f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *rows)]
+    settings = ", ".join(f"{name} {value}" for name, value in result.settings.items())
+    return "\n".join(
+        [
+            f"# {result.title}",
+            "",
+            f"Written by `calibrator experiment {result.name} --out FOLDER`. {LEGEND}{_failures(result)}",
+            "",
+            *lines,
+            "",
+            f"![{result.title}]({result.name}.png)",
+            "",
+            f"Settings: {settings}.",
+            "",
+        ]
+    )
 
 
 def _cell(figure: Figure) -> str:

@@ -114,8 +114,12 @@ def test_table_shows_the_papers_figure_beside_ours() -> None:
 
 
 @pytest.mark.parametrize("name", ["classifier", "snr"])
-def test_runner_writes_record_and_picture(name: str, tmp_path: Path) -> None:
-    run_experiment(name, quick=True, repetitions=1, out=tmp_path / "new", drive=smooth_drive(samples=2000), jobs=1)
+def test_runner_writes_page_record_and_picture(name: str, tmp_path: Path) -> None:
+    drive = smooth_drive(samples=2000)
+    result = run_experiment(name, quick=True, repetitions=1, out=tmp_path / "new", drive=drive, jobs=1)
+    page = (tmp_path / "new" / f"{name}.md").read_text()
+    assert f"calibrator experiment {name}" in page
+    assert page.count("\n| ") == 2 + len(result.rows)
     assert json.loads((tmp_path / "new" / f"{name}.json").read_text())["settings"]["repetitions"] == 1
     assert (tmp_path / "new" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
