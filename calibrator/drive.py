@@ -6,12 +6,13 @@ in place and are labelled, so that what was left out can always be counted.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Array", "Channel", "Drive", "Mask"]
+__all__ = ["Array", "Channel", "Drive", "DriveFile", "Mask"]
 
 Array = NDArray[np.floating[Any]]
 """Real numbers; always double precision in practice."""
@@ -63,3 +64,12 @@ class Drive:
         if not channels:
             return 0.0
         return float(max(c.time_s[-1] for c in channels) - min(c.time_s[0] for c in channels))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveFile:
+    """One file that holds a drive, a log or a file of a store, and whose it is; nothing of it has been read."""
+
+    vehicle: str
+    name: str
+    path: Path

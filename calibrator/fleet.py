@@ -14,7 +14,8 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 from calibrator.artificial.truth import FleetTruth, faults_of
-from calibrator.drives.fleet_source import DriveEntry, Equipment, FleetSource, find_fleet, probe_equipment
+from calibrator.drive import DriveFile
+from calibrator.drives.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment
 from calibrator.errors import FleetError
 from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_model
 from calibrator.options import Classifier, Method
@@ -210,7 +211,7 @@ def _read_models(
     return vehicles, left_out
 
 
-def _read_one(entries: Sequence[DriveEntry], equipment: Equipment, database: VehicleDatabase) -> VehicleModel | str:
+def _read_one(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> VehicleModel | str:
     """Model of one vehicle, or the text of the error. One thread: the processes share the cores."""
     with threadpool_limits(1):
         try:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from calibrator.drive import Drive
+from calibrator.drive import Drive, DriveFile
 from calibrator.drives.align import choose_inputs
 from calibrator.drives.store import list_drives, read_drive_file
 from calibrator.errors import FleetError
@@ -15,20 +15,11 @@ from calibrator.recordings.sources import find_logs
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 
-__all__ = ["DriveEntry", "Equipment", "FleetSource", "find_fleet", "load_drive", "probe_equipment"]
+__all__ = ["Equipment", "FleetSource", "find_fleet", "load_drive", "probe_equipment"]
 
 STORE_FOLDER, LOGS_FOLDER = "drives", "logs"
 PROBED_VEHICLES = 7
 """How many vehicles are looked at to learn which branches and inputs the fleet has."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DriveEntry:
-    """One drive that can be loaded."""
-
-    vehicle: str
-    name: str
-    path: Path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,14 +30,14 @@ class FleetSource:
     ----------
     path : Path
         Folder of the fleet.
-    vehicles : mapping of str to tuple of DriveEntry
+    vehicles : mapping of str to tuple of DriveFile
         Drives by vehicle, sorted.
     left_out : mapping of str to str
         Why a vehicle, or a file where its vehicle is unclear, was left out.
     """
 
     path: Path
-    vehicles: Mapping[str, tuple[DriveEntry, ...]]
+    vehicles: Mapping[str, tuple[DriveFile, ...]]
     left_out: Mapping[str, str]
 
 
@@ -81,10 +72,10 @@ def find_fleet(path: Path) -> FleetSource:
         raise FleetError(f"{path}: no such folder; give a drive store or a folder with one folder of logs per vehicle")
     left_out: dict[str, str] = {}
     if (path / STORE_FOLDER).is_dir():
-        entries = [DriveEntry(vehicle=d.vehicle, name=d.name, path=d.path) for d in list_drives(path)]
+        entries = list_drives(path)
     else:
         found = find_logs([path / LOGS_FOLDER if (path / LOGS_FOLDER).is_dir() else path])
-        entries = [DriveEntry(vehicle=log.vehicle, name=log.name, path=log.path) for log in found.logs]
+        entries = list(found.logs)
         left_out = {f"problem {k + 1}": str(problem) for k, problem in enumerate(found.problems)}
     if not entries:
         reasons = "".join(f"; {reason}" for reason in left_out.values())
@@ -94,12 +85,12 @@ def find_fleet(path: Path) -> FleetSource:
     return FleetSource(path=path, vehicles=vehicles, left_out=left_out)
 
 
-def load_drive(entry: DriveEntry, database: VehicleDatabase) -> Drive:
+def load_drive(entry: DriveFile, database: VehicleDatabase) -> Drive:
     """Load one drive from its store file or its log.
 
     Parameters
     ----------
-    entry : DriveEntry
+    entry : DriveFile
         Which.
     database : VehicleDatabase
         DBC and layout.

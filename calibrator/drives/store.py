@@ -9,20 +9,19 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from calibrator.drive import Channel, Drive
+from calibrator.drive import Channel, Drive, DriveFile
 from calibrator.errors import DriveError
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout
 from ecu_node.parameters import write_atomically
 
-__all__ = ["DriveFile", "iterate_drives", "list_drives", "read_drive_file", "require_plain_name", "write_drive"]
+__all__ = ["iterate_drives", "list_drives", "read_drive_file", "require_plain_name", "write_drive"]
 
 SCHEMA_VERSION = 1
 _FOLDER = "drives"
@@ -38,15 +37,6 @@ _SCHEMA = pa.schema(
         pa.field("good", pa.list_(pa.bool_()), nullable=False),
     ]
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class DriveFile:
-    """One drive of a store, not yet opened."""
-
-    vehicle: str
-    name: str
-    path: Path
 
 
 def require_plain_name(name: str, what: str) -> None:

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibrator.drive import Array, Mask
+from calibrator.drive import Array, DriveFile, Mask
 from calibrator.drives.align import Samples, align
-from calibrator.drives.fleet_source import DriveEntry, Equipment, load_drive
+from calibrator.drives.fleet_source import Equipment, load_drive
 from calibrator.errors import DriveError
 from calibrator.identification.identify import identify
 from calibrator.identification.state_space import StateSpaceModel, simulation_snr_db
@@ -73,12 +73,12 @@ class VehicleModel:
     lead_in: int
 
 
-def read_vehicle_model(entries: Sequence[DriveEntry], equipment: Equipment, database: VehicleDatabase) -> VehicleModel:
+def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> VehicleModel:
     """Read the drives of one vehicle and identify its model.
 
     Parameters
     ----------
-    entries : sequence of DriveEntry
+    entries : sequence of DriveFile
         Drives of one vehicle.
     equipment : Equipment
         Branches and model inputs of the fleet.

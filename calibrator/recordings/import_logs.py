@@ -6,10 +6,11 @@ from pathlib import Path
 
 from joblib import Parallel, delayed
 
+from calibrator.drive import DriveFile
 from calibrator.drives.store import list_drives, write_drive
 from calibrator.errors import LogError
 from calibrator.recordings.readers import read_recording
-from calibrator.recordings.sources import LogSource, find_logs
+from calibrator.recordings.sources import find_logs
 from calibrator.report.progress import progress_bar
 from calibrator.report.text import dumps, left_out_text, table
 from ecu_node.database import VehicleDatabase
@@ -99,7 +100,7 @@ def _grouped(notices: Mapping[str, Sequence[str]]) -> list[str]:
     return [f"  {where[0] if len(where) == 1 else f'{len(where)} drives'}: {text}" for text, where in drives.items()]
 
 
-def _import_one(log: LogSource, database: VehicleDatabase, store: Path, present: bool) -> ImportedDrive | str:
+def _import_one(log: DriveFile, database: VehicleDatabase, store: Path, present: bool) -> ImportedDrive | str:
     """Import one log; the text of the error if it cannot be used."""
     try:
         if present:

@@ -9,21 +9,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from calibrator.drive import DriveFile
 from calibrator.drives.store import require_plain_name
 from calibrator.errors import LogError
 from calibrator.recordings.frames import LOG_SUFFIXES, is_log
 from ecu_node.errors import UserError
 
-__all__ = ["LogSource", "LogSources", "find_logs"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class LogSource:
-    """One log file and whose it is."""
-
-    vehicle: str
-    name: str
-    path: Path
+__all__ = ["LogSources", "find_logs"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,13 +24,13 @@ class LogSources:
 
     Attributes
     ----------
-    logs : tuple of LogSource
+    logs : tuple of DriveFile
         No two have the same vehicle and name.
     problems : tuple of UserError
         One per file, vehicle or argument that is left out.
     """
 
-    logs: tuple[LogSource, ...]
+    logs: tuple[DriveFile, ...]
     problems: tuple[UserError, ...]
 
 
@@ -55,7 +47,7 @@ def find_logs(arguments: Iterable[Path]) -> LogSources:
     LogSources
         The logs, and what is left out; nothing is opened.
     """
-    found: dict[Path, LogSource] = {}
+    found: dict[Path, DriveFile] = {}
     problems: list[UserError] = []
     for argument in arguments:
         try:
@@ -80,15 +72,15 @@ def _logs_of(argument: Path) -> list[Path]:
     return paths
 
 
-def _source(path: Path) -> LogSource:
+def _source(path: Path) -> DriveFile:
     name = path.name.removesuffix(".gz")
     vehicle = path.resolve().parent.name
     require_plain_name(vehicle, f"{path}: the folder's name, which names the vehicle,")
     require_plain_name(Path(name).stem, f"{path}: the file's name, which names the drive,")
-    return LogSource(vehicle=vehicle, name=Path(name).stem, path=path)
+    return DriveFile(vehicle=vehicle, name=Path(name).stem, path=path)
 
 
-def _refused_vehicles(logs: Sequence[LogSource], problems: list[UserError]) -> set[str]:
+def _refused_vehicles(logs: Sequence[DriveFile], problems: list[UserError]) -> set[str]:
     """Vehicles of one name in two folders."""
     refused: set[str] = set()
     folders: dict[str, dict[Path, Path]] = {}
@@ -106,8 +98,8 @@ def _refused_vehicles(logs: Sequence[LogSource], problems: list[UserError]) -> s
     return refused
 
 
-def _without_twins(logs: Sequence[LogSource], problems: list[UserError]) -> list[LogSource]:
-    groups: dict[tuple[str, str], list[LogSource]] = {}
+def _without_twins(logs: Sequence[DriveFile], problems: list[UserError]) -> list[DriveFile]:
+    groups: dict[tuple[str, str], list[DriveFile]] = {}
     for log in logs:
         groups.setdefault((log.vehicle, log.name), []).append(log)
     for (vehicle, name), twins in groups.items():

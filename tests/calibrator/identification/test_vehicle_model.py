@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrator.drive import Array, Channel, Drive
-from calibrator.drives.fleet_source import DriveEntry, Equipment
+from calibrator.drive import Array, Channel, Drive, DriveFile
+from calibrator.drives.fleet_source import Equipment
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError
 from calibrator.faults import corrected_currents
@@ -41,7 +41,7 @@ def drive(name: str, samples: int, *, heater: bool = True, seed: int = 0) -> Dri
 
 def model_of(database: VehicleDatabase, store: Path, *drives: Drive) -> VehicleModel:
     entries = [
-        DriveEntry(vehicle=item.vehicle, name=item.name, path=write_drive(store, item, database.layout))
+        DriveFile(vehicle=item.vehicle, name=item.name, path=write_drive(store, item, database.layout))
         for item in drives
     ]
     return read_vehicle_model(entries, EQUIPMENT, database)
