@@ -86,8 +86,8 @@ class CalibrationReport:
     hardware_suspected: int
     junction_rms_measured_a: float
     """Median over vehicles. [A]"""
-    junction_rms_corrected_a: float
-    """Median over vehicles. [A]"""
+    junction_rms_deployed_a: float
+    """The same with the parameters that the node applies. [A]"""
 
     def as_json(self) -> str:
         """The report as JSON."""
@@ -103,7 +103,7 @@ class CalibrationReport:
             ("  hardware fault suspected", f"{self.hardware_suspected}"),
             ("vehicles left out", f"{len(run.left_out)}"),
             ("junction sum RMS, median, measured [A]", f"{self.junction_rms_measured_a:.2f}"),
-            ("junction sum RMS, median, corrected [A]", f"{self.junction_rms_corrected_a:.2f}"),
+            ("junction sum RMS, median, deployed [A]", f"{self.junction_rms_deployed_a:.2f}"),
             *((f"simulation SNR, median, {name} [dB]", f"{snr:.1f}") for name, snr in run.simulation_snr_db.items()),
         ]
         parts = [
@@ -285,12 +285,18 @@ def _median_snr_db(vehicles: Sequence[VehicleModel], equipment: Equipment) -> di
 
 def _report(out: Path, parameters: Sequence[VehicleParameters], run: RunRecord) -> CalibrationReport:
     verdicts = Counter[str](item.verdict for item in parameters)
-    residuals = [item.junction_residual for item in parameters]
+    measured = [item.junction_residual.measured_a for item in parameters]
+    deployed = [
+        item.junction_residual.corrected_a
+        if any(branch.apply for branch in item.branches.values())
+        else item.junction_residual.measured_a
+        for item in parameters
+    ]
     return CalibrationReport(
         result=str(out),
         run=run,
         verdicts=dict(verdicts),
         hardware_suspected=sum(item.hardware_fault.suspected for item in parameters),
-        junction_rms_measured_a=float(np.median([r.measured_a for r in residuals])),
-        junction_rms_corrected_a=float(np.median([r.corrected_a for r in residuals])),
+        junction_rms_measured_a=float(np.median(measured)),
+        junction_rms_deployed_a=float(np.median(deployed)),
     )
