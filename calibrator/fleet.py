@@ -32,6 +32,8 @@ from ecu_node.parameters import VehicleParameters
 
 __all__ = ["CalibrationReport", "CalibrationSettings", "calibrate_fleet"]
 
+LEAST_VEHICLES = 2
+"""A single vehicle would be its own reference."""
 MISFIT = 5.0
 """Simulation error over the fleet's median from which on a model is not one of the fleet. [1]"""
 
@@ -154,6 +156,13 @@ def calibrate_fleet(
         reason = next(iter(left_out.values()), "")
         raise FleetError(f"{path}: no vehicle has enough usable data; the first says: {reason}")
     vehicles = _without_misfits(vehicles, equipment, left_out)
+    learning = [vehicle for vehicle in vehicles if vehicle.vehicle not in settings.hold_out]
+    if len(learning) < LEAST_VEHICLES:
+        reasons = "".join(f"; {name}: {reason}" for name, reason in left_out.items())
+        raise FleetError(
+            f"{path}: {len(learning)} usable vehicle to learn from, at least {LEAST_VEHICLES} are needed, "
+            f"as every vehicle is compared with the mean of the fleet{reasons}"
+        )
     unity = _unity_vehicle(vehicles, settings.unity)
     recovery = _recover(vehicles, unity, equipment, database, settings)
     left_out |= {vehicles[j].vehicle: reason for j, reason in recovery.failed.items()}
@@ -166,7 +175,7 @@ def calibrate_fleet(
             branches=equipment.branches,
             database=database,
             method=settings.method,
-            fleet=path.name,
+            fleet=path.resolve().name,
             fleet_size=len(vehicles),
             created=created,
         )
@@ -176,7 +185,7 @@ def calibrate_fleet(
     run = RunRecord(
         tool=f"calibrator {__version__}",
         method=settings.method.value,
-        fleet=path.name,
+        fleet=path.resolve().name,
         layout=database.layout.name,
         branches=list(equipment.branches),
         model_inputs=list(equipment.inputs),
