@@ -5,14 +5,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from joblib import Parallel, delayed
 
 from calibrator.artificial.ground_truth import GroundTruth, choose_branches, with_branches
 from calibrator.artificial.random_fleet import draw_faults
-from calibrator.artificial.trips import Purpose, TripSource
+from calibrator.artificial.trips import TripPurpose, TripSource
 from calibrator.artificial.truth import TRUTH_FILE, FleetTruth, VehicleTruth, write_truth
 from calibrator.artificial.vehicle import Vehicle, draw_disturbances, write_vehicle
+from calibrator.random_streams import Purpose, random_stream
 from calibrator.results import require_new_folder
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
@@ -124,7 +124,7 @@ def simulate_fleet(
 
 
 def _draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) -> list[Vehicle]:
-    rng = np.random.default_rng([plan.seed])
+    rng = random_stream(Purpose.FAULTS, plan.seed)
     faults = draw_faults(
         rng,
         vehicles=plan.vehicles,
@@ -158,7 +158,7 @@ def _write(
 ) -> VehicleTruth:
     balance = _balance_branch(database.layout, vehicle.branches)
 
-    def trip(purpose: Purpose) -> GroundTruth:
+    def trip(purpose: TripPurpose) -> GroundTruth:
         return with_branches(trips.trip(number, purpose), vehicle.branches, balance)
 
     return write_vehicle(

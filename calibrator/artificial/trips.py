@@ -11,22 +11,27 @@ from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.artificial.ground_truth import GroundTruth, cut_and_rejoin, ground_truth_from_drive
 from calibrator.drives.store import iterate_drives
 from calibrator.errors import FleetError
+from calibrator.random_streams import Purpose, random_stream
 from ecu_node.layout import Layout
 
 __all__ = [
     "BuiltinTrips",
     "CommonTrips",
-    "Purpose",
     "RecordedTrips",
+    "TripPurpose",
     "TripSource",
     "choose_trips",
     "read_recorded_trips",
 ]
 
-Purpose = Literal["calibration", "unseen"]
+TripPurpose = Literal["calibration", "unseen"]
 """A trip to learn from, or one to test on."""
 
-_PURPOSE_NUMBER: dict[Purpose, int] = {"calibration": 0, "unseen": 1}
+_STREAM: dict[TripPurpose, Purpose] = {"calibration": Purpose.CALIBRATION_TRIP, "unseen": Purpose.UNSEEN_TRIP}
+
+
+LEARNT_SHARE = 0.75
+"""Share of a single recording that trips to learn from are made of; the rest is for unseen ones. [1]"""
 
 
 class TripSource(Protocol):
@@ -42,7 +47,7 @@ class TripSource(Protocol):
         """What a user should know about the trips."""
         ...
 
-    def trip(self, number: int, purpose: Purpose) -> GroundTruth:
+    def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
         """Trip of vehicle ``number``."""
         ...
 
@@ -57,9 +62,9 @@ class BuiltinTrips:
     branches: tuple[str, ...] = ("battery", "motor", "auxiliary", "dcdc", "motor_rear")
     notices: tuple[str, ...] = ()
 
-    def trip(self, number: int, purpose: Purpose) -> GroundTruth:
+    def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
         """Trip of vehicle ``number``."""
-        rng = np.random.default_rng([self.seed, number, _PURPOSE_NUMBER[purpose]])
+        rng = random_stream(_STREAM[purpose], self.seed, number)
         duration_s = self.duration_s if purpose == "calibration" else self.unseen_s
         return builtin_trip(rng, duration_s=duration_s, name=f"builtin-{number}-{purpose}")
 
@@ -68,7 +73,7 @@ class BuiltinTrips:
 class RecordedTrips:
     """Recorded trips: one each while they last, then pieces of them joined anew; unseen trips are joined anew.
 
-    The unseen trip of a vehicle contains nothing of its own recorded trip.
+    No piece of a recording is in both trips of a vehicle; a single recording is cut in time.
     """
 
     seed: int
@@ -82,24 +87,29 @@ class RecordedTrips:
         """Branches that all recordings have."""
         return tuple(b for b in self.recorded[0].currents_a if all(b in trip.currents_a for trip in self.recorded))
 
-    def trip(self, number: int, purpose: Purpose) -> GroundTruth:
+    def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
         """Trip of vehicle ``number``."""
         one_each = self.vehicles <= len(self.recorded)
-        if purpose == "calibration" and one_each:
+        if purpose == "calibration" and one_each and len(self.recorded) > 1:
             return self.recorded[number]
-        rng = np.random.default_rng([self.seed, number, _PURPOSE_NUMBER[purpose]])
-        half = len(self.recorded) // 2
-        if one_each:
-            pool = [trip for k, trip in enumerate(self.recorded) if k != number] or list(self.recorded)
-        elif half:
-            pool = list(self.recorded[:-half] if purpose == "calibration" else self.recorded[-half:])
-        else:
-            pool = list(self.recorded)
+        pool = self._pool(number, purpose)
         duration_s = self.unseen_s
         if purpose == "calibration":
-            duration_s = float(np.median([len(trip) * trip.period_s for trip in self.recorded]))
+            duration_s = float(np.median([len(trip) * trip.period_s for trip in pool]))
+        rng = random_stream(_STREAM[purpose], self.seed, number)
         joined = cut_and_rejoin(rng, pool, duration_s=duration_s, name=f"recorded-{number}-{purpose}")
         return joined.part(0, int(duration_s / joined.period_s))
+
+    def _pool(self, number: int, purpose: TripPurpose) -> list[GroundTruth]:
+        """Recordings that a trip may be made of; none serves both purposes of one vehicle."""
+        if len(self.recorded) == 1:
+            (only,) = self.recorded
+            cut = int(LEARNT_SHARE * len(only))
+            return [only.part(0, cut) if purpose == "calibration" else only.part(cut, len(only))]
+        if self.vehicles <= len(self.recorded):
+            return [trip for k, trip in enumerate(self.recorded) if k != number]
+        half = len(self.recorded) // 2
+        return list(self.recorded[:-half] if purpose == "calibration" else self.recorded[-half:])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +128,7 @@ class CommonTrips:
         """What a user should know about the trips."""
         return self.source.notices
 
-    def trip(self, number: int, purpose: Purpose) -> GroundTruth:  # noqa: ARG002
+    def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:  # noqa: ARG002
         """Trip of every vehicle."""
         return replace(self.source.trip(0, purpose), name=f"common-{purpose}")
 

@@ -17,6 +17,7 @@ from calibrator.artificial.truth import VehicleTruth
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.faults import Faults, measured_currents, true_currents
+from calibrator.random_streams import Purpose, random_stream
 from calibrator.recordings.canlog import FrameSeries, encode_message, write_candump
 from ecu_node.database import AMPERE, VehicleDatabase, unit_factor
 from ecu_node.layout import Branch, split_signal
@@ -162,7 +163,7 @@ def write_vehicle(
     VehicleTruth
         What was put in, with the moments of the true currents on the unseen trip.
     """
-    rng = np.random.default_rng(list(seed))
+    rng = random_stream(Purpose.FRAMES, *seed)
     for kind, trip in (("logs", calibration), ("unseen", unseen)):
         target = folder / kind / vehicle.name
         target.mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,7 @@ from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.artificial.ground_truth import with_branches
 from calibrator.drive import Array
 from calibrator.errors import DriveError
+from calibrator.random_streams import Purpose, random_stream
 
 __all__ = ["CommonDrive", "builtin_common_drive"]
 
@@ -83,19 +84,20 @@ def builtin_common_drive(*, branches: int = 2, seed: int = 0, duration_s: float 
     Returns
     -------
     CommonDrive
-        With the derived inputs of the default layout: mechanical current and loss, and the auxiliaries' demands over
-        voltage.
+        With the model inputs of ``dbc/hv_powertrain.toml``.
 
     Raises
     ------
     FleetError
         If fastsim is not installed.
     """
-    trip = builtin_trip(np.random.default_rng(seed), duration_s=duration_s, name=f"builtin-{seed}")
+    trip = builtin_trip(random_stream(Purpose.COMMON_DRIVE, seed), duration_s=duration_s, name=f"builtin-{seed}")
     trip = with_branches(trip, BRANCHES[:branches], BALANCE)
     x, voltage = trip.inputs, trip.inputs["voltage"]
+    power = x["torque"] * x["speed"]
     inputs = (
-        x["torque"] * x["speed"] / voltage,
+        np.maximum(power, 0.0) / voltage,
+        np.minimum(power, 0.0) / voltage,
         x["torque"] ** 2 / voltage,
         x["heater_demand"] / voltage,
         x["aircon_demand"] / voltage,

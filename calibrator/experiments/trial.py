@@ -14,6 +14,7 @@ from calibrator.experiments.common_drive import CommonDrive
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.identification.identify import choose_order, identify
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean, junction_mean_square
+from calibrator.random_streams import Purpose, random_stream
 
 __all__ = ["FleetLaw", "Trial", "artificial_trial", "noise_sd_a", "state_space_trial"]
 
@@ -110,7 +111,9 @@ def artificial_trial(drive: CommonDrive, law: FleetLaw, *, seed: int) -> Trial:
     Trial
         Evidence of N vehicles on the unity drive.
     """
-    evidence, truth = _artificial_fleet(drive, law, law.vehicles, seed=[seed, 0])
+    evidence, truth = _artificial_fleet(
+        drive, law, law.vehicles, streams=(Purpose.FAULTS, Purpose.SIMULATION_ERROR), seed=seed
+    )
     return _trial(drive, law, evidence, truth, seed)
 
 
@@ -129,7 +132,7 @@ def state_space_trial(drive: CommonDrive, law: FleetLaw, *, seed: int, order: in
     Trial
         Evidence of N vehicles on the unity drive.
     """
-    truth = law.draw(np.random.default_rng([seed, 0]), drive, law.vehicles)
+    truth = law.draw(random_stream(Purpose.FAULTS, seed), drive, law.vehicles)
     start = drive.unity_start
     simulated: list[Array] = []
     for measured in _measured(drive.i_s, truth):
@@ -143,16 +146,18 @@ def state_space_trial(drive: CommonDrive, law: FleetLaw, *, seed: int, order: in
 
 def _trial(drive: CommonDrive, law: FleetLaw, evidence: FleetEvidence, truth: Faults, seed: int) -> Trial:
     def training() -> tuple[FleetEvidence, Faults]:
-        return _artificial_fleet(drive, law, law.training_vehicles, seed=[seed, 1])
+        return _artificial_fleet(
+            drive, law, law.training_vehicles, streams=(Purpose.TRAINING_FAULTS, Purpose.TRAINING_ERROR), seed=seed
+        )
 
     return Trial(law=law, full_scale_a=drive.full_scale_a, evidence=evidence, truth=truth, training=training)
 
 
 def _artificial_fleet(
-    drive: CommonDrive, law: FleetLaw, vehicles: int, *, seed: list[int]
+    drive: CommonDrive, law: FleetLaw, vehicles: int, *, streams: tuple[Purpose, Purpose], seed: int
 ) -> tuple[FleetEvidence, Faults]:
-    truth = law.draw(np.random.default_rng(seed), drive, vehicles)
-    simulated = _ArtificialSimulation(drive.unity, truth, noise_sd_a(drive, law.snr_db), seed)
+    truth = law.draw(random_stream(streams[0], seed), drive, vehicles)
+    simulated = _ArtificialSimulation(drive.unity, truth, noise_sd_a(drive, law.snr_db), streams[1], seed)
     return _evidence(simulated, drive, truth), truth
 
 
@@ -170,10 +175,11 @@ def _measured(i_s: Array, truth: Faults) -> Iterator[Array]:
 class _ArtificialSimulation:
     """Measured currents with white noise (23), made anew in each pass instead of kept in memory."""
 
-    def __init__(self, unity: Array, truth: Faults, noise_a: float, seed: list[int]) -> None:
-        self._unity, self._truth, self._noise_a, self._seed = unity, truth, noise_a, seed
+    def __init__(self, unity: Array, truth: Faults, noise_a: float, stream: Purpose, seed: int) -> None:
+        self._unity, self._truth, self._noise_a = unity, truth, noise_a
+        self._stream, self._seed = stream, seed
 
     def __iter__(self) -> Iterator[Array]:
         for j, measured in enumerate(_measured(self._unity, self._truth)):
-            noise = np.random.default_rng([*self._seed, j]).standard_normal(measured.shape)
+            noise = random_stream(self._stream, self._seed, j).standard_normal(measured.shape)
             yield measured + self._noise_a * noise

@@ -19,6 +19,7 @@ from calibrator.options import Classifier
 from calibrator.published.classify import Classification, FaultTrees, classify_by_threshold, classify_by_truth
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.published.recovery import Recovery, recover_fleet
+from calibrator.random_streams import Purpose, random_stream
 
 __all__ = ["ExpectedFaults", "calibrate_published", "expected_features"]
 
@@ -154,7 +155,7 @@ def _classify_by_tree(
 ) -> Classification:
     i_s = reference - reference.mean(axis=1, keepdims=True)
     faults = draw_faults(
-        np.random.default_rng(expected.seed),
+        random_stream(Purpose.TRAINING_FAULTS, expected.seed),
         vehicles=TRAINING_VEHICLES,
         branches=evidence.branches,
         sparsity=expected.sparsity,
