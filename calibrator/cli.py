@@ -170,7 +170,7 @@ def calibrate(
     truth: Annotated[Path | None, typer.Option("--truth", help="truth.json, for the perfect classifier.")] = None,
     sparsity: Annotated[
         float, typer.Option("--sparsity", min=0, max=100, help="Of the tree's training fleet [%].")
-    ] = 60.0,
+    ] = 80.0,
     magnitude: Annotated[
         tuple[float, float],
         typer.Option("--magnitude", help="Of the tree's training fleet; drifts, offsets / full scale."),

@@ -14,9 +14,10 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 from calibrator.artificial.truth import FleetTruth, faults_of
-from calibrator.drive import DriveFile
+from calibrator.drive import Array, DriveFile
 from calibrator.drives.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment
 from calibrator.errors import FleetError
+from calibrator.folders import require_new_folder
 from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_model
 from calibrator.options import Classifier, Method
 from calibrator.parameter_files import parameters_of
@@ -24,7 +25,7 @@ from calibrator.published.calibration import ExpectedFaults, calibrate_published
 from calibrator.published.recovery import Recovery
 from calibrator.report.progress import progress_bar
 from calibrator.report.text import dumps, left_out_text, table
-from calibrator.results import LeftOut, RunRecord, require_new_folder, write_results
+from calibrator.results import LeftOut, RunRecord, write_results
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
@@ -69,7 +70,7 @@ class CalibrationSettings:
     method: Method = Method.PUBLISHED
     classifier: Classifier = Classifier.TREE
     truth: FleetTruth | None = None
-    sparsity: float = 60.0
+    sparsity: float = 80.0
     magnitude: tuple[float, float] = (0.05, 0.25)
     symmetric: bool = False
     branches: tuple[str, ...] | None = None
@@ -155,15 +156,15 @@ def calibrate_fleet(
     if not vehicles:
         reason = next(iter(left_out.values()), "")
         raise FleetError(f"{path}: no vehicle has enough usable data; the first says: {reason}")
-    vehicles = _without_misfits(vehicles, equipment, left_out)
-    learning = [vehicle for vehicle in vehicles if vehicle.vehicle not in settings.hold_out]
+    vehicles = _without_misfits(vehicles, settings.hold_out, equipment, left_out)
+    learning = _learning(vehicles, settings.hold_out)
     if len(learning) < LEAST_VEHICLES:
         reasons = "".join(f"; {name}: {reason}" for name, reason in left_out.items())
         raise FleetError(
             f"{path}: {len(learning)} usable vehicle to learn from, at least {LEAST_VEHICLES} are needed, "
             f"as every vehicle is compared with the mean of the fleet{reasons}"
         )
-    unity = _unity_vehicle(vehicles, settings.unity)
+    unity = _unity_vehicle(learning, settings.unity)
     recovery = _recover(vehicles, unity, equipment, database, settings)
     left_out |= {vehicles[j].vehicle: reason for j, reason in recovery.failed.items()}
     created = datetime.now(UTC).isoformat(timespec="seconds")
@@ -229,19 +230,32 @@ def _read_one(entries: Sequence[DriveFile], equipment: Equipment, database: Vehi
             return str(error)
 
 
+def _learning(vehicles: Sequence[VehicleModel], hold_out: frozenset[str]) -> list[VehicleModel]:
+    """Vehicles from which the fleet learns."""
+    return [vehicle for vehicle in vehicles if vehicle.vehicle not in hold_out]
+
+
 def _without_misfits(
-    vehicles: Sequence[VehicleModel], equipment: Equipment, left_out: dict[str, str]
+    vehicles: Sequence[VehicleModel], hold_out: frozenset[str], equipment: Equipment, left_out: dict[str, str]
 ) -> list[VehicleModel]:
     """Vehicles whose models hold on their own last 20 % about as well as the fleet's do; the others are named."""
-    errors = np.array([vehicle.simulation_error_a for vehicle in vehicles])
-    ratios = errors / np.maximum(np.median(errors, axis=0), np.finfo(float).tiny)
-    for vehicle, ratio in zip(vehicles, ratios, strict=True):
-        if ratio.max() > MISFIT:
+    usual_a = _median_error_a(_learning(vehicles, hold_out) or vehicles)
+    kept: list[VehicleModel] = []
+    for vehicle in vehicles:
+        ratio = vehicle.simulation_error_a / np.maximum(usual_a, np.finfo(float).tiny)
+        if ratio.max() <= MISFIT:
+            kept.append(vehicle)
+        else:
             left_out[vehicle.vehicle] = (
                 f"its model misses the {equipment.branches[int(ratio.argmax())]} current of its own last 20 % "
                 f"{ratio.max():.0f} times as far as the fleet's models do; record a drive with more varied use"
             )
-    return [vehicle for vehicle, ratio in zip(vehicles, ratios, strict=True) if ratio.max() <= MISFIT]
+    return kept
+
+
+def _median_error_a(vehicles: Sequence[VehicleModel]) -> Array:
+    """Median over vehicles of each branch's simulation error on held-out data, shape (K,). [A]"""
+    return np.asarray(np.median([vehicle.simulation_error_a for vehicle in vehicles], axis=0))
 
 
 def _unity_vehicle(vehicles: Sequence[VehicleModel], wanted: str | None) -> VehicleModel:
@@ -269,12 +283,11 @@ def _recover(
         if tuple(settings.truth.branches) != equipment.branches:
             raise FleetError(f"the truth is of branches {settings.truth.branches}, the fleet has {equipment.branches}")
         truth = faults_of(settings.truth, names)
-    error_a = np.median([vehicle.simulation_error_a for vehicle in vehicles], axis=0)
     return calibrate_published(
         simulated,
         junction_a2=np.array([float(np.sum(vehicle.moment_a2)) for vehicle in vehicles]),
         in_reference=np.array([name not in settings.hold_out for name in names]),
-        simulation_error_a=error_a,
+        simulation_error_a=_median_error_a(_learning(vehicles, settings.hold_out)),
         full_scale_a=database.layout.full_scale_a,
         classifier=settings.classifier,
         expected=ExpectedFaults(

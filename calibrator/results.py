@@ -4,7 +4,6 @@
 folder appears only when it is complete.
 """
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +14,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from calibrator.errors import FleetError
+from calibrator.folders import whole_folder
 from ecu_node.parameters import VehicleParameters, write_atomically, write_parameters
 
 __all__ = ["LeftOut", "RunRecord", "read_results", "write_results"]
+
+LEFT_OUT = "left out"
+"""Stands for the verdict of a vehicle, or of a file of unclear vehicle, that has no parameters."""
 
 SCHEMA = pa.schema(
     [
@@ -86,28 +89,14 @@ def write_results(
     FleetError
         If the folder exists and is not empty.
     """
-    require_new_folder(out)
-    partial = out.with_name(f".{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    (partial / "params").mkdir(parents=True)
-    try:
+    with whole_folder(out) as folder:
+        (folder / "params").mkdir()
         for item in parameters:
-            write_parameters(item, partial / "params" / f"{item.vehicle}.json")
+            write_parameters(item, folder / "params" / f"{item.vehicle}.json")
         rows = [row for item in parameters for row in _rows(item)]
-        rows += [{"vehicle": v.vehicle, "verdict": "not enough data", "reason": v.reason} for v in left_out]
-        pq.write_table(pa.Table.from_pylist(rows, schema=SCHEMA), partial / "results.parquet", compression="zstd")
-        write_atomically(partial / "run.json", msgspec.json.format(msgspec.json.encode(run), indent=2) + b"\n")
-        if out.exists():
-            out.rmdir()
-        partial.rename(out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def require_new_folder(out: Path) -> None:
-    """Raise FleetError if a folder to be written exists and holds something."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FleetError(f"{out}: exists and is not empty; choose another --out or remove it")
+        rows += [{"vehicle": v.vehicle, "verdict": LEFT_OUT, "reason": v.reason} for v in left_out]
+        pq.write_table(pa.Table.from_pylist(rows, schema=SCHEMA), folder / "results.parquet", compression="zstd")
+        write_atomically(folder / "run.json", msgspec.json.format(msgspec.json.encode(run), indent=2) + b"\n")
 
 
 def read_results(result: Path) -> list[dict[str, Any]]:

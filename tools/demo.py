@@ -35,8 +35,7 @@ LAYOUT = "dbc/hv_powertrain.toml"
 VEHICLES = 44
 SECONDS = 40.0
 """Length of the live drive. [s]"""
-START_S = 1.0
-"""Time the node's process is given to start. [s]"""
+MARKER = ".made-by-demo"
 
 
 def main(
@@ -58,8 +57,7 @@ def main(
 
 def show(drives: str, out: Path) -> None:
     """Run all steps."""
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir(parents=True)
+    make_empty(out)
     fleet, result = out / "fleet", out / "result"
     source = import_recordings(drives, out) if drives != "builtin" else "builtin"
     step(1, f"{VEHICLES} identical vehicles with faulty sensors drive, and log their CAN buses")
@@ -87,6 +85,15 @@ def show(drives: str, out: Path) -> None:
     )
     say(f"picture: {out / 'kirchhoff.png'}")
     tell_the_truth(truth, vehicle)
+
+
+def make_empty(out: Path) -> None:
+    """Empty the folder of an earlier demo, and no other."""
+    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / MARKER).exists())):
+        fail(f"{out}: is not empty and was not made by the demo; choose another folder")
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    (out / MARKER).touch()
 
 
 def import_recordings(folder: str, out: Path) -> str:
@@ -138,28 +145,49 @@ def choose_bus() -> tuple[str, str]:
 @contextmanager
 def running_node(parameters: Path, vehicle: str, interface: str, channel: str) -> Iterator[None]:
     """The node: a process of its own on SocketCAN; a thread on the virtual bus, which lives in one process."""
-    if interface == "socketcan":
-        command = ["ecu-node", "run", "--params", parameters, "--layout", LAYOUT, "--vehicle", vehicle]
-        with subprocess.Popen([*words(*command), "--interface", interface, "--channel", channel]) as process:
-            time.sleep(START_S)
+    run_it = node_process if interface == "socketcan" else node_thread
+    with run_it(parameters, vehicle, interface, channel):
+        yield
+
+
+@contextmanager
+def node_process(parameters: Path, vehicle: str, interface: str, channel: str) -> Iterator[None]:
+    """``ecu-node run``, from when it says that it runs until the end of the block."""
+    command = words("ecu-node", "run", "--params", parameters, "--layout", LAYOUT, "--vehicle", vehicle)
+    command += ["--interface", interface, "--channel", channel]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            while "running on" not in (line := process.stderr.readline()):
+                if not line:
+                    fail("the node ended at once")
+                say(line.rstrip())
             yield
+        finally:
             process.terminate()
-        return
+    if process.returncode:
+        fail(f"the node ended with exit code {process.returncode}")
+
+
+@contextmanager
+def node_thread(parameters: Path, vehicle: str, interface: str, channel: str) -> Iterator[None]:
+    """The node's own loop in a thread."""
     database = read_database(read_layout(ROOT / LAYOUT))
     in_force, why_not = choose_parameters(parameters, database, vehicle)
     if why_not is not None:
         fail(why_not)
     stop = threading.Event()
     with open_bus(database, interface=interface, channel=channel, fd=False) as bus:
-        node = threading.Thread(
-            target=serve,
-            args=(bus, wire(database, in_force, time.monotonic())),
-            kwargs={"stop": stop.is_set, "status_period_s": 0.1},
-        )
+        corrector = wire(database, in_force, time.monotonic())
+        options = {"stop": stop.is_set, "status_period_s": 0.1}
+        node = threading.Thread(target=serve, args=(bus, corrector), kwargs=options)
         node.start()
-        yield
-        stop.set()
-        node.join()
+        try:
+            yield
+        finally:
+            stop.set()
+            node.join()
+    say(f"node: {corrector.counters.text()}")
 
 
 def play(log: Path, bus: can.BusABC) -> None:

@@ -17,8 +17,7 @@ def nonzero_count(branches: int, sparsity: float) -> int:
 
     The paper counts 3K + 1 parameters in its example (K = 3, S = 60: 4 of 10) but draws the 3K that its footnote 1
     keeps; a share of these 3K gives the same 4. With K = 2, S = 60 these are 2 of 6. The 3 of 6 that a share of
-    3K + 1 would give cannot be meant: then no method, told the class and free of noise, recovers more than 0.89 of
-    the vehicles, and the paper reports 0.91 (docs/published_method.md).
+    3K + 1 would give fit the paper's share of hardware faults, but not its recovery (docs/published_method.md).
 
     Parameters
     ----------

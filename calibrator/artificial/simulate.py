@@ -1,6 +1,5 @@
 """Write an artificial fleet: a folder of CAN logs per vehicle, and the truth beside them."""
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,8 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.artificial.trips import TripPurpose, TripSource
 from calibrator.artificial.truth import TRUTH_FILE, FleetTruth, VehicleTruth, write_truth
 from calibrator.artificial.vehicle import Vehicle, draw_disturbances, write_vehicle
+from calibrator.folders import whole_folder
 from calibrator.random_streams import Purpose, random_stream
-from calibrator.results import require_new_folder
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
@@ -95,17 +94,13 @@ def simulate_fleet(
     FleetError
         If the folder is not empty or the plan does not fit the trips.
     """
-    require_new_folder(out)
     layout = database.layout
     branches = choose_branches(layout, trips.branches, plan.currents)
     vehicles = _draw_vehicles(plan, layout, branches)
-    partial = out.with_name(f".{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
+    with whole_folder(out) as folder:
         written = Parallel(n_jobs=workers, return_as="generator")(
             delayed(_write)(
-                folder=partial, database=database, vehicle=vehicle, trips=trips, number=number, seed=plan.seed
+                folder=folder, database=database, vehicle=vehicle, trips=trips, number=number, seed=plan.seed
             )
             for number, vehicle in enumerate(vehicles)
         )
@@ -114,12 +109,7 @@ def simulate_fleet(
             truths[vehicle.name] = truth
             progress(len(truths))
         fleet = _fleet_truth(plan, layout, branches, truths)
-        write_truth(partial / TRUTH_FILE, fleet)
-        if out.exists():
-            out.rmdir()
-        partial.rename(out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        write_truth(folder / TRUTH_FILE, fleet)
     return fleet
 
 

@@ -1,7 +1,7 @@
 """From the drives of one vehicle to what a fleet needs of it: its model, and second moments of its currents.
 
-The model is identified on the first 80 % of each drive. The last 20 % tell how well it simulates and may serve as the
-unity drive. Equations are those of [1]_.
+The model is identified on the first 80 % of each drive's valid samples. The rest tells how well it simulates and may
+serve as the unity drive. Equations are those of [1]_.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -111,7 +111,8 @@ def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, datab
     model = _identify_excited(inputs[:stop], currents[:stop], training[:stop])
     simulated = model.simulate(_bridged(inputs, valid), initial_state=model.x0)
     longest = max(drives, key=lambda drive: int(drive.valid.sum()))
-    start = max(0, int(TRAIN_SHARE * len(longest.valid)) - int(LEAD_IN_S / period_s))
+    first_held_out = int(np.flatnonzero(longest.valid & ~_in_training(longest.valid))[0])
+    start = max(0, first_held_out - int(LEAD_IN_S / period_s))
     return VehicleModel(
         vehicle=entries[0].vehicle,
         drives=tuple(entry.name for entry in entries),
@@ -122,7 +123,7 @@ def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, datab
         mean_a=np.mean(currents[valid], axis=0),
         moment_a2=currents[valid].T @ currents[valid] / valid.sum(),
         held_out_inputs=_bridged(longest.inputs, longest.valid)[start:],
-        lead_in=int(TRAIN_SHARE * len(longest.valid)) - start,
+        lead_in=first_held_out - start,
     )
 
 
@@ -147,10 +148,22 @@ def junction_rms_a(vehicle: VehicleModel, *, drift: Array, offset_a: Array) -> f
     return float(np.sqrt(max(float(mean_square), 0.0)))
 
 
+def _in_training(valid: Mask) -> Mask:
+    """First 80 % of the valid samples of a drive, and what lies between them."""
+    return np.asarray(np.cumsum(valid) <= TRAIN_SHARE * valid.sum())
+
+
 def _identify_excited(inputs: Array, currents: Array, valid: Mask) -> StateSpaceModel:
     """Identify from the inputs that vary; what the others do cannot be learnt from this vehicle, so it is zero."""
     excited = inputs[valid].std(axis=0) > QUIET * np.abs(inputs[valid].mean(axis=0))
-    model = identify(inputs[:, excited], currents, valid=valid)
+    if not excited.any():
+        raise DriveError("none of its inputs varies: was it parked? record a drive in which it is used")
+    try:
+        model = identify(inputs[:, excited], currents, valid=valid)
+    except np.linalg.LinAlgError as error:
+        raise DriveError(
+            f"no model can be identified from its drives ({error}); record a longer, varied drive"
+        ) from None
     B = np.zeros((model.order, inputs.shape[1]))
     D = np.zeros((currents.shape[1], inputs.shape[1]))
     B[:, excited], D[:, excited] = model.B, model.D
@@ -167,8 +180,7 @@ def _joined(drives: Sequence[Samples], gap: int) -> tuple[Array, Array, Mask, Ma
     def mask(first: bool) -> Mask:
         parts = []
         for drive in drives:
-            in_training = np.arange(len(drive.valid)) < int(TRAIN_SHARE * len(drive.valid))
-            parts += [drive.valid & (in_training == first), np.zeros(gap, bool)]
+            parts += [drive.valid & (_in_training(drive.valid) == first), np.zeros(gap, bool)]
         return np.concatenate(parts[:-1])
 
     inputs = stack([drive.inputs for drive in drives])

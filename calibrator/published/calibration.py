@@ -92,7 +92,7 @@ def calibrate_published(
         assert truth is not None
         classification = classify_by_truth(truth)
     elif classifier is Classifier.THRESHOLD:
-        classification = classify_by_threshold(evidence.features)
+        classification = classify_by_threshold(evidence.features, in_reference)
     else:
         classification = _classify_by_tree(
             evidence,

@@ -60,7 +60,7 @@ def decision_criterion(features: Array) -> Array:
     return np.asarray(features[:, :K].sum(axis=1) - features[:, K] / K)
 
 
-def classify_by_threshold(features: Array) -> Classification:
+def classify_by_threshold(features: Array, in_reference: Mask | None = None) -> Classification:
     """Simple thresholding classifier, (7) with delta_h of (27).
 
     The paper gives no threshold for sensor faults, so all sensors are held to be faulty: then every vehicle is
@@ -69,7 +69,9 @@ def classify_by_threshold(features: Array) -> Classification:
     Parameters
     ----------
     features : ndarray of shape (N, K + 1)
-        Of the whole fleet, whose spread sets the threshold. [A^2]
+        Of the whole fleet. [A^2]
+    in_reference : ndarray of bool of shape (N,), optional
+        Vehicles whose spread sets the threshold; all by default.
 
     Returns
     -------
@@ -77,7 +79,8 @@ def classify_by_threshold(features: Array) -> Classification:
         Hardware faults where the criterion is above a third of its standard deviation.
     """
     eta = decision_criterion(features)
-    threshold = THRESHOLD_SHARE * eta.std(ddof=1) if len(eta) > 1 else 0.0
+    learnt = eta if in_reference is None else eta[in_reference]
+    threshold = THRESHOLD_SHARE * learnt.std(ddof=1) if len(learnt) > 1 else 0.0
     return Classification(hardware=eta > threshold, sensor=np.ones(len(eta), bool))
 
 

@@ -51,10 +51,15 @@ def find_logs(arguments: Iterable[Path]) -> LogSources:
     problems: list[UserError] = []
     for argument in arguments:
         try:
-            for path in _logs_of(argument):
-                found.setdefault(path.resolve(), _source(path))
+            paths = _logs_of(argument)
         except UserError as error:
             problems.append(error)
+            continue
+        for path in paths:
+            try:
+                found.setdefault(path.resolve(), _source(path))
+            except UserError as error:
+                problems.append(error)
     logs = sorted(found.values(), key=lambda log: (log.vehicle, log.name, str(log.path)))
     refused = _refused_vehicles(logs, problems)
     logs = [log for log in logs if log.vehicle not in refused]

@@ -27,7 +27,7 @@ def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve vehicles on a common trip, few faults, no hardware faults."""
+    """Twelve vehicles on a common trip with few faults: three groups of four."""
     out = tmp_path_factory.mktemp("fleet") / "fleet"
     run = calibrator(
         *(
@@ -72,7 +72,8 @@ def test_symmetric_fleet_with_known_classes_is_recovered(fleet: Path, result: Pa
     assert figures["vehicles"] == 12
     assert figures["recovery_rate"] == 1.0
     assert figures["recovery_rate_25"] >= figures["recovery_rate"]
-    assert 0.0 <= figures["harmed_rate"] <= 1.0
+    assert figures["deployed_rate"] > 0.0
+    assert figures["hardware_f2"] == 1.0
 
 
 def test_parameters_are_close_to_the_truth(fleet: Path, result: Path) -> None:
@@ -86,7 +87,7 @@ def test_parameters_are_close_to_the_truth(fleet: Path, result: Path) -> None:
 def test_correction_makes_the_junction_sum_smaller(result: Path) -> None:
     rows = read_results(result)
     corrected = [row for row in rows if row["verdict"] == "corrected"]
-    assert len(corrected) == 16
+    assert len(corrected) >= 8
     assert all(row["junction_rms_corrected_a"] < 0.5 * row["junction_rms_measured_a"] for row in corrected)
 
 
@@ -131,6 +132,21 @@ def test_second_import_changes_nothing_and_says_so(fleet: Path, tmp_path: Path) 
     assert {path: path.read_bytes() for path in store.rglob("*.parquet")} == before
 
 
+def test_nothing_is_learnt_from_a_vehicle_that_is_held_out(fleet: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(fleet / "logs", other)
+    lines = calibrator_lines(fleet)
+    (other / "V001" / "drive.log.gz").write_bytes(gzip.compress(b"".join(lines[: len(lines) // 2])))
+    found = []
+    for k, logs in enumerate((fleet / "logs", other)):
+        out = tmp_path / f"result{k}"
+        run = calibrator("calibrate", logs, "--layout", LAYOUT, "--out", out, "--hold-out", "V001", "--workers", 1)
+        assert run.returncode == 0, run.stderr
+        found.append({(row["vehicle"], row["branch"]): row for row in read_results(out)})
+    assert found[0]["V001", "battery"] != found[1]["V001", "battery"]
+    assert all(found[0][key] == found[1][key] for key in found[0] if key[0] != "V001")
+
+
 @pytest.fixture
 def broken_fleet(fleet: Path, tmp_path: Path) -> Path:
     """Six good vehicles and five with one fault each."""
@@ -151,6 +167,8 @@ def broken_fleet(fleet: Path, tmp_path: Path) -> Path:
     (copy / "blf").mkdir()
     (copy / "blf" / "drive.blf").write_bytes(b"LOGG" + bytes(300))
     shutil.copytree(copy / "V001", copy / "elsewhere" / "V001")
+    (copy / "comma").mkdir()
+    shutil.copy(copy / "V002" / "drive.log.gz", copy / "comma" / "my,drive.log.gz")
     return copy
 
 
@@ -171,6 +189,7 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
     assert "drive.blf" in left_out["blf"]
     twins = [reason for reason in left_out.values() if "V001" in reason and "elsewhere" in reason]
     assert twins, left_out
+    assert any("my,drive" in reason for reason in left_out.values()), left_out
     assert sorted(path.stem for path in (out / "params").iterdir()) == ["V002", "V003", "V004", "V005", "V006"]
     assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)
 

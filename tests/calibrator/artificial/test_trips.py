@@ -46,6 +46,15 @@ def test_larger_fleets_learn_from_some_recordings_and_are_tested_on_the_others()
         assert levels(trips.trip(k, "unseen")) <= {2.0, 3.0}
 
 
+def test_single_recording_is_cut_in_time() -> None:
+    ramp = np.arange(600.0)
+    inputs = recorded("only", 0.0).inputs
+    only = GroundTruth(name="only", period_s=0.1, currents_a={"battery": ramp, "motor": -ramp}, inputs=inputs)
+    for vehicles in (1, 3):
+        trips = RecordedTrips(seed=0, recorded=[only], vehicles=vehicles, unseen_s=10.0)
+        assert levels(trips.trip(0, "calibration")).isdisjoint(levels(trips.trip(0, "unseen")))
+
+
 def test_common_trips_are_the_same_for_all_and_differ_by_purpose() -> None:
     trips = CommonTrips(source=BuiltinTrips(seed=0, duration_s=60.0, unseen_s=60.0))
     first, second = trips.trip(0, "calibration"), trips.trip(5, "calibration")

@@ -69,6 +69,24 @@ def test_input_that_never_varies_has_no_effect_in_the_model(database: VehicleDat
     np.testing.assert_allclose(vehicle.model.simulate(varied)[:, 0], 10.0, atol=1e-6)
 
 
+def test_parked_vehicle_is_left_out_in_words(database: VehicleDatabase, tmp_path: Path) -> None:
+    moving = drive("a", 3000, heater=False)
+    still = channel(np.zeros(3000))
+    inputs = {**moving.inputs, "torque": still, "heater_demand": still}
+    with pytest.raises(DriveError, match="none of its inputs varies: was it parked"):
+        model_of(database, tmp_path, Drive(vehicle="V1", name="a", branches=moving.branches, inputs=inputs))
+
+
+def test_drive_that_is_good_only_at_its_start_has_held_out_data(database: VehicleDatabase, tmp_path: Path) -> None:
+    recorded = drive("a", 3000)
+    battery = recorded.branches["battery"]
+    half = Channel(time_s=battery.time_s, value=battery.value, good=np.arange(3000) < 1500)
+    branches = {**recorded.branches, "battery": half}
+    vehicle = model_of(database, tmp_path, Drive(vehicle="V1", name="a", branches=branches, inputs=recorded.inputs))
+    assert np.isfinite(vehicle.simulation_error_a).all()
+    assert vehicle.duration_s == pytest.approx(150.0, abs=0.2)
+
+
 def test_three_seconds_are_too_little(database: VehicleDatabase, tmp_path: Path) -> None:
     with pytest.raises(DriveError, match=r"of usable data in 1 drives; at least 60 s are needed"):
         model_of(database, tmp_path, drive("a", 30))

@@ -1,0 +1,72 @@
+"""Folders that appear only when they are complete."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from calibrator.errors import FleetError
+
+__all__ = ["require_new_folder", "whole_folder"]
+
+
+def require_new_folder(out: Path) -> None:
+    """Raise FleetError if a folder to be written exists and holds something."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FleetError(f"{out}: exists and is not empty; choose another --out or remove it")
+
+
+@contextmanager
+def whole_folder(out: Path) -> Iterator[Path]:
+    """Fill a hidden folder beside the one wanted, and rename it when the block ends well.
+
+    Parameters
+    ----------
+    out : Path
+        New or empty folder.
+
+    Yields
+    ------
+    Path
+        Folder to fill. It is removed if the block fails; one that a killed process left is removed by the next run.
+
+    Raises
+    ------
+    FleetError
+        If the folder is not empty or cannot be made.
+    """
+    require_new_folder(out)
+    out = out.absolute()
+    partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        _remove_abandoned(out)
+        partial.mkdir()
+    except OSError as error:
+        raise FleetError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
+    try:
+        yield partial
+        if out.exists():
+            out.rmdir()
+        partial.rename(out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _remove_abandoned(out: Path) -> None:
+    """Remove what processes that are gone have left."""
+    for left in out.parent.glob(f".{out.name}.partial-*"):
+        number = left.name.rpartition("-")[2]
+        if number.isdecimal() and not _is_running(int(number)):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -1,0 +1,55 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from calibrator.errors import FleetError
+from calibrator.folders import whole_folder
+
+
+def test_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "out"
+    with whole_folder(out) as partial:
+        (partial / "x").write_text("1")
+        assert not out.exists()
+    assert [path.name for path in out.iterdir()] == ["x"]
+    assert [path.name for path in out.parent.iterdir()] == ["out"]
+
+
+def test_failure_leaves_nothing(tmp_path: Path) -> None:
+    def fill() -> None:
+        with whole_folder(tmp_path / "out") as partial:
+            (partial / "x").write_text("1")
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fill()
+    assert not list(tmp_path.iterdir())
+
+
+def test_folder_in_use_is_refused_untouched(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").write_text("1")
+    with pytest.raises(FleetError, match="exists and is not empty"), whole_folder(tmp_path / "out"):
+        pass
+    assert (tmp_path / "out" / "mine").read_text() == "1"
+
+
+def test_what_a_killed_process_left_is_removed_and_that_of_a_running_one_stays(tmp_path: Path) -> None:
+    gone = subprocess.Popen([sys.executable, "-c", "pass"])
+    gone.wait()
+    (tmp_path / f".out.partial-{gone.pid}").mkdir()
+    (tmp_path / ".out.partial-1").mkdir()
+    with whole_folder(tmp_path / "out"):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".out.partial-1", "out"]
+
+
+def test_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("1")
+    with (
+        pytest.raises(FleetError, match=r"file/out: cannot be made: File exists"),
+        whole_folder(tmp_path / "file" / "out"),
+    ):
+        pass
