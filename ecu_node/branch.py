@@ -203,17 +203,18 @@ class LiveBranch:
             return None
         return corrected_current(measured, drift=self.fault.drift, offset_a=self.fault.offset_a)
 
-    def write(self, payload: bytearray, now_s: float) -> None:
-        """Write corrected code and quality into the payload of the branch's target message."""
+    def write(self, payload: bytearray, now_s: float) -> bool:
+        """Write corrected code and quality into the payload of the target message; True if the code saturated."""
         if self._republished is None:
-            return
+            return False
         out, reading = self._republished, self._reading
-        quality, code = reading.quality, out.not_available
+        quality, code, saturated = reading.quality, out.not_available, False
         if self.is_stale(now_s) or not self.seen:
             quality = Quality.NOT_AVAILABLE
         elif reading.code is not None:
-            code = out.plan.apply(reading.code)
+            code, saturated = out.plan.apply(reading.code), out.plan.saturates(reading.code)
             quality = Quality.CORRECTED if self.fault.applied else Quality.PASSED_THROUGH
         out.place.put(payload, code)
         if out.quality is not None:
             out.quality.put(payload, quality)
+        return saturated

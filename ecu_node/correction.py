@@ -52,10 +52,14 @@ class IntegerPlan:
 
     def apply(self, code: int) -> int:
         """Correct one code; the result saturates at the ends and never wraps."""
-        result = (code * self.gain + self.bias + (1 << (self.shift - 1))) >> self.shift
-        if result < self.lowest:
-            return self.lowest
-        return min(result, self.highest)
+        return min(max(self._unbounded(code), self.lowest), self.highest)
+
+    def saturates(self, code: int) -> bool:
+        """Whether the result for a code lies beyond the ends, so that :meth:`apply` returns an end instead."""
+        return not self.lowest <= self._unbounded(code) <= self.highest
+
+    def _unbounded(self, code: int) -> int:
+        return (code * self.gain + self.bias + (1 << (self.shift - 1))) >> self.shift
 
 
 def integer_plan(source: Codes, target: Codes, *, sign: int, drift: float, offset_a: float) -> IntegerPlan:

@@ -49,6 +49,8 @@ class Counters:
     """Times that the counter showed lost frames."""
     send_errors: int = 0
     """Frames that the bus did not take."""
+    saturated: int = 0
+    """Corrected values beyond the ends of their signal; the end was sent instead."""
 
     def text(self) -> str:
         """One line for the log."""
@@ -81,10 +83,11 @@ class Target:
         self._sender = sender
         self._payload = bytearray(length)
 
-    def frame(self, now_s: float, source: Frame) -> Frame:
-        """Make the message anew; CAN FD where the DBC says so or the source's frame was."""
+    def frame(self, now_s: float, source: Frame, counters: Counters) -> Frame:
+        """Make the message anew, and count it; CAN FD where the DBC says so or the source's frame was."""
+        counters.corrected += 1
         for branch in self._branches:
-            branch.write(self._payload, now_s)
+            counters.saturated += branch.write(self._payload, now_s)
         if self._sender is not None:
             self._sender.protect(self._payload)
         return Frame(self.key, bytes(self._payload), self._fd or source.fd, source.bitrate_switch)
@@ -168,15 +171,14 @@ class Corrector:
             voltage.update(frame.data, now_s)
         for branch in source.branches:
             branch.update(frame.data, now_s)
-        self.counters.corrected += len(source.targets)
-        return [target.frame(now_s, frame) for target in source.targets]
+        return [target.frame(now_s, frame, self.counters) for target in source.targets]
 
     def state(self, now_s: float) -> tuple[State, Reason]:
-        """What the node does at this instant, and why."""
+        """What the node does at this instant, and why; it corrects while a branch to be corrected is not stale."""
         if self.reason is not Reason.NONE:
             return State.PASSING_THROUGH, self.reason
         reason = Reason.BRANCH_STALE if any(branch.is_stale(now_s) for branch in self.branches) else Reason.NONE
-        if not any(branch.fault.applied for branch in self.branches):
+        if not any(branch.fault.applied and not branch.is_stale(now_s) for branch in self.branches):
             return State.PASSING_THROUGH, reason
         waiting = any(branch.is_fitted and not branch.seen for branch in self.branches)
         return State.STARTING if waiting and reason is Reason.NONE else State.CORRECTING, reason

@@ -1,10 +1,11 @@
 """What the node receives and sends, and the checks that keep the two apart.
 
-Loop guard: no identifier may be both received and sent, else the node would correct its own output, or speak in the
-name of another control unit. And each bit it sends belongs to one signal only.
+Loop guard: no message that the layout reads may be sent, else the node would correct its own output, or speak in the
+name of another control unit; and by the DBC all that is sent comes from one control unit, which sends nothing that is
+read. And each bit the node sends belongs to one signal only.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from cantools.database.can import Message, Signal
@@ -21,6 +22,8 @@ __all__ = ["PARAMETER_SETS", "check_output", "is_fd", "key_of", "needs_fd", "rec
 PARAMETER_SETS = 256
 """The status publishes the number of the parameter set modulo this."""
 
+_NOBODY = "Vector__XXX"
+"""How a DBC says that a message has no sender."""
 _CLASSIC_BYTES = 8
 _HEADER_BYTES = 2
 
@@ -69,7 +72,8 @@ def check_output(database: VehicleDatabase) -> None:
     Raises
     ------
     LayoutError
-        If nothing is published, a message is both received and sent, or two signals are written in one place.
+        If nothing is published, a message of a branch or an input would be sent, the DBC says that another control
+        unit sends it, or two signals are written in one place.
     DatabaseError
         If a signal to write does not fit its message or its values do not fit the signal.
     """
@@ -77,12 +81,7 @@ def check_output(database: VehicleDatabase) -> None:
     sent = transmitted(database)
     if not sent:
         raise LayoutError(f"{where}: nothing to publish: give branches a 'corrected' signal, or add [status]")
-    both = [message.name for key, message in sent.items() if key in received(database)]
-    if both:
-        raise LayoutError(
-            f"{where}: {', '.join(both)} would be both received and sent; corrected values and status need messages "
-            f"of their own"
-        )
+    _require_own_messages(database, sent)
     for message in sent.values():
         if _is_protected(database, message) and message.length < _HEADER_BYTES:
             raise DatabaseError(f"{where}: message {message.name} has no room for the E2E header of 2 bytes")
@@ -130,6 +129,31 @@ def _written(database: VehicleDatabase) -> Iterable[_Written]:
         if name is not None:
             message, signal = database.signal(f"{status.message}.{name}")
             yield _Written(message=message, signal=signal, purpose="status", largest=largest)
+
+
+def _require_own_messages(database: VehicleDatabase, sent: Mapping[FrameKey, Message]) -> None:
+    """Refuse to send what the layout reads, or what the DBC says is not sent by one control unit of its own."""
+    where = database.layout.path
+    inputs = (database.signal(item.signal)[0] for item in database.layout.input)
+    read = {**received(database), **{key_of(message): message for message in inputs}}
+    both = [message.name for key, message in sent.items() if key in read]
+    if both:
+        raise LayoutError(
+            f"{where}: {', '.join(both)} would be both received and sent; corrected values and status need messages "
+            f"of their own"
+        )
+    others = {sender for message in read.values() for sender in _senders(message)}
+    senders = {sender: message.name for message in sent.values() for sender in _senders(message)}
+    if len(senders) > 1 or others & senders.keys():
+        found = ", ".join(f"{message} by {sender}" for sender, message in senders.items())
+        raise LayoutError(
+            f"{where}: {database.layout.dbc_path} has {found}; all corrected values and the status need to be sent by "
+            f"one control unit of their own, which sends no branch and no input"
+        )
+
+
+def _senders(message: Message) -> list[str]:
+    return [sender for sender in message.senders if sender != _NOBODY]
 
 
 def _check_place(item: _Written) -> None:

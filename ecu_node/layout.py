@@ -219,6 +219,10 @@ def _check(layout: Layout, path: Path) -> None:
     unknown = [name for name in layout.model_inputs if name not in known]
     if unknown:
         refuse(f"model_inputs: {', '.join(unknown)} is no [[input]] or [[derived]]")
+    if layout.e2e is not None:
+        unknown = [name for name in layout.e2e.data_id if name not in layout.e2e.messages]
+        if unknown:
+            refuse(f"[e2e] data_id: {', '.join(unknown)} is not in 'messages'; add it there, or leave its data_id out")
 
 
 def _check_branch(branch: Branch, refuse: Callable[[str], NoReturn]) -> None:

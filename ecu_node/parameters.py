@@ -4,7 +4,6 @@ JSON, UTF-8, one file per vehicle. The structures below are the schema: ``ecu-no
 made from them, which stands in ``ecu_node/parameters.schema.json``. Currents are positive into the junction.
 """
 
-import math
 import os
 import tempfile
 from pathlib import Path
@@ -36,6 +35,9 @@ MAX_FILE_BYTES = 1_000_000
 """A parameter file has some kilobytes; a larger one is not one."""
 
 Verdict = Literal["no sensor fault", "corrected", "cannot tell", "not enough data"]
+_UNDECIDED: tuple[Verdict, ...] = ("cannot tell", "not enough data")
+"""Verdicts with which nothing was found that could be applied."""
+
 _Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$", description="SHA-256, line ends counted as LF")]
 _Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 _NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
@@ -48,7 +50,7 @@ class BranchParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     offset_a: Annotated[float, msgspec.Meta(description="offset of the sensor, positive into the junction [A]")]
     drift_sd: Annotated[_NotNegative | None, msgspec.Meta(description="standard deviation of the drift [1]")] = None
     offset_sd_a: Annotated[_NotNegative | None, msgspec.Meta(description="standard deviation of the offset [A]")] = None
-    apply: Annotated[bool, msgspec.Meta(description="false: the node passes this branch through")] = True
+    apply: Annotated[bool, msgspec.Meta(description="false: the node passes this branch through")]
 
 
 class HardwareFault(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -149,7 +151,9 @@ def read_parameters(path: Path) -> VehicleParameters:
 
 
 def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:
-    """Check that parameters were made for this vehicle, layout and DBC, and lie within the layout's limits.
+    """Check that parameters were made for this vehicle, layout and DBC, decided on, and within the layout's limits.
+
+    A file whose verdict is "cannot tell" or "not enough data" fits only if it applies no branch.
 
     Parameters
     ----------
@@ -182,6 +186,13 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
             f"parameters were made with DBC {parameters.dbc.name} ({parameters.dbc.sha256[:12]}), "
             f"this is {layout.dbc_path} ({database.digest[:12]}); calibrate with this DBC",
         )
+    applied = [name for name, branch in parameters.branches.items() if branch.apply]
+    if parameters.verdict in _UNDECIDED and applied:
+        raise UnfitError(
+            Reason.IMPLAUSIBLE_PARAMETERS,
+            f"verdict {parameters.verdict!r}, yet branch {', '.join(applied)} has 'apply': true; nothing was found to "
+            f"apply, calibrate with more drives",
+        )
     for name, branch in parameters.branches.items():
         if name not in layout.branch_names:
             raise UnfitError(Reason.WRONG_LAYOUT, f"parameters for branch {name!r}, which {layout.path} does not have")
@@ -211,16 +222,22 @@ def write_parameters(parameters: VehicleParameters, path: Path) -> None:
     Raises
     ------
     ParameterError
-        If a number is not finite: JSON has no such number.
+        If what would be written could not be read back: a number is not finite, which JSON cannot say, or a field is
+        outside the schema. Nothing is written.
     """
-    bad = [
-        name
-        for name, branch in parameters.branches.items()
-        if not (math.isfinite(branch.drift) and math.isfinite(branch.offset_a))
-    ]
-    if bad:
-        raise ParameterError(f"{path}: drift or offset of branch {', '.join(bad)} is not finite; nothing was written")
-    write_atomically(path, msgspec.json.format(msgspec.json.encode(parameters), indent=2) + b"\n")
+    content = msgspec.json.encode(parameters)
+    try:
+        read_back = msgspec.json.decode(content, type=VehicleParameters)
+    except msgspec.DecodeError as error:
+        raise ParameterError(
+            f"{path}: {error}; numbers that are not finite count as null; nothing was written"
+        ) from None
+    if read_back != parameters:
+        raise ParameterError(
+            f"{path}: a standard deviation or the confidence is not finite; leave it out where it is not known; "
+            f"nothing was written"
+        )
+    write_atomically(path, msgspec.json.format(content, indent=2) + b"\n")
 
 
 def write_atomically(path: Path, content: bytes) -> None:

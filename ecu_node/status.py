@@ -11,7 +11,6 @@ class State(IntEnum):
     STARTING = 0
     CORRECTING = 1
     PASSING_THROUGH = 2
-    FAULT = 3
 
 
 class Reason(IntEnum):

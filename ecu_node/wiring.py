@@ -29,9 +29,9 @@ class InForce:
 
 
 def sensor_fault(in_force: InForce, branch: str) -> SensorFault:
-    """What is corrected on one branch: nothing where no parameters are in force, or they do not apply to it."""
+    """What is corrected on one branch: nothing without parameters that apply to it, or where they find no fault."""
     found = in_force.parameters.branches.get(branch) if in_force.parameters is not None else None
-    if found is None or not found.apply:
+    if found is None or not found.apply or found.drift == found.offset_a == 0.0:
         return SensorFault()
     return SensorFault(drift=found.drift, offset_a=found.offset_a, applied=True)
 

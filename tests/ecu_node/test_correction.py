@@ -158,6 +158,14 @@ def test_results_saturate_beside_named_codes() -> None:
 def test_results_saturate_at_the_range_of_the_dbc() -> None:
     plan = integer_plan(current(), current(limits=(-650, 650)), sign=1, drift=-0.4, offset_a=0.0)
     assert (plan.apply(32767), plan.apply(-32767)) == (32500, -32500)
+    exact_end = round(32500 * 0.6)
+    assert plan.apply(exact_end) == 32500
+    assert [plan.saturates(code) for code in (-32767, -exact_end, exact_end, exact_end + 1)] == [
+        True,
+        False,
+        False,
+        True,
+    ]
 
 
 def test_the_plan_is_the_written_formula() -> None:

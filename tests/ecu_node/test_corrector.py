@@ -92,6 +92,30 @@ def test_codes_that_are_no_values_come_out_as_not_available(
     assert corrector.junction_sums_a(0.0) == (None, None)
 
 
+def test_a_branch_without_a_fault_is_passed_through(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
+    (answer,) = corrector.receive(motor(database, 0), 0.0)
+    values = decoded(database, "HV_MotorCorrected", answer.data)
+    assert (values["MotorCurrentCorrected"], values["MotorCurrentQuality"]) == (100.0, Quality.PASSED_THROUGH)
+
+
+def test_parameters_without_any_fault_pass_everything_through(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.0, 0.0))
+    corrector.receive(battery(database, 0), 0.0)
+    assert corrector.state(0.01) == (State.PASSING_THROUGH, Reason.NONE)
+
+
+def test_a_result_beyond_the_signal_is_clamped_and_counted(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(-0.2, 0.0))
+    frames = [battery(database, counter, current) for counter, current in enumerate((520.0, 520.02, -640.0))]
+    answers = [corrector.receive(frame, 0.0)[0] for frame in frames]
+    values = [decoded(database, "HV_BatteryCorrected", answer.data) for answer in answers]
+    assert [value["BatteryCurrentCorrected"] for value in values] == [650.0, 650.0, -650.0]
+    assert {value["BatteryCurrentQuality"] for value in values} == {Quality.CORRECTED}
+    assert corrector.counters.saturated == 2
+    assert corrector.counters.text().endswith(", saturated 2")
+
+
 def test_nothing_is_made_of_a_corrupt_frame(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.1, 0.0))
     good = battery(database, 3)
@@ -150,6 +174,33 @@ def test_a_branch_of_the_parameters_that_never_appears_is_stale_after_its_timeou
     corrector.receive(battery(database, 0), 0.05)
     assert corrector.state(0.09) == (State.STARTING, Reason.NONE)
     assert corrector.state(0.11) == (State.CORRECTING, Reason.BRANCH_STALE)
+
+
+def test_the_node_does_not_say_that_it_corrects_when_every_branch_is_stale(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.1, 0.0))
+    corrector.receive(battery(database, 0), 0.0)
+    corrector.receive(motor(database, 0), 0.05)
+    assert corrector.state(0.12) == (State.CORRECTING, Reason.BRANCH_STALE)
+    assert corrector.state(0.2) == (State.PASSING_THROUGH, Reason.BRANCH_STALE)
+    corrector.receive(motor(database, 1), 0.21)
+    assert corrector.state(0.22) == (State.CORRECTING, Reason.BRANCH_STALE)
+
+
+def test_the_node_does_not_say_that_it_corrects_when_only_branches_passed_through_are_alive(
+    database: VehicleDatabase,
+) -> None:
+    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
+    corrector.receive(motor(database, 0), 0.2)
+    assert corrector.state(0.21) == (State.PASSING_THROUGH, Reason.BRANCH_STALE)
+
+
+@pytest.mark.parametrize(("signal", "codes"), [("State", State), ("Reason", Reason)])
+def test_the_dbc_names_the_codes_of_the_status(
+    database: VehicleDatabase, signal: str, codes: type[State] | type[Reason]
+) -> None:
+    choices: dict[int, Any] = dict(database.signal(f"HV_CorrectionStatus.{signal}")[1].choices or {})
+    names = {code: str(name).upper() for code, name in choices.items()}
+    assert names == {code.value: code.name.replace("_", "") for code in codes}
 
 
 def test_a_branch_that_is_neither_named_nor_seen_is_not_fitted(database: VehicleDatabase) -> None:
@@ -213,6 +264,15 @@ def test_the_answer_is_can_fd_where_the_source_is(make_database: MakeDatabase) -
 
 
 LOOP = ("PairOut.Motor", "Pair.Motor")
+INPUT = '\ninput = [{ name = "x", signal = "PairOut.Quality" }]\n'
+OWN_STATUS = '\n[status]\nmessage = "Own"\nstate = "State"\nreason = "Reason"\n'
+OTHER_SENDER = (
+    SMALL_DBC.replace("Node Corrector", "Node Corrector Other")
+    + """BO_ 600 Own: 8 Other
+ SG_ State : 0|8@1+ (1,0) [0|255] "" Node
+ SG_ Reason : 8|8@1+ (1,0) [0|255] "" Node
+"""
+)
 STATUS_TABLE = '\n[status]\nmessage = "PairOut"\nstate = "Quality"\nreason = "Battery"\n'
 
 
@@ -220,6 +280,10 @@ STATUS_TABLE = '\n[status]\nmessage = "PairOut"\nstate = "Quality"\nreason = "Ba
     ("layout", "dbc", "words"),
     [
         (SMALL_LAYOUT.replace(*LOOP), SMALL_DBC, "Pair would be both received and sent"),
+        (SMALL_LAYOUT + INPUT, SMALL_DBC, "PairOut would be both received and sent"),
+        (SMALL_LAYOUT, SMALL_DBC.replace("8 Corrector", "8 Node"), r"small\.dbc has PairOut by Node; all corrected"),
+        (SMALL_LAYOUT, SMALL_DBC + "BO_TX_BU_ 512 : Corrector,Node;\n", "PairOut by Corrector, PairOut by Node; all"),
+        (SMALL_LAYOUT + OWN_STATUS, OTHER_SENDER, "PairOut by Corrector, Own by Other; all corrected values and the"),
         (SMALL_LAYOUT.replace("PairOut.Motor", "PairOut.Battery"), SMALL_DBC, "PairOut.Battery is written twice"),
         (SMALL_LAYOUT, SMALL_DBC.replace("Motor : 16|16", "Motor : 15|16"), "PairOut.Motor is written twice"),
         (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 64|2"), "Quality ends in byte 9"),
@@ -242,6 +306,12 @@ def test_a_layout_that_would_disturb_the_bus_is_refused(
 ) -> None:
     with pytest.raises((LayoutError, DatabaseError), match=words):
         corrector_for(make_database(layout, dbc))
+
+
+@pytest.mark.parametrize(("old", "new"), [("8 Corrector", "8 Vector__XXX"), ("8 Other", "8 Corrector")])
+def test_messages_of_one_control_unit_or_of_none_may_be_sent(make_database: MakeDatabase, old: str, new: str) -> None:
+    database = make_database(SMALL_LAYOUT + OWN_STATUS, OTHER_SENDER.replace(old, new))
+    assert corrector_for(database).status_fields is not None
 
 
 def test_a_layout_that_publishes_nothing_is_refused(make_database: MakeDatabase) -> None:

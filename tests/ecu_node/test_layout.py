@@ -58,6 +58,11 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
         ('voltage = "Net.Voltage"', 'voltage = "Net.Voltage", corrected = "PairOut.Motor"', "'corrected' needs"),
         ('"Net.Voltage"', '"Net.Voltage", quality = "PairOut.Quality"', "'quality' without 'corrected'"),
         ('quality = "PairOut.Quality"', 'quality = "Net.Voltage"', "must be signals of one message"),
+        (
+            "\n]\n",
+            '\n]\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\ndata_id = { Pair = 1 }\n',
+            "data_id: Pair is not in",
+        ),
         ("full_scale_a", 'model_inputs = ["speed"]\nfull_scale_a', "model_inputs: speed is no"),
         ("full_scale_a", 'derived = [{ name = "d", formula = "speed * 2" }]\nfull_scale_a', "speed is no input"),
         ("full_scale_a", 'derived = [{ name = "d", formula = "open(1)" }]\nfull_scale_a', "not allowed"),

@@ -1,6 +1,7 @@
 """The parameter file: schema and reader agree, and whatever is wrong is one line with a reason."""
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,18 @@ import jsonschema
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 import ecu_node
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError
 from ecu_node.parameters import (
     MAX_FILE_BYTES,
+    BranchParameters,
+    HardwareFault,
+    JunctionResidual,
     UnfitError,
+    Verdict,
     check_fit,
     parameter_schema,
     read_parameters,
@@ -51,10 +57,48 @@ def test_written_parameters_are_read_back_and_match_the_schema(database: Vehicle
     assert [path.name for path in tmp_path.iterdir()] == ["p.json"]
 
 
-def test_numbers_that_json_lacks_are_not_written(database: VehicleDatabase, tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match="branch battery is not finite; nothing was written"):
-        write_parameters(parameters_for(database, battery=(0.1, float("nan"))), tmp_path / "p.json")
+SOUND = BranchParameters(drift=0.1, offset_a=-2.5, apply=True)
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    ("field", "change", "words"),
+    [
+        ("branches", lambda x: {"battery": replace(SOUND, drift=x)}, r"branches\[\.\.\.\]\.drift"),
+        ("branches", lambda x: {"battery": replace(SOUND, offset_a=x)}, r"branches\[\.\.\.\]\.offset_a"),
+        ("branches", lambda x: {"battery": replace(SOUND, drift_sd=x)}, "a standard deviation .* is not finite"),
+        ("branches", lambda x: {"battery": replace(SOUND, offset_sd_a=x)}, "a standard deviation .* is not finite"),
+        ("confidence", lambda x: x, "the confidence is not finite"),
+        ("hardware_fault", lambda x: HardwareFault(suspected=True, drift=x), r"hardware_fault\.drift"),
+        ("hardware_fault", lambda x: HardwareFault(suspected=True, offset_a={"motor": x}), r"hardware_fault\.offset_a"),
+        ("junction_residual", lambda x: JunctionResidual(measured_a=x, corrected_a=0), r"residual\.measured_a"),
+        ("junction_residual", lambda x: JunctionResidual(measured_a=0, corrected_a=x), r"residual\.corrected_a"),
+    ],
+)
+def test_numbers_that_json_lacks_are_not_written(
+    database: VehicleDatabase,
+    tmp_path: Path,
+    field: str,
+    change: Callable[[float], object],
+    words: str,
+    number: float,
+) -> None:
+    parameters = replace(parameters_for(database, battery=(0.1, 0.0)), **{field: change(number)})
+    with pytest.raises(ParameterError, match=rf"p\.json: .*{words}.*; nothing was written$") as caught:
+        write_parameters(parameters, tmp_path / "p.json")
+    assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+def test_what_the_schema_refuses_is_not_written(database: VehicleDatabase, tmp_path: Path) -> None:
+    parameters = parameters_for(database, battery=(0.1, 0.0))
+    endless = replace(parameters, provenance=replace(parameters.provenance, duration_s=math.nan))
+    empty = replace(parameters, provenance=replace(parameters.provenance, fleet_size=0))
+    (tmp_path / "p.json").write_text("older")
+    for bad, words in ((endless, "duration_s"), (empty, "fleet_size")):
+        with pytest.raises(ParameterError, match=rf"\$\.provenance\.{words}"):
+            write_parameters(bad, tmp_path / "p.json")
+    assert (tmp_path / "p.json").read_text() == "older"
 
 
 CHANGES: dict[str, Change] = {
@@ -80,6 +124,7 @@ CHANGES: dict[str, Change] = {
     "deviation null": lambda d: d["branches"]["battery"].update(drift_sd=None),
     "deviation negative": lambda d: d["branches"]["battery"].update(drift_sd=-0.1),
     "offset missing": lambda d: d["branches"]["battery"].pop("offset_a"),
+    "apply missing": lambda d: d["branches"]["battery"].pop("apply"),
     "apply a number": lambda d: d["branches"]["battery"].update(apply=1),
     "unknown verdict": lambda d: d.update(verdict="fine"),
     "confidence above 1": lambda d: d.update(confidence=1.01),
@@ -194,3 +239,27 @@ def test_parameters_that_do_not_belong_here_are_unfit(
 def test_parameters_made_for_this_vehicle_fit(database: VehicleDatabase) -> None:
     for vehicle in ("v1", None):
         check_fit(parameters_for(database, battery=(0.4, -150.0)), database, vehicle)
+
+
+def test_a_file_must_say_of_each_branch_whether_it_is_applied(database: VehicleDatabase, tmp_path: Path) -> None:
+    document = as_document(parameters_for(database, battery=(0.1, 1.0)))
+    del document["branches"]["battery"]["apply"]
+    (tmp_path / "p.json").write_text(json.dumps(document))
+    with pytest.raises(UnfitError, match="missing required field `apply`"):
+        read_parameters(tmp_path / "p.json")
+
+
+@pytest.mark.parametrize("verdict", ["cannot tell", "not enough data"])
+def test_what_was_not_decided_is_not_applied(database: VehicleDatabase, verdict: Verdict) -> None:
+    parameters = replace(parameters_for(database, battery=(0.1, 1.0), motor=(0.1, 1.0)), verdict=verdict)
+    withheld = {name: replace(branch, apply=False) for name, branch in parameters.branches.items()}
+    check_fit(replace(parameters, branches=withheld), database, "v1")
+    one = replace(parameters, branches={**withheld, "motor": SOUND})
+    with pytest.raises(UnfitError, match=f"verdict '{verdict}', yet branch motor has 'apply': true") as caught:
+        check_fit(one, database, "v1")
+    assert caught.value.reason is Reason.IMPLAUSIBLE_PARAMETERS
+
+
+@pytest.mark.parametrize("verdict", ["no sensor fault", "corrected"])
+def test_what_was_decided_may_be_applied(database: VehicleDatabase, verdict: Verdict) -> None:
+    check_fit(replace(parameters_for(database, battery=(0.1, 1.0)), verdict=verdict), database, "v1")

@@ -30,7 +30,7 @@ branch = [
 ]
 """
 SMALL_DBC = """VERSION ""
-BU_: Node
+BU_: Node Corrector
 BO_ 256 Pair: 8 Node
  SG_ Battery : 7|16@0- (0.1,0) [-3000|3000] "A" Node
  SG_ Motor : 23|16@0- (-0.05,0) [-1600|1600] "A" Node
@@ -38,7 +38,7 @@ BO_ 2147484160 Heater: 4 Node
  SG_ Power : 0|16@1+ (1,0) [0|60000] "W" Node
 BO_ 258 Net: 2 Node
  SG_ Voltage : 0|16@1+ (0.01,0) [0|650] "V" Node
-BO_ 512 PairOut: 8 Node
+BO_ 512 PairOut: 8 Corrector
  SG_ Battery : 0|16@1- (0.1,0) [-3000|3000] "A" Node
  SG_ Motor : 16|16@1- (-0.05,0) [-1600|1600] "A" Node
  SG_ Quality : 32|2@1+ (1,0) [0|3] "" Node
@@ -57,7 +57,9 @@ def parameters_for(database: VehicleDatabase, **faults: tuple[float, float]) -> 
         layout=FileReference(name=layout.path.name, sha256=layout.digest),
         dbc=FileReference(name=layout.dbc, sha256=database.digest),
         verdict="corrected",
-        branches={name: BranchParameters(drift=drift, offset_a=offset) for name, (drift, offset) in faults.items()},
+        branches={
+            name: BranchParameters(drift=drift, offset_a=offset, apply=True) for name, (drift, offset) in faults.items()
+        },
         hardware_fault=HardwareFault(suspected=False),
         junction_residual=JunctionResidual(measured_a=1.0, corrected_a=0.1),
         provenance=Provenance(

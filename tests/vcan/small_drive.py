@@ -76,7 +76,7 @@ def true_parameters(database: VehicleDatabase) -> VehicleParameters:
         dbc=FileReference(name=layout.dbc, sha256=database.digest),
         verdict="corrected",
         branches={
-            name: BranchParameters(drift=float(branch.drift), offset_a=float(branch.offset_a))
+            name: BranchParameters(drift=float(branch.drift), offset_a=float(branch.offset_a), apply=True)
             for name, branch in BRANCHES.items()
         },
         hardware_fault=HardwareFault(suspected=False),

@@ -79,7 +79,10 @@ def test_a_drive_is_corrected_bit_by_bit_and_everything_else_left_alone(
     assert [frame for frame in recording.frames if frame.identifier not in own] == frames_of(drive)
     assert state_and_reason(database, status[-1]) == (State.CORRECTING, Reason.NONE)
     assert [data[1] & 15 for data in status] == [k % 15 for k in range(len(status))]
-    assert f"corrected {3 * INSTANTS}, corrupt {INSTANTS // 10}, repeated 0, gaps 0, send errors 0" in node.messages
+    assert (
+        f"corrected {3 * INSTANTS}, corrupt {INSTANTS // 10}, repeated 0, gaps 0, send errors 0, saturated 0"
+        in node.messages
+    )
     before, after = (kirchhoff_rmse(database, recording, corrected=which) for which in (False, True))
     assert before >= 10.0 * after
 
