@@ -24,7 +24,7 @@ def write_picture(result: ExperimentResult, path: Path) -> None:
     """
     figure = Figure(figsize=(10.0, 4.0), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(result.title)
+    figure.suptitle(f"{result.title}; crosses: the paper")
     for axes, (name, label) in zip(figure.subplots(1, len(SHOWN)), SHOWN.items(), strict=True):
         for k, method in enumerate(dict.fromkeys(row.method for row in result.rows)):
             rows = [row for row in result.rows if row.method == method]
