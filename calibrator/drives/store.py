@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from calibrator.drive import Channel, Drive, DriveFile
 from calibrator.errors import DriveError
 from ecu_node.errors import UserError
-from ecu_node.layout import Layout
+from ecu_node.layout import Layout, file_digest
 from ecu_node.parameters import write_atomically
 
 __all__ = ["iterate_drives", "list_drives", "read_drive_file", "require_plain_name", "write_drive"]
@@ -206,6 +206,7 @@ def _table(drive: Drive, layout: Layout) -> pa.Table:
         "drive": drive.name,
         "layout": layout.name,
         "layout_sha256": layout.digest,
+        "dbc_sha256": file_digest(layout.dbc_path),
     }
     table = pa.Table.from_pylist(rows, schema=_SCHEMA)
     return table.replace_schema_metadata({_METADATA: json.dumps(about)})
@@ -221,6 +222,8 @@ def _check_identity(about: Mapping[str, object], path: Path, layout: Layout) -> 
             f"{path}: made with layout {about['layout']} ({str(about['layout_sha256'])[:12]}), this is {layout.path} "
             f"({layout.digest[:12]}); import the logs again with this layout"
         )
+    if about.get("dbc_sha256") != file_digest(layout.dbc_path):
+        raise DriveError(f"{path}: made with another DBC than {layout.dbc_path}; import the logs again with this DBC")
 
 
 def _channels(table: pa.Table) -> Iterator[tuple[str, str, Channel]]:

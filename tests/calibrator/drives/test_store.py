@@ -12,7 +12,7 @@ from calibrator.drives.store import iterate_drives, list_drives, read_drive_file
 from calibrator.errors import DriveError
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
-from ecu_node.layout import Layout
+from ecu_node.layout import Layout, read_layout
 
 
 @pytest.fixture
@@ -124,3 +124,15 @@ def test_a_store_that_cannot_be_written_is_named(tmp_path: Path, layout: Layout)
     (tmp_path / "store").write_text("a file")
     with pytest.raises(DriveError, match="cannot write the drive"):
         write_drive(tmp_path / "store", some_drive(), layout)
+
+
+def test_a_drive_decoded_with_another_dbc_is_refused(tmp_path: Path) -> None:
+    layout_file, dbc = tmp_path / "hv_powertrain.toml", tmp_path / "hv_powertrain.dbc"
+    original = Path(__file__).parents[3] / "dbc"
+    layout_file.write_bytes((original / layout_file.name).read_bytes())
+    dbc.write_bytes((original / dbc.name).read_bytes())
+    layout = read_layout(layout_file)
+    path = write_drive(tmp_path / "store", Drive(vehicle="V", name="d", branches={}, inputs={}), layout)
+    dbc.write_text(dbc.read_text().replace("(0.02,0)", "(0.04,0)"))
+    with pytest.raises(DriveError, match=r"made with another DBC than .*hv_powertrain\.dbc; import the logs again"):
+        read_drive_file(path, layout)
