@@ -1,0 +1,135 @@
+"""Means of a branch current over short windows, at any instant, from its raw frames.
+
+Between good samples the current i is taken as linear. Its charge Q (integral of i) and the integral P of that are then
+exact, and so are the mean of i with triangular weight over +-w, and the slope of this mean:
+
+    m_w(t) = (P(t + w) - 2 P(t) + P(t - w)) / w^2          dm_w/dt = (Q(t + w) - 2 Q(t) + Q(t - w)) / w^2
+
+The band (w, W) of the current is m_w - m_W: free of offsets and of what changes slowly, and smooth enough to be
+compared between branches whose frames come at different instants. It is linear and the same for all branches, so the
+junction law holds for it too.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrator.drive import Array, Channel, Mask
+
+__all__ = ["Band", "ChargeCurve", "charge_curve"]
+
+GAP_PERIODS = 3.5
+"""Good samples farther apart than this many median distances leave a gap: two lost frames in a row are bridged. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Band:
+    """Windows over which currents are averaged.
+
+    Attributes
+    ----------
+    short_s, long_s : float
+        Half widths w and W of the triangles. [s]
+    """
+
+    short_s: float
+    long_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChargeCurve:
+    """A branch current, linear between its good samples, with its integrals.
+
+    Attributes
+    ----------
+    time_s : ndarray of shape (n,)
+        Instants of the good samples, strictly increasing, n >= 2. [s]
+    pieces : ndarray of shape (4, n-1)
+        Integral of the charge [A s^2], charge since the first sample [A s] and current [A] at the start of the line
+        after each sample, and the slope of that line [A/s].
+    gap_s : ndarray of shape (n,)
+        Time spent in gaps before each sample. [s]
+    period_s : float
+        Median distance of the samples. [s]
+    """
+
+    time_s: Array
+    pieces: Array
+    gap_s: Array
+    period_s: float
+
+    def band(self, time_s: Array, band: Band) -> tuple[Array, Array]:
+        """Band of the current and its slope.
+
+        Parameters
+        ----------
+        time_s : ndarray of shape (T,)
+            Instants that the samples cover by at least W on both sides. [s]
+        band : Band
+            Windows w and W.
+
+        Returns
+        -------
+        x, slope : ndarray of shape (T,)
+            Band of the current [A] and its derivative by time [A/s].
+        """
+        centre = 2.0 * self._integrals(time_s)
+
+        def mean(half_s: float) -> Array:
+            outside = self._integrals(time_s + half_s) + self._integrals(time_s - half_s)
+            return np.asarray((outside - centre) / half_s**2)
+
+        x, slope = mean(band.short_s) - mean(band.long_s)
+        return x, slope
+
+    def covers(self, time_s: Array, margin_s: float) -> Mask:
+        """Whether this much time on both sides of each instant lies within the samples and touches no gap."""
+        first, last = time_s - margin_s, time_s + margin_s
+        inside = (first >= self.time_s[0]) & (last <= self.time_s[-1])
+        gap_s = np.interp(last, self.time_s, self.gap_s) - np.interp(first, self.time_s, self.gap_s)
+        return np.asarray(inside & (gap_s <= 0.0))
+
+    def _integrals(self, time_s: Array) -> Array:
+        """Integral of the charge, and charge, at instants within the samples; shape (2, T)."""
+        k = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.time_s) - 2)
+        h = time_s - self.time_s[k]
+        integral, charge, current, slope = self.pieces[:, k]
+        return np.stack([
+            integral + h * (charge + h * (current / 2.0 + h * slope / 6.0)),
+            charge + h * (current + h * slope / 2.0),
+        ])  # fmt: skip
+
+
+def charge_curve(channel: Channel) -> ChargeCurve | None:
+    """Integrate the good samples of a channel.
+
+    Parameters
+    ----------
+    channel : Channel
+        A branch current, positive into the junction. [A]
+
+    Returns
+    -------
+    ChargeCurve or None
+        None with fewer than two good samples at different instants. Of several at one instant the last counts.
+    """
+    time_s, current = channel.time_s[channel.good], channel.value[channel.good]
+    last = np.diff(time_s, append=np.inf) > 0.0
+    time_s, current = time_s[last], current[last]
+    if len(time_s) < 2:
+        return None
+    h = np.diff(time_s)
+    slope = np.diff(current) / h
+    charge = _cumulated(h * (current[1:] + current[:-1]) / 2.0)[:-1]
+    integral = _cumulated(h * (charge + h * (current[:-1] / 2.0 + h * slope / 6.0)))[:-1]
+    period_s = float(np.median(h))
+    return ChargeCurve(
+        time_s=time_s,
+        pieces=np.stack([integral, charge, current[:-1], slope]),
+        gap_s=_cumulated(np.where(h > GAP_PERIODS * period_s, h, 0.0)),
+        period_s=period_s,
+    )
+
+
+def _cumulated(parts: Array) -> Array:
+    return np.concatenate([[0.0], np.cumsum(parts)])
