@@ -139,7 +139,8 @@ def _all_starts(stretches: Sequence[Stretch]) -> NDArray[np.intp]:
 def _strong(slope: Array) -> Array:
     """Slopes, weakened where they are no greater than each branch's usual ones."""
     usual = SLOPE_NOISES * MAD_TO_SD * np.median(np.abs(slope), axis=0)
-    return np.asarray(slope**3 / np.maximum(slope**2 + usual**2, _TINY))
+    square = slope * slope
+    return np.asarray(slope * (square / np.maximum(square + usual**2, _TINY)))
 
 
 def _huber_weight(e: Array) -> Array:

@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+
+from calibrator.drive import Array, Channel, Mask
+from calibrator.drives.charge import Band, ChargeCurve, charge_curve
+
+BAND = Band(short_s=0.2, long_s=2.0)
+DENSE_S = 1e-4
+
+
+def curve_of(time_s: Array, value: Array, *, good: Mask | None = None) -> ChargeCurve:
+    kept = np.ones(len(time_s), np.bool_) if good is None else good
+    curve = charge_curve(Channel(time_s=time_s, value=value, good=kept))
+    assert curve is not None
+    return curve
+
+
+def uneven(seed: int, duration_s: float = 20.0) -> tuple[Array, Array]:
+    rng = np.random.default_rng(seed)
+    time_s = np.sort(rng.uniform(0.0, duration_s, int(20 * duration_s)))
+    return time_s, rng.normal(0.0, 30.0, len(time_s))
+
+
+def triangle_mean(time_s: Array, value: Array, centre_s: float, half_s: float) -> float:
+    """The definition, summed finely: mean of the linear interpolation with triangular weight."""
+    around_s = centre_s + np.arange(-half_s, half_s, DENSE_S) + DENSE_S / 2.0
+    weight = 1.0 - np.abs(around_s - centre_s) / half_s
+    return float(np.sum(weight * np.interp(around_s, time_s, value)) / np.sum(weight))
+
+
+def test_the_band_is_the_difference_of_two_triangular_means() -> None:
+    time_s, value = uneven(1)
+    instants_s = np.array([3.0, 7.123, 11.0, time_s[150]])
+    x, _ = curve_of(time_s, value).band(instants_s, BAND)
+    oracle = [triangle_mean(time_s, value, t, 0.2) - triangle_mean(time_s, value, t, 2.0) for t in instants_s]
+    np.testing.assert_allclose(x, oracle, atol=1e-3)
+
+
+def test_the_slope_is_the_derivative_of_the_band() -> None:
+    curve = curve_of(*uneven(2))
+    instants_s, h = np.linspace(3.0, 17.0, 50), 1e-4
+    _, slope = curve.band(instants_s, BAND)
+    difference = (curve.band(instants_s + h, BAND)[0] - curve.band(instants_s - h, BAND)[0]) / (2.0 * h)
+    np.testing.assert_allclose(slope, difference, rtol=1e-3, atol=0.05)
+
+
+def test_the_band_of_a_straight_line_is_zero_even_after_hours() -> None:
+    time_s, _ = uneven(3)
+    time_s = time_s + 36_000.0
+    x, slope = curve_of(time_s, 200.0 + 3.0 * (time_s - 36_000.0)).band(36_000.0 + np.linspace(3.0, 17.0, 50), BAND)
+    np.testing.assert_allclose(x, 0.0, atol=1e-6)
+    np.testing.assert_allclose(slope, 0.0, atol=1e-6)
+
+
+def test_bands_add_up_as_the_currents_do() -> None:
+    (time_s, one), (_, two) = uneven(4), uneven(5)
+    instants_s = np.linspace(3.0, 17.0, 50)
+    bands = [curve_of(time_s, value).band(instants_s, BAND)[0] for value in (one, two, one - 2.0 * two)]
+    np.testing.assert_allclose(bands[2], bands[0] - 2.0 * bands[1], atol=1e-9)
+
+
+def test_covered_is_what_has_samples_around_and_no_gap_near() -> None:
+    time_s = np.concatenate([np.arange(0.0, 5.0, 0.1), np.arange(7.0, 12.0, 0.1)])
+    curve = curve_of(time_s, np.zeros(len(time_s)))
+    instants_s = np.array([0.5, 1.5, 3.8, 4.5, 6.0, 7.5, 8.5, 10.5, 11.5])
+    assert curve.covers(instants_s, 1.0).tolist() == [False, True, True, False, False, False, True, True, False]
+
+
+def test_one_or_two_lost_frames_are_bridged_and_bad_samples_make_gaps() -> None:
+    time_s = np.arange(0.0, 10.0, 0.1)
+    for lost, bridged in ((1, True), (2, True), (3, False)):
+        good = np.ones(100, np.bool_)
+        good[50 : 50 + lost] = False
+        curve = curve_of(time_s, np.where(good, 1.0, np.nan), good=good)
+        assert curve.covers(np.array([5.0]), 1.0).tolist() == [bridged]
+
+
+def test_of_several_samples_at_one_instant_the_last_counts() -> None:
+    time_s, value = np.array([0.0, 1.0, 1.0, 2.0]), np.array([0.0, 9.0, 1.0, 2.0])
+    curve = curve_of(time_s, value)
+    assert curve.time_s.tolist() == [0.0, 1.0, 2.0]
+    assert curve.pieces[2].tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_fewer_than_two_good_samples_make_no_curve(count: int) -> None:
+    good = np.arange(5) < count
+    assert charge_curve(Channel(time_s=np.arange(5.0), value=np.zeros(5), good=good)) is None

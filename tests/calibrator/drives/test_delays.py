@@ -1,0 +1,244 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrator.drive import Array, Channel, Drive
+from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
+from calibrator.errors import DriveError
+from tests.calibrator.drives.delayed_drives import MadeUp, made_up_drive
+
+TWO = ("battery", "motor")
+THREE = ("battery", "motor", "auxiliary")
+PAIR = MadeUp(
+    size_a={"motor": 50.0},
+    delay_s={"battery": 0.05, "motor": 0.237},
+    gain={"battery": 1.1, "motor": 0.85},
+    offset_a={"motor": 60.0},
+    noise_a=0.4,
+)
+TRIO = MadeUp(
+    size_a={"motor": 50.0, "auxiliary": 10.0},
+    delay_s={"battery": 0.25, "motor": 0.02, "auxiliary": 0.183},
+    noise_a=0.4,
+    stepping=frozenset({"auxiliary"}),
+)
+
+
+def with_channel(drive: Drive, branch: str, channel: Channel) -> Drive:
+    return replace(drive, branches={**drive.branches, branch: channel})
+
+
+def with_value(drive: Drive, branch: str, value: Array) -> Drive:
+    return with_channel(drive, branch, replace(drive.branches[branch], value=value))
+
+
+def test_a_delay_is_found_whatever_gain_and_offset_the_sensors_have() -> None:
+    found = estimate_delays([made_up_drive(1, PAIR)], TWO)
+    assert found.branches == TWO
+    assert found.known.all()
+    np.testing.assert_allclose(found.delay_s, [0.0, 0.187], atol=1e-3)
+    assert found.sd_s[0] == 0.0
+    assert 0.0 < found.sd_s[1] < 1e-3
+
+
+def test_a_small_branch_that_switches_tells_its_delay_to_a_fraction_of_its_sample_period() -> None:
+    found = estimate_delays([made_up_drive(2, TRIO)], THREE)
+    assert found.known.all()
+    np.testing.assert_allclose(found.delay_s, [0.0, -0.23, -0.067], atol=5e-3)
+
+
+@pytest.mark.parametrize("delay_s", [-0.49, -0.301, 0.0, 0.0137, 0.49])
+def test_delays_up_to_the_longest_are_found_ahead_and_behind(delay_s: float) -> None:
+    vehicle = replace(PAIR, delay_s={"battery": 0.5, "motor": 0.5 + delay_s})
+    found = estimate_delays([made_up_drive(3, vehicle)], TWO)
+    assert found.known.all()
+    assert found.delay_s[1] == pytest.approx(delay_s, abs=1e-3)
+
+
+def test_two_motors_that_do_much_the_same_and_a_slow_converter_are_told_apart() -> None:
+    vehicle = MadeUp(
+        size_a={"motor": 50.0, "motor_rear": 80.0, "dcdc": 20.0},
+        delay_s={"battery": 0.1, "motor": 0.28, "motor_rear": 0.0, "dcdc": 0.2},
+        noise_a=0.2,
+        alike=0.95,
+    )
+    found = estimate_delays([made_up_drive(4, vehicle)], ("battery", "motor", "motor_rear", "dcdc"))
+    assert found.known.all()
+    np.testing.assert_allclose(found.delay_s, [0.0, 0.18, -0.1, 0.1], atol=5e-3)
+
+
+def test_without_noise_the_delay_is_exact() -> None:
+    for seed in range(3):
+        found = estimate_delays([made_up_drive(seed, replace(PAIR, noise_a=0.0))], TWO)
+        assert found.delay_s[1] == pytest.approx(0.187, abs=1e-4)
+
+
+def test_without_noise_steps_seen_by_slow_frames_are_exact_to_a_hundredth_of_the_period() -> None:
+    found = estimate_delays([made_up_drive(5, replace(TRIO, noise_a=0.0, duration_s=900.0))], THREE)
+    np.testing.assert_allclose(found.delay_s, [0.0, -0.23, -0.067], atol=5e-4)
+
+
+def test_noise_at_any_phase_of_the_frames_pulls_the_delay_nowhere() -> None:
+    """Frames of 50 and 100 Hz whose phases stay put: the mean error over many phases and noises is zero."""
+    errors_s, sds_s = [], []
+    for seed in range(40):
+        delay_s = 0.1 + 0.02 * seed / 40.0
+        vehicle = replace(PAIR, size_a={"motor": 5.0}, delay_s={"motor": delay_s}, duration_s=100.0)
+        found = estimate_delays([made_up_drive(seed, vehicle)], TWO, max_sd_s=0.05)
+        errors_s.append(found.delay_s[1] - delay_s)
+        sds_s.append(found.sd_s[1])
+    assert abs(np.mean(errors_s)) < 3.0 * np.std(errors_s) / np.sqrt(40.0)
+    z = np.array(errors_s) / np.array(sds_s)
+    assert 0.7 < np.sqrt(np.mean(z**2)) < 1.5
+
+
+def test_a_channel_seen_later_by_some_time_has_its_delay_longer_by_that() -> None:
+    drive = made_up_drive(1, PAIR)
+    later = replace(drive.branches["motor"], time_s=drive.branches["motor"].time_s + 0.0731)
+    before, after = estimate_delays([drive], TWO), estimate_delays([with_channel(drive, "motor", later)], TWO)
+    assert after.delay_s[1] - before.delay_s[1] == pytest.approx(0.0731, abs=2e-4)
+
+
+def test_scaling_a_branch_or_adding_to_it_does_not_move_its_delay() -> None:
+    drive = made_up_drive(1, PAIR)
+    before = estimate_delays([drive], TWO)
+    after = estimate_delays([with_value(drive, "motor", 1.3 * drive.branches["motor"].value - 40.0)], TWO)
+    np.testing.assert_allclose(after.delay_s, before.delay_s, atol=1e-6)
+
+
+def test_the_order_of_the_branches_after_the_first_does_not_matter() -> None:
+    drive = made_up_drive(2, TRIO)
+    found, swapped = estimate_delays([drive], THREE), estimate_delays([drive], ("battery", "auxiliary", "motor"))
+    np.testing.assert_allclose(swapped.delay_s, found.delay_s[[0, 2, 1]], atol=1e-5)
+
+
+def test_the_other_branch_as_reference_turns_the_sign() -> None:
+    drive = made_up_drive(1, PAIR)
+    found, turned = estimate_delays([drive], TWO), estimate_delays([drive], TWO[::-1])
+    assert turned.delay_s[1] == pytest.approx(-found.delay_s[1], abs=2e-4)
+
+
+def test_more_drives_of_the_vehicle_make_the_delay_surer() -> None:
+    drives = [made_up_drive(seed, TRIO, name=f"d{seed}") for seed in range(4)]
+    one, four = estimate_delays(drives[:1], THREE), estimate_delays(drives, THREE)
+    assert np.all(four.sd_s[1:] < 0.8 * one.sd_s[1:])
+    np.testing.assert_allclose(four.delay_s, [0.0, -0.23, -0.067], atol=4e-3)
+
+
+def test_what_is_taken_out_is_gone() -> None:
+    drive = made_up_drive(1, PAIR)
+    value, time_s = drive.branches["motor"].value.copy(), drive.branches["motor"].time_s.copy()
+    aligned = without_delays(drive, estimate_delays([drive], TWO).by_branch())
+    assert estimate_delays([aligned], TWO).delay_s[1] == pytest.approx(0.0, abs=1e-5)
+    np.testing.assert_array_equal(drive.branches["motor"].time_s, time_s)
+    np.testing.assert_array_equal(drive.branches["motor"].value, value)
+    assert aligned.branches["battery"].time_s.tolist() == drive.branches["battery"].time_s.tolist()
+
+
+def test_wild_samples_that_nobody_labelled_move_the_delay_little() -> None:
+    drive = made_up_drive(1, PAIR)
+    rng = np.random.default_rng(9)
+    spoilt = drive
+    for name in TWO:
+        value = drive.branches[name].value.copy()
+        value[rng.integers(0, len(value), 20)] = 650.0
+        spoilt = with_value(spoilt, name, value)
+    found = estimate_delays([spoilt], TWO)
+    assert found.known.all()
+    assert found.delay_s[1] == pytest.approx(0.187, abs=2e-3)
+
+
+def test_samples_labelled_as_bad_do_not_count() -> None:
+    drive = made_up_drive(1, PAIR)
+    motor = drive.branches["motor"]
+    bad = np.random.default_rng(9).random(len(motor.time_s)) < 0.1
+    labelled = replace(motor, value=np.where(bad, np.nan, motor.value), good=~bad)
+    found = estimate_delays([with_channel(drive, "motor", labelled)], TWO)
+    assert found.delay_s[1] == pytest.approx(0.187, abs=1e-3)
+
+
+def test_gaps_are_not_bridged() -> None:
+    drive = made_up_drive(1, PAIR)
+    motor = drive.branches["motor"]
+    kept = np.floor(motor.time_s / 20.0) % 3 != 0
+    cut = Channel(time_s=motor.time_s[kept], value=motor.value[kept], good=motor.good[kept])
+    found = estimate_delays([with_channel(drive, "motor", cut)], TWO)
+    assert found.known.all()
+    assert found.delay_s[1] == pytest.approx(0.187, abs=1e-3)
+
+
+def test_a_load_without_sensor_that_switches_does_not_matter() -> None:
+    drive = made_up_drive(1, PAIR)
+    battery = drive.branches["battery"]
+    load_a = 4.0 * (np.floor(battery.time_s / 17.0) % 2)
+    found = estimate_delays([with_value(drive, "battery", battery.value + load_a)], TWO)
+    assert found.delay_s[1] == pytest.approx(0.187, abs=2e-3)
+
+
+def test_a_sensor_whose_gain_depends_on_the_sign_does_not_matter() -> None:
+    drive = made_up_drive(1, replace(PAIR, offset_a={}))
+    value = drive.branches["motor"].value
+    found = estimate_delays([with_value(drive, "motor", np.where(value > 0.0, 1.15, 0.95) * value)], TWO)
+    assert found.delay_s[1] == pytest.approx(0.187, abs=3e-3)
+
+
+@pytest.mark.parametrize("branch", TWO)
+@pytest.mark.parametrize("noise_a", [0.0, 0.4])
+def test_a_branch_that_stands_still_is_flagged(branch: str, noise_a: float) -> None:
+    drive = made_up_drive(1, PAIR)
+    value = 12.0 + noise_a * np.random.default_rng(2).normal(size=len(drive.branches[branch].value))
+    assert_nothing_known(estimate_delays([with_value(drive, branch, value)], TWO))
+
+
+def test_a_constant_drive_tells_nothing() -> None:
+    drive = made_up_drive(1, replace(PAIR, size_a={"motor": 0.0}))
+    assert_nothing_known(estimate_delays([drive], TWO))
+
+
+def test_a_branch_lost_in_noise_is_flagged_and_the_others_are_still_found() -> None:
+    vehicle = replace(TRIO, size_a={"motor": 50.0, "auxiliary": 0.05})
+    found = estimate_delays([made_up_drive(2, vehicle)], THREE)
+    assert found.known.tolist() == [True, True, False]
+    assert found.delay_s[1] == pytest.approx(-0.23, abs=1e-3)
+    assert found.delay_s[2] == 0.0
+    assert np.isinf(found.sd_s[2])
+
+
+def test_a_delay_beyond_the_longest_is_flagged() -> None:
+    vehicle = replace(PAIR, delay_s={"motor": 0.3})
+    assert_nothing_known(estimate_delays([made_up_drive(1, vehicle)], TWO, max_delay_s=0.1))
+
+
+def test_a_branch_of_the_wrong_sign_is_flagged() -> None:
+    drive = made_up_drive(1, PAIR)
+    assert_nothing_known(estimate_delays([with_value(drive, "motor", -drive.branches["motor"].value)], TWO))
+
+
+def test_a_drive_too_short_or_without_good_samples_tells_nothing() -> None:
+    short = made_up_drive(1, replace(PAIR, duration_s=30.0))
+    assert_nothing_known(estimate_delays([short], TWO))
+    drive = made_up_drive(1, PAIR)
+    motor = drive.branches["motor"]
+    empty = with_channel(drive, "motor", replace(motor, good=np.zeros(len(motor.time_s), np.bool_)))
+    assert_nothing_known(estimate_delays([empty], TWO))
+    both = estimate_delays([empty, drive, short], TWO)
+    assert both.delay_s[1] == pytest.approx(0.187, abs=1e-3)
+
+
+def test_drives_or_branches_that_are_not_there_are_refused() -> None:
+    drive = made_up_drive(1, replace(PAIR, duration_s=1.0))
+    with pytest.raises(DriveError, match="no drive to estimate delays from"):
+        estimate_delays([], TWO)
+    with pytest.raises(DriveError, match="vehicle V1, drive d: no branch heater; it has battery, motor"):
+        estimate_delays([drive], ("battery", "heater"))
+    with pytest.raises(DriveError, match="choose at least two"):
+        estimate_delays([drive], ("battery",))
+    with pytest.raises(DriveError, match="no branch heater"):
+        without_delays(drive, {"heater": 0.1})
+
+
+def assert_nothing_known(found: BranchDelays) -> None:
+    assert found.known.tolist() == [True, False]
+    assert found.delay_s.tolist() == [0.0, 0.0]
+    assert found.sd_s.tolist() == [0.0, np.inf]
