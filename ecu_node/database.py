@@ -64,19 +64,26 @@ def read_database(layout: Layout) -> VehicleDatabase:
     Raises
     ------
     DatabaseError
-        If the file cannot be read or parsed, or lacks a message or signal; the message names both files.
+        If the file cannot be read or parsed, or lacks messages or a signal that the layout names.
     """
     path = layout.dbc_path
     try:
+        if not path.read_bytes().strip():
+            raise DatabaseError(f"{path}: the DBC is empty, it has no message; copy it again")
         database = cantools.database.load_file(path, strict=False)
         digest = file_digest(path)
     except OSError as error:
-        raise DatabaseError(f"{path}: cannot read the DBC that {layout.path} names: {error.strerror}") from None
+        raise DatabaseError(
+            f'{path}: cannot read the DBC: {error.strerror}; it is named by the line dbc = "{layout.dbc}" of '
+            f"{layout.path}"
+        ) from None
     except (cantools.Error, ValueError, KeyError, TypeError) as error:
         first_line = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise DatabaseError(f"{path}: not a CAN database: {first_line}") from None
     if not isinstance(database, Database):
         raise DatabaseError(f"{path}: a diagnostics database; a CAN database (DBC) is needed")
+    if not database.messages:
+        raise DatabaseError(f"{path}: the DBC has no message; check that it is the one that {layout.path} needs")
     vehicle = VehicleDatabase(layout=layout, database=database, digest=digest)
     _look_everything_up(vehicle)
     return vehicle

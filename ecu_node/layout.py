@@ -6,13 +6,14 @@ All later steps use the names given here; the DBC's own names appear nowhere els
 
 import hashlib
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, NoReturn
 
 import msgspec
 
 from ecu_node.errors import LayoutError
+from ecu_node.field_errors import field_error, toml_place
 from ecu_node.formula import formula_names, parse_formula
 
 __all__ = [
@@ -172,15 +173,17 @@ def read_layout(path: Path) -> Layout:
     """
     try:
         text = path.read_text(encoding="utf-8")
-        layout = msgspec.convert(tomllib.loads(text), Layout)
+        document = tomllib.loads(text)
     except OSError as error:
         raise LayoutError(f"{path}: cannot read the layout: {error.strerror}") from None
     except UnicodeDecodeError:
         raise LayoutError(f"{path}: not a layout: the file is not UTF-8 text") from None
     except tomllib.TOMLDecodeError as error:
         raise LayoutError(f"{path}: not TOML: {error}") from None
+    try:
+        layout = msgspec.convert(document, Layout)
     except msgspec.ValidationError as error:
-        raise LayoutError(f"{path}: {error}") from None
+        raise LayoutError(f"{path}: {field_error(error, document, Layout, toml_place)}; see docs/layout.md") from None
     _check(layout, path)
     return msgspec.structs.replace(layout, path=path, digest=file_digest(path))
 
@@ -203,26 +206,56 @@ def _check(layout: Layout, path: Path) -> None:
         raise LayoutError(f"{path}: {text}")
 
     names = [*layout.branch_names, *(item.name for item in layout.input), *(item.name for item in layout.derived)]
-    twice = sorted({name for name in names if names.count(name) > 1})
+    twice = _repeated(names)
     if twice:
         refuse(f"{', '.join(twice)} is named twice; branches, inputs and derived inputs need different names")
     for branch in layout.branch:
         _check_branch(branch, refuse)
     if sum(branch.balance for branch in layout.branch) > 1:
         refuse("more than one branch has 'balance = true'; at most one can take what the others leave")
+    _check_signals(layout, refuse)
+    _check_inputs(layout, refuse)
+    if layout.e2e is not None:
+        unknown = [name for name in layout.e2e.data_id if name not in layout.e2e.messages]
+        if unknown:
+            refuse(f"[e2e] data_id: {', '.join(unknown)} is not in 'messages'; add it there, or leave its data_id out")
+
+
+def _repeated(names: Sequence[str]) -> list[str]:
+    return sorted({name for name in names if names.count(name) > 1})
+
+
+def _check_signals(layout: Layout, refuse: Callable[[str], NoReturn]) -> None:
+    """Refuse one signal for two branches, for two outputs, or for both reading and writing."""
+    for name in _repeated([branch.source for branch in layout.branch]):
+        sharing = " and ".join(branch.name for branch in layout.branch if branch.source == name)
+        refuse(f"branches {sharing}: both read {name}; each branch needs a signal of its own")
+    outputs = [name for branch in layout.branch for name in (branch.corrected, branch.quality) if name is not None]
+    for name in _repeated(outputs):
+        writing = " and ".join(branch.name for branch in layout.branch if name in (branch.corrected, branch.quality))
+        refuse(f"branch {writing}: {name} is written twice; each 'corrected' and 'quality' needs a signal of its own")
+    read = {name for branch in layout.branch for name in (branch.signal, branch.power, branch.voltage)}
+    read |= {item.signal for item in layout.input}
+    for branch in layout.branch:
+        for output in (branch.corrected, branch.quality):
+            if output is not None and output in read:
+                refuse(f"branch {branch.name}: {output} is both read and written; give the output a signal of its own")
+
+
+def _check_inputs(layout: Layout, refuse: Callable[[str], NoReturn]) -> None:
     known = {item.name for item in layout.input}
     for item in layout.derived:
-        unknown = [name for name in formula_names(parse_formula(item.formula)) if name not in known]
+        try:
+            names = formula_names(parse_formula(item.formula))
+        except LayoutError as error:
+            refuse(f"derived input {item.name}: {error}")
+        unknown = [name for name in names if name not in known]
         if unknown:
             refuse(f"derived input {item.name}: {', '.join(unknown)} is no input or derived input declared above it")
         known.add(item.name)
     unknown = [name for name in layout.model_inputs if name not in known]
     if unknown:
         refuse(f"model_inputs: {', '.join(unknown)} is no [[input]] or [[derived]]")
-    if layout.e2e is not None:
-        unknown = [name for name in layout.e2e.data_id if name not in layout.e2e.messages]
-        if unknown:
-            refuse(f"[e2e] data_id: {', '.join(unknown)} is not in 'messages'; add it there, or leave its data_id out")
 
 
 def _check_branch(branch: Branch, refuse: Callable[[str], NoReturn]) -> None:

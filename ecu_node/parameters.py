@@ -13,6 +13,7 @@ import msgspec
 
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError
+from ecu_node.field_errors import field_error, quoted_place
 from ecu_node.status import Reason
 
 __all__ = [
@@ -140,14 +141,25 @@ def read_parameters(path: Path) -> VehicleParameters:
             raise UnfitError(
                 Reason.MALFORMED_PARAMETERS, f"{path}: larger than {MAX_FILE_BYTES} bytes; not a parameter file"
             )
-        return msgspec.json.decode(path.read_bytes(), type=VehicleParameters)
+        content = path.read_bytes()
     except OSError as error:
         raise UnfitError(Reason.NO_PARAMETERS, f"{path}: cannot read the parameter file: {error.strerror}") from None
+    try:
+        return msgspec.json.decode(content, type=VehicleParameters)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise UnfitError(
             Reason.MALFORMED_PARAMETERS,
-            f"{path}: not a parameter file: {error}; write it anew with 'calibrator calibrate'",
+            f"{path}: not a parameter file: {_why_not(error, content)}; write it anew with 'calibrator calibrate'",
         ) from None
+
+
+def _why_not(error: Exception, content: bytes) -> str:
+    if not isinstance(error, msgspec.ValidationError):
+        return str(error)
+    try:
+        return field_error(error, msgspec.json.decode(content), VehicleParameters, quoted_place)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return str(error)
 
 
 def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:

@@ -263,8 +263,9 @@ def test_the_answer_is_can_fd_where_the_source_is(make_database: MakeDatabase) -
     assert (answer.fd, answer.bitrate_switch) == (True, True)
 
 
-LOOP = ("PairOut.Motor", "Pair.Motor")
-INPUT = '\ninput = [{ name = "x", signal = "PairOut.Quality" }]\n'
+LOOP = ("PairOut.Motor", "Pair.Spare")
+SPARE = (" SG_ Battery", ' SG_ Spare : 48|16@1- (1,0) [0|0] "A" Node\n SG_ Battery')
+INPUT = '\ninput = [{ name = "x", signal = "PairOut.Spare" }]\n'
 OWN_STATUS = '\n[status]\nmessage = "Own"\nstate = "State"\nreason = "Reason"\n'
 OTHER_SENDER = (
     SMALL_DBC.replace("Node Corrector", "Node Corrector Other")
@@ -279,8 +280,8 @@ STATUS_TABLE = '\n[status]\nmessage = "PairOut"\nstate = "Quality"\nreason = "Ba
 @pytest.mark.parametrize(
     ("layout", "dbc", "words"),
     [
-        (SMALL_LAYOUT.replace(*LOOP), SMALL_DBC, "Pair would be both received and sent"),
-        (SMALL_LAYOUT + INPUT, SMALL_DBC, "PairOut would be both received and sent"),
+        (SMALL_LAYOUT.replace(*LOOP), SMALL_DBC.replace(*SPARE), "Pair would be both received and sent"),
+        (SMALL_LAYOUT + INPUT, SMALL_DBC.replace(*SPARE), "PairOut would be both received and sent"),
         (SMALL_LAYOUT, SMALL_DBC.replace("8 Corrector", "8 Node"), r"small\.dbc has PairOut by Node; all corrected"),
         (SMALL_LAYOUT, SMALL_DBC + "BO_TX_BU_ 512 : Corrector,Node;\n", "PairOut by Corrector, PairOut by Node; all"),
         (SMALL_LAYOUT + OWN_STATUS, OTHER_SENDER, "PairOut by Corrector, Own by Other; all corrected values and the"),

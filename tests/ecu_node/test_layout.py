@@ -46,12 +46,18 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
     ("old", "new", "words"),
     [
         ("schema = 1", "schema = 2", "schema"),
-        ('name = "small"', 'name = "small"\nextra = 1', "unknown field `extra`"),
+        ('name = "small"', 'name = "small"\nextra = 1', "unknown key 'extra'; allowed are schema, name"),
         ("full_scale_a = 400.0", "full_scale_a = -1.0", "full_scale_a"),
-        ("full_scale_a = 400.0", "", "missing required field `full_scale_a`"),
+        ("full_scale_a = 400.0", "", "'full_scale_a' is missing"),
         ("full_scale_a = 400.0", "full_scale_a = 4 00", "not TOML"),
         ('name = "battery", sign = 1', 'name = "battery", sign = 2', "sign"),
-        ('"Pair.Battery"', '"Battery"', "signal"),
+        (
+            '"Pair.Battery"',
+            '"Battery"',
+            r"\[\[branch\]\] 'battery', signal: 'Message.Signal' as in the DBC is",
+        ),
+        ("sign = 1", "sign = 1, timout_s = 1", "'battery': unknown key 'timout_s'; did you mean 'timeout_s'"),
+        ("sign = 1", 'sign = 1, timeout_s = "x"', "'battery', timeout_s: a number is expected, found \"x\""),
         ('name = "battery"', 'name = "motor"', "motor is named twice"),
         (BATTERY, BATTERY + ', power = "Heater.Power"', "branch battery: give either 'signal'"),
         (', voltage = "Net.Voltage"', "", "branch heater: give either 'signal'"),
@@ -65,15 +71,57 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
         ),
         ("full_scale_a", 'model_inputs = ["speed"]\nfull_scale_a', "model_inputs: speed is no"),
         ("full_scale_a", 'derived = [{ name = "d", formula = "speed * 2" }]\nfull_scale_a', "speed is no input"),
-        ("full_scale_a", 'derived = [{ name = "d", formula = "open(1)" }]\nfull_scale_a', "not allowed"),
+        (
+            "full_scale_a",
+            'derived = [{ name = "d", formula = "open(1)" }]\nfull_scale_a',
+            "input d: .*not allowed",
+        ),
+        (
+            "full_scale_a",
+            'derived = [{ name = "d", formula = "a b" }]\nfull_scale_a',
+            "input d: .*not arithmetic",
+        ),
     ],
 )
 def test_a_layout_with_a_mistake_is_refused(make_database: MakeDatabase, old: str, new: str, words: str) -> None:
     assert old in SMALL_LAYOUT
     with pytest.raises(LayoutError, match=words) as caught:
         make_database(SMALL_LAYOUT.replace(old, new))
-    assert "small.toml: " in str(caught.value) or "formula" in str(caught.value)
+    assert "small.toml: " in str(caught.value)
+    assert "$" not in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"Pair.Motor"', '"Pair.Battery"', "branches battery and motor: both read Pair.Battery"),
+        ('"PairOut.Motor"', '"PairOut.Battery"', "branch battery and motor: PairOut.Battery is written twice"),
+        ('"PairOut.Motor"', '"PairOut.Quality"', "branch battery and motor: PairOut.Quality is written twice"),
+        ('quality = "PairOut.Quality"', 'quality = "PairOut.Battery"', "branch battery: PairOut.Battery is written"),
+        ('"PairOut.Motor"', '"Pair.Motor"', "branch motor: Pair.Motor is both read and written"),
+        ('"PairOut.Motor"', '"Heater.Power"', "branch motor: Heater.Power is both read and written"),
+        ('"PairOut.Motor"', '"Net.Voltage"', "branch motor: Net.Voltage is both read and written"),
+        (
+            "full_scale_a",
+            'input = [{ name = "x", signal = "PairOut.Quality" }]\nfull_scale_a',
+            "branch battery: PairOut.Quality is both read and written",
+        ),
+    ],
+)
+def test_one_signal_in_two_roles_is_refused(make_database: MakeDatabase, old: str, new: str, words: str) -> None:
+    assert old in SMALL_LAYOUT
+    with pytest.raises(LayoutError, match=rf"small\.toml: {words}"):
+        make_database(SMALL_LAYOUT.replace(old, new))
+
+
+def test_two_power_branches_may_share_a_voltage(make_database: MakeDatabase) -> None:
+    layout = SMALL_LAYOUT.replace(
+        "\n]\n", '\n{ name = "cooler", sign = -1, power = "Net.Cooling", voltage = "Net.Voltage" },\n]\n'
+    )
+    cooling = ' SG_ Voltage : 0|16@1+ (0.01,0) [0|650] "V" Node\n SG_ Cooling : 16|8@1+ (1,0) [0|0] "W" Node\n'
+    dbc = SMALL_DBC.replace("Net: 2", "Net: 3").replace(' SG_ Voltage : 0|16@1+ (0.01,0) [0|650] "V" Node\n', cooling)
+    assert make_database(layout, dbc).layout.branch_names[-1] == "cooler"
 
 
 def test_two_balancing_branches_are_refused(make_database: MakeDatabase) -> None:
@@ -100,7 +148,8 @@ def test_a_layout_file_that_cannot_be_read_is_named(tmp_path: Path, content: byt
         (SMALL_DBC.replace('"V" Node', '"A" Node'), "branch heater: signal Voltage is in 'A'; expected V, mV, kV"),
         (SMALL_DBC.replace('"W" Node', '"V" Node'), "branch heater: signal Power is in 'V'; expected W"),
         ("this is no dbc", "small.dbc: not a CAN database"),
-        ("", "small.dbc: not a CAN database"),
+        ("", "small.dbc: the DBC is empty, it has no message"),
+        ('VERSION ""\n', "small.dbc: the DBC has no message; check that it is the one that .*small.toml needs"),
     ],
 )
 def test_a_dbc_that_lacks_what_the_layout_names_is_refused(make_database: MakeDatabase, dbc: str, words: str) -> None:
@@ -111,7 +160,7 @@ def test_a_dbc_that_lacks_what_the_layout_names_is_refused(make_database: MakeDa
 
 def test_a_missing_dbc_is_named_with_its_layout(tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
-    with pytest.raises(DatabaseError, match=r"small\.dbc: cannot read the DBC that .*small\.toml names: No such file"):
+    with pytest.raises(DatabaseError, match=r'small\.dbc: .* No such file .* line dbc = "small\.dbc" of .*\.toml$'):
         read_database(read_layout(tmp_path / "small.toml"))
 
 

@@ -245,8 +245,36 @@ def test_a_file_must_say_of_each_branch_whether_it_is_applied(database: VehicleD
     document = as_document(parameters_for(database, battery=(0.1, 1.0)))
     del document["branches"]["battery"]["apply"]
     (tmp_path / "p.json").write_text(json.dumps(document))
-    with pytest.raises(UnfitError, match="missing required field `apply`"):
+    with pytest.raises(UnfitError, match="'branches', 'battery': 'apply' is missing"):
         read_parameters(tmp_path / "p.json")
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        (("branches", "motor", "drift"), "x", "'branches', 'motor', 'drift': a number is expected, found \"x\""),
+        (("branches", "motor", "drift"), 2, "'branches', 'motor', 'drift': a number < 1.0 is expected, found 2;"),
+        (("branches", "motor", "drifts"), 0, "'branches', 'motor': unknown key 'drifts'; did you mean 'drift'"),
+        (("hardware_fault", "offset_a"), {"b": 1, "c": True}, "'offset_a', 'c': a number is expected, found true"),
+        (("verdict",), "fine", "'verdict': 'cannot tell' or .* is expected, found \"fine\""),
+        (("provenance", "drives"), [1], "'provenance', 'drives', entry number 1: a text is expected, found 1"),
+        (("dbc", "sha256"), "abc", "'dbc', 'sha256': a text of 64 digits 0-9 and a-f is expected, found \"abc\""),
+    ],
+)
+def test_a_wrong_field_is_named_with_its_place_and_value(
+    database: VehicleDatabase, tmp_path: Path, place: tuple[str, ...], value: object, words: str
+) -> None:
+    document = as_document(parameters_for(database, battery=(0.1, 1.0), motor=(0.1, 1.0)))
+    *outer, last = place
+    table = document
+    for key in outer:
+        table = table[key]
+    table[last] = value
+    (tmp_path / "p.json").write_text(json.dumps(document))
+    with pytest.raises(UnfitError, match=words) as caught:
+        read_parameters(tmp_path / "p.json")
+    assert "$" not in str(caught.value)
+    assert "`" not in str(caught.value)
 
 
 @pytest.mark.parametrize("verdict", ["cannot tell", "not enough data"])
