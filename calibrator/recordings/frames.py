@@ -33,6 +33,13 @@ MAX_DAMAGED_SHARE = 0.05
 BLOCK_BYTES = 1 << 23
 """Text parsed at a time: bounds the memory, large enough for the array operations."""
 
+_TEXT_SUFFIXES = (".asc", ".trc")
+"""Text formats; not .log, because broken lines of candump logs are counted and left out."""
+_NO_TEXT = frozenset(range(32)) - frozenset(b"\t\n\v\f\r\x1a")
+"""Control characters; the last one kept ends text files of old systems."""
+_LOOKED_AT = 4096
+"""Bytes: of random ones, a tenth are control characters."""
+
 _UNREADABLE = (OSError, EOFError, zlib.error)
 """What opening and unpacking may raise; gzip.BadGzipFile is an OSError."""
 
@@ -66,6 +73,7 @@ def read_frames(path: Path) -> Frames:
     if not path.is_file():
         raise LogError(f"{path}: no such file")
     try:
+        _require_text(path)
         with _quiet() as complaints:
             frames = reader(path)
     except _UNREADABLE as error:
@@ -76,6 +84,15 @@ def read_frames(path: Path) -> Frames:
             f"remote frames, {frames.damaged} damaged lines); record it again"
         )
     return replace(frames, damaged=frames.damaged + len(complaints))
+
+
+def _require_text(path: Path) -> None:
+    """Refuse binary data under a name of text, of which python-can skips whatever it does not know."""
+    if _suffix(path) not in _TEXT_SUFFIXES:
+        return
+    with _open(path) as file:
+        if _NO_TEXT.intersection(file.read(_LOOKED_AT)):
+            raise LogError(f"{path}: not a {_suffix(path)} log but binary data; give the file the suffix of its format")
 
 
 def _suffix(path: Path) -> str:
