@@ -8,13 +8,23 @@ from pathlib import Path
 
 from calibrator.errors import FleetError
 
-__all__ = ["require_new_folder", "whole_folder"]
+__all__ = ["require_new_folder", "require_possible_folder", "whole_folder"]
+
+
+def require_possible_folder(out: Path) -> None:
+    """Raise FleetError, before any work is done, if a folder neither exists nor can be made."""
+    nearest = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    if not nearest.is_dir():
+        raise FleetError(f"{out}: cannot be made: {nearest} is a file; choose another folder")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise FleetError(f"{out}: cannot be written: no right to write into {nearest}; choose another folder")
 
 
 def require_new_folder(out: Path) -> None:
-    """Raise FleetError if a folder to be written exists and holds something."""
+    """Raise FleetError if a folder to be written exists and holds something, or cannot be made."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FleetError(f"{out}: exists and is not empty; choose another --out or remove it")
+    require_possible_folder(out)
 
 
 @contextmanager
@@ -44,7 +54,7 @@ def whole_folder(out: Path) -> Iterator[Path]:
         _remove_abandoned(out)
         partial.mkdir()
     except OSError as error:
-        raise FleetError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
+        raise FleetError(f"{out}: cannot be made: {error.strerror}; choose another folder") from None
     try:
         yield partial
         if out.exists():

@@ -4,16 +4,19 @@
 import json
 import sys
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from calibrator.drives.store import require_plain_name, write_drive
+from calibrator.drives.store import has_drive, require_plain_name, write_drive
 from calibrator.errors import LogError
+from calibrator.folders import require_possible_folder
 from calibrator.recordings.bmw_i3 import BRANCHES, INPUTS, ImportedTrip, trip_from_table
 from calibrator.recordings.csv_table import read_csv_table
 from calibrator.recordings.drive_log import write_drive_log
+from calibrator.recordings.signal_range import signal_ranges
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.layout import read_layout
@@ -21,29 +24,58 @@ from ecu_node.layout import read_layout
 _SUFFIXES = (".csv", ".csv.gz")
 
 
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.command()
 def main(
     *,
     csv: Annotated[list[Path], typer.Argument(help="CSV files (.csv, .csv.gz), or folders of them.")],
     layout: Annotated[Path, typer.Option(help="Layout with the branches battery, motor and auxiliary.")],
-    out: Annotated[Path, typer.Option(help="Drive store to write to.")],
+    out: Annotated[Path, typer.Option(help="Drive store to write to; trips that it has stay as they are.")],
     logs: Annotated[Path | None, typer.Option(help="Write CAN logs into this folder too: VEHICLE/TRIP.log.gz.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the account as JSON.")] = False,
 ) -> None:
     """Turn recordings of a BMW i3 into drives; each file becomes a vehicle named after it."""
-    failed: dict[str, str] = {}
-    done: dict[str, ImportedTrip] = {}
+    account = Account()
     try:
+        for folder in (out, logs):
+            if folder is not None:
+                require_possible_folder(folder)
         database = read_database(read_layout(layout))
         _require_names(database)
         for name, paths in _trips(csv).items():
             try:
-                done[name] = _import_trip(name, paths, database, out, logs)
+                trip = _import_trip(name, paths, database, out, logs)
             except UserError as error:
-                failed[name] = str(error)
+                account.failed[name] = str(error)
+            else:
+                account.take(name, trip)
     except UserError as error:
-        failed[""] = str(error)
-    _print_account(done, failed, as_json=as_json)
-    raise typer.Exit(1 if failed else 0)
+        account.failed[""] = str(error)
+    _print_account(account, as_json=as_json)
+    raise typer.Exit(1 if account.failed else 0)
+
+
+@dataclass(kw_only=True)
+class Account:
+    """What became of each trip."""
+
+    done: dict[str, ImportedTrip] = field(default_factory=dict)
+    already_there: list[str] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def take(self, name: str, trip: ImportedTrip | None) -> None:
+        """Count a trip that was imported now, or before (None)."""
+        if trip is None:
+            self.already_there.append(name)
+        else:
+            self.done[name] = trip
 
 
 def _require_names(database: VehicleDatabase) -> None:
@@ -68,37 +100,57 @@ def _trips(arguments: Iterable[Path]) -> dict[str, list[Path]]:
     return trips
 
 
-def _import_trip(name: str, paths: list[Path], database: VehicleDatabase, out: Path, logs: Path | None) -> ImportedTrip:
+def _import_trip(
+    name: str, paths: list[Path], database: VehicleDatabase, out: Path, logs: Path | None
+) -> ImportedTrip | None:
+    """Import what is missing of drive and log; None if nothing is."""
     if len(paths) > 1:
         raise LogError(f"two files for one trip: {' and '.join(map(str, paths))}; remove or rename one")
     require_plain_name(name, f"{paths[0]}: the file's name, which names the trip,")
+    log = None if logs is None else logs / name / f"{name}.log.gz"
+    in_store = has_drive(out, name, name, database.layout)
+    if in_store and (log is None or log.exists()):
+        return None
     table = read_csv_table(paths[0], delimiter=";", encoding="latin-1")
-    trip = trip_from_table(table, vehicle=name, name=name)
-    write_drive(out, trip.drive, database.layout)
-    if logs is not None:
-        write_drive_log(logs / name / f"{name}.log.gz", trip.drive, database)
+    trip = trip_from_table(table, vehicle=name, name=name, ranges=signal_ranges(database))
+    if not in_store:
+        write_drive(out, trip.drive, database.layout)
+    if log is not None and not log.exists():
+        _write_log(log, trip, database)
     return trip
 
 
-def _print_account(done: dict[str, ImportedTrip], failed: dict[str, str], *, as_json: bool) -> None:
+def _write_log(path: Path, trip: ImportedTrip, database: VehicleDatabase) -> None:
+    try:
+        write_drive_log(path, trip.drive, database)
+    except OSError as error:
+        raise LogError(f"{path}: cannot write the log: {error.strerror}; choose another --logs") from None
+
+
+def _print_account(account: Account, *, as_json: bool) -> None:
+    done, failed = account.done, account.failed
     duration_h = sum(trip.drive.duration_s for trip in done.values()) / 3600.0
     if as_json:
-        account = {
+        values = {
             "drives": {
                 name: {"duration_s": trip.drive.duration_s, "notices": trip.notices} for name, trip in done.items()
             },
+            "already_there": account.already_there,
             "failed": failed,
         }
-        typer.echo(json.dumps(account, indent=2))
+        typer.echo(json.dumps(values, indent=2))
     else:
         for name, trip in done.items():
             for notice in trip.notices:
                 typer.echo(f"{name}: {notice}")
-        typer.echo(f"{len(done)} trips imported, {duration_h:.1f} h; {len(failed)} left out")
+        typer.echo(
+            f"{len(done)} trips imported, {duration_h:.1f} h; {len(account.already_there)} already there; "
+            f"{len(failed)} left out"
+        )
         typer.echo("motor is minus the sum of battery and auxiliary: not independent of the battery's sensor")
     for text in failed.values():
         print(f"import_bmw_i3: {text}", file=sys.stderr)
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    app()

@@ -9,7 +9,9 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,7 +23,7 @@ from ecu_node.errors import UserError
 from ecu_node.layout import Layout, file_digest
 from ecu_node.parameters import write_atomically
 
-__all__ = ["iterate_drives", "list_drives", "read_drive_file", "require_plain_name", "write_drive"]
+__all__ = ["has_drive", "iterate_drives", "list_drives", "read_drive_file", "require_plain_name", "write_drive"]
 
 SCHEMA_VERSION = 1
 _FOLDER = "drives"
@@ -86,7 +88,7 @@ def write_drive(store: Path, drive: Drive, layout: Layout) -> Path:
     """
     require_plain_name(drive.vehicle, "vehicle")
     require_plain_name(drive.name, f"vehicle {drive.vehicle}: drive")
-    path = store / _FOLDER / drive.vehicle / f"{drive.name}.parquet"
+    path = _path(store, drive.vehicle, drive.name)
     buffer = io.BytesIO()
     pq.write_table(_table(drive, layout), buffer, compression="zstd", use_dictionary=False)
     try:
@@ -95,6 +97,36 @@ def write_drive(store: Path, drive: Drive, layout: Layout) -> Path:
     except OSError as error:
         raise DriveError(f"{path}: cannot write the drive: {error.strerror}; choose another folder") from None
     return path
+
+
+def has_drive(store: Path, vehicle: str, name: str, layout: Layout) -> bool:
+    """Whether a store has a drive already.
+
+    Parameters
+    ----------
+    store : Path
+        Folder of the store; there need not be one.
+    vehicle, name : str
+        Whose drive, and which.
+    layout : Layout
+        The layout it must have been made with.
+
+    Returns
+    -------
+    bool
+        True if it is there and was made with this layout and DBC.
+
+    Raises
+    ------
+    DriveError
+        If it is there, but is damaged or was made with another layout or DBC.
+    """
+    path = _path(store, vehicle, name)
+    if not path.exists():
+        return False
+    with _reading(path):
+        _check_identity(_about(pq.read_schema(path)), path, layout)
+    return True
 
 
 def list_drives(store: Path) -> list[DriveFile]:
@@ -175,22 +207,42 @@ def read_drive_file(path: Path, layout: Layout) -> Drive:
     DriveError
         If the file is cut, no drive, of another version, or was made with another layout.
     """
-    try:
+    with _reading(path):
         table = pq.read_table(io.BytesIO(path.read_bytes()))
-        about = json.loads((table.schema.metadata or {})[_METADATA])
+        about = _about(table.schema)
         _check_identity(about, path, layout)
         rows = {(kind, name): channel for kind, name, channel in _channels(table)}
         vehicle, name = str(about["vehicle"]), str(about["drive"])
-    except OSError as error:
-        raise DriveError(f"{path}: cannot read the drive: {error.strerror or 'damaged'}; import it again") from None
-    except (pa.ArrowException, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise DriveError(f"{path}: not a drive: {str(error).splitlines()[0][:120]}; import it again") from None
     return Drive(
         vehicle=vehicle,
         name=name,
         branches={key: channel for (kind, key), channel in rows.items() if kind == "branch"},
         inputs={key: channel for (kind, key), channel in rows.items() if kind == "input"},
     )
+
+
+def _path(store: Path, vehicle: str, name: str) -> Path:
+    return store / _FOLDER / vehicle / f"{name}.parquet"
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """What a damaged file makes pyarrow raise becomes a DriveError."""
+    try:
+        yield
+    except OSError as error:
+        raise DriveError(
+            f"{path}: cannot read the drive: {error.strerror or 'damaged'}; remove it and import it again"
+        ) from None
+    except (pa.ArrowException, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DriveError(
+            f"{path}: not a drive: {str(error).splitlines()[0][:120]}; remove it and import it again"
+        ) from None
+
+
+def _about(schema: pa.Schema) -> dict[str, Any]:
+    about: dict[str, Any] = json.loads((schema.metadata or {})[_METADATA])
+    return about
 
 
 def _table(drive: Drive, layout: Layout) -> pa.Table:

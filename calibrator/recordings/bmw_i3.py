@@ -15,6 +15,7 @@ Known faults of the recordings, found in the data and labelled:
 
 * heater power reads exactly 5.52 kW for single seconds (a default of the signal), often at the end of a straight
   line of up to ten seconds that comes from interpolation over a gap;
+* a value beyond the range of its signal in the DBC: no frame could have carried it;
 * heater power that does not flow: with the inverter idle, battery power minus heater minus air conditioning is what the
   DC/DC converter takes; in sound trips its median is 330 W or more, in trips with a stuck heater signal below 100 W.
 """
@@ -27,6 +28,7 @@ import numpy as np
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.errors import DriveError
 from calibrator.recordings.csv_table import CsvTable
+from calibrator.recordings.signal_range import SignalRange
 
 __all__ = ["BRANCHES", "COLUMNS", "INPUTS", "ImportedTrip", "trip_from_table"]
 
@@ -59,6 +61,8 @@ IMPOSSIBLE_JUMP_KW = 3.0
 NEAR_DEFAULT_KW = 0.6
 """One sample of an interpolation over one second, from the default to zero."""
 _HEATER_CHANNELS = "auxiliary, motor and heater_demand"
+_MADE_OF = {"auxiliary": ("voltage", "heater_demand", "aircon_demand"), "motor": ("battery", "auxiliary")}
+"""Branches that are computed, in this order, and from what: good only where all of that is."""
 _JUDGED_SAMPLES = 100
 """10 s with the inverter idle suffice to judge the heater signal."""
 
@@ -79,7 +83,7 @@ class ImportedTrip:
     notices: tuple[str, ...]
 
 
-def trip_from_table(table: CsvTable, *, vehicle: str, name: str) -> ImportedTrip:
+def trip_from_table(table: CsvTable, *, vehicle: str, name: str, ranges: Mapping[str, SignalRange]) -> ImportedTrip:
     """Turn one file into a drive.
 
     Parameters
@@ -88,6 +92,8 @@ def trip_from_table(table: CsvTable, *, vehicle: str, name: str) -> ImportedTrip
         The file.
     vehicle, name : str
         Identity of vehicle and drive.
+    ranges : mapping of str to SignalRange
+        What the DBC allows, by branch and input; a channel without one may have any value.
 
     Returns
     -------
@@ -99,7 +105,7 @@ def trip_from_table(table: CsvTable, *, vehicle: str, name: str) -> ImportedTrip
     LogError
         If a column is missing, a cell is not a number, or time does not increase.
     DriveError
-        If the file is too short.
+        If the file is too short, or the battery current, of which the motor's is made, has no usable value.
     """
     columns = {key: table.numbers(header) for key, header in COLUMNS.items()}
     table.require_increasing(COLUMNS["time"])
@@ -112,11 +118,14 @@ def trip_from_table(table: CsvTable, *, vehicle: str, name: str) -> ImportedTrip
         for key, values in columns.items()
         if (bad := ~np.isfinite(values)).any()
     ]
-    heater_good = _heater_good(columns, notices)
     values = _values(columns)
     good = {key: np.isfinite(value) for key, value in values.items()}
-    for key in ("auxiliary", "motor", "heater_demand"):
-        good[key] &= heater_good
+    good["heater_demand"] &= _heater_good(columns, notices)
+    _label_ranges(values, good, ranges, notices)
+    for key, sources in _MADE_OF.items():
+        good[key] &= np.logical_and.reduce([good[source] for source in sources])
+    if not good["battery"].any():
+        raise DriveError(f"{table.where}: column '{COLUMNS['current']}' has no usable value; leave the file out")
     channels = {key: Channel(time_s=time_s, value=value, good=good[key]) for key, value in values.items()}
     drive = Drive(
         vehicle=vehicle,
@@ -142,6 +151,22 @@ def _values(columns: Mapping[str, Array]) -> dict[str, Array]:
         "aircon_demand": aircon_w,
         **{key: columns[key] for key in ("torque", "speed", "acceleration", "accelerator")},
     }
+
+
+def _label_ranges(
+    values: Mapping[str, Array], good: Mapping[str, Mask], ranges: Mapping[str, SignalRange], notices: list[str]
+) -> None:
+    """Label what the DBC does not allow."""
+    for key, limits in ranges.items():
+        if key not in values:
+            continue
+        beyond = good[key] & ~limits.holds(values[key])
+        if beyond.any():
+            good[key][beyond] = False
+            notices.append(
+                f"{key}: {np.sum(beyond)} samples beyond the DBC's {limits.low:g} to {limits.high:g}; "
+                f"labelled as not good"
+            )
 
 
 def _heater_good(columns: Mapping[str, Array], notices: list[str]) -> Mask:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array
 from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import write_atomically
 
 __all__ = ["FrameSeries", "encode_message", "write_candump"]
 
@@ -118,7 +119,7 @@ def write_candump(path: Path, series: Iterable[FrameSeries], *, start_s: float =
         with gzip.GzipFile(fileobj=buffer, mode="wb", compresslevel=1, mtime=0) as file:
             file.write(content)
         content = buffer.getvalue()
-    path.write_bytes(content)
+    write_atomically(path, content)
     return len(lines)
 
 

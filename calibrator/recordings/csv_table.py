@@ -111,7 +111,8 @@ def read_csv_table(path: Path, *, delimiter: str, encoding: str) -> CsvTable:
     lines = text.splitlines()
     kept = [number for number, line in enumerate(lines, start=1) if line.strip()]
     if len(kept) <= _HEADER_LINES:
-        raise LogError(f"{path}: the file is empty; expected a header and lines of numbers separated by '{delimiter}'")
+        found = f"only one line, of {len(lines[kept[0] - 1])} characters" if kept else "the file is empty"
+        raise LogError(f"{path}: {found}; expected a header and lines of numbers separated by '{delimiter}'")
     cells = [[cell.strip() for cell in lines[number - 1].split(delimiter)] for number in kept]
     header, rows = cells[0], cells[_HEADER_LINES:]
     cut = next((row for row, line in enumerate(rows) if len(line) < len(header)), None)

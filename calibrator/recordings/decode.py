@@ -16,6 +16,7 @@ from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
+from calibrator.recordings.signal_range import signal_range
 from ecu_node.errors import DatabaseError
 
 __all__ = ["Decoded", "decode_signal", "means_not_available", "raw_values"]
@@ -24,8 +25,6 @@ Raw = NDArray[np.int64] | NDArray[np.uint64] | NDArray[np.float64]
 
 _WORD_BITS = 64
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
-_RANGE_SLACK = 1e-6
-"""Rounding of decimal scales must not push a value out of its range. [steps of the signal]"""
 _NOT_AVAILABLE = re.compile(
     r"(signal |value |data )?"
     r"(sna|snv|na|n a|not available|unavailable|invalid|not valid|error|not defined|undefined|init)"
@@ -78,8 +77,16 @@ def decode_signal(message: Message, signal: Signal, data: NDArray[np.uint8], len
     """
     present, known = _presence(message, signal, data, length)
     raw, complete = raw_values(signal, data, length)
-    value = np.where(complete, raw.astype(np.float64) * float(signal.scale) + float(signal.offset), np.nan)
-    good = present & known & complete & np.isfinite(value) & ~_is_named_bad(signal, raw) & _in_range(signal, value)
+    with np.errstate(invalid="ignore"):  # a signalling NaN in a float signal
+        value = np.where(complete, raw.astype(np.float64) * float(signal.scale) + float(signal.offset), np.nan)
+    good = (
+        present
+        & known
+        & complete
+        & np.isfinite(value)
+        & ~_is_named_bad(signal, raw)
+        & signal_range(signal).holds(value)
+    )
     return Decoded(value=value, present=present, good=good)
 
 
@@ -191,16 +198,3 @@ def _is_named_bad(signal: Signal, raw: Raw) -> Mask:
         else:
             bad |= raw.view(np.uint64) & np.uint64(mask) == np.uint64(int(code) & mask)
     return bad
-
-
-def _in_range(signal: Signal, value: Array) -> Mask:
-    low, high = signal.minimum, signal.maximum
-    inside = np.ones(len(value), np.bool_)
-    if not low and not high:
-        return inside
-    slack = abs(float(signal.scale)) * _RANGE_SLACK
-    if low is not None:
-        inside &= value >= float(low) - slack
-    if high is not None:
-        inside &= value <= float(high) + slack
-    return inside

@@ -13,6 +13,7 @@ from calibrator.errors import DriveError, LogError
 from calibrator.recordings.bmw_i3 import COLUMNS, ImportedTrip, trip_from_table
 from calibrator.recordings.csv_table import read_csv_table
 from calibrator.recordings.readers import read_drive
+from calibrator.recordings.signal_range import signal_ranges
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 
@@ -20,6 +21,7 @@ ROOT = Path(__file__).parents[2]
 LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
 SAMPLES = 600
 IDLE_W = 500.0
+RANGES = signal_ranges(read_database(read_layout(LAYOUT)))
 
 
 def columns() -> dict[str, Array]:
@@ -50,7 +52,8 @@ def write_csv(path: Path, values: dict[str, Array]) -> Path:
 
 
 def imported(path: Path) -> ImportedTrip:
-    return trip_from_table(read_csv_table(path, delimiter=";", encoding="latin-1"), vehicle="v", name="d")
+    table = read_csv_table(path, delimiter=";", encoding="latin-1")
+    return trip_from_table(table, vehicle="v", name="d", ranges=RANGES)
 
 
 def with_text(path: Path, old: str, new: str, line: int) -> Path:
@@ -151,6 +154,9 @@ def test_an_empty_or_cut_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty.csv").touch()
     with pytest.raises(LogError, match="the file is empty"):
         imported(tmp_path / "empty.csv")
+    (tmp_path / "line.csv").write_text("1;2;" * 1000)
+    with pytest.raises(LogError, match=r"line\.csv: only one line, of 4000 characters; expected a header"):
+        imported(tmp_path / "line.csv")
     path = write_csv(tmp_path / "cut.csv.gz", columns())
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(LogError, match=r"cut\.csv\.gz: cannot be read"):
@@ -170,7 +176,7 @@ def test_one_bad_file_does_not_stop_the_others_and_the_exit_code_says_so(tmp_pat
     assert len(errors) == 2
     assert "two files for one trip" in errors[0]
     assert "C.csv: there is no column 'Time [s]'" in errors[1]
-    assert "1 trips imported, 0.0 h; 2 left out" in done.stdout
+    assert "1 trips imported, 0.0 h; 0 already there; 2 left out" in done.stdout
 
 
 def test_the_log_holds_what_the_drive_holds(tmp_path: Path) -> None:
@@ -198,3 +204,63 @@ def test_a_layout_without_these_branches_is_refused(tmp_path: Path) -> None:
     done = run(path, "--layout", tmp_path / "l.toml", "--out", tmp_path / "store")
     assert done.returncode == 1
     assert "no branch or input named auxiliary" in done.stderr
+
+
+def test_values_beyond_the_range_of_the_dbc_are_labelled_with_what_is_computed_from_them(tmp_path: Path) -> None:
+    values = columns()
+    values["current"][100] = -2000.0
+    values["voltage"][200] = 1500.0
+    values["accelerator"][300] = 250.0
+    trip = imported(write_csv(tmp_path / "a.csv", values))
+    bad = {
+        name: np.flatnonzero(~channel.good).tolist()
+        for name, channel in {**trip.drive.branches, **trip.drive.inputs}.items()
+    }
+    assert {name: rows for name, rows in bad.items() if rows} == {
+        "battery": [100],
+        "motor": [100, 200],
+        "auxiliary": [200],
+        "voltage": [200],
+        "accelerator": [300],
+    }
+    assert "accelerator: 1 samples beyond the DBC's 0 to 100; labelled as not good" in trip.notices
+
+
+def test_a_trip_without_any_battery_current_is_left_out(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "A.csv", columns() | {"current": np.full(SAMPLES, np.nan)})
+    with pytest.raises(
+        DriveError, match=r"A\.csv: column 'Battery Current \[A\]' has no usable value; leave the file out"
+    ):
+        imported(path)
+
+
+def test_trips_that_are_there_stay_as_they_are_and_only_missing_logs_are_written(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "A.csv", columns())
+    store, logs = tmp_path / "store", tmp_path / "logs"
+    assert run(path, "--layout", LAYOUT, "--out", store).returncode == 0
+    before = list_drives(store)[0].path.read_bytes()
+    write_csv(path, columns() | {"speed": np.full(SAMPLES, 50.0)})
+    again = run(path, "--layout", LAYOUT, "--out", store)
+    assert again.returncode == 0
+    assert "0 trips imported, 0.0 h; 1 already there; 0 left out" in again.stdout
+    assert run(path, "--layout", LAYOUT, "--out", store, "--logs", logs).returncode == 0
+    assert (logs / "A" / "A.log.gz").is_file()
+    assert list_drives(store)[0].path.read_bytes() == before
+
+
+@pytest.mark.parametrize("option", ["--out", "--logs"])
+def test_a_folder_that_cannot_be_made_is_refused_before_anything_is_written(tmp_path: Path, option: str) -> None:
+    path = write_csv(tmp_path / "A.csv", columns())
+    (tmp_path / "file").write_text("mine")
+    folders = {"--out": tmp_path / "store"} | {option: tmp_path / "file"}
+    done = run(path, "--layout", LAYOUT, *(word for pair in folders.items() for word in pair))
+    assert done.returncode == 1
+    assert "file is a file; choose another" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "store").exists()
+
+
+def test_short_help_is_given() -> None:
+    done = run("-h")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "--logs" in done.stdout
