@@ -1,21 +1,45 @@
-"""``python -m calibrator`` and the console command; the base install has the node alone."""
+"""``python -m calibrator`` and the console command; the base install has the node alone.
 
+All that takes time is imported inside a function, so that Ctrl-C and a closed pipe end it the same way at any time.
+"""
+
+import os
+import signal
 import sys
+
+from calibrator.interrupts import INTERRUPTED, MESSAGE, importing
 
 __all__ = ["main"]
 
 
 def main() -> None:
-    """Run the command line, or say which extra it needs."""
+    """Run the command line; exit code 0 done, 1 failed, 2 wrong use, 130 interrupted."""
     try:
-        from calibrator.cli import main as run  # noqa: PLC0415
+        code = _run()
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    except BrokenPipeError:
+        # What is still buffered has no reader; without this the interpreter would try to write it at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 1
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done or undone; threads only have to be joined
+    if code == INTERRUPTED:
+        print(MESSAGE, file=sys.stderr)
+    raise SystemExit(code)
+
+
+def _run() -> int:
+    try:
+        with importing():
+            from calibrator.cli import main as run  # noqa: PLC0415
     except ModuleNotFoundError as error:
         print(
             f"calibrator: {error.name} is not installed; pip install 'hv-current-correction[calibrator]'",
             file=sys.stderr,
         )
-        raise SystemExit(1) from None
-    run()
+        return 1
+    return run()
 
 
 if __name__ == "__main__":

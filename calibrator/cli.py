@@ -2,11 +2,30 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
+from calibrator.command_options import (
+    BranchesOption,
+    CurrentsOption,
+    DelayOption,
+    JsonOption,
+    LayoutOption,
+    MagnitudeOption,
+    MinutesOption,
+    NoiseOption,
+    SeedOption,
+    SparsityOption,
+    UnmeasuredOption,
+    UnseenMinutesOption,
+    VehiclesOption,
+    WorkersOption,
+)
+from calibrator.errors import LogError
+from calibrator.folders import require_new_folder, require_possible_folder
+from calibrator.interrupts import importing
 from calibrator.options import Classifier, ExperimentName, Method
 from calibrator.report.progress import progress_bar
 from calibrator.report.text import dumps
@@ -15,10 +34,14 @@ from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import UserError
 from ecu_node.layout import read_layout
 
+if TYPE_CHECKING:
+    from calibrator.artificial.truth import FleetTruth
+
 __all__ = ["app", "main"]
 
 app = typer.Typer(
     help="Learn from recorded drives what each vehicle's high-voltage current sensors do wrong.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong use, 130 interrupted.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -26,32 +49,23 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-LayoutOption = Annotated[Path, typer.Option("--layout", help="Layout (TOML) that says what the signals mean.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
-WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Number of processes.")]
 
-
-def main() -> None:
-    """Run the command line: exit code 0 done, 1 failed, 2 wrong use."""
+def main() -> int:
+    """Run the command line and return its exit code: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
     debug = "--debug" in sys.argv[1:]
     try:
         app(args=[argument for argument in sys.argv[1:] if argument != "--debug"], prog_name="calibrator")
-    except UserError as error:
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 0
+    except BrokenPipeError:
+        raise
+    except (UserError, OSError) as error:
         if debug:
             raise
-        _fail(str(error))
-    except OSError as error:
-        if debug:
-            raise
-        _fail(f"{error.filename or 'file'}: {error.strerror or error}")
-    except KeyboardInterrupt:
-        print("calibrator: interrupted; nothing was written", file=sys.stderr)
-        raise SystemExit(130) from None
-
-
-def _fail(text: str) -> NoReturn:
-    print(f"calibrator: {text}", file=sys.stderr)
-    raise SystemExit(1)
+        text = str(error) if isinstance(error, UserError) else f"{error.filename or 'file'}: {error.strerror or error}"
+        print(f"calibrator: {text}", file=sys.stderr)
+        return 1
+    return 0
 
 
 def _version(wanted: bool) -> None:
@@ -78,56 +92,47 @@ def import_(
     json: JsonOption = False,
 ) -> None:
     """Turn CAN logs of one or many vehicles into drives."""
-    from calibrator.recordings.import_logs import import_logs
+    with importing():
+        from calibrator.recordings.import_logs import import_logs
 
+    require_possible_folder(out)
     report = import_logs(logs, _database(layout), out, workers=workers)
     _print_report(report.as_json() if json else report.as_text())
-    if not report.drives:
-        _fail(f"none of the logs could be used; {out} was not changed")
+    if not report.drives and not report.already_there:
+        raise LogError(f"none of the logs could be used; {out} was not changed")
 
 
 @app.command()
 def simulate(
     layout: LayoutOption,
     out: Annotated[Path, typer.Option("--out", help="Folder of the fleet, new or empty.")],
-    vehicles: Annotated[int, typer.Option("--vehicles", min=1, help="Number of vehicles N.")],
+    vehicles: VehiclesOption,
     drives: Annotated[
         str, typer.Option("--drives", help="Drive store with the trips to drive, or 'builtin'.")
     ] = "builtin",
-    currents: Annotated[int, typer.Option("--currents", min=2, max=16, help="Number of branches K.")] = 2,
-    sparsity: Annotated[
-        float, typer.Option("--sparsity", min=0, max=100, help="Share of zero fault parameters S [%].")
-    ] = 80.0,
-    magnitude: Annotated[
-        tuple[float, float],
-        typer.Option("--magnitude", help="Range of fault magnitudes: drifts, and offsets as fractions of full scale."),
-    ] = (0.05, 0.25),
+    currents: CurrentsOption = 2,
+    sparsity: SparsityOption = 80.0,
+    magnitude: MagnitudeOption = (0.05, 0.25),
     common_drive: Annotated[bool, typer.Option("--common-drive", help="One trip for all vehicles.")] = False,
     symmetric: Annotated[
         bool, typer.Option("--symmetric", help="Mean of the fleet is the ideal vehicle (22).")
     ] = False,
     balanced: Annotated[bool, typer.Option("--balanced", help="No hardware faults in half of the vehicles.")] = False,
-    noise: Annotated[float, typer.Option("--noise", min=0, help="Sensor noise (sd), fraction of full scale.")] = 0.001,
-    delay: Annotated[float, typer.Option("--delay", min=0, help="Largest delay of a branch [ms].")] = 0.0,
-    unmeasured: Annotated[
-        tuple[float, float], typer.Option("--unmeasured", help="Load without a sensor: mean and sd over vehicles [A].")
-    ] = (0.0, 0.0),
-    minutes: Annotated[float, typer.Option("--minutes", min=0.1, help="Length of each built-in trip.")] = 10.0,
-    unseen_minutes: Annotated[
-        float, typer.Option("--unseen-minutes", min=0.1, help="Length of each unseen trip.")
-    ] = 3.0,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of everything.")] = 0,
+    noise: NoiseOption = 0.001,
+    delay: DelayOption = 0.0,
+    unmeasured: UnmeasuredOption = (0.0, 0.0),
+    minutes: MinutesOption = 10.0,
+    unseen_minutes: UnseenMinutesOption = 3.0,
+    seed: SeedOption = 0,
     workers: WorkersOption = 2,
     json: JsonOption = False,
 ) -> None:
     """Write an artificial fleet: CAN logs of vehicles with known faults, and truth.json."""
-    from calibrator.artificial.simulate import FleetPlan, simulate_fleet
-    from calibrator.artificial.trips import choose_trips
+    with importing():
+        from calibrator.artificial.simulate import FleetPlan, simulate_fleet
+        from calibrator.artificial.trips import choose_trips
 
-    if not 0 <= magnitude[0] <= magnitude[1] < 1:
-        raise typer.BadParameter(
-            f"{magnitude[0]:g} {magnitude[1]:g}: expected 0 <= LO <= HI < 1", param_hint="--magnitude"
-        )
+    require_new_folder(out)
     database = _database(layout)
     plan = FleetPlan(
         vehicles=vehicles,
@@ -168,15 +173,10 @@ def calibrate(
         Classifier, typer.Option("--classifier", help="Tells hardware faults (published).")
     ] = Classifier.TREE,
     truth: Annotated[Path | None, typer.Option("--truth", help="truth.json, for the perfect classifier.")] = None,
-    sparsity: Annotated[
-        float, typer.Option("--sparsity", min=0, max=100, help="Of the tree's training fleet [%].")
-    ] = 80.0,
-    magnitude: Annotated[
-        tuple[float, float],
-        typer.Option("--magnitude", help="Of the tree's training fleet; drifts, offsets / full scale."),
-    ] = (0.05, 0.25),
+    sparsity: SparsityOption = 80.0,
+    magnitude: MagnitudeOption = (0.05, 0.25),
     symmetric: Annotated[bool, typer.Option("--symmetric", help="The fleet's mean is the ideal vehicle (22).")] = False,
-    branches: Annotated[str | None, typer.Option("--branches", help="Branches to use, with commas.")] = None,
+    branches: BranchesOption = None,
     hold_out: Annotated[
         list[str] | None,
         typer.Option("--hold-out", help="Calibrate this vehicle, but learn nothing from it for others."),
@@ -184,20 +184,23 @@ def calibrate(
     unity: Annotated[
         str | None, typer.Option("--unity", help="Vehicle whose held-out data is the unity drive.")
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the classifier's training fleet.")] = 0,
+    seed: SeedOption = 0,
     workers: WorkersOption = 2,
     json: JsonOption = False,
 ) -> None:
-    """Estimate the sensor faults of every vehicle and write its parameter file."""
-    from calibrator.artificial.truth import read_truth
-    from calibrator.fleet import CalibrationSettings, calibrate_fleet
+    """Estimate the sensor faults of every vehicle and write its parameter file.
+
+    The classifier 'tree' is trained on an artificial fleet of this --sparsity, --magnitude and --seed.
+    """
+    with importing():
+        from calibrator.fleet import CalibrationSettings, calibrate_fleet
 
     if (classifier is Classifier.PERFECT) != (truth is not None):
         raise typer.BadParameter("--classifier perfect and --truth FILE belong together", param_hint="--classifier")
     settings = CalibrationSettings(
         method=method,
         classifier=classifier,
-        truth=read_truth(truth) if truth is not None else None,
+        truth=_truth_of(fleet, truth) if truth is not None else None,
         sparsity=sparsity,
         magnitude=magnitude,
         symmetric=symmetric,
@@ -217,7 +220,8 @@ def score(
     json: JsonOption = False,
 ) -> None:
     """Compare a result with the truth of its artificial fleet."""
-    from calibrator.result_score import score_result
+    with importing():
+        from calibrator.result_score import score_result
 
     figures = score_result(result, truth)
     _print_report(figures.as_json() if json else figures.as_text())
@@ -229,15 +233,20 @@ def experiment(
     quick: Annotated[
         bool, typer.Option("--quick", help="Small and fast: shows that it runs, not the figures.")
     ] = False,
-    repetitions: Annotated[int | None, typer.Option("--repetitions", min=1, help="Trials per setting.")] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the first trial.")] = 0,
+    repetitions: Annotated[
+        int | None, typer.Option("--repetitions", min=1, max=1000, help="Trials per setting.")
+    ] = None,
+    seed: SeedOption = 0,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for NAME.md, NAME.json and NAME.png.")] = None,
     workers: WorkersOption = 2,
     json: JsonOption = False,
 ) -> None:
     """Repeat an experiment of the paper and print its figures beside the paper's."""
-    from calibrator.experiments.runner import run_experiment
+    with importing():
+        from calibrator.experiments.runner import run_experiment
 
+    if out is not None:
+        require_possible_folder(out)
     result = run_experiment(
         name.value,
         quick=quick,
@@ -249,6 +258,19 @@ def experiment(
     )
     if json:
         _print_report(result.to_json().decode())
+
+
+def _truth_of(fleet: Path, path: Path) -> "FleetTruth":
+    """The truth, if it is that of the fleet's vehicles."""
+    from calibrator.artificial.truth import faults_of, read_truth
+    from calibrator.drives.fleet_id import require_same_fleet
+    from calibrator.drives.fleet_source import find_fleet
+
+    truth = read_truth(path)
+    source = find_fleet(fleet)
+    require_same_fleet(source.fleet_ids, truth.fleet_id, drives=fleet, truth=path)
+    faults_of(truth, list(source.vehicles))
+    return truth
 
 
 def _database(layout: Path) -> VehicleDatabase:

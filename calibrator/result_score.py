@@ -8,10 +8,11 @@ import numpy as np
 
 from calibrator.artificial.truth import FleetTruth, faults_of, read_truth
 from calibrator.drive import Array, Mask
+from calibrator.drives.fleet_id import require_same_fleet
 from calibrator.errors import FleetError
 from calibrator.faults import Faults
 from calibrator.report.text import dumps, table
-from calibrator.results import read_results
+from calibrator.results import RunRecord, read_results, read_run
 from calibrator.score import f2_score, harmed, recovered
 
 __all__ = ["FleetScore", "score_result"]
@@ -85,6 +86,7 @@ def score_result(result: Path, truth_file: Path) -> FleetScore:
         If one of them cannot be read, or they are of different fleets or branches.
     """
     truth = read_truth(truth_file)
+    _check_run(read_run(result), truth, result, truth_file)
     rows = {(row["vehicle"], row["branch"]): row for row in read_results(result) if row["branch"] is not None}
     names = list(truth.vehicles)
     known = [name for name in names if (name, truth.branches[0]) in rows]
@@ -129,6 +131,15 @@ def score_result(result: Path, truth_file: Path) -> FleetScore:
     )
 
 
+def _check_run(run: RunRecord, truth: FleetTruth, result: Path, truth_file: Path) -> None:
+    require_same_fleet(run.fleet_ids, truth.fleet_id, drives=result, truth=truth_file)
+    if (run.layout, set(run.branches)) != (truth.layout, set(truth.branches)):
+        raise FleetError(
+            f"{result}: of layout {run.layout} with branches {', '.join(run.branches)}, the truth of layout "
+            f"{truth.layout} with branches {', '.join(truth.branches)}; calibrate with the branches of the truth"
+        )
+
+
 def _check(rows: dict[tuple[str, str], dict[str, Any]], truth: FleetTruth, known: list[str], result: Path) -> None:
     strangers = sorted({vehicle for vehicle, _ in rows} - truth.vehicles.keys())
     if strangers or not known:
@@ -136,9 +147,6 @@ def _check(rows: dict[tuple[str, str], dict[str, Any]], truth: FleetTruth, known
             f"{result}: vehicles {', '.join(strangers[:5]) or 'none'} are not in the truth; "
             "is it the truth of another fleet?"
         )
-    lacking = [branch for branch in truth.branches if (known[0], branch) not in rows]
-    if lacking:
-        raise FleetError(f"{result}: no parameters for branch {', '.join(lacking)}, which the truth has")
 
 
 def _column(rows: dict[tuple[str, str], dict[str, Any]], truth: FleetTruth, known: list[str], name: str) -> Array:

@@ -17,7 +17,7 @@ from calibrator.errors import FleetError
 from calibrator.folders import whole_folder
 from ecu_node.parameters import VehicleParameters, write_atomically, write_parameters
 
-__all__ = ["LeftOut", "RunRecord", "read_results", "write_results"]
+__all__ = ["LeftOut", "RunRecord", "read_results", "read_run", "write_results"]
 
 LEFT_OUT = "left out"
 """Stands for the verdict of a vehicle, or of a file of unclear vehicle, that has no parameters."""
@@ -55,6 +55,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     tool: str
     method: str
     fleet: str
+    fleet_ids: list[str] = []
+    """Artificial fleets that the drives come from; empty if they are recorded."""
     layout: str
     branches: list[str]
     model_inputs: list[str]
@@ -112,6 +114,17 @@ def read_results(result: Path) -> list[dict[str, Any]]:
         raise FleetError(f"{path}: column {', '.join(missing)} is missing; write the result anew with this version")
     rows: list[dict[str, Any]] = table.to_pylist()
     return rows
+
+
+def read_run(result: Path) -> RunRecord:
+    """``run.json`` of a result folder; FleetError if it is none."""
+    path = result / "run.json"
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=RunRecord)
+    except OSError as error:
+        raise FleetError(f"{path}: not a result of 'calibrator calibrate': {error.strerror}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise FleetError(f"{path}: not a run of 'calibrator calibrate': {error}; calibrate again") from None
 
 
 def _rows(item: VehicleParameters) -> list[dict[str, Any]]:

@@ -19,7 +19,13 @@ from calibrator.artificial.ground_truth import GroundTruth
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 
-__all__ = ["builtin_trip"]
+__all__ = ["BUILTIN_BRANCHES", "BUILTIN_INPUTS", "builtin_trip"]
+
+BUILTIN_BRANCHES = ("battery", "motor", "auxiliary", "dcdc", "motor_rear")
+BUILTIN_INPUTS = (
+    "voltage", "torque", "speed", "acceleration", "accelerator", "heater_demand", "aircon_demand", "low_voltage_demand",
+)  # fmt: skip
+"""Inputs of ``dbc/hv_powertrain.toml``, in the units of its DBC."""
 
 VEHICLE = "2022_Renault_Zoe_ZE50_R135.yaml"
 CYCLES = ("udds.csv", "hwfet.csv")
@@ -64,7 +70,7 @@ def builtin_trip(rng: np.random.Generator, *, duration_s: float, name: str) -> G
     Returns
     -------
     GroundTruth
-        Branches battery, motor, auxiliary, dcdc, motor_rear, and all inputs of ``dbc/hv_powertrain.toml``.
+        Branches :data:`BUILTIN_BRANCHES` and inputs :data:`BUILTIN_INPUTS`.
 
     Raises
     ------

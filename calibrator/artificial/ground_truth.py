@@ -88,6 +88,11 @@ def choose_branches(layout: Layout, available: Sequence[str], count: int) -> tup
         If the recordings have fewer branches.
     """
     names = [name for name in layout.branch_names if name in available]
+    if len(names) < 2:
+        raise FleetError(
+            f"{layout.path}: has the branches {', '.join(layout.branch_names)}, these drives have "
+            f"{', '.join(available)}; at least two must be common; give --drives a store made with this layout"
+        )
     if not 2 <= count <= len(names):
         raise FleetError(
             f"{count} currents asked for; these drives have {len(names)} of the branches of {layout.path} "

@@ -4,14 +4,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from joblib import Parallel, delayed
+from joblib import delayed
 
 from calibrator.artificial.ground_truth import GroundTruth, choose_branches, with_branches
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.artificial.trips import TripPurpose, TripSource
-from calibrator.artificial.truth import TRUTH_FILE, FleetTruth, VehicleTruth, write_truth
+from calibrator.artificial.truth import TRUTH_FILE, FleetTruth, VehicleTruth, with_fleet_id, write_truth
 from calibrator.artificial.vehicle import Vehicle, draw_disturbances, write_vehicle
+from calibrator.drives.fleet_id import write_fleet_ids
 from calibrator.folders import whole_folder
+from calibrator.interrupts import in_processes
 from calibrator.random_streams import Purpose, random_stream
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
@@ -98,18 +100,21 @@ def simulate_fleet(
     branches = choose_branches(layout, trips.branches, plan.currents)
     vehicles = _draw_vehicles(plan, layout, branches)
     with whole_folder(out) as folder:
-        written = Parallel(n_jobs=workers, return_as="generator")(
+        tasks = (
             delayed(_write)(
                 folder=folder, database=database, vehicle=vehicle, trips=trips, number=number, seed=plan.seed
             )
             for number, vehicle in enumerate(vehicles)
         )
+        written = in_processes(tasks, workers=workers)
         truths: dict[str, VehicleTruth] = {}
         for vehicle, truth in zip(vehicles, written, strict=True):
             truths[vehicle.name] = truth
             progress(len(truths))
-        fleet = _fleet_truth(plan, layout, branches, truths)
+        fleet = with_fleet_id(_fleet_truth(plan, layout, branches, truths))
         write_truth(folder / TRUTH_FILE, fleet)
+        for kind in ("logs", "unseen"):
+            write_fleet_ids(folder / kind, {fleet.fleet_id})
     return fleet
 
 
@@ -166,6 +171,7 @@ def _fleet_truth(
     plan: FleetPlan, layout: Layout, branches: tuple[str, ...], vehicles: dict[str, VehicleTruth]
 ) -> FleetTruth:
     return FleetTruth(
+        fleet_id="",
         layout=layout.name,
         branches=list(branches),
         full_scale_a=layout.full_scale_a,

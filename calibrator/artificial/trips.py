@@ -7,8 +7,9 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from calibrator.artificial.builtin_drives import builtin_trip
+from calibrator.artificial.builtin_drives import BUILTIN_BRANCHES, BUILTIN_INPUTS, builtin_trip
 from calibrator.artificial.ground_truth import GroundTruth, cut_and_rejoin, ground_truth_from_drive
+from calibrator.drives.align import choose_inputs
 from calibrator.drives.store import iterate_drives
 from calibrator.errors import FleetError
 from calibrator.random_streams import Purpose, random_stream
@@ -59,7 +60,7 @@ class BuiltinTrips:
     seed: int
     duration_s: float
     unseen_s: float
-    branches: tuple[str, ...] = ("battery", "motor", "auxiliary", "dcdc", "motor_rear")
+    branches: tuple[str, ...] = BUILTIN_BRANCHES
     notices: tuple[str, ...] = ()
 
     def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
@@ -192,10 +193,16 @@ def choose_trips(
     -------
     TripSource
         The trips.
+
+    Raises
+    ------
+    FleetError
+        If no drive of the store is usable, or the built-in vehicle has not what the layout names.
     """
     source: TripSource
     if drives == "builtin":
-        source = BuiltinTrips(seed=seed, duration_s=duration_s, unseen_s=unseen_s)
+        notices = _builtin_notices(layout)
+        source = BuiltinTrips(seed=seed, duration_s=duration_s, unseen_s=unseen_s, notices=notices)
     else:
         recorded, unusable = read_recorded_trips(Path(drives), layout)
         notice = f"{len(unusable)} drives lack good samples of some channel and are left out: {', '.join(unusable)}"
@@ -207,3 +214,16 @@ def choose_trips(
             notices=(notice,) if unusable else (),
         )
     return CommonTrips(source=source) if common else source
+
+
+def _builtin_notices(layout: Layout) -> tuple[str, ...]:
+    """What the built-in vehicle lacks of the layout's model inputs; refused if it lacks all, or has no junction."""
+    inputs, missing = choose_inputs(layout, BUILTIN_INPUTS)
+    common = [name for name in layout.branch_names if name in BUILTIN_BRANCHES]
+    if len(common) < 2 or not inputs:
+        raise FleetError(
+            f"{layout.path}: the built-in vehicle needs two or more branches named {', '.join(BUILTIN_BRANCHES)} and "
+            f"model inputs made of {', '.join(BUILTIN_INPUTS)}; name them so, use dbc/hv_powertrain.toml, or give "
+            "--drives a store made with this layout"
+        )
+    return (f"model inputs that the built-in vehicle has not: {', '.join(missing)}",) if missing else ()

@@ -8,12 +8,14 @@ from pathlib import Path
 
 from calibrator.drive import Drive, DriveFile
 from calibrator.drives.align import choose_inputs
+from calibrator.drives.fleet_id import read_fleet_ids
 from calibrator.drives.store import list_drives, read_drive_file
 from calibrator.errors import FleetError
 from calibrator.recordings.readers import read_drive
 from calibrator.recordings.sources import find_logs
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
+from ecu_node.layout import Layout
 
 __all__ = ["Equipment", "FleetSource", "find_fleet", "load_drive", "probe_equipment"]
 
@@ -34,11 +36,14 @@ class FleetSource:
         Drives by vehicle, sorted.
     left_out : mapping of str to str
         Why a vehicle, or a file where its vehicle is unclear, was left out.
+    fleet_ids : frozenset of str
+        Artificial fleets that the drives come from, see :mod:`calibrator.drives.fleet_id`; empty if unknown.
     """
 
     path: Path
     vehicles: Mapping[str, tuple[DriveFile, ...]]
     left_out: Mapping[str, str]
+    fleet_ids: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,10 +76,12 @@ def find_fleet(path: Path) -> FleetSource:
     if not path.is_dir():
         raise FleetError(f"{path}: no such folder; give a drive store or a folder with one folder of logs per vehicle")
     left_out: dict[str, str] = {}
+    folder = path
     if (path / STORE_FOLDER).is_dir():
         entries = list_drives(path)
     else:
-        found = find_logs([path / LOGS_FOLDER if (path / LOGS_FOLDER).is_dir() else path])
+        folder = path / LOGS_FOLDER if (path / LOGS_FOLDER).is_dir() else path
+        found = find_logs([folder])
         entries = list(found.logs)
         left_out = {f"problem {k + 1}": str(problem) for k, problem in enumerate(found.problems)}
     if not entries:
@@ -82,7 +89,7 @@ def find_fleet(path: Path) -> FleetSource:
         raise FleetError(f"{path}: no drive in it{reasons}")
     entries.sort(key=lambda entry: (entry.vehicle, entry.name))
     vehicles = {vehicle: tuple(group) for vehicle, group in groupby(entries, key=lambda entry: entry.vehicle)}
-    return FleetSource(path=path, vehicles=vehicles, left_out=left_out)
+    return FleetSource(path=path, vehicles=vehicles, left_out=left_out, fleet_ids=read_fleet_ids(folder))
 
 
 def load_drive(entry: DriveFile, database: VehicleDatabase) -> Drive:
@@ -122,7 +129,7 @@ def probe_equipment(fleet: FleetSource, database: VehicleDatabase, branches: Seq
     database : VehicleDatabase
         DBC and layout.
     branches : sequence of str, optional
-        Branches to use instead of those found.
+        Different branches to use instead of those found.
 
     Returns
     -------
@@ -132,7 +139,9 @@ def probe_equipment(fleet: FleetSource, database: VehicleDatabase, branches: Seq
     Raises
     ------
     FleetError
-        If no vehicle can be read or too little is there.
+        If no vehicle can be read, too little is there, or a branch is asked for twice.
+    LayoutError
+        If a branch is asked for that the layout does not have.
     """
     layout = database.layout
     drives, errors = _some_drives(fleet, database)
@@ -142,21 +151,29 @@ def probe_equipment(fleet: FleetSource, database: VehicleDatabase, branches: Seq
         )
     seen = Counter(name for drive in drives for name in drive.branches)
     found = [name for name in layout.branch_names if 2 * seen[name] > len(drives)]
-    chosen = tuple(branches) if branches is not None else tuple(found)
-    for name in chosen:
-        layout.find_branch(name)
+    chosen = _distinct(branches, layout) if branches is not None else tuple(found)
     inputs, missing_inputs = choose_inputs(layout, {name for drive in drives for name in drive.inputs})
     if len(chosen) < 2:
         raise FleetError(f"{fleet.path}: branches found: {', '.join(chosen) or 'none'}; a junction needs two or more")
     if not inputs:
         raise FleetError(f"{fleet.path}: none of the model inputs of {layout.path} was recorded")
-    notices = []
-    missing_branches = [name for name in layout.branch_names if name not in chosen]
-    if missing_branches:
-        notices.append(f"branches not recorded, taken as not fitted: {', '.join(missing_branches)}")
-    if missing_inputs:
-        notices.append(f"model inputs not recorded, left out: {', '.join(missing_inputs)}")
-    return Equipment(branches=chosen, inputs=inputs, notices=tuple(notices))
+    texts = {
+        "branches not recorded, taken as not fitted": [b for b in layout.branch_names if b not in {*found, *chosen}],
+        "branches recorded but not asked for, missing from the junction sum": [b for b in found if b not in chosen],
+        "model inputs not recorded, left out": missing_inputs,
+    }
+    notices = tuple(f"{text}: {', '.join(names)}" for text, names in texts.items() if names)
+    return Equipment(branches=chosen, inputs=inputs, notices=notices)
+
+
+def _distinct(branches: Sequence[str], layout: Layout) -> tuple[str, ...]:
+    """Branches asked for; refused if the layout lacks one or one is there twice."""
+    for name in branches:
+        layout.find_branch(name)
+    twice = sorted({name for name in branches if branches.count(name) > 1})
+    if twice:
+        raise FleetError(f"branch {', '.join(twice)} is asked for twice; name each branch once")
+    return tuple(branches)
 
 
 def _some_drives(fleet: FleetSource, database: VehicleDatabase) -> tuple[list[Drive], list[UserError]]:

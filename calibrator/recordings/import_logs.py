@@ -4,11 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from joblib import Parallel, delayed
+from joblib import delayed
 
 from calibrator.drive import DriveFile
-from calibrator.drives.store import list_drives, write_drive
-from calibrator.errors import LogError
+from calibrator.drives.fleet_id import read_fleet_ids, write_fleet_ids
+from calibrator.drives.store import has_drive, write_drive
+from calibrator.interrupts import in_processes
 from calibrator.recordings.readers import read_recording
 from calibrator.recordings.sources import find_logs
 from calibrator.report.progress import progress_bar
@@ -36,6 +37,8 @@ class ImportReport:
 
     store: str
     drives: tuple[ImportedDrive, ...]
+    already_there: tuple[str, ...]
+    """Drives, VEHICLE/NAME, that an earlier import has written; they were not read again."""
     left_out: dict[str, str]
 
     def as_json(self) -> str:
@@ -50,7 +53,8 @@ class ImportReport:
             table(("vehicle", "drive", "duration [s]", "branches"), rows) if rows else "",
             "\n".join(["notices:", *notices]) if notices else "",
             left_out_text(self.left_out),
-            f"{len(self.drives)} drives written to {self.store}, {len(self.left_out)} left out",
+            f"{len(self.drives)} drives written to {self.store}, {len(self.already_there)} already there, "
+            f"{len(self.left_out)} left out",
         ]
         return "\n\n".join(part for part in parts if part)
 
@@ -72,23 +76,33 @@ def import_logs(logs: Sequence[Path], database: VehicleDatabase, store: Path, *,
     Returns
     -------
     ImportReport
-        What was written, and what was left out and why.
+        What was written, what was there already, and what was left out and why.
     """
     found = find_logs(logs)
-    present = {(d.vehicle, d.name) for d in list_drives(store)} if (store / "drives").is_dir() else set()
     left_out = {f"problem {k + 1}": str(problem) for k, problem in enumerate(found.problems)}
     drives: list[ImportedDrive] = []
-    runs = Parallel(n_jobs=workers, return_as="generator")(
-        delayed(_import_one)(log, database, store, (log.vehicle, log.name) in present) for log in found.logs
-    )
+    already_there: list[str] = []
+    runs = in_processes((delayed(_import_one)(log, database, store) for log in found.logs), workers=workers)
     with progress_bar("import", len(found.logs), "logs") as progress:
         for done, (log, outcome) in enumerate(zip(found.logs, runs, strict=True), start=1):
             if isinstance(outcome, ImportedDrive):
                 drives.append(outcome)
+            elif outcome is None:
+                already_there.append(f"{log.vehicle}/{log.name}")
             else:
                 left_out[f"{log.vehicle}/{log.name}"] = outcome
             progress(done)
-    return ImportReport(store=str(store), drives=tuple(drives), left_out=left_out)
+    if drives:
+        _note_fleets(store, found.logs)
+    return ImportReport(store=str(store), drives=tuple(drives), already_there=tuple(already_there), left_out=left_out)
+
+
+def _note_fleets(store: Path, logs: Sequence[DriveFile]) -> None:
+    """Carry over which artificial fleets the logs are of."""
+    folders = {log.path.resolve().parent.parent for log in logs}
+    fleet_ids = read_fleet_ids(store).union(*map(read_fleet_ids, folders))
+    if fleet_ids:
+        write_fleet_ids(store, fleet_ids)
 
 
 def _grouped(notices: Mapping[str, Sequence[str]]) -> list[str]:
@@ -100,13 +114,11 @@ def _grouped(notices: Mapping[str, Sequence[str]]) -> list[str]:
     return [f"  {where[0] if len(where) == 1 else f'{len(where)} drives'}: {text}" for text, where in drives.items()]
 
 
-def _import_one(log: DriveFile, database: VehicleDatabase, store: Path, present: bool) -> ImportedDrive | str:
-    """Import one log; the text of the error if it cannot be used."""
+def _import_one(log: DriveFile, database: VehicleDatabase, store: Path) -> ImportedDrive | str | None:
+    """Import one log; the text of the error if it cannot be used; None if it was imported before."""
     try:
-        if present:
-            raise LogError(
-                f"{log.path}: the store already has drive {log.name} of vehicle {log.vehicle}; it stays as it is"
-            )
+        if has_drive(store, log.vehicle, log.name, database.layout):
+            return None
         recording = read_recording(log.path, database, vehicle=log.vehicle, name=log.name)
         write_drive(store, recording.drive, database.layout)
     except UserError as error:

@@ -127,8 +127,9 @@ def test_second_import_changes_nothing_and_says_so(fleet: Path, tmp_path: Path) 
     assert calibrator("import", log, "--layout", LAYOUT, "--out", store).returncode == 0
     before = {path: path.read_bytes() for path in store.rglob("*.parquet")}
     again = calibrator("import", log, "--layout", LAYOUT, "--out", store, "--json")
-    assert again.returncode == 1
-    assert "already has drive" in json.loads(again.stdout)["left_out"][f"{log.parent.name}/drive"]
+    assert again.returncode == 0, again.stderr
+    report = json.loads(again.stdout)
+    assert (report["already_there"], report["left_out"]) == ([f"{log.parent.name}/drive"], {})
     assert {path: path.read_bytes() for path in store.rglob("*.parquet")} == before
 
 
@@ -208,7 +209,6 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
             1,
             "2 to 5 are possible",
         ),
-        (("simulate", "--vehicles", "3", "--magnitude", "2", "1", "--layout", LAYOUT, "--out", "x"), 2, "LO <= HI"),
         (("nonsense",), 2, "nonsense"),
     ],
 )
@@ -238,3 +238,53 @@ def test_truth_of_another_fleet_is_refused(fleet: Path, result: Path, tmp_path: 
     run = calibrator("score", result, "--truth", tmp_path / "truth.json")
     assert run.returncode == 1
     assert "truth of another fleet" in run.stderr
+
+
+@pytest.fixture(scope="module")
+def other_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Vehicles of the same names and branches as those of `fleet`, with other faults."""
+    out = tmp_path_factory.mktemp("other") / "fleet"
+    run = calibrator(
+        *("simulate", "--vehicles", 12, "--common-drive", "--minutes", 1, "--unseen-minutes", 1, "--seed", 4),
+        *("--layout", LAYOUT, "--out", out, "--workers", 1),
+    )
+    assert run.returncode == 0, run.stderr
+    return out
+
+
+def test_score_refuses_the_truth_of_a_fleet_with_the_same_names(
+    fleet: Path, other_fleet: Path, result: Path, tmp_path: Path
+) -> None:
+    copy = shutil.copytree(result, tmp_path / "result")
+    record = json.loads((copy / "run.json").read_text())
+    record["fleet_ids"] = [read_truth(fleet / "truth.json").fleet_id]
+    (copy / "run.json").write_text(json.dumps(record))
+    assert calibrator("score", copy, "--truth", fleet / "truth.json").returncode == 0
+    run = calibrator("score", copy, "--truth", other_fleet / "truth.json")
+    assert run.returncode == 1
+    assert "give the truth.json that lies beside the logs of this fleet" in run.stderr
+
+
+def test_perfect_classifier_refuses_the_truth_of_another_fleet_before_the_work(
+    fleet: Path, other_fleet: Path, tmp_path: Path
+) -> None:
+    store = tmp_path / "store"
+    log = fleet / "logs" / "V001" / "drive.log.gz"
+    assert calibrator("import", log, "--layout", LAYOUT, "--out", store).returncode == 0
+    for source in (fleet, fleet / "logs", store):
+        run = calibrator(
+            *("calibrate", source, "--layout", LAYOUT, "--out", tmp_path / "x"),
+            *("--classifier", "perfect", "--truth", other_fleet / "truth.json"),
+        )
+        assert run.returncode == 1
+        assert "the truth of fleet" in run.stderr
+        assert "identify" not in run.stderr
+
+
+def test_score_refuses_a_result_of_other_branches(fleet: Path, result: Path, tmp_path: Path) -> None:
+    truth = json.loads((fleet / "truth.json").read_text())
+    truth["branches"] = ["battery", "dcdc"]
+    (tmp_path / "truth.json").write_text(json.dumps(truth))
+    run = calibrator("score", result, "--truth", tmp_path / "truth.json")
+    assert run.returncode == 1
+    assert "with branches battery, motor, the truth of layout hv_powertrain with branches battery, dcdc" in run.stderr

@@ -1,0 +1,124 @@
+"""Options of the command line, with what each accepts: a wrong value ends a command before it has done anything.
+
+Upper bounds are far beyond what a vehicle has; they catch slips of units before these fill memory or disk.
+"""
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = [
+    "BranchesOption",
+    "CurrentsOption",
+    "DelayOption",
+    "JsonOption",
+    "LayoutOption",
+    "MagnitudeOption",
+    "MinutesOption",
+    "NoiseOption",
+    "SeedOption",
+    "SparsityOption",
+    "UnmeasuredOption",
+    "UnseenMinutesOption",
+    "VehiclesOption",
+    "WorkersOption",
+]
+
+MAX_VEHICLES = 100_000
+MAX_CURRENTS = 16
+MAX_SEED = 2**32 - 1
+MAX_WORKERS = 256
+MAX_MINUTES = 240.0
+"""A trip's log is made in memory, at some 250 frames per second. [min]"""
+MAX_DELAY_MS = 1000.0
+"""The branch signals of a real car lag each other by tens to hundreds of milliseconds. [ms]"""
+MAX_UNMEASURED_A = 1000.0
+"""More than the full scale of any car's junction. [A]"""
+
+
+def _finite(value: float) -> float:
+    """Refuse not-a-number, which is neither above nor below any bound."""
+    if not math.isfinite(value):
+        raise typer.BadParameter(f"{value:g}: expected a finite number")
+    return value
+
+
+def _magnitude(value: tuple[float, float]) -> tuple[float, float]:
+    if not 0 <= value[0] <= value[1] < 1:
+        raise typer.BadParameter(f"{value[0]:g} {value[1]:g}: expected 0 <= LO <= HI < 1")
+    return value
+
+
+def _unmeasured(value: tuple[float, float]) -> tuple[float, float]:
+    if not all(0 <= number <= MAX_UNMEASURED_A for number in value):
+        raise typer.BadParameter(
+            f"{value[0]:g} {value[1]:g}: expected mean and standard deviation from 0 to {MAX_UNMEASURED_A:g} A"
+        )
+    return value
+
+
+def _branches(value: str | None) -> str | None:
+    names = [] if value is None else [name.strip() for name in value.split(",")]
+    if "" in names:
+        raise typer.BadParameter(f"{value!r}: expected names of branches with commas between them")
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise typer.BadParameter(f"{', '.join(twice)} is named twice; name each branch once")
+    return None if value is None else ",".join(names)
+
+
+LayoutOption = Annotated[Path, typer.Option("--layout", help="Layout (TOML) that says what the signals mean.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
+WorkersOption = Annotated[int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Number of processes.")]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, max=MAX_SEED, help="Seed of everything random.")]
+VehiclesOption = Annotated[int, typer.Option("--vehicles", min=1, max=MAX_VEHICLES, help="Number of vehicles N.")]
+CurrentsOption = Annotated[int, typer.Option("--currents", min=2, max=MAX_CURRENTS, help="Number of branches K.")]
+BranchesOption = Annotated[
+    str | None, typer.Option("--branches", callback=_branches, help="Branches to use, with commas.")
+]
+SparsityOption = Annotated[
+    float,
+    typer.Option(
+        "--sparsity",
+        min=0,
+        max=100,
+        callback=_finite,
+        help="Share of zero fault parameters of an artificial fleet [%].",
+    ),
+]
+MagnitudeOption = Annotated[
+    tuple[float, float],
+    typer.Option(
+        "--magnitude",
+        metavar="LO HI",
+        callback=_magnitude,
+        help="Range of its fault magnitudes, 0 <= LO <= HI < 1: drifts, and offsets as fractions of full scale.",
+    ),
+]
+NoiseOption = Annotated[
+    float,
+    typer.Option("--noise", min=0, max=1, callback=_finite, help="Sensor noise (sd), fraction of full scale."),
+]
+DelayOption = Annotated[
+    float,
+    typer.Option("--delay", min=0, max=MAX_DELAY_MS, callback=_finite, help="Largest delay of a branch [ms]."),
+]
+UnmeasuredOption = Annotated[
+    tuple[float, float],
+    typer.Option(
+        "--unmeasured",
+        metavar="MEAN SD",
+        callback=_unmeasured,
+        help=f"Load without a sensor: mean and sd over vehicles, each 0 to {MAX_UNMEASURED_A:g} [A].",
+    ),
+]
+MinutesOption = Annotated[
+    float,
+    typer.Option("--minutes", min=0.1, max=MAX_MINUTES, callback=_finite, help="Length of each built-in trip."),
+]
+UnseenMinutesOption = Annotated[
+    float,
+    typer.Option("--unseen-minutes", min=0.1, max=MAX_MINUTES, callback=_finite, help="Length of each unseen trip."),
+]

@@ -1,0 +1,64 @@
+"""Ctrl-C at the two times when KeyboardInterrupt does not do: while libraries are imported, and in worker processes.
+
+Libraries swallow exceptions of their own imports, or turn them into others; workers would each print a traceback.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+__all__ = ["INTERRUPTED", "MESSAGE", "importing", "in_processes"]
+
+INTERRUPTED = 130
+"""Exit code that shells give to a program ended by SIGINT."""
+MESSAGE = "calibrator: interrupted; nothing unfinished was kept"
+
+
+@contextmanager
+def importing() -> Iterator[None]:
+    """While the block imports what a command needs, Ctrl-C ends the program at once; nothing is open yet."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.SIG_IGN:
+        yield
+        return
+    signal.signal(signal.SIGINT, _end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def in_processes(tasks: Iterable[Any], *, workers: int) -> Iterator[Any]:
+    """Results of tasks in their order, from worker processes that leave Ctrl-C to this one.
+
+    Parameters
+    ----------
+    tasks : iterable
+        Of ``joblib.delayed`` calls.
+    workers : int
+        Number of processes; 1 is this process.
+
+    Yields
+    ------
+    object
+        What the calls return.
+    """
+    from joblib import Parallel  # noqa: PLC0415 (this module is imported before anything that takes time)
+
+    # Not through shared files (max_nbytes), which would outlive a process that is killed.
+    parallel = Parallel(n_jobs=workers, return_as="generator", max_nbytes=None)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        results: Iterator[Any] = parallel(tasks)  # starts the workers, which inherit that SIGINT is ignored
+    finally:
+        signal.signal(signal.SIGINT, before)
+    return results
+
+
+def _end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+    print(MESSAGE, file=sys.stderr, flush=True)
+    os._exit(INTERRUPTED)

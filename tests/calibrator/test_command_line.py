@@ -1,0 +1,155 @@
+"""Wrong options, Ctrl-C and closed pipes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from calibrator.cli import app
+from calibrator.interrupts import INTERRUPTED, MESSAGE
+
+ROOT = Path(__file__).parents[2]
+LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
+
+
+def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "calibrator", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--noise", "inf"], ""),
+        (["--noise", "nan"], ""),
+        (["--noise", "-0.1"], ""),
+        (["--delay", "inf"], ""),
+        (["--delay", "1e9"], ""),
+        (["--minutes", "1e9"], ""),
+        (["--minutes", "nan"], ""),
+        (["--unseen-minutes", "inf"], ""),
+        (["--sparsity", "nan"], ""),
+        (["--unmeasured", "nan", "1"], "expected mean and standard deviation from 0 to 1000 A"),
+        (["--unmeasured", "1", "-1"], "expected mean and standard deviation from 0 to 1000 A"),
+        (["--unmeasured", "1e6", "1"], "expected mean and standard deviation from 0 to 1000 A"),
+        (["--magnitude", "nan", "0.2"], "expected 0 <= LO <= HI < 1"),
+        (["--magnitude", "0.1", "inf"], "expected 0 <= LO <= HI < 1"),
+        (["--magnitude", "0.2", "0.1"], "expected 0 <= LO <= HI < 1"),
+        (["--vehicles", "1000000000"], ""),
+        (["--seed", "1" + 30 * "0"], ""),
+        (["--workers", "100000"], ""),
+    ],
+)
+def test_simulate_refuses_what_no_fleet_has_before_it_does_anything(
+    options: list[str], message: str, tmp_path: Path
+) -> None:
+    # The layout is missing too, and is not complained of: nothing has been looked at yet.
+    vehicles = [] if "--vehicles" in options else ["--vehicles", "2"]
+    files = ["--layout", str(tmp_path / "none.toml"), "--out", str(tmp_path / "x")]
+    run = CliRunner().invoke(app, ["simulate", *vehicles, *options, *files])
+    assert run.exit_code == 2
+    (error,) = [line for line in run.stderr.splitlines() if line.startswith("Error")]
+    assert f"Invalid value for '{options[0]}'" in error
+    assert message in error
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--branches", "battery,battery"], "battery is named twice"),
+        (["--branches", "battery,"], "expected names of branches with commas between them"),
+        (["--magnitude", "nan", "nan"], "expected 0 <= LO <= HI < 1"),
+    ],
+)
+def test_calibrate_refuses_wrong_options(options: list[str], message: str, tmp_path: Path) -> None:
+    files = ["--layout", str(LAYOUT), "--out", str(tmp_path / "x")]
+    run = CliRunner().invoke(app, ["calibrate", str(tmp_path), *options, *files])
+    assert run.exit_code == 2
+    assert message in run.stderr
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["simulate", "--vehicles", "2"],
+        ["calibrate", "nowhere"],
+        ["import", "nowhere.log"],
+        ["experiment", "snr"],
+    ],
+)
+def test_output_that_cannot_be_made_is_refused_before_the_work(command: list[str], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    layout = [] if command[0] == "experiment" else ["--layout", str(LAYOUT)]
+    run = calibrator(*command, *layout, "--out", tmp_path / "file" / "x")
+    assert run.returncode == 1
+    assert run.stderr == (
+        f"calibrator: {tmp_path / 'file' / 'x'}: cannot be made: {tmp_path / 'file'} is a file; choose another folder\n"
+    )
+
+
+def test_layout_without_the_builtin_vehicles_names_is_told_them(tmp_path: Path) -> None:
+    text = LAYOUT.read_text().replace('"hv_powertrain.dbc"', f'"{LAYOUT.parent / "hv_powertrain.dbc"}"')
+    for name in ("battery", "motor", "auxiliary", "dcdc", "motor_rear"):
+        text = text.replace(f'name = "{name}"', f'name = "my_{name}"')
+    (tmp_path / "mine.toml").write_text(text)
+    run = calibrator("simulate", "--vehicles", 2, "--layout", tmp_path / "mine.toml", "--out", tmp_path / "x")
+    assert run.returncode == 1
+    assert "needs two or more branches named battery, motor, auxiliary, dcdc, motor_rear" in run.stderr
+    assert "--drives" in run.stderr
+
+
+def test_help_names_the_exit_codes() -> None:
+    run = calibrator("-h")
+    assert run.returncode == 0
+    assert "130 interrupted" in " ".join(run.stdout.split())
+
+
+def test_ctrl_c_during_start_up_ends_it_in_one_line() -> None:
+    # The import of the command line sends SIGINT to itself and swallows what comes of it, as libraries do.
+    code = (
+        "import os, signal, sys, types\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'typer':\n"
+        "            try: os.kill(os.getpid(), signal.SIGINT)\n"
+        "            except BaseException: pass\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "from calibrator.__main__ import main\n"
+        "sys.argv = ['calibrator', '--version']\n"
+        "main()\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert (run.returncode, run.stdout, run.stderr) == (INTERRUPTED, "", f"{MESSAGE}\n")
+
+
+@pytest.mark.parametrize("delay_s", [0.4, 0.8])
+def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(delay_s: float, tmp_path: Path) -> None:
+    command = [
+        *(sys.executable, "-m", "calibrator", "simulate", "--vehicles", "200", "--minutes", "2"),
+        *("--layout", str(LAYOUT), "--out", str(tmp_path / "x")),
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        while not list(tmp_path.iterdir()):  # the hidden folder: the workers are about to start
+            assert process.poll() is None
+            time.sleep(0.01)
+        time.sleep(delay_s)
+        os.killpg(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=30)
+    assert (process.returncode, errors) == (INTERRUPTED, f"{MESSAGE}\n")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["simulate", "--help"]])
+def test_closed_pipe_gives_no_traceback(arguments: list[str]) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "calibrator", *arguments]
+    run = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False, timeout=60)
+    os.close(writer)
+    assert (run.returncode, run.stderr) == (1, "")
