@@ -1,6 +1,7 @@
 """Command line of the node: ``ecu-node run``, ``ecu-node check``, ``ecu-node schema``.
 
-Results go to standard output, what happens to standard error. Exit code 0: done, 1: failed, 2: wrong use.
+Results go to standard output, what happens to standard error. Exit code 0: done, 1: failed, 2: wrong use,
+130: interrupted by Ctrl-C before the node was at work (at work, Ctrl-C and SIGTERM end it with 0).
 """
 
 import argparse
@@ -16,11 +17,13 @@ from types import FrameType
 
 from ecu_node import __version__
 from ecu_node.errors import UserError
+from ecu_node.interrupts import ending_at_interrupt
 
 __all__ = ["main"]
 
 _VEHICLE_VARIABLE = "ECU_NODE_VEHICLE"
 _DEFAULT_STATUS_PERIOD_S = 0.1
+_EXIT_CODES = "Exit codes: 0 done (also when ended by a signal), 1 failed, 2 wrong use, 130 interrupted at start."
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -34,22 +37,34 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0 done, 1 failed. Wrong use ends in SystemExit(2).
+        Exit code: 0 done, 1 failed. Wrong use ends in SystemExit(2), Ctrl-C during start-up ends the process with 130.
     """
+    try:
+        with ending_at_interrupt():
+            try:
+                return _main(argv)
+            finally:
+                sys.stdout.flush()
+    except UserError as error:
+        _say(str(error))
+    except BrokenPipeError:
+        # What is still buffered has no reader; without this the interpreter would try to write it at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 1
+
+
+def _main(argv: Sequence[str] | None) -> int:
     options = _parser().parse_args(argv)
     logging.getLogger("can").addHandler(logging.NullHandler())
     _load_python_can()
-    try:
-        return int(options.command(options))
-    except UserError as error:
-        _say(str(error))
-        return 1
+    return int(options.command(options))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="ecu-node",
         description="Corrects the high-voltage currents on a CAN bus with the parameters of this vehicle.",
+        epilog=_EXIT_CODES,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
@@ -59,6 +74,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Reads the branch currents from a bus and publishes them corrected, under identifiers of their "
         "own on the same bus. With parameters that do not fit it passes the measured values through and says so in "
         "its status message.",
+        epilog=_EXIT_CODES,
     )
     _add_files(run)
     run.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
@@ -69,7 +85,8 @@ def _parser() -> argparse.ArgumentParser:
         "check",
         help="would these parameters be applied?",
         description="Checks parameters against layout, DBC and vehicle, and shows the integer plan of each branch. "
-        "Exit code 0: they fit, 1: they do not.",
+        "What it accepts, 'ecu-node run' accepts.",
+        epilog="Exit codes: 0 they fit, 1 they do not, 2 wrong use, 130 interrupted.",
     )
     _add_files(check)
     check.add_argument("--json", action="store_true", help="print JSON")
@@ -105,19 +122,22 @@ def _run(options: argparse.Namespace) -> int:
     from ecu_node.database import read_database  # noqa: PLC0415  # after _load_python_can
     from ecu_node.layout import read_layout  # noqa: PLC0415
     from ecu_node.node import choose_parameters, open_bus, serve  # noqa: PLC0415
-    from ecu_node.wiring import wire  # noqa: PLC0415
+    from ecu_node.wiring import WHY_NOT_PUBLISHED, not_published, wire  # noqa: PLC0415
 
-    stop = _StopRequest()
     database = read_database(read_layout(options.layout))
     in_force, why_not = choose_parameters(options.params, database, options.vehicle)
     corrector = wire(database, in_force, time.monotonic())
     status = database.layout.status
     with open_bus(database, interface=options.interface, channel=options.channel, fd=options.fd) as bus:
+        stop = _StopRequest()
         if why_not is not None:
             _say(f"passing measured values through: {why_not}")
         elif options.vehicle is None:
             _say(f"the vehicle is not checked: give --vehicle or ${_VEHICLE_VARIABLE}")
-        applied = ", ".join(branch.name for branch in corrector.branches if branch.fault.applied)
+        hidden = not_published(database, in_force)
+        for name in hidden:
+            _say(f"branch {name} is not published: {WHY_NOT_PUBLISHED}")
+        applied = ", ".join(item.name for item in corrector.branches if item.fault.applied and item.name not in hidden)
         _say(f"running on {options.interface} {options.channel}, correcting {applied or 'nothing'}")
         try:
             serve(

@@ -17,7 +17,9 @@ from ecu_node.layout import Branch, SignalName, split_signal
 from ecu_node.parameters import VehicleParameters
 from ecu_node.status import Reason
 
-__all__ = ["InForce", "branch_plan", "sensor_fault", "wire"]
+__all__ = ["WHY_NOT_PUBLISHED", "InForce", "branch_plan", "not_published", "sensor_fault", "wire"]
+
+WHY_NOT_PUBLISHED = "the parameters apply a fault to it, but the layout has no 'corrected' for it"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +36,12 @@ def sensor_fault(in_force: InForce, branch: str) -> SensorFault:
     if found is None or not found.apply or found.drift == found.offset_a == 0.0:
         return SensorFault()
     return SensorFault(drift=found.drift, offset_a=found.offset_a, applied=True)
+
+
+def not_published(database: VehicleDatabase, in_force: InForce) -> list[str]:
+    """Branches with a fault to correct, but no signal to publish the result in; it counts in the status' sum alone."""
+    branches = database.layout.branch
+    return [item.name for item in branches if item.corrected is None and sensor_fault(in_force, item.name).applied]
 
 
 def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault) -> IntegerPlan | None:

@@ -2,8 +2,10 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,7 +14,7 @@ from ecu_node import __version__
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import parameter_schema, write_parameters
-from tests.ecu_node.vehicles import LAYOUT, parameters_for
+from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, parameters_for
 
 
 @pytest.fixture
@@ -44,9 +46,74 @@ def test_the_same_as_text(params: Path, capsys: pytest.CaptureFixture[str]) -> N
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "vehicle v1, parameter set 300: fit"
     assert lines[2].split()[:3] == ["battery", "+25.0000%", "+5.000"]
-    assert lines[3].split()[0] == "gain"
-    dcdc = next(line for line in lines if line.startswith("dcdc"))
-    assert dcdc.endswith("HV_DcdcCorrected.DcdcCurrentCorrected (passed through)")
+    assert lines[2].endswith("A  corrected")
+    assert lines[3:5] == ["  target HV_BatteryCorrected.BatteryCurrentCorrected", lines[4]]
+    assert lines[4].startswith("  gain ")
+    dcdc = next(index for index, line in enumerate(lines) if line.startswith("dcdc"))
+    assert lines[dcdc].endswith("passed through")
+    assert lines[dcdc + 1] == "  target HV_DcdcCorrected.DcdcCurrentCorrected"
+    assert max(map(len, lines)) <= 80
+
+
+@pytest.fixture
+def small(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> Callable[..., list[str]]:
+    """Options for a small vehicle whose parameters apply a fault to the heater, a power branch."""
+
+    def make(dbc: str = SMALL_DBC) -> list[str]:
+        database = make_database(dbc=dbc)
+        path = tmp_path / "small.json"
+        write_parameters(parameters_for(database, battery=(0.1, 1.0), heater=(0.1, 0.0)), path)
+        return ["--params", str(path), "--layout", str(database.layout.path), "--vehicle", "v1"]
+
+    return make
+
+
+WITHOUT_SNA = SMALL_DBC.replace('VAL_ 512 Motor -32768 "SNA";\n', "")
+
+
+def test_check_refuses_what_run_refuses(small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]) -> None:
+    options = small(WITHOUT_SNA)
+    run = ["run", *options, "--interface", "virtual", "--channel", "c0"]
+    assert [main(["check", *options]), main(run)] == [1, 1]
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    first, second = captured.err.splitlines()
+    assert first == second
+    assert first.endswith("branch motor: signal Motor needs a code named SNA in the DBC (VAL_) that says 'no value'")
+
+
+def test_check_warns_of_a_correction_that_is_not_published(
+    small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = small()
+    words = "branch heater is not published: the parameters apply a fault to it, but the layout has no 'corrected'"
+    assert main(["check", *options]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1].startswith(f"warning: {words}")
+    assert next(line for line in lines if line.startswith("heater")).endswith("A  not published")
+    assert main(["check", *options, "--json"]) == 0
+    (warning,) = json.loads(capsys.readouterr().out)["warnings"]
+    assert warning.startswith(words)
+
+
+def test_check_says_that_run_needs_fd(small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", *small(SMALL_DBC.replace("PairOut: 8", "PairOut: 16"))]) == 0
+    assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in capsys.readouterr().out
+
+
+def test_run_does_not_claim_to_correct_what_it_cannot_publish(
+    small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ecu_node.cli._StopRequest.requested", lambda self: True)
+    handlers = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
+    try:
+        assert main(["run", *small(), "--interface", "virtual", "--channel", "c0"]) == 0
+    finally:
+        signal.signal(signal.SIGTERM, handlers[0])
+    assert signal.getsignal(signal.SIGINT) == handlers[1]
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("ecu-node: branch heater is not published: ")
+    assert lines[1] == "ecu-node: running on virtual c0, correcting battery"
 
 
 def test_unfit_parameters_end_in_1_and_say_why(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -79,10 +146,12 @@ def test_wrong_use_ends_in_2(arguments: list[str], capsys: pytest.CaptureFixture
     assert "usage: ecu-node" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["check", "--help"], ["schema", "--help"]])
-def test_help_is_given(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["-h"], ["run", "-h"], ["run", "--help"], ["check", "--help"], ["schema", "--help"]]
+)
+def test_help_is_given(command: list[str], option: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        main(arguments)
+        main([*command, option])
     assert caught.value.code == 0
     assert "usage: ecu-node" in capsys.readouterr().out
 
@@ -120,6 +189,37 @@ def test_what_keeps_the_node_from_running_is_one_line(params: Path, layout: str,
     assert result.stdout == ""
     assert result.stderr.startswith(words)
     assert result.stderr.count("\n") == 1
+
+
+def test_ctrl_c_at_start_is_one_line_and_130(params: Path) -> None:
+    os.mkfifo(pipe := params.with_name("layout.toml"))
+    command = ["check", "--params", str(params), "--layout", str(pipe)]
+    with (
+        subprocess.Popen(
+            [sys.executable, "-m", "ecu_node", *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process,
+        pipe.open("w"),
+    ):  # opens when the node reads its layout, and keeps it waiting
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (130, "", "ecu-node: interrupted\n")
+
+
+@pytest.mark.parametrize(("command", "code"), [("check", 1), ("schema", 1), ("--help", 0)])
+def test_a_reader_that_leaves_early_gets_no_traceback(params: Path, command: str, code: int) -> None:
+    arguments = check(params) if command == "check" else [command]
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as closed:
+        done = subprocess.run(
+            [sys.executable, "-m", "ecu_node", *arguments],
+            stdout=closed,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (code, "")
 
 
 def test_the_node_brings_no_numpy_with_it(params: Path) -> None:

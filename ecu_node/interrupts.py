@@ -1,0 +1,36 @@
+"""Ctrl-C while nothing is open yet.
+
+Libraries swallow KeyboardInterrupt in their own imports, or print it; so until the node is at work, SIGINT ends the
+process at once. What the node does at work is for :mod:`ecu_node.cli` to say.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+__all__ = ["INTERRUPTED", "ending_at_interrupt"]
+
+INTERRUPTED = 130
+"""Exit code that shells give to a program ended by SIGINT."""
+
+
+@contextmanager
+def ending_at_interrupt() -> Iterator[None]:
+    """Within the block SIGINT ends the process with one line and :data:`INTERRUPTED`, unless it is ignored."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.SIG_IGN:
+        yield
+        return
+    signal.signal(signal.SIGINT, _end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+    os.write(sys.stderr.fileno(), b"ecu-node: interrupted\n")
+    os._exit(INTERRUPTED)
