@@ -6,9 +6,9 @@ With x_k the band of the measured current of branch k (:mod:`calibrator.drives.c
 
 The last equation is that of the slopes x_k'. f weakens slopes that are no greater than the branch's noise: a small
 branch tells its delay by its few steps. Noise in x_k' would make the sums of f(x_k') g_k x_k', and so the confidence,
-too great; the slope g_k x_k' - e', which the other branches predict, stands in its place. The instants t fill the
-phases of all frames evenly: noise of a sensor then has the same power in e whatever its tau, and pulls nothing.
-Huber's weights defend against wild samples.
+too great; the slope g_k x_k' - e', which the other branches predict, stands in its place. The windows of x_k hold
+several samples of every branch: noise of a sensor then has nearly the same power in e whatever the phase of its
+frames, and pulls tau nowhere. Huber's weights defend against wild samples.
 """
 
 from collections.abc import Sequence

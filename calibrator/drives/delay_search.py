@@ -1,10 +1,12 @@
 """First guess of the delays between branches: the lags on a grid that make the junction sum smallest.
 
 The second moments of the bands of all branches at all lags are gathered once; every combination of lags is then a
-small least-squares problem made of some of them. Branch after branch takes its best lag with those of the others held.
+small least-squares problem made of some of them. Two branches at a time take their best lags with those of the others
+held: branches that do much the same, as two motors, pull each other's lag off when they are searched one by one.
 """
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -19,8 +21,8 @@ LAG_STEP_S = 0.02
 """Grid of the search, far finer than the windows: the true delay lies in the neighbourhood of the best lag. [s]"""
 THINNING = 5
 """The sum is looked at on every fifth grid instant, ten times a second."""
-SWEEPS = 3
-"""How many times each branch takes its best lag; the second time already rarely changes one."""
+SWEEPS = 2
+"""How many times each pair of branches takes its best lags: the first time those of the rest are still guesses."""
 SINGULAR = 1e-10
 """Combinations of branches with less than this share of the greatest power count as none. [1]"""
 
@@ -47,9 +49,9 @@ def search_lags(drives: Sequence[Sequence[ChargeCurve]], band: Band, max_delay_s
     moments = np.sum([_lagged_moments(curves, band, reach) for curves in drives], axis=0)
     branches = len(drives[0])
     column = reach + width * np.arange(branches)
-    for _ in range(SWEEPS):
-        for k in range(1, branches):
-            column[k] = width * k + _best_lag(moments, column, k, width)
+    groups = list(combinations(range(1, branches), min(2, branches - 1)))
+    for group in groups * SWEEPS:
+        column[list(group)] = _best_columns(moments, column, group, width)
     return np.asarray((column[1:] % width - reach) * LAG_STEP_S)
 
 
@@ -69,10 +71,11 @@ def _lagged_moments(curves: Sequence[ChargeCurve], band: Band, reach: int) -> Ar
     return z.T @ z
 
 
-def _best_lag(moments: Array, column: NDArray[np.intp], k: int, width: int) -> int:
-    """Index of the lag of branch k with which the branches explain most of the first one."""
-    tried = np.repeat(column[None, 1:], width, axis=0)
-    tried[:, k - 1] = width * k + np.arange(width)
+def _best_columns(moments: Array, column: NDArray[np.intp], group: Sequence[int], width: int) -> NDArray[np.intp]:
+    """Columns (lags) of some branches with which all together explain most of the first one."""
+    choices = np.stack(np.meshgrid(*(width * k + np.arange(width) for k in group)), axis=-1).reshape(-1, len(group))
+    tried = np.repeat(column[None, 1:], len(choices), axis=0)
+    tried[:, np.array(group) - 1] = choices
     target = moments[tried, column[0]][:, :, None]
     gain = np.linalg.pinv(moments[tried[:, :, None], tried[:, None, :]], rcond=SINGULAR, hermitian=True) @ target
-    return int(np.argmax((gain * target).sum(axis=(1, 2))))
+    return np.asarray(choices[np.argmax((gain * target).sum(axis=(1, 2)))])

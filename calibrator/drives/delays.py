@@ -39,8 +39,6 @@ LONG_S = 5.0
 """Loads that change more slowly count as constant; auxiliaries still change within it. [s]"""
 INSTANTS_PER_WINDOW = 4.0
 """Instants looked at in each SHORT_S; more tell nothing new. [1]"""
-GOLDEN = (5.0**0.5 - 1.0) / 2.0
-"""Multiples of it fill an interval evenly."""
 BLOCK_S = 10.0
 """Longer than the residual remembers (LONG_S), so that blocks count as independent. [s]"""
 FEWEST_BLOCKS = 6
@@ -164,11 +162,9 @@ def _curves(drive: Drive, branches: Sequence[str]) -> tuple[ChargeCurve, ...]:
 
 
 def _stretch(curves: tuple[ChargeCurve, ...], band: Band, max_delay_s: float) -> Stretch:
-    """Instants in blocks, one at an even but never periodic place in every step."""
+    """Instants in blocks, and the currents around them."""
     start_s, stop_s = max(curve.time_s[0] for curve in curves), min(curve.time_s[-1] for curve in curves)
-    step_s = band.short_s / INSTANTS_PER_WINDOW
-    number = np.arange(max((stop_s - start_s) / step_s - 1.0, 0.0))
-    time_s = start_s + (number + GOLDEN * number % 1.0) * step_s
+    time_s = np.arange(start_s, stop_s, band.short_s / INSTANTS_PER_WINDOW)
     time_s = time_s[covered(curves, time_s, band.long_s + max_delay_s)]
     block = np.floor((time_s - start_s) / BLOCK_S)
     return Stretch(curves=curves, time_s=time_s, starts=np.flatnonzero(np.diff(block, prepend=-1.0)))
