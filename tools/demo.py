@@ -32,12 +32,23 @@ from replay import read_log, replay
 
 ROOT = Path(__file__).resolve().parent.parent
 LAYOUT = "dbc/hv_powertrain.toml"
-VEHICLES = 44
+VEHICLES, BRANCHES = 44, 3
+MINUTES = 8
+"""Length of the trip that each vehicle is calibrated on. [min]"""
 SECONDS = 40.0
 """Length of the live drive. [s]"""
 MARKER = ".made-by-demo"
 
 
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.command()
 def main(
     drives: Annotated[
         str, typer.Option(help="'builtin', or a folder of BMW i3 recordings (.csv, .csv.gz).")
@@ -62,8 +73,8 @@ def show(drives: str, out: Path) -> None:
     source = import_recordings(drives, out) if drives != "builtin" else "builtin"
     step(1, f"{VEHICLES} identical vehicles with faulty sensors drive, and log their CAN buses")
     run(
-        *("calibrator", "simulate", "--drives", source, "--vehicles", VEHICLES, "--currents", 3, "--sparsity", 80),
-        *("--balanced", "--symmetric", "--minutes", 8, "--unseen-minutes", 2, "--layout", LAYOUT, "--out", fleet),
+        *("calibrator", "simulate", "--drives", source, "--vehicles", VEHICLES, "--currents", BRANCHES, "--sparsity", 80),
+        *("--balanced", "--symmetric", "--minutes", MINUTES, "--unseen-minutes", 2, "--layout", LAYOUT, "--out", fleet),
     )
     truth = read_truth(fleet / "truth.json")
     vehicle = faulty_vehicle(truth)
@@ -240,4 +251,4 @@ def fail(text: str) -> None:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    app()
