@@ -17,13 +17,21 @@ from calibrator.recordings.readers import drive_from_frames
 from calibrator.report.kirchhoff import compare_kirchhoff
 from calibrator.report.kirchhoff_view import kirchhoff_table, plot_kirchhoff
 from ecu_node.database import read_database
-from ecu_node.errors import UserError
+from ecu_node.errors import DatabaseError, UserError
 from ecu_node.layout import read_layout
 
 _POLL_S = 0.1
 """How often the end of a live recording is checked. [s]"""
 
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 
+
+@app.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong use, 130 interrupted.")
 def main(
     *,
     layout: Annotated[Path, typer.Option(help="Layout of the vehicle (TOML).")],
@@ -41,6 +49,8 @@ def main(
     try:
         settings = read_layout(layout)
         if dbc is not None:
+            if not dbc.is_file():
+                raise DatabaseError(f"{dbc}: no such DBC; check --dbc")
             settings = msgspec.structs.replace(settings, dbc=str(dbc.absolute()))
         database = read_database(settings)
         where = str(log) if log is not None else f"{interface}:{channel}"
@@ -90,4 +100,4 @@ def _fail(text: str) -> NoReturn:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    app()

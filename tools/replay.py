@@ -1,36 +1,32 @@
 #!/usr/bin/env python3
 """Play a CAN log onto a bus, with the timing of the recording or as fast as the bus takes it.
 
-Formats are those of python-can (.log of candump, .asc, .blf, .trc, .csv, .mf4), each also gzipped.
+Formats are those of the calibrator (.log of candump, .asc, .blf, .trc, .mf4), each also gzipped, and a log is read as
+there: whole, before the first frame is sent, so that a damaged one sends nothing. Data frames are played; error and
+remote frames are left out. A frame goes out as CAN FD where its payload is longer than 8 bytes.
 """
 
 import argparse
-import gzip
 import logging
 import math
-import struct
 import sys
 import time
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO, cast
 
 import can
 
 from calibrator.errors import LogError
-from calibrator.recordings.blf import check_blf
+from calibrator.recordings.frame_arrays import CLASSIC_BYTES, EXTENDED_BIT, Frames
+from calibrator.recordings.frames import LOG_SUFFIXES, read_frames
 from ecu_node.errors import BusError, UserError
 from ecu_node.node import connect
 
 __all__ = ["main", "read_log", "replay"]
 
-SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv", ".mf4")
-_DAMAGE = (
-    ValueError, LookupError, TypeError, OSError, EOFError, NotImplementedError, struct.error, zlib.error,
-    can.io.blf.BLFParseError,
-)  # fmt: skip
-"""What python-can's readers raise on a damaged file."""
+_INTERRUPTED = 130
+"""Exit code that shells give to a program ended by SIGINT."""
+_EXIT_CODES = "Exit codes: 0 done, 1 failed, 2 wrong use, 130 interrupted."
 _SEND_LIMIT_S = 1.0
 """A bus that takes nothing for this long has nobody listening, or is off. [s]"""
 _SEND_PAUSE_S = 0.0005
@@ -39,42 +35,38 @@ _PROGRESS_PERIOD_S = {True: 0.5, False: 10.0}
 
 
 def read_log(path: Path) -> Iterator[can.Message]:
-    """Read a log frame by frame.
+    """Read a log.
 
     Parameters
     ----------
     path : Path
         The log; its suffix says the format.
 
-    Yields
-    ------
-    can.Message
-        The frames in the order of the file.
+    Returns
+    -------
+    iterator of can.Message
+        Its data frames in the order of the file; the whole log is read before the first one.
 
     Raises
     ------
     LogError
-        If the file is missing, of an unknown format, damaged or empty.
+        If the file is missing, a folder, of an unknown format, damaged or empty.
     """
-    suffix = Path(path.name.removesuffix(".gz")).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise LogError(f"{path}: not a known log format; expected {', '.join(SUFFIXES)}, each also with .gz")
-    if not path.is_file():
-        raise LogError(f"{path}: no such log file")
-    count = 0
-    try:
-        if suffix == ".blf":
-            with cast("BinaryIO", gzip.open(path) if path.suffix == ".gz" else path.open("rb")) as file:
-                check_blf(file, str(path))
-        with can.LogReader(path) as reader:
-            for message in reader:
-                yield message
-                count += 1
-    except _DAMAGE as error:
-        why = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise LogError(f"{path}: damaged after {count} frames ({why}); copy or record it again") from None
-    if not count:
-        raise LogError(f"{path}: the log is empty; record it again")
+    if path.is_dir():
+        raise LogError(f"{path}: a folder; give one log file ({' '.join(LOG_SUFFIXES)}, each also .gz)")
+    return _messages(read_frames(path))
+
+
+def _messages(frames: Frames) -> Iterator[can.Message]:
+    for time_ns, key, length, data in zip(frames.time_ns, frames.key, frames.length, frames.data, strict=True):
+        yield can.Message(
+            timestamp=int(time_ns) * 1e-9,
+            arbitration_id=int(key) & ~EXTENDED_BIT,
+            is_extended_id=bool(int(key) & EXTENDED_BIT),
+            is_fd=int(length) > CLASSIC_BYTES,
+            data=data[: int(length)].tobytes(),
+            is_rx=False,
+        )
 
 
 def replay(
@@ -125,28 +117,31 @@ def replay(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
+    """Command line; returns the exit code: 0 done, 1 failed, 130 interrupted. Wrong use ends in SystemExit(2)."""
     options = _parser().parse_args(argv)
     logging.getLogger("can").addHandler(logging.NullHandler())
     show = _Progress()
     try:
+        messages = read_log(options.log)
+        show.start()
         with connect(options.interface, options.channel, fd=options.fd) as bus:
-            sent = replay(read_log(options.log), bus, speed=options.speed, progress=show)
+            sent = replay(messages, bus, speed=options.speed, progress=show)
     except UserError as error:
+        show.close()
         print(f"replay: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print(f"replay: interrupted after {show.sent} frames", file=sys.stderr)
-        return 1
-    finally:
         show.close()
+        print(f"replay: interrupted after {show.sent} frames", file=sys.stderr)
+        return _INTERRUPTED
+    show.close()
     print(f"{sent} frames in {time.monotonic() - show.begin_s:.1f} s")
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="replay.py", description="Plays a CAN log onto a bus.")
-    parser.add_argument("log", type=Path, metavar="LOG", help=f"log file: {' '.join(SUFFIXES)}, each also .gz")
+    parser = argparse.ArgumentParser(prog="replay.py", description="Plays a CAN log onto a bus.", epilog=_EXIT_CODES)
+    parser.add_argument("log", type=Path, metavar="LOG", help=f"log file: {' '.join(LOG_SUFFIXES)}, each also .gz")
     parser.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
     parser.add_argument("--channel", required=True, help="channel of the interface, such as vcan0")
     parser.add_argument("--speed", type=_speed, default=1.0, help="1: as recorded (default), 0: as fast as it goes")
@@ -178,11 +173,15 @@ class _Progress:
     """Shows on standard error how far it is: one line kept up to date on a terminal, a line now and then elsewhere."""
 
     def __init__(self) -> None:
-        self.begin_s = time.monotonic()
         self.sent = 0
         self._terminal = sys.stderr.isatty()
-        self._due_s = self.begin_s + _PROGRESS_PERIOD_S[self._terminal]
         self._line_open = False
+        self.start()
+
+    def start(self) -> None:
+        """Count the time from here."""
+        self.begin_s = time.monotonic()
+        self._due_s = self.begin_s + _PROGRESS_PERIOD_S[self._terminal]
 
     def __call__(self, sent: int, age_s: float) -> None:
         self.sent = sent
@@ -194,9 +193,10 @@ class _Progress:
             self._line_open = self._terminal
 
     def close(self) -> None:
-        """End the line on a terminal."""
+        """End the line on a terminal, before anything else is said."""
         if self._line_open:
             print(file=sys.stderr)
+            self._line_open = False
 
 
 if __name__ == "__main__":

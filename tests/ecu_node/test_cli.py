@@ -146,9 +146,8 @@ def test_wrong_use_ends_in_2(arguments: list[str], capsys: pytest.CaptureFixture
     assert "usage: ecu-node" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["-h"], ["run", "-h"], ["run", "--help"], ["check", "--help"], ["schema", "--help"]]
-)
+@pytest.mark.parametrize("option", ["-h", "--help"])
+@pytest.mark.parametrize("command", [[], ["run"], ["check"], ["schema"]])
 def test_help_is_given(command: list[str], option: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         main([*command, option])

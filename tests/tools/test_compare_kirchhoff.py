@@ -92,6 +92,18 @@ def test_wrong_use_is_exit_code_2(log: Path) -> None:
     assert run(log).returncode == 2
 
 
+def test_help_has_a_short_form() -> None:
+    short, long = run("-h"), run("--help")
+    assert short.returncode == long.returncode == 0
+    assert short.stdout == long.stdout
+    assert "Usage: compare_kirchhoff.py" in short.stdout
+
+
+def test_a_missing_dbc_is_the_options_and_not_the_layouts(log: Path) -> None:
+    done = run(log, "--layout", LAYOUT, "--dbc", "missing.dbc")
+    assert (done.returncode, done.stderr) == (1, "compare_kirchhoff: missing.dbc: no such DBC; check --dbc\n")
+
+
 def test_a_silent_bus_and_an_unknown_interface_are_named() -> None:
     silent = run("--interface", "virtual", "--channel", "x", "--duration", 0.2, "--layout", LAYOUT)
     assert (silent.returncode, silent.stdout) == (1, "")

@@ -13,6 +13,7 @@ import pytest
 from can.interfaces.virtual import VirtualBus
 
 from calibrator.errors import LogError
+from calibrator.recordings.frames import LOG_SUFFIXES
 from ecu_node.errors import BusError
 from replay import main, read_log, replay
 
@@ -56,7 +57,7 @@ def heard(bus: can.BusABC) -> list[tuple[int, bool, bytes]]:
 SENT = [(frame.arbitration_id, frame.is_extended_id, bytes(frame.data)) for frame in FRAMES]
 
 
-@pytest.mark.parametrize("name", ["x.log", "x.asc", "x.blf", "x.trc", "x.csv", "x.log.gz", "x.asc.gz", "X.BLF"])
+@pytest.mark.parametrize("name", ["x.log", "x.asc", "x.blf", "x.trc", "x.mf4", "x.log.gz", "x.asc.gz", "X.BLF"])
 def test_every_frame_of_every_format_comes_in_order(
     tmp_path: Path, listener: can.BusABC, name: str, request: pytest.FixtureRequest
 ) -> None:
@@ -127,16 +128,19 @@ def looping_blf(path: Path) -> Path:
 
 def test_logs_that_cannot_be_played_are_named_with_the_reason(tmp_path: Path) -> None:
     cases: dict[str, tuple[Callable[[Path], object], str]] = {
-        "missing.log": (lambda path: path, "no such log file"),
+        "missing.log": (lambda path: path, "no such file"),
+        "folder.log": (Path.mkdir, r"a folder; give one log file \(\.log"),
         "x.xyz": (written_text, r"not a known log format; expected \.log"),
+        "x.csv": (written, r"not a known log format; expected \.log"),
         "empty.log": (lambda path: path.write_bytes(b""), "the log is empty"),
-        "torn.log": (written_text, "damaged after 0 frames"),
-        "binary.asc": (lambda path: path.write_bytes(b"\xff\xfe\x00" * 50), "damaged after 0 frames|empty"),
+        "torn.log": (written_text, "line 1 is damaged"),
+        "binary.asc": (lambda path: path.write_bytes(b"\xff\xfe\x00" * 50), "binary.asc: "),
         "empty.blf": (lambda path: path.write_bytes(b""), "truncated or damaged BLF"),
         "cut.blf": (lambda path: cut(written(path), 200), "truncated or damaged BLF"),
         "loop.blf": (looping_blf, "object of 0 bytes"),
-        "notzip.log.gz": (written_text, "damaged after 0 frames"),
-        "cut.log.gz": (lambda path: cut(written(path), 150), "damaged after"),
+        "damaged.mf4": (lambda path: cut(written(path), 500), "not a readable MF4 log"),
+        "notzip.log.gz": (written_text, "truncated or damaged after line 0"),
+        "cut.log.gz": (lambda path: cut(written(path), 150), "truncated or damaged after line"),
     }
     for name, (make, words) in cases.items():
         make(tmp_path / name)
@@ -159,7 +163,7 @@ def test_the_command_plays_a_log_and_counts(log: Path, capsys: pytest.CaptureFix
 
 @pytest.mark.parametrize(
     ("name", "interface", "words"),
-    [("missing.log", "virtual", "replay: .*no such log"), ("drive.log", "pigeon", "replay: pigeon c: cannot open")],
+    [("missing.log", "virtual", "replay: .*no such file"), ("drive.log", "pigeon", "replay: pigeon c: cannot open")],
 )
 def test_a_replay_that_fails_ends_in_1(
     log: Path, capsys: pytest.CaptureFixture[str], name: str, interface: str, words: str
@@ -168,6 +172,35 @@ def test_a_replay_that_fails_ends_in_1(
     captured = capsys.readouterr()
     assert captured.out == ""
     assert re.match(words, captured.err)
+
+
+def test_ctrl_c_ends_the_line_of_progress_first_and_the_replay_with_130(
+    log: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def send(self: VirtualBus, msg: can.Message, timeout: float | None = None) -> None:
+        if msg.arbitration_id == FRAMES[3].arbitration_id:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(VirtualBus, "send", send)
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    monkeypatch.setattr("replay._PROGRESS_PERIOD_S", {True: 0.0, False: 0.0})
+    assert main([str(log), "--interface", "virtual", "--channel", "c"]) == 130
+    last = capsys.readouterr().err.rpartition("\r")[2]
+    assert last == "replay: 3 frames, 0 s of the log\nreplay: interrupted after 3 frames\n"
+
+
+def test_long_payloads_are_played_as_can_fd(tmp_path: Path) -> None:
+    path = tmp_path / "fd.log"
+    path.write_text("(1.000000) can0 123##1" + "AB" * 12 + "\n(1.100000) can0 123#AB\n")
+    assert [(frame.is_fd, bytes(frame.data)) for frame in read_log(path)] == [(True, b"\xab" * 12), (False, b"\xab")]
+
+
+@pytest.mark.parametrize("option", ["-h", "--help"])
+def test_help_names_the_formats_that_are_read(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([option])
+    assert caught.value.code == 0
+    assert " ".join(LOG_SUFFIXES) in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("more", [[], ["--channel"], ["--channel=c", "--speed=-1"], ["--channel=c", "--speed=nan"]])
