@@ -1,6 +1,7 @@
 """Command line of the calibrator. Results go to stdout, progress and messages to stderr."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +12,7 @@ from calibrator.command_options import (
     BranchesOption,
     CurrentsOption,
     DelayOption,
+    DrivesOption,
     JsonOption,
     LayoutOption,
     MagnitudeOption,
@@ -18,6 +20,7 @@ from calibrator.command_options import (
     NoiseOption,
     SeedOption,
     SparsityOption,
+    SymmetricOption,
     UnmeasuredOption,
     UnseenMinutesOption,
     VehiclesOption,
@@ -107,16 +110,12 @@ def simulate(
     layout: LayoutOption,
     out: Annotated[Path, typer.Option("--out", help="Folder of the fleet, new or empty.")],
     vehicles: VehiclesOption,
-    drives: Annotated[
-        str, typer.Option("--drives", help="Drive store with the trips to drive, or 'builtin'.")
-    ] = "builtin",
+    drives: DrivesOption = "builtin",
     currents: CurrentsOption = 2,
     sparsity: SparsityOption = 80.0,
     magnitude: MagnitudeOption = (0.05, 0.25),
     common_drive: Annotated[bool, typer.Option("--common-drive", help="One trip for all vehicles.")] = False,
-    symmetric: Annotated[
-        bool, typer.Option("--symmetric", help="Mean of the fleet is the ideal vehicle (22).")
-    ] = False,
+    symmetric: SymmetricOption = False,
     balanced: Annotated[bool, typer.Option("--balanced", help="No hardware faults in half of the vehicles.")] = False,
     noise: NoiseOption = 0.001,
     delay: DelayOption = 0.0,
@@ -158,9 +157,7 @@ def simulate(
     )
     with progress_bar("simulate", vehicles, "vehicles") as progress:
         truth = simulate_fleet(plan, trips, database, out, workers=workers, progress=progress)
-    figures = {"vehicles": len(truth.vehicles), "branches": truth.branches, "out": str(out), "notices": trips.notices}
-    lines = [f"{out}: {len(truth.vehicles)} vehicles with branches {', '.join(truth.branches)}"]
-    _print_report(dumps(figures) if json else "\n".join([*lines, *(f"notice: {notice}" for notice in trips.notices)]))
+    _print_fleet(truth, out, trips.notices, json=json)
 
 
 @app.command()
@@ -175,7 +172,7 @@ def calibrate(
     truth: Annotated[Path | None, typer.Option("--truth", help="truth.json, for the perfect classifier.")] = None,
     sparsity: SparsityOption = 80.0,
     magnitude: MagnitudeOption = (0.05, 0.25),
-    symmetric: Annotated[bool, typer.Option("--symmetric", help="The fleet's mean is the ideal vehicle (22).")] = False,
+    symmetric: SymmetricOption = False,
     branches: BranchesOption = None,
     hold_out: Annotated[
         list[str] | None,
@@ -275,6 +272,12 @@ def _truth_of(fleet: Path, path: Path) -> "FleetTruth":
 
 def _database(layout: Path) -> VehicleDatabase:
     return read_database(read_layout(layout))
+
+
+def _print_fleet(truth: "FleetTruth", out: Path, notices: Sequence[str], *, json: bool) -> None:
+    figures = {"vehicles": len(truth.vehicles), "branches": truth.branches, "out": str(out), "notices": notices}
+    lines = [f"{out}: {len(truth.vehicles)} vehicles with branches {', '.join(truth.branches)}"]
+    _print_report(dumps(figures) if json else "\n".join([*lines, *(f"notice: {notice}" for notice in notices)]))
 
 
 def _print_report(text: str) -> None:

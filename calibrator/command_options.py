@@ -13,6 +13,7 @@ __all__ = [
     "BranchesOption",
     "CurrentsOption",
     "DelayOption",
+    "DrivesOption",
     "JsonOption",
     "LayoutOption",
     "MagnitudeOption",
@@ -20,6 +21,7 @@ __all__ = [
     "NoiseOption",
     "SeedOption",
     "SparsityOption",
+    "SymmetricOption",
     "UnmeasuredOption",
     "UnseenMinutesOption",
     "VehiclesOption",
@@ -78,6 +80,8 @@ CurrentsOption = Annotated[int, typer.Option("--currents", min=2, max=MAX_CURREN
 BranchesOption = Annotated[
     str | None, typer.Option("--branches", callback=_branches, help="Branches to use, with commas.")
 ]
+DrivesOption = Annotated[str, typer.Option("--drives", help="Drive store with the trips to drive, or 'builtin'.")]
+SymmetricOption = Annotated[bool, typer.Option("--symmetric", help="The fleet's mean is the ideal vehicle (22).")]
 SparsityOption = Annotated[
     float,
     typer.Option(

@@ -1,14 +1,17 @@
+from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
-from calibrator.artificial.ground_truth import GroundTruth
-from calibrator.artificial.trips import BuiltinTrips, CommonTrips, RecordedTrips, choose_trips
+from calibrator.artificial.ground_truth import GroundTruth, choose_branches
+from calibrator.artificial.trips import BuiltinTrips, CommonTrips, RecordedTrips, TripSource, choose_trips
 from calibrator.drive import Channel, Drive
 from calibrator.drives.store import write_drive
 from calibrator.errors import FleetError
 from ecu_node.database import VehicleDatabase
+from ecu_node.layout import Layout
 
 
 def recorded(name: str, level: float) -> GroundTruth:
@@ -82,3 +85,40 @@ def test_store_without_any_usable_drive_is_refused(database: VehicleDatabase, tm
     write_drive(tmp_path, bad, database.layout)
     with pytest.raises(FleetError, match="no drive with usable samples"):
         choose_trips(str(tmp_path), database.layout, vehicles=1, seed=0, duration_s=5.0, unseen_s=5.0, common=False)
+
+
+def builtin(layout: Layout) -> TripSource:
+    return choose_trips("builtin", layout, vehicles=1, seed=0, duration_s=5.0, unseen_s=5.0, common=False)
+
+
+def renamed(layout: Layout, *, branches: bool = False, inputs: Sequence[str] = ()) -> Layout:
+    """The layout with its branches, and the derived inputs that read some inputs, under other names."""
+    branch = [msgspec.structs.replace(b, name=f"my_{b.name}") if branches else b for b in layout.branch]
+    derived = layout.derived
+    for name in inputs:
+        derived = [msgspec.structs.replace(d, formula=d.formula.replace(name, f"my_{name}")) for d in derived]
+    return msgspec.structs.replace(layout, branch=branch, derived=derived)
+
+
+def test_builtin_vehicle_has_all_that_its_own_layout_names(database: VehicleDatabase) -> None:
+    assert builtin(database.layout).notices == ()
+
+
+def test_layout_with_other_branches_is_told_those_of_the_builtin_vehicle(database: VehicleDatabase) -> None:
+    with pytest.raises(FleetError, match=r"two or more branches named battery, motor, .* or give --drives a store"):
+        builtin(renamed(database.layout, branches=True))
+
+
+def test_layout_with_other_inputs_is_told_those_of_the_builtin_vehicle(database: VehicleDatabase) -> None:
+    with pytest.raises(FleetError, match="model inputs made of voltage, torque, speed"):
+        builtin(renamed(database.layout, inputs=["voltage"]))
+
+
+def test_inputs_that_the_builtin_vehicle_has_not_are_named(database: VehicleDatabase) -> None:
+    (notice,) = builtin(renamed(database.layout, inputs=["heater_demand"])).notices
+    assert notice == "model inputs that the built-in vehicle has not: heater_current"
+
+
+def test_drives_with_other_branches_than_the_layout_are_refused_with_both(database: VehicleDatabase) -> None:
+    with pytest.raises(FleetError, match=r"has the branches battery, .*, these drives have pack, drive; at least two"):
+        choose_branches(database.layout, ("pack", "drive"), 2)
