@@ -40,7 +40,7 @@ LONG_S = 5.0
 INSTANTS_PER_WINDOW = 4.0
 """Instants looked at in each SHORT_S; more tell nothing new. [1]"""
 BLOCK_S = 10.0
-"""Longer than the residual remembers (LONG_S), so that blocks count as independent. [s]"""
+"""As long as the long windows reach: blocks count as independent. [s]"""
 FEWEST_BLOCKS = 6
 """Fewer do not give a standard deviation worth the name."""
 GAIN_RANGE = (1.0 / 3.0, 3.0)
