@@ -73,8 +73,9 @@ def show(drives: str, out: Path) -> None:
     source = import_recordings(drives, out) if drives != "builtin" else "builtin"
     step(1, f"{VEHICLES} identical vehicles with faulty sensors drive, and log their CAN buses")
     run(
-        *("calibrator", "simulate", "--drives", source, "--vehicles", VEHICLES, "--currents", BRANCHES, "--sparsity", 80),
-        *("--balanced", "--symmetric", "--minutes", MINUTES, "--unseen-minutes", 2, "--layout", LAYOUT, "--out", fleet),
+        *("calibrator", "simulate", "--drives", source, "--vehicles", VEHICLES, "--currents", BRANCHES),
+        *("--sparsity", 80, "--balanced", "--symmetric", "--minutes", MINUTES, "--unseen-minutes", 2),
+        *("--layout", LAYOUT, "--out", fleet),
     )
     truth = read_truth(fleet / "truth.json")
     vehicle = faulty_vehicle(truth)
