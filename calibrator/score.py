@@ -13,7 +13,7 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.faults import Faults
 
-__all__ = ["correction_error_rms", "f2_score", "harmed", "recovered", "recovery_rate"]
+__all__ = ["TOLERANCE", "correction_error_rms", "f2_score", "harmed", "recovered", "recovery_rate"]
 
 TOLERANCE = 0.10
 """Relative error below which a vehicle counts as recovered, section IV-D. [1]"""

@@ -1,0 +1,1 @@
+"""What recorded drives say of each vehicle's sensors, as Gaussian rows with covariance."""

@@ -1,0 +1,106 @@
+"""Evidence rows of a fleet from its drive summaries, with covariances earned from the spread between blocks."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrator.drive import Array
+from calibrator.evidence.fleet_model import FleetModel, regress_on_fleet
+from calibrator.evidence.junction_law import junction_law
+from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
+from calibrator.evidence.summary import DriveSummary
+
+__all__ = ["collect_rows"]
+
+LEAST_GAIN = 0.3
+"""Slopes and gain ratios below are no sensor's, but those of a branch that hardly moved. [1]"""
+FLEET_BLOCKS = 20.0
+"""Weight of the fleet's usual correlation of rows against that of one vehicle, in blocks."""
+LEAST_SD = np.array([5e-5, 1e-5])
+"""Least deviation of relative and constant rows: resolution of the signals and of their interpolation. [1]"""
+
+
+@dataclass(frozen=True)
+class _Raw:
+    """Rows of one vehicle: a (K), -g (K - 1), b / full scale (K), c / full scale (1)."""
+
+    values: Array
+    covariance: Array
+    blocks: int
+
+
+def collect_rows(summaries: Sequence[DriveSummary], model: FleetModel, *, full_scale_a: float) -> FleetRows:
+    """Evidence of every vehicle of a fleet.
+
+    Parameters
+    ----------
+    summaries : sequence of DriveSummary
+        One per vehicle.
+    model : FleetModel
+        Of the same fleet.
+    full_scale_a : float
+        Full scale of the junction. [A]
+
+    Returns
+    -------
+    FleetRows
+        Slopes and intercepts over the fleet model, and the junction law; no bench readings.
+    """
+    raw = [_of_vehicle(summary, model, full_scale_a) for summary in summaries]
+    usual = np.mean([_correlation(vehicle.covariance) for vehicle in raw], axis=0)
+    values = np.stack([vehicle.values for vehicle in raw])
+    return _rows(values, np.stack([_steadied(vehicle, usual) for vehicle in raw]))
+
+
+def _of_vehicle(summary: DriveSummary, model: FleetModel, full_scale_a: float) -> _Raw:
+    K = summary.branches
+    slopes, law = regress_on_fleet(summary, model.read_out), junction_law(summary)
+    estimate = np.concatenate([*(fit.estimate for fit in slopes), law.estimate])
+    influence = np.concatenate([*(fit.influence for fit in slopes), law.influence], axis=1)
+    covariance = influence.T @ influence
+    for k, fit in enumerate([*slopes, law]):
+        part = slice(2 * k, 2 * k + len(fit.estimate))
+        covariance[part, part] += fit.prior_covariance
+    order = [*range(0, 2 * K, 2), *range(2 * K, 3 * K - 1), *range(1, 2 * K, 2), 3 * K - 1]
+    unit = np.concatenate([np.ones(K), -np.ones(K - 1), np.full(K + 1, 1.0 / full_scale_a)])
+    return _Raw(estimate[order] * unit, covariance[order][:, order] * np.outer(unit, unit), len(influence))
+
+
+def _correlation(covariance: Array) -> Array:
+    sd = np.sqrt(np.diag(covariance))
+    safe = np.where(sd > 0.0, sd, np.inf)
+    return covariance / np.outer(safe, safe)
+
+
+def _steadied(vehicle: _Raw, usual: Array) -> Array:
+    """Covariance whose correlations lie between the vehicle's own and the fleet's: few blocks tell few of them."""
+    own = _correlation(vehicle.covariance)
+    correlation = (vehicle.blocks * own + FLEET_BLOCKS * usual) / (vehicle.blocks + FLEET_BLOCKS)
+    np.fill_diagonal(correlation, 1.0)
+    sd = np.sqrt(np.diag(vehicle.covariance))
+    return np.asarray(correlation * np.outer(sd, sd))
+
+
+def _rows(values: Array, covariance: Array) -> FleetRows:
+    """Logarithms of the ratios, constants as seen in true currents, and rows without bench readings."""
+    N, K = len(values), values.shape[1] // 3
+    ratios = values[:, : 2 * K - 1]
+    told = ratios > LEAST_GAIN
+    safe = np.where(told, ratios, 1.0)
+    derivative = np.concatenate([1.0 / safe, 1.0 / safe[:, :K], 1.0 / safe[:, :1]], axis=1)
+    covariance = covariance * derivative[:, :, None] * derivative[:, None, :]
+    vehicle, row = np.nonzero(~told)
+    covariance[vehicle, row, :], covariance[vehicle, :, row] = 0.0, 0.0
+    covariance[vehicle, row, row] = UNKNOWN_VARIANCE
+    full = np.zeros((N, 5 * K, 5 * K))
+    place = np.array([*range(2 * K - 1), *range(3 * K - 1, 4 * K)])
+    full[:, place[:, None], place] = covariance + np.diag(np.repeat(LEAST_SD, [2 * K - 1, K + 1]) ** 2)
+    for readings in (range(2 * K - 1, 3 * K - 1), range(4 * K, 5 * K)):
+        full[:, readings, readings] = UNKNOWN_VARIANCE
+    none = np.zeros((N, K))
+    return FleetRows(
+        relative=np.concatenate([np.log(safe), none], axis=1),
+        constant=np.concatenate([values[:, 2 * K - 1 :], none], axis=1),
+        covariance=full,
+    )

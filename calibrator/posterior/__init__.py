@@ -1,0 +1,1 @@
+"""Sparse posterior over hardware and sensor faults: the default estimator."""

@@ -1,0 +1,94 @@
+"""Densest cluster of numbers: fault-free sensors agree with each other, faulty ones do not.
+
+Values are taken as a mixture of one Gaussian cluster (centre c, spread s, each value with its own sampling error) and a
+broad background (half a Gaussian, half uniform). Of a grid of centres and spreads the most likely is chosen. Unlike the mean and the median the result
+does not need a symmetric fleet, nor that most vehicles are without faults.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+from calibrator.drive import Array
+
+__all__ = ["Cluster", "densest_clusters"]
+
+MOST_CENTRES = 200
+SPREADS = 12
+SHARE_STEPS = 8
+MARGIN = 0.1
+"""The background reaches beyond the values by this share of their range. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cluster:
+    """One cluster.
+
+    Attributes
+    ----------
+    centre, spread : float
+        Mean and standard deviation of its members, sampling error apart.
+    share : float
+        Share of the values in it. [1]
+    gain : float
+        Logarithm of its likelihood over that of the background alone.
+    """
+
+    centre: float
+    spread: float
+    share: float
+    gain: float
+
+
+def densest_clusters(values: Array, sd: Array, *, most: int = 1) -> list[Cluster]:
+    """Find the most likely clusters, the best first; later ones lie apart from those before.
+
+    Parameters
+    ----------
+    values, sd : ndarray of shape (N,)
+        Values, and standard deviations of their sampling errors, positive.
+    most : int
+        Number of clusters wanted.
+
+    Returns
+    -------
+    list of Cluster
+        At least one; fewer than wanted if there are not so many.
+    """
+    centres = np.unique(np.quantile(values, np.linspace(0.0, 1.0, min(len(values), MOST_CENTRES)), method="nearest"))
+    extent = float(np.ptp(values))
+    narrowest = float(np.median(sd))
+    if extent <= narrowest:
+        return [Cluster(centre=float(np.median(values)), spread=0.0, share=1.0, gain=0.0)]
+    spreads = np.geomspace(narrowest / 4.0, max(extent / 4.0, narrowest), SPREADS)
+    background = 0.5 * norm.pdf(values, values.mean(), values.std()) + 0.5 / (extent * (1.0 + 2.0 * MARGIN))
+    found = [_at_spread(values, sd, centres, float(spread), background) for spread in spreads]
+    gain = np.array([gain for gain, _ in found])
+    share = np.array([share for _, share in found])
+    clusters: list[Cluster] = []
+    while len(clusters) < most and np.isfinite(gain).any():
+        s, c = np.unravel_index(int(np.argmax(gain)), gain.shape)
+        clusters.append(_refined(values, sd, float(centres[c]), float(spreads[s]), float(share[s, c]), gain[s, c]))
+        apart = np.abs(centres - clusters[-1].centre) <= 3.0 * (spreads[s] + narrowest)
+        gain[:, apart] = -np.inf
+    return clusters
+
+
+def _at_spread(values: Array, sd: Array, centres: Array, spread: float, background: Array) -> tuple[Array, Array]:
+    """Gain and share of a cluster at each centre."""
+    variance = sd**2 + spread**2
+    density = np.exp(-0.5 * (values - centres[:, None]) ** 2 / variance) / np.sqrt(2.0 * np.pi * variance)
+    share = np.full((len(centres), 1), 0.5)
+    for _ in range(SHARE_STEPS):
+        inside = share * density
+        share = np.mean(inside / (inside + (1.0 - share) * background), axis=1, keepdims=True)
+    gain = np.sum(np.log(share * density / background + (1.0 - share)), axis=1)
+    return gain, share[:, 0]
+
+
+def _refined(values: Array, sd: Array, centre: float, spread: float, share: float, gain: float) -> Cluster:
+    """The same cluster with the mean of its members as centre."""
+    window = np.abs(values - centre) <= 3.0 * np.sqrt(sd**2 + spread**2)
+    weight = window / (sd**2 + spread**2)
+    return Cluster(centre=float(np.average(values, weights=weight)), spread=spread, share=share, gain=float(gain))

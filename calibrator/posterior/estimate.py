@@ -1,0 +1,144 @@
+"""The default estimator: from the evidence of a fleet to the posterior of each vehicle."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrator.drive import Array
+from calibrator.evidence.rows import FleetRows
+from calibrator.faults import Faults
+from calibrator.posterior.decision import best_estimates, harm_probability, spread_points
+from calibrator.posterior.fault_prior import FaultPrior
+from calibrator.posterior.hyperparameters import Hyperparameters, estimate_hyperparameters, initial_spreads
+from calibrator.posterior.states import States, enumerate_states
+
+__all__ = ["FleetPosterior", "Moments", "estimate_fleet"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moments:
+    """Mean (N, K) [A] and mean square (N, K) [A^2] of each vehicle's measured currents."""
+
+    mean_a: Array
+    mean_square_a2: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetPosterior:
+    """What the posterior says of N vehicles with K branches.
+
+    Attributes
+    ----------
+    faults : Faults
+        Estimates.
+    confidence : ndarray of shape (N,)
+        Probability that the sensor faults are within 10 % of the estimate. [1]
+    drift_sd : ndarray of shape (N, K)
+        Root mean square of the posterior's distance from the estimate. [1]
+    offset_sd_a : ndarray of shape (N, K)
+        The same for the offsets. [A]
+    sensor_fault : ndarray of shape (N, K)
+        Probability that each sensor is faulty. [1]
+    hardware_fault : ndarray of shape (N,)
+        Probability of a hardware fault. [1]
+    harm : ndarray of shape (N, K)
+        Probability that correcting makes the branch worse. [1]
+    hyperparameters : Hyperparameters
+        What was learnt of the fleet.
+    states : States
+        The explanations of each vehicle.
+    """
+
+    faults: Faults
+    confidence: Array
+    drift_sd: Array
+    offset_sd_a: Array
+    sensor_fault: Array
+    hardware_fault: Array
+    harm: Array
+    hyperparameters: Hyperparameters
+    states: States
+
+    def __len__(self) -> int:
+        return len(self.confidence)
+
+
+def estimate_fleet(
+    rows: FleetRows, moments: Moments, *, full_scale_a: float, given: FaultPrior | None = None
+) -> FleetPosterior:
+    """Estimate the faults of every vehicle of a fleet.
+
+    Parameters
+    ----------
+    rows : FleetRows
+        Evidence of N vehicles.
+    moments : Moments
+        Of their measured currents.
+    full_scale_a : float
+        Full scale of the junction. [A]
+    given : FaultPrior or None
+        Prior of the faults, if it is known; None: estimated from the fleet.
+
+    Returns
+    -------
+    FleetPosterior
+        In the order of the rows.
+    """
+    hyperparameters = estimate_hyperparameters(rows, initial_spreads(rows), given=given)
+    states = enumerate_states(rows, hyperparameters.prior, hyperparameters.spread)
+    vehicles = [_of_vehicle(states, j, hyperparameters.prior, moments, full_scale_a) for j in range(len(rows))]
+    return _joined(vehicles, states, hyperparameters, full_scale_a)
+
+
+@dataclass(frozen=True)
+class _Vehicle:
+    state: int
+    confidence: float
+    variance: Array
+    harm: Array
+
+
+def _of_vehicle(states: States, j: int, prior: FaultPrior, moments: Moments, full_scale_a: float) -> _Vehicle:
+    points = spread_points(states, j)
+    state, confidence = best_estimates(points, states, j, least=(prior.relative.low, prior.constant.low))
+    drift, offset = states.drift[j, state], states.offset[j, state]
+    variance = points.weight @ np.concatenate([points.drift - drift, points.offset - offset], axis=1) ** 2
+    mean, mean_square = _true_moments(moments, j, drift, offset * full_scale_a)
+    harm = harm_probability(points, drift, offset, mean=mean / full_scale_a, mean_square=mean_square / full_scale_a**2)
+    return _Vehicle(state, confidence, variance, harm)
+
+
+def _true_moments(moments: Moments, j: int, drift: Array, offset_a: Array) -> tuple[Array, Array]:
+    """Moments of the true currents on the vehicle's own drives and on the fleet's usual one, each of shape (2, K)."""
+    mean, square = moments.mean_a[j], moments.mean_square_a2[j]
+    own_mean = (mean - offset_a) / (1.0 + drift)
+    own_square = np.maximum((square - 2.0 * offset_a * mean + offset_a**2) / (1.0 + drift) ** 2, own_mean**2)
+    usual_mean, usual_square = np.median(moments.mean_a, axis=0), np.median(moments.mean_square_a2, axis=0)
+    return np.stack([own_mean, usual_mean]), np.stack([own_square, np.maximum(usual_square, usual_mean**2)])
+
+
+def _joined(
+    vehicles: Sequence[_Vehicle], states: States, hyperparameters: Hyperparameters, full_scale_a: float
+) -> FleetPosterior:
+    K, N = states.branches, len(vehicles)
+    chosen = (np.arange(N), [vehicle.state for vehicle in vehicles])
+    free = states.constant[chosen][:, : K - 1] * full_scale_a
+    sd = np.sqrt([vehicle.variance for vehicle in vehicles])
+    faulty = (states.drift != 0.0) | (states.offset != 0.0)
+    return FleetPosterior(
+        faults=Faults(
+            hardware_drift=states.relative[chosen][:, 0],
+            hardware_offset_a=np.column_stack([free, -free.sum(axis=1)]),
+            drift=states.drift[chosen],
+            offset_a=states.offset[chosen] * full_scale_a,
+        ),
+        confidence=np.array([vehicle.confidence for vehicle in vehicles]),
+        drift_sd=sd[:, :K],
+        offset_sd_a=sd[:, K:] * full_scale_a,
+        sensor_fault=np.einsum("ns,nsk->nk", states.weight, faulty),
+        hardware_fault=np.sum(states.weight * states.hardware, axis=1),
+        harm=np.stack([vehicle.harm for vehicle in vehicles]),
+        hyperparameters=hyperparameters,
+        states=states,
+    )
