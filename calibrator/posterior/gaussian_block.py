@@ -86,7 +86,7 @@ def integrate_relative(rows: Array, design: Array, support: Support, noise: Nois
 
 
 def integrate_constant(
-    rows: Array, design: Array, support: Support, noise: Noise, slab: Slab, scale: Array
+    rows: Array, design: Array, support: Support, noise: Noise, slab: Slab, *, scale: Array
 ) -> BlockFit:
     """Integrate over (o_h,1 .. o_h,K-1, o_1 .. o_K).
 

@@ -39,13 +39,16 @@ class Slab:
         return 0.5 / (self.high - self.low)
 
     def log_mass(self, mean: Array, sd: Array) -> Array:
-        """Logarithm of the integral of prior density times N(mean, sd^2), elementwise."""
+        """Logarithm of the integral of prior density times N(mean, sd^2), elementwise; never minus infinity.
+
+        Each half of the slab is seen from its centre, so that the difference is one of small numbers in the tails.
+        """
         spread = np.maximum(sd, LEAST_DEVIATION)
-        magnitude = np.abs(mean)
-        near = ndtr((self.high - magnitude) / spread) - ndtr((self.low - magnitude) / spread)
-        far = ndtr((-self.low - magnitude) / spread) - ndtr((-self.high - magnitude) / spread)
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.log((near + far) * self.density))
+        half, centre, magnitude = (self.high - self.low) / 2.0, (self.high + self.low) / 2.0, np.abs(mean)
+        mass = np.zeros(np.broadcast_shapes(magnitude.shape, spread.shape))
+        for distance in (np.abs(magnitude - centre), magnitude + centre):
+            mass += ndtr((half - distance) / spread) - ndtr(-(half + distance) / spread)
+        return np.asarray(np.log(np.maximum(mass, np.finfo(float).tiny) * self.density))
 
     def nodes(self, dimensions: int) -> Array:
         """Equally weighted points of the prior, shape (Q, dimensions); one point without coordinates for 0."""

@@ -1,7 +1,10 @@
 """States: the explanations of each vehicle's evidence, with their weights.
 
-A state is a support, and a node where the support has pivots. The joint evidence is that of the relative rows times that
-of the constant rows given what the relative rows left as residual.
+A state is a support, and a node where the support has pivots. Up to :data:`EXACT_BRANCHES` branches all supports are
+looked at. With more branches the sum over supports is approximate: all relative supports, of whose states the best go
+on (:data:`calibrator.posterior.joint_evidence.MOST_RELATIVE`); with each of these the constant supports of at most
+:data:`calibrator.posterior.supports.MOST_CONSTANT` parameters; and where the best explanation of a vehicle has so many,
+those with one parameter more, as long as that is better.
 """
 
 from collections.abc import Sequence
@@ -12,19 +15,19 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from calibrator.drive import Array
-from calibrator.evidence.rows import FleetRows, constant_design, relative_design
+from calibrator.evidence.rows import FleetRows
 from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
-from calibrator.posterior.gaussian_block import BlockFit, Noise, integrate_constant, integrate_relative
-from calibrator.posterior.supports import Support, constant_supports, relative_supports
+from calibrator.posterior.joint_evidence import JointEvidence, StateArrays
+from calibrator.posterior.supports import EXACT_BRANCHES, MOST_CONSTANT, constant_supports, grown_supports
 
-__all__ = ["States", "enumerate_states"]
+__all__ = ["States", "enumerate_states", "mean_states"]
 
 MOST_STATES = 128
 """States kept per vehicle, the most probable ones. [1]"""
+MOST_WAITING = 1024
+"""States that are collected before the most probable ones are picked: picking costs more than fitting. [1]"""
 CHUNK = 64
 """Vehicles worked on at a time: bounds the memory. [1]"""
-NEGLIGIBLE = 40.0
-"""Relative supports so far below the best (logarithm) cannot matter for any constant support. [1]"""
 
 
 @dataclass(frozen=True)
@@ -100,106 +103,82 @@ def enumerate_states(rows: FleetRows, prior: FaultPrior, spread: ModelSpread) ->
     return States(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(States)))
 
 
+def mean_states(several: Sequence[States]) -> States:
+    """Average the posteriors of the same vehicles under several hyper-parameters."""
+    if len(several) == 1:
+        return several[0]
+    every = np.concatenate([states.weight for states in several], axis=1) / len(several)
+    weight, order = _largest(np.asarray(every), MOST_STATES)
+    arrays = []
+    for name in ("relative", "relative_sd", "constant", "constant_sd"):
+        both = np.concatenate([getattr(states, name) for states in several], axis=1)
+        arrays.append(np.take_along_axis(both, order[:, :, None], axis=1))
+    log_evidence = logsumexp([states.log_evidence for states in several], axis=0) - np.log(len(several))
+    return States(weight / weight.sum(axis=1, keepdims=True), np.asarray(log_evidence), *arrays)
+
+
 def _enumerate(rows: FleetRows, prior: FaultPrior, spread: ModelSpread) -> States:
-    problem = _Problem.of(rows, prior, spread)
-    relative = [(support, problem.relative_fit(support)) for support in relative_supports(rows.branches)]
-    supports = constant_supports(rows.branches)
-    best = np.max([fit.log_evidence.max(axis=(1, 2)) for _, fit in relative], axis=0)
-    found = _Found.nothing(len(rows), rows.branches)
-    for support, fit in relative:
-        if np.any(fit.log_evidence.max(axis=(1, 2)) >= best - NEGLIGIBLE):
-            found.add(*problem.with_constants(support, fit, supports))
+    evidence = JointEvidence.of(rows, prior, spread)
+    K = rows.branches
+    found = _Found(len(rows), K)
+    most = None if K <= EXACT_BRANCHES else MOST_CONSTANT
+    for support in constant_supports(K, most=most):
+        found.add(*evidence.with_constant(support))
+    if most is not None:
+        _grow(found, evidence, K, most)
     return found.states()
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """Rows of N vehicles, ready for both blocks."""
-
-    rows: FleetRows
-    prior: FaultPrior
-    mean: Array
-    first: Noise
-    second: Noise
-    carry: Array
-    """How the constant rows follow the residuals of the relative ones, (N, 2K + 1, 3K - 1)."""
-    log_prior: Array
-
-    @classmethod
-    def of(cls, rows: FleetRows, prior: FaultPrior, spread: ModelSpread) -> "_Problem":
-        r = rows.relative.shape[1]
-        R = rows.covariance + spread.covariance
-        first = Noise.of(R[:, :r, :r])
-        carry = R[:, r:, :r] @ first.precision
-        second = Noise.of(R[:, r:, r:] - carry @ R[:, :r, r:])
-        return cls(rows, prior, spread.mean, first, second, carry, prior.log_supports())
-
-    def relative_fit(self, support: Support) -> BlockFit:
-        """Evidence of one relative support, constant rows apart."""
-        r = self.rows.relative.shape[1]
-        centred = (self.rows.relative - self.mean[:r])[:, None, :]
-        return integrate_relative(
-            centred, relative_design(self.rows.branches), support, self.first, self.prior.relative
-        )
-
-    def with_constants(self, support: Support, fit: BlockFit, supports: Sequence[Support]) -> tuple[Array, list[Array]]:
-        """Log weight of each state of one relative support (N, .), and its four arrays of parameters."""
-        N, K = len(self.rows), self.rows.branches
-        relative, relative_sd, residual = fit.parameters[:, 0], fit.sd[:, 0], fit.residual[:, 0]
-        factor = 1.0 + relative[:, :, 1:]
-        y = self.rows.constant[:, None, :] / np.concatenate([factor, factor[..., :1], factor], axis=2)
-        y -= self.mean[-y.shape[2] :] + np.matmul(residual, np.swapaxes(self.carry, 1, 2))
-        scale = np.concatenate([np.ones((*factor.shape[:2], K - 1)), factor], axis=2)
-        log_factor = np.log(factor)
-        log_density = fit.log_evidence[:, 0] - log_factor.sum(axis=2) - log_factor[:, :, 0]
-        weights: list[Array] = []
-        arrays: list[list[Array]] = [[], [], [], []]
-        for constant in supports:
-            hardware = int(support.hardware or constant.hardware)
-            log_share = self.log_prior[hardware, len(support.active) + len(constant.active)]
-            if np.isneginf(log_share):
-                continue
-            other = integrate_constant(y, constant_design(K), constant, self.second, self.prior.constant, scale)
-            shape = other.log_evidence.shape
-            weights.append((log_density[:, :, None] + other.log_evidence + log_share).reshape(N, -1))
-            parts = (relative[:, :, None], relative_sd[:, :, None], other.parameters, other.sd)
-            for store, part in zip(arrays, parts, strict=True):
-                store.append(np.broadcast_to(part, (*shape, part.shape[-1])).reshape(N, -1, part.shape[-1]))
-        if not weights:
-            return np.full((N, 0), -np.inf), [np.zeros((N, 0, width)) for width in (K + 1, K + 1, 2 * K - 1, 2 * K - 1)]
-        return np.concatenate(weights, axis=1), [np.concatenate(store, axis=1) for store in arrays]
+def _grow(found: "_Found", evidence: JointEvidence, branches: int, size: int) -> None:
+    """Add constant supports with one parameter more than the best ones of the vehicles, while these are the largest."""
+    while True:
+        largest = {support for support in found.best_constant_supports() if len(support) == size}
+        if not largest:
+            return
+        for child in sorted({c.active: c for s in largest for c in grown_supports(branches, s)}.items()):
+            found.add(*evidence.with_constant(child[1]))
+        size += 1
 
 
-@dataclass
 class _Found:
-    """The most probable states so far."""
+    """The most probable states so far, and those that wait to be compared with them."""
 
-    log_weight: Array
-    log_total: Array
-    arrays: list[Array]
-
-    @classmethod
-    def nothing(cls, vehicles: int, branches: int) -> "_Found":
+    def __init__(self, vehicles: int, branches: int) -> None:
         widths = (branches + 1, branches + 1, 2 * branches - 1, 2 * branches - 1)
-        return cls(
-            np.full((vehicles, 0), -np.inf), np.full(vehicles, -np.inf), [np.zeros((vehicles, 0, w)) for w in widths]
-        )
+        self._log_weight: Array = np.full((vehicles, MOST_STATES), -np.inf)
+        self._log_total: Array = np.full(vehicles, -np.inf)
+        self._arrays: list[Array] = [np.zeros((vehicles, MOST_STATES, width)) for width in widths]
+        self._waiting: list[tuple[Array, StateArrays]] = []
 
-    def add(self, log_weight: Array, arrays: Sequence[Array]) -> None:
-        """Take up more states, and drop the least probable beyond MOST_STATES."""
-        merged = np.concatenate([self.log_weight, log_weight], axis=1)
-        self.log_total = np.asarray(logsumexp(np.column_stack([self.log_total, log_weight]), axis=1))
-        self.log_weight, keep = _largest(merged, MOST_STATES)
-        self.arrays = [
-            np.take_along_axis(np.concatenate([old, new], axis=1), keep[:, :, None], axis=1)
-            for old, new in zip(self.arrays, arrays, strict=True)
-        ]
+    def add(self, log_weight: Array, arrays: StateArrays) -> None:
+        """Take up more states."""
+        self._waiting.append((log_weight, arrays))
+        if sum(weights.shape[1] for weights, _ in self._waiting) > MOST_WAITING:
+            self._merge()
+
+    def best_constant_supports(self) -> set[tuple[int, ...]]:
+        """Positions of the constant parameters that are not zero in the best state of each vehicle."""
+        self._merge()
+        return {tuple(np.flatnonzero(values).tolist()) for values in self._arrays[2][:, 0]}
 
     def states(self) -> States:
         """What was found, in order of falling weight."""
-        log_weight, order = _largest(self.log_weight, self.log_weight.shape[1])
-        weight = np.exp(log_weight - logsumexp(log_weight, axis=1, keepdims=True))
-        return States(weight, self.log_total, *(np.take_along_axis(a, order[:, :, None], axis=1) for a in self.arrays))
+        self._merge()
+        weight = np.exp(self._log_weight - logsumexp(self._log_weight, axis=1, keepdims=True))
+        return States(weight, self._log_total, *self._arrays)
+
+    def _merge(self) -> None:
+        """Keep the :data:`MOST_STATES` most probable ones."""
+        if not self._waiting:
+            return
+        log_weights, arrays = zip(*self._waiting, strict=True)
+        self._waiting = []
+        self._log_total = np.asarray(logsumexp(np.column_stack([self._log_total, *log_weights]), axis=1))
+        self._log_weight, keep = _largest(np.concatenate([self._log_weight, *log_weights], axis=1), MOST_STATES)
+        self._arrays = [
+            np.take_along_axis(np.concatenate([old, *new], axis=1), keep[:, :, None], axis=1)
+            for old, new in zip(self._arrays, zip(*arrays, strict=True), strict=True)
+        ]
 
 
 def _largest(values: Array, most: int) -> tuple[Array, NDArray[np.int64]]:

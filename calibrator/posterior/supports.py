@@ -4,22 +4,35 @@ Relative parameters are (d_h, d_1 .. d_K), constant ones (o_h,1 .. o_h,K-1, o_1 
 there, a common factor can move from d_h to the drifts unseen. If o_h,k and o_k are there, an offset can move from one
 to the other unseen, as long as the hardware offsets still sum to zero. One hardware parameter of each such direction is
 the pivot: its value is taken from the nodes of the slab, the others follow.
+
+There are 2^(K + 1) relative and 2^(2K - 1) constant supports. The former are always all looked at. The latter are up to
+:data:`EXACT_BRANCHES`; with more branches those of at most :data:`MOST_CONSTANT` parameters are, and
+:mod:`calibrator.posterior.states` grows the best of them.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import chain, combinations
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["EXACT_BRANCHES", "Support", "constant_supports", "log_support_counts", "relative_supports"]
+__all__ = [
+    "EXACT_BRANCHES",
+    "MOST_CONSTANT",
+    "Support",
+    "constant_support",
+    "constant_supports",
+    "grown_supports",
+    "log_support_counts",
+    "relative_supports",
+]
 
 EXACT_BRANCHES = 3
 """Up to so many branches all supports are looked at."""
-MOST_ACTIVE = {4: 4, 5: 3}
-"""Most nonzero parameters of each kind that are looked at, by number of branches above that."""
-MOST_ACTIVE_BEYOND = 2
+MOST_CONSTANT = 3
+"""Nonzero constant parameters of the supports that are looked at in any case, with more branches than that."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +42,7 @@ class Support:
     Attributes
     ----------
     active : tuple of int
-        Positions of the parameters that are not zero.
+        Positions of the parameters that are not zero, in rising order.
     pivots : tuple of int
         Those of them whose value the rows leave open.
     hardware : bool
@@ -47,44 +60,44 @@ class Support:
 
 
 def relative_supports(branches: int) -> list[Support]:
-    """Supports of (d_h, d_1 .. d_K)."""
-    found = []
-    for active in _subsets(branches + 1, _most_active(branches)):
-        everything = len(active) == branches + 1
-        found.append(Support(active, (0,) if everything else (), 0 in active))
-    return found
+    """All supports of (d_h, d_1 .. d_K), the smallest first."""
+    size = branches + 1
+    return [
+        Support(active, (0,) if len(active) == size else (), 0 in active)
+        for active in _subsets(range(size), range(size + 1))
+    ]
 
 
-def constant_supports(branches: int) -> list[Support]:
-    """Supports of (o_h,1 .. o_h,K-1, o_1 .. o_K)."""
-    K = branches
-    found = []
-    for active in _subsets(2 * K - 1, _most_active(K)):
-        both = [k for k in range(K - 1) if k in active and K - 1 + k in active]
-        last_sensor = 2 * K - 2 in active
-        pivots = both if last_sensor else both[1:]
-        found.append(Support(active, tuple(pivots), any(i < K - 1 for i in active)))
-    return found
+def constant_support(branches: int, active: Iterable[int]) -> Support:
+    """Support of (o_h,1 .. o_h,K-1, o_1 .. o_K) with these parameters not zero."""
+    K, chosen = branches, tuple(sorted(active))
+    both = tuple(k for k in range(K - 1) if k in chosen and K - 1 + k in chosen)
+    last_sensor = 2 * K - 2 in chosen
+    return Support(chosen, both if last_sensor else both[1:], any(i < K - 1 for i in chosen))
+
+
+def constant_supports(branches: int, *, most: int | None = None) -> list[Support]:
+    """Supports of (o_h,1 .. o_h,K-1, o_1 .. o_K) with at most so many parameters, the smallest first; None: all."""
+    size = 2 * branches - 1
+    counts = range((size if most is None else min(size, most)) + 1)
+    return [constant_support(branches, active) for active in _subsets(range(size), counts)]
+
+
+def grown_supports(branches: int, support: Iterable[int]) -> list[Support]:
+    """Constant supports with one parameter more."""
+    present = set(support)
+    return [constant_support(branches, present | {i}) for i in range(2 * branches - 1) if i not in present]
 
 
 def log_support_counts(branches: int) -> NDArray[np.float64]:
     """Logarithm of how many supports there are, shape (2, 3K + 1): by hardware fault, and number of parameters."""
-    counts = np.zeros((2, 3 * branches + 1))
-    constants = constant_supports(branches)
-    for relative in relative_supports(branches):
-        for constant in constants:
-            hardware = relative.hardware or constant.hardware
-            counts[int(hardware), len(relative.active) + len(constant.active)] += 1
+    K = branches
+    without = np.array([comb(2 * K, count) for count in range(3 * K + 1)], np.float64)
+    every = np.array([comb(3 * K, count) for count in range(3 * K + 1)], np.float64)
     with np.errstate(divide="ignore"):
-        return np.log(counts)
+        return np.asarray(np.log(np.stack([without, every - without])))
 
 
-def _most_active(branches: int) -> int:
-    if branches <= EXACT_BRANCHES:
-        return 2 * branches
-    return MOST_ACTIVE.get(branches, MOST_ACTIVE_BEYOND)
-
-
-def _subsets(size: int, most: int) -> Iterator[tuple[int, ...]]:
-    for count in range(min(size, most) + 1):
-        yield from combinations(range(size), count)
+def _subsets(items: Iterable[int], counts: Iterable[int]) -> Iterable[tuple[int, ...]]:
+    pool = tuple(items)
+    return chain.from_iterable(combinations(pool, count) for count in counts)
