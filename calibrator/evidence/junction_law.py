@@ -5,8 +5,8 @@ sum_k (i_m,k - o_k) / (1 + d_k) = l holds at every instant, so the first measure
     i_m,1 = sum_k>1 g_k i_m,k + c,    g_k = -(1 + d_1) / (1 + d_k),    c = (1 + d_1) (sum_k o_k / (1 + d_k) + l).
 
 Least squares would draw the g of a small branch towards zero, as its measured current holds noise (errors in
-variables); the noise is therefore taken out of the second moments first. How much noise there is, is bounded by the fast
-changes of each current, and by what the junction law leaves unexplained.
+variables); the noise is therefore taken out of the second moments first. How much noise there is, is bounded by the
+fast changes of each current, and by what the junction law leaves unexplained.
 """
 
 import numpy as np
@@ -59,7 +59,7 @@ def junction_law(summary: DriveSummary) -> BlockRegression:
 
 def _weights(estimate: Array) -> Array:
     """Squares of the weights of each branch in the junction sum, first branch 1."""
-    return np.maximum(np.append(1.0, estimate[:-1]) ** 2, LEAST_WEIGHT)
+    return np.asarray(np.maximum(np.append(1.0, estimate[:-1]) ** 2, LEAST_WEIGHT))
 
 
 def _residual_a2(total: Array, first: int, branches: int, estimate: Array) -> float:

@@ -64,7 +64,7 @@ class FleetRows:
     @property
     def branches(self) -> int:
         """Number of branches K."""
-        return (self.relative.shape[1] + 1) // 3
+        return int(self.relative.shape[1] + 1) // 3
 
     def take(self, index: Index) -> "FleetRows":
         """Return the evidence of some of the vehicles."""

@@ -39,12 +39,15 @@ class DriveSummary:
         Number of branches K.
     period_s : float
         Distance of the samples. [s]
+    extra : ndarray of shape (B, E, M + K + 1 + E), or None
+        Sums of the products of E extra columns with (inputs, measured currents [A], 1, extra columns).
     """
 
     moments: Array
     noise_a2: Array
     branches: int
     period_s: float
+    extra: Array | None = None
 
     @property
     def inputs(self) -> int:
@@ -74,7 +77,7 @@ class DriveSummary:
         return np.asarray(total[self.inputs : -1, self.inputs : -1] / total[-1, -1])
 
     def take_branches(self, order: Sequence[int]) -> "DriveSummary":
-        """Return the same summary for some branches, in another order."""
+        """Return the same summary for some branches, in another order, without extra columns."""
         columns = [*range(self.inputs), *(self.inputs + k for k in order), self.inputs + self.branches]
         return DriveSummary(
             moments=self.moments[:, columns][:, :, columns],
@@ -84,7 +87,7 @@ class DriveSummary:
         )
 
 
-def summarise(drives: Sequence[Samples], *, period_s: float) -> DriveSummary:
+def summarise(drives: Sequence[Samples], *, period_s: float, extra: Sequence[Array] | None = None) -> DriveSummary:
     """Summarise the drives of one vehicle.
 
     Parameters
@@ -93,6 +96,8 @@ def summarise(drives: Sequence[Samples], *, period_s: float) -> DriveSummary:
         Aligned samples with the same branches and inputs.
     period_s : float
         Distance of the samples. [s]
+    extra : sequence of ndarray of shape (T, E), or None
+        More columns of each drive, finite wherever its samples are valid.
 
     Returns
     -------
@@ -104,9 +109,9 @@ def summarise(drives: Sequence[Samples], *, period_s: float) -> DriveSummary:
     DriveError
         If no block has enough valid samples.
     """
-    length = max(int(round(BLOCK_S / period_s)), 1)
-    moments, noise = [], []
-    for drive in drives:
+    length = max(round(BLOCK_S / period_s), 1)
+    moments, noise, products = [], [], []
+    for number, drive in enumerate(drives):
         for start in range(0, len(drive.time_s), length):
             part = slice(start, start + length)
             valid = drive.valid[part]
@@ -115,11 +120,18 @@ def summarise(drives: Sequence[Samples], *, period_s: float) -> DriveSummary:
             currents = drive.currents_a[part]
             columns = np.column_stack([drive.inputs[part], currents, np.ones(len(valid))])[valid]
             moments.append(columns.T @ columns)
+            if extra is not None:
+                more = extra[number][part][valid]
+                products.append(more.T @ np.column_stack([columns, more]))
             noise.append(_noise_a2(currents))
     if not moments:
         raise DriveError(f"no {BLOCK_S:.0f} s of drive in which {LEAST_SHARE:.0%} of the samples are valid")
     return DriveSummary(
-        moments=np.stack(moments), noise_a2=np.stack(noise), branches=drives[0].currents_a.shape[1], period_s=period_s
+        moments=np.stack(moments),
+        noise_a2=np.stack(noise),
+        branches=drives[0].currents_a.shape[1],
+        period_s=period_s,
+        extra=np.stack(products) if extra is not None else None,
     )
 
 

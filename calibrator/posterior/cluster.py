@@ -1,11 +1,11 @@
 """Densest cluster of numbers: fault-free sensors agree with each other, faulty ones do not.
 
 Values are taken as a mixture of one Gaussian cluster (centre c, spread s, each value with its own sampling error) and a
-broad background (half a Gaussian, half uniform). Of a grid of centres and spreads the most likely is chosen. Unlike the mean and the median the result
-does not need a symmetric fleet, nor that most vehicles are without faults.
+broad background (half a Gaussian, half uniform). Of a grid of centres and spreads the most likely is chosen. Unlike the
+mean and the median the result does not need a symmetric fleet, nor that most vehicles are without faults.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import norm
@@ -69,7 +69,10 @@ def densest_clusters(values: Array, sd: Array, *, most: int = 1) -> list[Cluster
     clusters: list[Cluster] = []
     while len(clusters) < most and np.isfinite(gain).any():
         s, c = np.unravel_index(int(np.argmax(gain)), gain.shape)
-        clusters.append(_refined(values, sd, float(centres[c]), float(spreads[s]), float(share[s, c]), gain[s, c]))
+        guess = Cluster(
+            centre=float(centres[c]), spread=float(spreads[s]), share=float(share[s, c]), gain=float(gain[s, c])
+        )
+        clusters.append(_refined(guess, values, sd))
         apart = np.abs(centres - clusters[-1].centre) <= 3.0 * (spreads[s] + narrowest)
         gain[:, apart] = -np.inf
     return clusters
@@ -87,8 +90,8 @@ def _at_spread(values: Array, sd: Array, centres: Array, spread: float, backgrou
     return gain, share[:, 0]
 
 
-def _refined(values: Array, sd: Array, centre: float, spread: float, share: float, gain: float) -> Cluster:
+def _refined(cluster: Cluster, values: Array, sd: Array) -> Cluster:
     """The same cluster with the mean of its members as centre."""
-    window = np.abs(values - centre) <= 3.0 * np.sqrt(sd**2 + spread**2)
-    weight = window / (sd**2 + spread**2)
-    return Cluster(centre=float(np.average(values, weights=weight)), spread=spread, share=share, gain=float(gain))
+    variance = sd**2 + cluster.spread**2
+    weight = (np.abs(values - cluster.centre) <= 3.0 * np.sqrt(variance)) / variance
+    return replace(cluster, centre=float(np.average(values, weights=weight)))

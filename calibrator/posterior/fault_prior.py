@@ -34,7 +34,7 @@ class FaultPrior:
     @property
     def branches(self) -> int:
         """Number of branches K."""
-        return (self.counts.shape[1] - 1) // 3
+        return int(self.counts.shape[1] - 1) // 3
 
     def log_supports(self) -> Array:
         """Logarithm of the probability of one support, shape (2, 3K + 1): by hardware fault, and by number."""
