@@ -72,7 +72,7 @@ def fit_fleet_model(summaries: Sequence[DriveSummary]) -> FleetModel:
         read_out = read_out * centre[:, 0]
         read_out[-1] += centre[:, 1]
         slopes = values[:, :, 0] / centre[:, 0]
-    return FleetModel(read_out=read_out)
+    return FleetModel(read_out=_on_junction_law(read_out, totals))
 
 
 def regress_on_fleet(summary: DriveSummary, read_out: Array) -> list[BlockRegression]:
@@ -102,6 +102,23 @@ def regress_on_fleet(summary: DriveSummary, read_out: Array) -> list[BlockRegres
         prior = {"prior_mean": np.array([1.0, 0.0]), "prior_precision": np.array([SLOPE_SD**-2, 0.0])}
         found.append(regress_blocks(gram, right, power, **prior))
     return found
+
+
+def _on_junction_law(read_out: Array, totals: Sequence[Array]) -> Array:
+    """Read-outs that sum to zero: ideal currents do, whatever the inputs.
+
+    What is left over of the inputs is shared by the branches as their currents' power. What is left over of the constants
+    is the mean load that no branch measures; it is taken from the source, as that load does not grow with the others.
+    """
+    K = read_out.shape[1]
+    M = len(read_out) - 1
+    mean = np.mean(totals, axis=0)
+    power = np.diag(mean)[M : M + K]
+    source = int(np.argmax(mean[-1, M : M + K]))
+    excess = read_out.sum(axis=1)
+    projected = read_out - np.outer(np.append(excess[:-1], 0.0), power / power.sum())
+    projected[-1, source] -= excess[-1]
+    return projected
 
 
 def _fit_read_out(totals: Sequence[Array], slopes: Array) -> Array:

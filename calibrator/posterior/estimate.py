@@ -10,8 +10,13 @@ from calibrator.evidence.rows import FleetRows
 from calibrator.faults import Faults
 from calibrator.posterior.decision import best_estimates, harm_probability, spread_points
 from calibrator.posterior.fault_prior import FaultPrior
-from calibrator.posterior.hyperparameters import Hyperparameters, estimate_hyperparameters, initial_spreads
-from calibrator.posterior.states import States, enumerate_states
+from calibrator.posterior.hyperparameters import (
+    Hyperparameters,
+    estimate_hyperparameters,
+    initial_spreads,
+    resampled_hyperparameters,
+)
+from calibrator.posterior.states import States, enumerate_states, mean_states
 
 __all__ = ["FleetPosterior", "Moments", "estimate_fleet"]
 
@@ -86,7 +91,8 @@ def estimate_fleet(
         In the order of the rows.
     """
     hyperparameters = estimate_hyperparameters(rows, initial_spreads(rows), given=given)
-    states = enumerate_states(rows, hyperparameters.prior, hyperparameters.spread)
+    resampled = resampled_hyperparameters(rows, hyperparameters, given=given)
+    states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in resampled])
     vehicles = [_of_vehicle(states, j, hyperparameters.prior, moments, full_scale_a) for j in range(len(rows))]
     return _joined(vehicles, states, hyperparameters, full_scale_a)
 

@@ -20,8 +20,9 @@ from calibrator.posterior.cluster import densest_clusters
 from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
 from calibrator.posterior.slab import Slab
 from calibrator.posterior.states import States, enumerate_states
+from calibrator.random_streams import Purpose, random_stream
 
-__all__ = ["Hyperparameters", "estimate_hyperparameters", "initial_spreads"]
+__all__ = ["Hyperparameters", "estimate_hyperparameters", "initial_spreads", "resampled_hyperparameters"]
 
 WIDEST = Slab(0.002, 0.45)
 """Any fault that a sensor of a running vehicle can have. [1]"""
@@ -31,9 +32,13 @@ CONVERGED = 0.01
 """Gain of log evidence per vehicle below which the climb ends."""
 MOST_VEHICLES = 300
 """Vehicles that hyper-parameters are learnt from; more change them less than the faults themselves. [1]"""
+MOST_RESAMPLED, RESAMPLINGS, RESAMPLED_STEPS = 200, 8, 4
+"""Fleet size up to which hyper-parameters are resampled, how often, and how far each is climbed."""
 USED_STATES = 24
-PSEUDO_VEHICLES = 2.0
-"""Weight of the guess that few parameters are faulty, in vehicles."""
+PSEUDO_VEHICLES = 5.0
+"""Weight of the guesses of the shares of faults, in vehicles."""
+GUESSED_HARDWARE_SHARE = 0.3
+"""Share of vehicles with a hardware fault before anything is known. [1]"""
 DECAY = 0.7
 SPREAD_VEHICLES = 5.0
 """Weight of the guess of the model spread, in vehicles."""
@@ -98,6 +103,39 @@ def estimate_hyperparameters(
     return _climb(chosen, best.spread, best.prior, given, centres, STEPS)
 
 
+def resampled_hyperparameters(
+    rows: FleetRows, best: Hyperparameters, *, given: FaultPrior | None = None, free: Array | None = None
+) -> list[Hyperparameters]:
+    """Hyper-parameters that fleets like this one would have given: climbs from the best on resampled vehicles.
+
+    A small fleet does not fix them; the posterior is averaged over these, as taking one set for true would make it
+    surer than it may be [1]_.
+
+    Parameters
+    ----------
+    rows, given, free
+        As in :func:`estimate_hyperparameters`.
+    best : Hyperparameters
+        Of the whole fleet.
+
+    Returns
+    -------
+    list of Hyperparameters
+        One per resampling; the best alone for a fleet of more than :data:`MOST_RESAMPLED` vehicles.
+
+    References
+    ----------
+    .. [1] J. H. Huggins, J. W. Miller, "Robust inference and model criticism using bagged posteriors",
+       arXiv:1912.07104.
+    """
+    if len(rows) > MOST_RESAMPLED:
+        return [best]
+    centres = _free_centres(rows.branches) if free is None else free
+    rng = random_stream(Purpose.RESAMPLING, len(rows))
+    samples = [rows.take(np.sort(rng.integers(len(rows), size=len(rows)))) for _ in range(RESAMPLINGS)]
+    return [_climb(sample, best.spread, best.prior, given, centres, RESAMPLED_STEPS) for sample in samples]
+
+
 def initial_spreads(rows: FleetRows) -> list[ModelSpread]:
     """Starts of the climb: the densest cluster of each row (narrow, and as wide as it is), the second, and the mean.
 
@@ -157,7 +195,7 @@ def _climb(
 
 
 def _first_prior(branches: int) -> FaultPrior:
-    return FaultPrior(hardware_share=0.3, counts=_guess(branches), relative=WIDEST, constant=WIDEST)
+    return FaultPrior(hardware_share=GUESSED_HARDWARE_SHARE, counts=_guess(branches), relative=WIDEST, constant=WIDEST)
 
 
 def _guess(branches: int) -> Array:
@@ -176,7 +214,9 @@ def _next_prior(states: States, prior: FaultPrior) -> FaultPrior:
     )
     counts = shares + PSEUDO_VEHICLES * _guess(prior.branches)
     return FaultPrior(
-        hardware_share=float((shares[1].sum() + 1.0) / (shares.sum() + 2.0)),
+        hardware_share=float(
+            (shares[1].sum() + PSEUDO_VEHICLES * GUESSED_HARDWARE_SHARE) / (shares.sum() + PSEUDO_VEHICLES)
+        ),
         counts=counts / counts.sum(axis=1, keepdims=True),
         relative=_next_slab(states.relative, states.relative_sd, weight, prior.relative),
         constant=_next_slab(states.constant, states.constant_sd, weight, prior.constant),
