@@ -70,7 +70,7 @@ def _of_vehicle(summary: DriveSummary, model: FleetModel, full_scale_a: float) -
 def _correlation(covariance: Array) -> Array:
     sd = np.sqrt(np.diag(covariance))
     safe = np.where(sd > 0.0, sd, np.inf)
-    return covariance / np.outer(safe, safe)
+    return np.asarray(covariance / np.outer(safe, safe))
 
 
 def _steadied(vehicle: _Raw, usual: Array) -> Array:

@@ -107,8 +107,8 @@ def regress_on_fleet(summary: DriveSummary, read_out: Array) -> list[BlockRegres
 def _on_junction_law(read_out: Array, totals: Sequence[Array]) -> Array:
     """Read-outs that sum to zero: ideal currents do, whatever the inputs.
 
-    What is left over of the inputs is shared by the branches as their currents' power. What is left over of the constants
-    is the mean load that no branch measures; it is taken from the source, as that load does not grow with the others.
+    What is left over of the inputs is shared by the branches as their currents' power. What is left over of the
+    constants is the mean load that no branch measures: it is taken from the source, as it does not grow with others.
     """
     K = read_out.shape[1]
     M = len(read_out) - 1

@@ -4,20 +4,29 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibrator.drive import Mask
 from calibrator.evidence.collect import collect_rows
 from calibrator.evidence.fleet_model import fit_fleet_model
+from calibrator.evidence.readings import Readings, no_readings, trusted_readings, with_readings
 from calibrator.evidence.summary import DriveSummary
 from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
 from calibrator.posterior.fault_prior import FaultPrior
+from calibrator.posterior.health import ReferenceHealth, examine_reference
 
 __all__ = ["calibrate_posterior"]
 
 
 def calibrate_posterior(
-    summaries: Sequence[DriveSummary], *, full_scale_a: float, given: FaultPrior | None = None
+    summaries: Sequence[DriveSummary],
+    *,
+    full_scale_a: float,
+    branches: Sequence[str] | None = None,
+    given: FaultPrior | None = None,
+    readings: Readings | None = None,
+    trusted: Mask | None = None,
+    learning: Mask | None = None,
 ) -> FleetPosterior:
     """Estimate the faults of a fleet from its drives.
 
@@ -27,35 +36,51 @@ def calibrate_posterior(
         One per vehicle, with the same inputs and branches.
     full_scale_a : float
         Full scale of the junction. [A]
+    branches : sequence of str or None
+        Names of the K branches, for warnings; None: numbers.
     given : FaultPrior or None
         Prior of the faults, if it is known; None: estimated from the fleet.
+    readings : Readings or None
+        Direct readings of single sensors.
+    trusted : ndarray of bool of shape (N,) or None
+        Vehicles whose sensors were found faultless on a bench; they carry the reference.
+    learning : ndarray of bool of shape (N,) or None
+        Vehicles from which the fleet's reference and hyper-parameters are learnt; None: all.
 
     Returns
     -------
     FleetPosterior
-        In the order of the summaries, branches in theirs.
+        In the order of the summaries, branches in theirs; with the health of the reference.
     """
+    K, N = summaries[0].branches, len(summaries)
+    names = [f"{k + 1}" for k in range(K)] if branches is None else branches
     order = _largest_first(summaries)
-    ordered = [summary.take_branches(order.tolist()) for summary in summaries]
-    model = fit_fleet_model(ordered)
+    ordered = [summary.take_branches(order) for summary in summaries]
+    learnt = np.ones(N, bool) if learning is None else learning
+    model = fit_fleet_model([summary for summary, use in zip(ordered, learnt, strict=True) if use])
     rows = collect_rows(ordered, model, full_scale_a=full_scale_a)
+    known = no_readings(N, K) if readings is None else readings
+    if trusted is not None:
+        known = known.merged(trusted_readings(trusted, K, full_scale_a))
+    rows = with_readings(rows, known.take_branches(order), full_scale_a=full_scale_a)
     moments = Moments(
         mean_a=np.stack([summary.mean_a for summary in ordered]),
         mean_square_a2=np.stack([np.diag(summary.mean_product_a2) for summary in ordered]),
     )
-    posterior = estimate_fleet(rows, moments, full_scale_a=full_scale_a, given=given)
-    return _reordered(posterior, np.argsort(order))
+    posterior = estimate_fleet(rows, moments, full_scale_a=full_scale_a, given=given, trusted=trusted, learning=learnt)
+    health = examine_reference(rows.take(learnt), [names[k] for k in order], full_scale_a=full_scale_a)
+    return _in_own_order(posterior, health, order)
 
 
-def _largest_first(summaries: Sequence[DriveSummary]) -> NDArray[np.int64]:
+def _largest_first(summaries: Sequence[DriveSummary]) -> list[int]:
     """Branches by falling current: the junction law is written for the first, and small ones are drowned in noise."""
     power = np.median([np.diag(summary.mean_product_a2) for summary in summaries], axis=0)
-    return np.argsort(-power, kind="stable")
+    return [int(k) for k in np.argsort(-power, kind="stable")]
 
 
-def _reordered(posterior: FleetPosterior, place: NDArray[np.int64]) -> FleetPosterior:
+def _in_own_order(posterior: FleetPosterior, health: ReferenceHealth, order: list[int]) -> FleetPosterior:
     """The same posterior with the branches in their own order; the states keep theirs."""
-    faults = posterior.faults
+    faults, place = posterior.faults, np.argsort(order)
     return replace(
         posterior,
         faults=Faults(
@@ -68,4 +93,7 @@ def _reordered(posterior: FleetPosterior, place: NDArray[np.int64]) -> FleetPost
         offset_sd_a=posterior.offset_sd_a[:, place],
         sensor_fault=posterior.sensor_fault[:, place],
         harm=posterior.harm[:, place],
+        identifiable=posterior.identifiable[:, place],
+        health=health.in_order(place),
+        order=tuple(order),
     )

@@ -5,20 +5,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrator.drive import Array
+from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import FleetRows
 from calibrator.faults import Faults
 from calibrator.posterior.decision import best_estimates, harm_probability, spread_points
 from calibrator.posterior.fault_prior import FaultPrior
+from calibrator.posterior.health import ReferenceHealth
 from calibrator.posterior.hyperparameters import (
     Hyperparameters,
     estimate_hyperparameters,
     initial_spreads,
     resampled_hyperparameters,
+    trusted_spread,
 )
 from calibrator.posterior.states import States, enumerate_states, mean_states
 
 __all__ = ["FleetPosterior", "Moments", "estimate_fleet"]
+
+MOST_GAIN_SD = 0.1
+"""Standard deviation from which on a gain is not told: smaller than the faults that matter. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +56,14 @@ class FleetPosterior:
         Probability that correcting makes the branch worse. [1]
     hyperparameters : Hyperparameters
         What was learnt of the fleet.
+    identifiable : ndarray of bool of shape (N, K)
+        False where a branch moved too little for its gain to be told.
     states : States
-        The explanations of each vehicle.
+        The explanations of each vehicle, branches in the order ``order``.
+    order : tuple of int
+        Branches of the states: position of each in the vehicle's own order.
+    health : ReferenceHealth or None
+        Of the fleet reference, if it was examined.
     """
 
     faults: Faults
@@ -62,15 +73,24 @@ class FleetPosterior:
     sensor_fault: Array
     hardware_fault: Array
     harm: Array
+    identifiable: Mask
     hyperparameters: Hyperparameters
     states: States
+    order: tuple[int, ...]
+    health: ReferenceHealth | None = None
 
     def __len__(self) -> int:
         return len(self.confidence)
 
 
 def estimate_fleet(
-    rows: FleetRows, moments: Moments, *, full_scale_a: float, given: FaultPrior | None = None
+    rows: FleetRows,
+    moments: Moments,
+    *,
+    full_scale_a: float,
+    given: FaultPrior | None = None,
+    trusted: Mask | None = None,
+    learning: Mask | None = None,
 ) -> FleetPosterior:
     """Estimate the faults of every vehicle of a fleet.
 
@@ -84,17 +104,25 @@ def estimate_fleet(
         Full scale of the junction. [A]
     given : FaultPrior or None
         Prior of the faults, if it is known; None: estimated from the fleet.
+    trusted : ndarray of bool of shape (N,) or None
+        Vehicles that were found faultless, whose rows hold that reading; they alone carry the reference then.
+    learning : ndarray of bool of shape (N,) or None
+        Vehicles from which hyper-parameters are learnt; None: all.
 
     Returns
     -------
     FleetPosterior
         In the order of the rows.
     """
-    hyperparameters = estimate_hyperparameters(rows, initial_spreads(rows), given=given)
-    resampled = resampled_hyperparameters(rows, hyperparameters, given=given)
+    starts, free = initial_spreads(rows if learning is None else rows.take(learning)), None
+    if trusted is not None and trusted.any():
+        starts, free = [trusted_spread(rows, trusted)], np.zeros(5 * rows.branches, bool)
+    learnt = rows if learning is None else rows.take(learning)
+    hyperparameters = estimate_hyperparameters(learnt, starts, given=given, free=free)
+    resampled = resampled_hyperparameters(learnt, hyperparameters, given=given, free=free)
     states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in resampled])
     vehicles = [_of_vehicle(states, j, hyperparameters.prior, moments, full_scale_a) for j in range(len(rows))]
-    return _joined(vehicles, states, hyperparameters, full_scale_a)
+    return _joined(vehicles, rows, states, hyperparameters, full_scale_a)
 
 
 @dataclass(frozen=True)
@@ -125,7 +153,7 @@ def _true_moments(moments: Moments, j: int, drift: Array, offset_a: Array) -> tu
 
 
 def _joined(
-    vehicles: Sequence[_Vehicle], states: States, hyperparameters: Hyperparameters, full_scale_a: float
+    vehicles: Sequence[_Vehicle], rows: FleetRows, states: States, hyperparameters: Hyperparameters, full_scale_a: float
 ) -> FleetPosterior:
     K, N = states.branches, len(vehicles)
     chosen = (np.arange(N), [vehicle.state for vehicle in vehicles])
@@ -145,6 +173,18 @@ def _joined(
         sensor_fault=np.einsum("ns,nsk->nk", states.weight, faulty),
         hardware_fault=np.sum(states.weight * states.hardware, axis=1),
         harm=np.stack([vehicle.harm for vehicle in vehicles]),
+        identifiable=_identifiable(rows),
         hyperparameters=hyperparameters,
         states=states,
+        order=tuple(range(K)),
     )
+
+
+def _identifiable(rows: FleetRows) -> Mask:
+    """Branches whose gain some row tells better than :data:`MOST_GAIN_SD`: slope, gain ratio, or a bench reading."""
+    K = rows.branches
+    sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
+    slope, ratio, reading = sd[:, :K], sd[:, K : 2 * K - 1], sd[:, 2 * K - 1 : 3 * K - 1]
+    best = np.minimum(slope, reading)
+    best[:, 1:] = np.minimum(best[:, 1:], ratio)
+    return np.asarray(best < MOST_GAIN_SD)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from calibrator.drive import Array
+from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, constant_design, relative_design
 from calibrator.posterior.cluster import densest_clusters
 from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
@@ -22,7 +22,13 @@ from calibrator.posterior.slab import Slab
 from calibrator.posterior.states import States, enumerate_states
 from calibrator.random_streams import Purpose, random_stream
 
-__all__ = ["Hyperparameters", "estimate_hyperparameters", "initial_spreads", "resampled_hyperparameters"]
+__all__ = [
+    "Hyperparameters",
+    "estimate_hyperparameters",
+    "initial_spreads",
+    "resampled_hyperparameters",
+    "trusted_spread",
+]
 
 WIDEST = Slab(0.002, 0.45)
 """Any fault that a sensor of a running vehicle can have. [1]"""
@@ -174,6 +180,26 @@ def initial_spreads(rows: FleetRows) -> list[ModelSpread]:
     ]
 
 
+def trusted_spread(rows: FleetRows, trusted: Mask) -> ModelSpread:
+    """Start of the climb whose centre is that of trusted vehicles.
+
+    Parameters
+    ----------
+    rows : FleetRows
+        Evidence of the fleet.
+    trusted : ndarray of bool of shape (N,)
+        Vehicles without sensor faults.
+
+    Returns
+    -------
+    ModelSpread
+        Centres of slopes, intercepts and junction constant are the trusted vehicles'.
+    """
+    values = np.concatenate([rows.relative, rows.constant], axis=1)
+    mean = np.where(_free_centres(rows.branches), np.median(values[trusted], axis=0), 0.0)
+    return ModelSpread(mean=mean, covariance=_guessed_spread(rows) + np.diag(_least_spread(rows.branches) ** 2))
+
+
 def _climb(
     rows: FleetRows, spread: ModelSpread, prior: FaultPrior, given: FaultPrior | None, free: Array, steps: int
 ) -> Hyperparameters:
@@ -302,8 +328,8 @@ def _hidden_by_parameters(states: States, used: int, prior: FaultPrior, precisio
         active[..., :, None] & active[..., None, :]
     )
     C = np.linalg.inv(information + np.eye(3 * K) / slab**2) * active[..., None, :]
-    shown = np.matmul(gain @ design, np.eye(3 * K))[:, None] * active[..., None, :]
-    return shown @ C @ np.swapaxes(shown, 2, 3)
+    shown = (gain @ design)[:, None] * active[..., None, :]
+    return np.asarray(shown @ C @ np.swapaxes(shown, 2, 3))
 
 
 def _informed_rows(branches: int) -> list[int]:

@@ -3,12 +3,13 @@
 A state is a support, and a node where the support has pivots. Up to :data:`EXACT_BRANCHES` branches all supports are
 looked at. With more branches the sum over supports is approximate: all relative supports, of whose states the best go
 on (:data:`calibrator.posterior.joint_evidence.MOST_RELATIVE`); with each of these the constant supports of at most
-:data:`calibrator.posterior.supports.MOST_CONSTANT` parameters; and where the best explanation of a vehicle has so many,
-those with one parameter more, as long as that is better.
+:data:`calibrator.posterior.supports.MOST_CONSTANT` parameters; and where a likely explanation has so many, its like with
+one parameter more, and so on.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +19,20 @@ from calibrator.drive import Array
 from calibrator.evidence.rows import FleetRows
 from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
 from calibrator.posterior.joint_evidence import JointEvidence, StateArrays
-from calibrator.posterior.supports import EXACT_BRANCHES, MOST_CONSTANT, constant_supports, grown_supports
+from calibrator.posterior.supports import EXACT_BRANCHES, MOST_CONSTANT, Support, constant_supports, grown_supports
 
 __all__ = ["States", "enumerate_states", "mean_states"]
 
 MOST_STATES = 128
 """States kept per vehicle, the most probable ones. [1]"""
+BEAM = 16
+"""Constant supports of one size that are grown, the best ones. [1]"""
+GROWING = 3.0
+"""None are if the best of them lies farther below the vehicle's best state (logarithm). [1]"""
 MOST_WAITING = 1024
 """States that are collected before the most probable ones are picked: picking costs more than fitting. [1]"""
-CHUNK = 64
-"""Vehicles worked on at a time: bounds the memory. [1]"""
+CHUNK, GROWN_CHUNK = 64, 16
+"""Vehicles worked on at a time: bounds the memory; where supports are grown, what one wants is fitted to all. [1]"""
 
 
 @dataclass(frozen=True)
@@ -99,7 +104,8 @@ def enumerate_states(rows: FleetRows, prior: FaultPrior, spread: ModelSpread) ->
     States
         The most probable ones of each vehicle.
     """
-    parts = [_enumerate(rows.take(slice(start, start + CHUNK)), prior, spread) for start in range(0, len(rows), CHUNK)]
+    chunk = CHUNK if rows.branches <= EXACT_BRANCHES else GROWN_CHUNK
+    parts = [_enumerate(rows.take(slice(start, start + chunk)), prior, spread) for start in range(0, len(rows), chunk)]
     return States(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(States)))
 
 
@@ -130,14 +136,26 @@ def _enumerate(rows: FleetRows, prior: FaultPrior, spread: ModelSpread) -> State
 
 
 def _grow(found: "_Found", evidence: JointEvidence, branches: int, size: int) -> None:
-    """Add constant supports with one parameter more than the best ones of the vehicles, while these are the largest."""
-    while True:
-        largest = {support for support in found.best_constant_supports() if len(support) == size}
-        if not largest:
-            return
-        for child in sorted({c.active: c for s in largest for c in grown_supports(branches, s)}.items()):
-            found.add(*evidence.with_constant(child[1]))
+    """Add constant supports with one parameter more than the largest so far that are likely, while there are any.
+
+    A vehicle gets its own ones only, so that it does not matter with which others it is worked on.
+    """
+    while wanted := _wanted(found, branches, size):
+        for support, vehicles in wanted.items():
+            log_weight, arrays = evidence.with_constant(support)
+            others = np.ones(len(log_weight), bool)
+            others[list(vehicles)] = False
+            found.add(np.where(others[:, None], -np.inf, log_weight), arrays)
         size += 1
+
+
+def _wanted(found: "_Found", branches: int, size: int) -> dict[Support, set[int]]:
+    """Supports grown from those of this size, and for which vehicles."""
+    wanted: dict[Support, set[int]] = {}
+    for vehicle, beam in enumerate(found.beams(size)):
+        for support in chain.from_iterable(grown_supports(branches, active) for active in beam):
+            wanted.setdefault(support, set()).add(vehicle)
+    return wanted
 
 
 class _Found:
@@ -156,10 +174,14 @@ class _Found:
         if sum(weights.shape[1] for weights, _ in self._waiting) > MOST_WAITING:
             self._merge()
 
-    def best_constant_supports(self) -> set[tuple[int, ...]]:
-        """Positions of the constant parameters that are not zero in the best state of each vehicle."""
+    def beams(self, size: int) -> list[list[tuple[int, ...]]]:
+        """Of each vehicle the best constant supports of this size, if one of them is likely."""
         self._merge()
-        return {tuple(np.flatnonzero(values).tolist()) for values in self._arrays[2][:, 0]}
+        present = self._arrays[2] != 0.0
+        live = (present.sum(axis=2) == size) & np.isfinite(self._log_weight)
+        likely = (live & (self._log_weight >= self._log_weight[:, :1] - GROWING)).any(axis=1)
+        found = [map(tuple, present[j, live[j]]) if likely[j] else () for j in range(len(live))]
+        return [[tuple(np.flatnonzero(mask)) for mask in islice(dict.fromkeys(masks), BEAM)] for masks in found]
 
     def states(self) -> States:
         """What was found, in order of falling weight."""

@@ -1,0 +1,205 @@
+"""Health of the fleet reference: can the vehicles that agree with each other be trusted to be right?
+
+Vehicles without faults form a cluster. What would fool the reference shows elsewhere: a fault that most vehicles share
+moves the clusters of the junction law, which needs no reference; two variants of a vehicle form two clusters; a branch
+whose sensors are all faulty forms none.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrator.drive import Array
+from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
+from calibrator.posterior.cluster import Cluster, densest_clusters
+
+__all__ = ["ReferenceHealth", "examine_reference"]
+
+LEAST_AGREEING = 5
+"""Vehicles that must agree for their centre to be trusted."""
+LEAST_SHARE, LEAST_GAIN = 0.15, 3.0
+"""Share of the fleet, and log likelihood over no cluster, that a cluster needs. [1]"""
+SURE = 4.0
+"""Standard deviations from which on a centre is off. [1]"""
+LEAST_COMMON_GAIN, LEAST_COMMON_OFFSET = 0.003, 0.001
+"""Smallest common error that matters: gains, offsets in fractions of full scale. [1]"""
+ALIKE = 0.25
+"""Relative difference up to which distances of second clusters count as one. [1]"""
+SECOND_SHARE, SECOND_GAIN, SECOND_DISTANCE = 0.15, 5.0, 4.0
+"""Share, gain, and distance over its spread, of a second cluster that is taken for another variant. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceHealth:
+    """What is known about the fleet reference.
+
+    Attributes
+    ----------
+    agreeing_share : tuple of float
+        Per branch: share of the vehicles in the densest cluster of slopes. [1]
+    mean_distance : tuple of float
+        Per branch: mean slope of the fleet minus the cluster's; how far off the published reference (3) is. [1]
+    least_vehicles : int
+        Smallest fleet of this kind whose reference can be trusted.
+    unmeasured_a : float
+        Centre of the junction's constant: mean load that no branch measures. [A]
+    doubtful : tuple of int
+        Branches whose scale or zero the fleet may have wrong as a whole.
+    warnings : tuple of str
+        What would fool the reference, one text each.
+    """
+
+    agreeing_share: tuple[float, ...]
+    mean_distance: tuple[float, ...]
+    least_vehicles: int
+    unmeasured_a: float
+    doubtful: tuple[int, ...]
+    warnings: tuple[str, ...]
+
+    def in_order(self, place: NDArray[np.int64]) -> "ReferenceHealth":
+        """Return the same for branches in another order: branch k is at position ``place[k]`` here."""
+        return replace(
+            self,
+            agreeing_share=tuple(self.agreeing_share[p] for p in place),
+            mean_distance=tuple(self.mean_distance[p] for p in place),
+            doubtful=tuple(k for k, p in enumerate(place) if p in self.doubtful),
+        )
+
+
+def examine_reference(rows: FleetRows, branches: Sequence[str], *, full_scale_a: float) -> ReferenceHealth:
+    """Look for what would fool the reference.
+
+    Parameters
+    ----------
+    rows : FleetRows
+        Evidence of the fleet.
+    branches : sequence of str
+        Names of the K branches in the order of the rows.
+    full_scale_a : float
+        Full scale of the junction. [A]
+
+    Returns
+    -------
+    ReferenceHealth
+        With warnings in words.
+    """
+    K = rows.branches
+    slopes = [_cluster(rows, k) for k in range(K)]
+    share = [found[0].share if found else 0.0 for found in slopes]
+    distance = [
+        float(np.mean(rows.relative[:, k])) - (found[0].centre if found else 0.0) for k, found in enumerate(slopes)
+    ]
+    warnings, doubtful = _common_gains(rows, branches)
+    warnings += _no_cluster(slopes, branches, doubtful, len(rows)) + _second_clusters(slopes, branches, len(rows))
+    least = ceil(LEAST_AGREEING / max(min(share), 1.0 / 1000.0))
+    if len(rows) < least:
+        warnings.append(
+            f"{len(rows)} vehicles are few for a fleet in which {min(share):.0%} agree: at least {least} are needed "
+            f"to trust its reference"
+        )
+    constant = densest_clusters(rows.constant[:, K], _sd(rows, 4 * K - 1))[0]
+    unmeasured_a = constant.centre * full_scale_a
+    if abs(constant.centre) > max(LEAST_COMMON_OFFSET, SURE * _uncertainty(constant, _sd(rows, 4 * K - 1))):
+        warnings.append(
+            f"the currents of most vehicles sum to {unmeasured_a:+.1f} A: a load without a sensor, as is taken here, "
+            f"or an offset that most vehicles share"
+        )
+    return ReferenceHealth(
+        agreeing_share=tuple(share),
+        mean_distance=tuple(distance),
+        least_vehicles=least,
+        unmeasured_a=unmeasured_a,
+        doubtful=tuple(sorted(doubtful)),
+        warnings=tuple(warnings),
+    )
+
+
+def _sd(rows: FleetRows, row: int) -> Array:
+    return np.sqrt(rows.covariance[:, row, row])
+
+
+def _told(rows: FleetRows, row: int) -> Array:
+    return np.asarray(rows.covariance[:, row, row] < UNKNOWN_VARIANCE / 2.0)
+
+
+def _cluster(rows: FleetRows, row: int) -> list[Cluster]:
+    """The two densest clusters of a relative row among the vehicles that tell it."""
+    told = _told(rows, row)
+    return densest_clusters(rows.relative[told, row], _sd(rows, row)[told], most=2) if told.any() else []
+
+
+def _uncertainty(cluster: Cluster, sd: Array) -> float:
+    """Standard deviation of a cluster's centre."""
+    members = max(cluster.share * len(sd), 1.0)
+    return float(np.sqrt((cluster.spread**2 + np.median(sd) ** 2) / members))
+
+
+def _common_gains(rows: FleetRows, branches: Sequence[str]) -> tuple[list[str], set[int]]:
+    """Gain ratios of the junction law whose cluster is not at 1: a gain fault that most vehicles share."""
+    K = rows.branches
+    off: dict[int, float] = {}
+    for k in range(1, K):
+        row = K + k - 1
+        found = _cluster(rows, row)
+        if found and found[0].share >= LEAST_SHARE:
+            doubt = SURE * _uncertainty(found[0], _sd(rows, row)[_told(rows, row)])
+            if abs(found[0].centre) > max(LEAST_COMMON_GAIN, doubt):
+                off[k] = found[0].centre
+    if not off:
+        return [], set()
+    same = len(off) == K - 1 and np.ptp(list(off.values())) < LEAST_COMMON_GAIN + 0.1 * max(map(abs, off.values()))
+    suspects = {0, *off} if K == 2 else {0} if same else set(off)
+    names = " or ".join(branches[k] for k in sorted(suspects))
+    size = max(off.values(), key=abs)
+    text = (
+        f"the reference breaks the junction law by {size:+.1%}: a gain fault that most vehicles share (a batch of "
+        f"sensors), in branch {names}; name bench-checked vehicles with --trusted"
+    )
+    return [text], suspects
+
+
+def _no_cluster(
+    slopes: Sequence[Sequence[Cluster]], branches: Sequence[str], doubtful: set[int], vehicles: int
+) -> list[str]:
+    """Branches in which no two vehicles agree."""
+    texts = []
+    for k, found in enumerate(slopes):
+        if vehicles > LEAST_AGREEING and (not found or found[0].share < LEAST_SHARE):
+            doubtful.add(k)
+            texts.append(
+                f"no cluster of vehicles agrees in branch {branches[k]}: every sensor of it may be faulty; name "
+                f"bench-checked vehicles with --trusted"
+            )
+    return texts
+
+
+def _second_clusters(slopes: Sequence[Sequence[Cluster]], branches: Sequence[str], vehicles: int) -> list[str]:
+    """A second cluster: another variant of the vehicle if it is in all branches, else a batch of sensors."""
+    apart = {k: found for k, found in enumerate(slopes) if len(found) > 1 and _is_apart(found[0], found[1])}
+    if not apart:
+        return []
+    distances = np.abs([second.centre - first.centre for first, second in apart.values()])
+    count = round(min(second.share for _, second in apart.values()) * vehicles)
+    if len(apart) == len(slopes) and np.ptp(distances) <= ALIKE * distances.max():
+        return [
+            f"about {count} vehicles form a second cluster, {distances.mean():.1%} apart in all currents: two variants "
+            f"of the vehicle? calibrate them apart"
+        ]
+    names = ", ".join(branches[k] for k in apart)
+    return [
+        f"about {count} vehicles form a second cluster, {distances.mean():.1%} apart in branch {names}: a batch of "
+        f"sensors, or a variant of the vehicle?"
+    ]
+
+
+def _is_apart(first: Cluster, second: Cluster) -> bool:
+    """Whether a second cluster is one of its own, not the flank of the first or of the background."""
+    distance = abs(second.centre - first.centre)
+    return (
+        second.share >= SECOND_SHARE
+        and second.gain >= SECOND_GAIN
+        and distance >= SECOND_DISTANCE * max(first.spread, second.spread)
+    )
