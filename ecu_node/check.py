@@ -10,7 +10,16 @@ from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.guard import needs_fd
 from ecu_node.layout import Branch, read_layout
 from ecu_node.node import choose_parameters
-from ecu_node.wiring import WHY_NOT_PUBLISHED, InForce, branch_plan, not_published, sensor_fault, wire
+from ecu_node.wiring import (
+    WHY_NOT_LINEAR,
+    WHY_NOT_PUBLISHED,
+    InForce,
+    branch_plan,
+    not_linear,
+    not_published,
+    sensor_fault,
+    wire,
+)
 
 __all__ = ["check_report", "report_text"]
 
@@ -73,6 +82,7 @@ def report_text(report: dict[str, Any]) -> str:
 
 def _warnings(database: VehicleDatabase, in_force: InForce) -> list[str]:
     texts = [f"branch {name} is not published: {WHY_NOT_PUBLISHED}" for name in not_published(database, in_force)]
+    texts += [f"branch {name} is passed through: {WHY_NOT_LINEAR}" for name in not_linear(in_force)]
     if names := needs_fd(database):
         texts.append(f"CAN FD messages ({', '.join(names)}): 'ecu-node run' needs --fd")
     return texts

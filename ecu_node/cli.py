@@ -122,7 +122,7 @@ def _run(options: argparse.Namespace) -> int:
     from ecu_node.database import read_database  # noqa: PLC0415  # after _load_python_can
     from ecu_node.layout import read_layout  # noqa: PLC0415
     from ecu_node.node import choose_parameters, open_bus, serve  # noqa: PLC0415
-    from ecu_node.wiring import WHY_NOT_PUBLISHED, not_published, wire  # noqa: PLC0415
+    from ecu_node.wiring import WHY_NOT_LINEAR, WHY_NOT_PUBLISHED, not_linear, not_published, wire  # noqa: PLC0415
 
     database = read_database(read_layout(options.layout))
     in_force, why_not = choose_parameters(options.params, database, options.vehicle)
@@ -137,6 +137,8 @@ def _run(options: argparse.Namespace) -> int:
         hidden = not_published(database, in_force)
         for name in hidden:
             _say(f"branch {name} is not published: {WHY_NOT_PUBLISHED}")
+        for name in not_linear(in_force):
+            _say(f"branch {name} is passed through: {WHY_NOT_LINEAR}")
         applied = ", ".join(item.name for item in corrector.branches if item.fault.applied and item.name not in hidden)
         _say(f"running on {options.interface} {options.channel}, correcting {applied or 'nothing'}")
         try:

@@ -120,6 +120,8 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     max_age_s: _Positive = 1.0
     """An input without a frame for this long is stale. [s]"""
     input: list[Input] = []
+    temperature: Name | None = None
+    """Input that is the temperature of the current sensors. [degC]"""
     derived: list[Derived] = []
     model_inputs: list[str] = []
     limits: Limits = Limits()
@@ -253,6 +255,8 @@ def _check_inputs(layout: Layout, refuse: Callable[[str], NoReturn]) -> None:
         if unknown:
             refuse(f"derived input {item.name}: {', '.join(unknown)} is no input or derived input declared above it")
         known.add(item.name)
+    if layout.temperature is not None and layout.temperature not in {item.name for item in layout.input}:
+        refuse(f"temperature: {layout.temperature!r} is no [[input]]; declare the signal as one, or leave the key out")
     unknown = [name for name in layout.model_inputs if name not in known]
     if unknown:
         refuse(f"model_inputs: {', '.join(unknown)} is no [[input]] or [[derived]]")

@@ -14,6 +14,7 @@ import msgspec
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError
 from ecu_node.field_errors import field_error, quoted_place
+from ecu_node.sensor_models import SensorModel
 from ecu_node.status import Reason
 
 __all__ = [
@@ -52,6 +53,9 @@ class BranchParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     drift_sd: Annotated[_NotNegative | None, msgspec.Meta(description="standard deviation of the drift [1]")] = None
     offset_sd_a: Annotated[_NotNegative | None, msgspec.Meta(description="standard deviation of the offset [A]")] = None
     apply: Annotated[bool, msgspec.Meta(description="false: the node passes this branch through")]
+    sensor_model: Annotated[
+        SensorModel | None, msgspec.Meta(description="null: linear; the node passes any other branch through")
+    ] = None
 
 
 class HardwareFault(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -17,9 +17,20 @@ from ecu_node.layout import Branch, SignalName, split_signal
 from ecu_node.parameters import VehicleParameters
 from ecu_node.status import Reason
 
-__all__ = ["WHY_NOT_PUBLISHED", "InForce", "branch_plan", "not_published", "sensor_fault", "wire"]
+__all__ = [
+    "WHY_NOT_LINEAR",
+    "WHY_NOT_PUBLISHED",
+    "InForce",
+    "branch_plan",
+    "not_linear",
+    "not_published",
+    "sensor_fault",
+    "wire",
+]
 
 WHY_NOT_PUBLISHED = "the parameters apply a fault to it, but the layout has no 'corrected' for it"
+
+WHY_NOT_LINEAR = "its sensor model is not linear, and the node corrects linear sensors only"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,9 +42,9 @@ class InForce:
 
 
 def sensor_fault(in_force: InForce, branch: str) -> SensorFault:
-    """What is corrected on one branch: nothing without parameters that apply to it, or where they find no fault."""
+    """What is corrected on one branch: nothing without a linear fault that the parameters apply to it."""
     found = in_force.parameters.branches.get(branch) if in_force.parameters is not None else None
-    if found is None or not found.apply or found.drift == found.offset_a == 0.0:
+    if found is None or not found.apply or found.drift == found.offset_a == 0.0 or found.sensor_model is not None:
         return SensorFault()
     return SensorFault(drift=found.drift, offset_a=found.offset_a, applied=True)
 
@@ -42,6 +53,12 @@ def not_published(database: VehicleDatabase, in_force: InForce) -> list[str]:
     """Branches with a fault to correct, but no signal to publish the result in; it counts in the status' sum alone."""
     branches = database.layout.branch
     return [item.name for item in branches if item.corrected is None and sensor_fault(in_force, item.name).applied]
+
+
+def not_linear(in_force: InForce) -> list[str]:
+    """Branches that the parameters apply a sensor model to that is not linear; they are passed through."""
+    branches = in_force.parameters.branches.items() if in_force.parameters is not None else ()
+    return [name for name, found in branches if found.apply and found.sensor_model is not None]
 
 
 def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault) -> IntegerPlan | None:
