@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "main"]
 
+DEFAULT_LAYOUT = Path("dbc/hv_powertrain.toml")
+"""Of the examples that come with the source."""
+
 app = typer.Typer(
     help="Learn from recorded drives what each vehicle's high-voltage current sensors do wrong.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong use, 130 interrupted.",
@@ -165,7 +168,15 @@ def calibrate(
     fleet: Annotated[Path, typer.Argument(help="Drive store, or folder with a folder of logs per vehicle.")],
     layout: LayoutOption,
     out: Annotated[Path, typer.Option("--out", help="Folder of the result, new or empty.")],
-    method: Annotated[Method, typer.Option("--method", help="Estimator.")] = Method.PUBLISHED,
+    method: Annotated[Method, typer.Option("--method", help="Estimator.")] = Method.POSTERIOR,
+    harm_limit: Annotated[
+        float,
+        typer.Option("--harm-limit", min=0, max=1, help="Correct a branch if harm is less probable (posterior)."),
+    ] = 0.001,
+    trusted: Annotated[
+        list[str] | None,
+        typer.Option("--trusted", help="Vehicle with bench-checked sensors: it carries the reference (posterior)."),
+    ] = None,
     classifier: Annotated[
         Classifier, typer.Option("--classifier", help="Tells hardware faults (published).")
     ] = Classifier.TREE,
@@ -179,7 +190,7 @@ def calibrate(
         typer.Option("--hold-out", help="Calibrate this vehicle, but learn nothing from it for others."),
     ] = None,
     unity: Annotated[
-        str | None, typer.Option("--unity", help="Vehicle whose held-out data is the unity drive.")
+        str | None, typer.Option("--unity", help="Vehicle whose held-out data is the unity drive (published).")
     ] = None,
     seed: SeedOption = 0,
     workers: WorkersOption = 2,
@@ -187,7 +198,9 @@ def calibrate(
 ) -> None:
     """Estimate the sensor faults of every vehicle and write its parameter file.
 
-    The classifier 'tree' is trained on an artificial fleet of this --sparsity, --magnitude and --seed.
+    The default method, posterior, says how sure it is and corrects a branch only if that hardly harms. The options
+    classifier to seed are for the published method, which is kept as a reference: its classifier 'tree' is trained on
+    an artificial fleet of this --sparsity, --magnitude and --seed.
     """
     with importing():
         from calibrator.fleet import CalibrationSettings, calibrate_fleet
@@ -196,6 +209,8 @@ def calibrate(
         raise typer.BadParameter("--classifier perfect and --truth FILE belong together", param_hint="--classifier")
     settings = CalibrationSettings(
         method=method,
+        harm_limit=harm_limit,
+        trusted=frozenset(trusted or ()),
         classifier=classifier,
         truth=_truth_of(fleet, truth) if truth is not None else None,
         sparsity=sparsity,
@@ -226,7 +241,7 @@ def score(
 
 @app.command()
 def experiment(
-    name: Annotated[ExperimentName, typer.Argument(help="Which of the paper's experiments.")],
+    name: Annotated[ExperimentName, typer.Argument(help="Which experiment, or all.")],
     quick: Annotated[
         bool, typer.Option("--quick", help="Small and fast: shows that it runs, not the figures.")
     ] = False,
@@ -234,27 +249,35 @@ def experiment(
         int | None, typer.Option("--repetitions", min=1, max=1000, help="Trials per setting.")
     ] = None,
     seed: SeedOption = 0,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for NAME.md, NAME.json and NAME.png.")] = None,
+    drives: Annotated[
+        Path | None,
+        typer.Option("--drives", help="Drive store for real, delay, data and phase; without it the built-in vehicle."),
+    ] = None,
+    layout: Annotated[
+        Path, typer.Option("--layout", help="Layout that the drive store was made with.")
+    ] = DEFAULT_LAYOUT,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for NAME.md, NAME.json and NAME.png; FOLDER.md beside it lists all."),
+    ] = None,
     workers: WorkersOption = 2,
     json: JsonOption = False,
 ) -> None:
-    """Repeat an experiment of the paper and print its figures beside the paper's."""
+    """Run an experiment and print the paper's figures, the published method and the default side by side.
+
+    'calibration' pools the confidences of the experiments recorded in --out.
+    """
     with importing():
-        from calibrator.experiments.runner import run_experiment
+        from calibrator.experiments.runner import CALIBRATION, EXPERIMENTS, RunOptions, run_experiments
 
     if out is not None:
         require_possible_folder(out)
-    result = run_experiment(
-        name.value,
-        quick=quick,
-        seed=seed,
-        repetitions=repetitions,
-        out=out,
-        console=None if json else Console(),
-        jobs=workers,
-    )
+    names = (*EXPERIMENTS, CALIBRATION) if name is ExperimentName.ALL else (name.value,)
+    options = RunOptions(quick=quick, seed=seed, repetitions=repetitions, jobs=workers, layout=layout, drives=drives)
+    results = run_experiments(names, options, out=out, console=None if json else Console())
     if json:
-        _print_report(result.to_json().decode())
+        texts = [result.to_json().decode().rstrip() for result in results]
+        _print_report(texts[0] if len(texts) == 1 else f"[{','.join(texts)}]")
 
 
 def _truth_of(fleet: Path, path: Path) -> "FleetTruth":

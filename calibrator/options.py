@@ -8,6 +8,7 @@ __all__ = ["Classifier", "ExperimentName", "Method"]
 class Method(StrEnum):
     """How sensor faults are estimated."""
 
+    POSTERIOR = "posterior"
     PUBLISHED = "published"
 
 
@@ -20,9 +21,16 @@ class Classifier(StrEnum):
 
 
 class ExperimentName(StrEnum):
-    """Experiments of the paper: table 1, figure 7, figure 8 and table 2."""
+    """Experiments of the paper (table 1, figure 7, figure 8, table 2), those beyond it, and all of them."""
 
     CLASSIFIER = "classifier"
     SNR = "snr"
     SPARSITY = "sparsity"
     STATESPACE = "statespace"
+    ASYMMETRY = "asymmetry"
+    REAL = "real"
+    DELAY = "delay"
+    DATA = "data"
+    PHASE = "phase"
+    CALIBRATION = "calibration"
+    ALL = "all"

@@ -1,105 +1,89 @@
-"""From what was found for one vehicle to its parameter file.
-
-Parameters that leave a larger Kirchhoff sum than no correction at all are written down, but marked not to be applied,
-and the verdict is 'cannot tell': whatever they are, they do not explain this vehicle's sensors.
-"""
+"""What every parameter file of one run has in common."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from calibrator.drive import Array
-from calibrator.identification.vehicle_model import VehicleModel, junction_rms_a
 from calibrator.options import Method
-from calibrator.published.recovery import Recovery
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import (
-    BranchParameters,
-    FileReference,
-    HardwareFault,
-    JunctionResidual,
-    Provenance,
-    VehicleParameters,
-    Verdict,
-)
+from ecu_node.parameters import FileReference, Provenance
 
-__all__ = ["parameters_of"]
+__all__ = ["RunIdentity", "by_branch", "junction_rms_a"]
 
 
-def parameters_of(
-    vehicle: VehicleModel,
-    recovery: Recovery,
-    position: int,
-    *,
-    branches: Sequence[str],
-    database: VehicleDatabase,
-    method: Method,
-    fleet: str,
-    fleet_size: int,
-    created: str,
-) -> VehicleParameters:
-    """Write down what was found for one vehicle.
+@dataclass(frozen=True, kw_only=True)
+class RunIdentity:
+    """One run of the calibrator.
 
-    Parameters
+    Attributes
     ----------
-    vehicle : VehicleModel
-        The vehicle.
-    recovery : Recovery
-        What was found for the fleet.
-    position : int
-        Which row of it is this vehicle's.
-    branches : sequence of str
-        Names of the K branches.
     database : VehicleDatabase
         DBC and layout that the parameters belong to.
     method : Method
-        How they were found.
+        How they are found.
     fleet, created : str
         Name of the fleet; time, ISO 8601.
-    fleet_size : int
-        Number of vehicles calibrated together.
+    """
+
+    database: VehicleDatabase
+    method: Method
+    fleet: str
+    created: str
+
+    @property
+    def tool(self) -> str:
+        """Name and version of the program."""
+        return f"calibrator {__version__}"
+
+    @property
+    def layout(self) -> FileReference:
+        """The layout file."""
+        return FileReference(name=self.database.layout.name, sha256=self.database.layout.digest)
+
+    @property
+    def dbc(self) -> FileReference:
+        """The DBC file."""
+        return FileReference(name=self.database.layout.dbc_path.name, sha256=self.database.digest)
+
+    def provenance(self, *, fleet_size: int, drives: Sequence[str], duration_s: float) -> Provenance:
+        """Where the parameters of one vehicle come from."""
+        return Provenance(
+            tool=self.tool,
+            method=self.method.value,
+            created=self.created,
+            fleet=self.fleet,
+            fleet_size=fleet_size,
+            drives=list(drives),
+            duration_s=round(duration_s, 3),
+        )
+
+
+def by_branch(branches: Sequence[str], values: Array) -> dict[str, float]:
+    """Values of the branches by name."""
+    return dict(zip(branches, values.tolist(), strict=True))
+
+
+def junction_rms_a(mean_a: Array, product_a2: Array, *, drift: Array, offset_a: Array) -> float:
+    """Root mean square of the Kirchhoff sum after correction with given sensor faults.
+
+    Parameters
+    ----------
+    mean_a : ndarray of shape (K,)
+        Mean measured currents. [A]
+    product_a2 : ndarray of shape (K, K)
+        Mean products of measured currents. [A^2]
+    drift, offset_a : ndarray of shape (K,)
+        Sensor faults to correct; zeros give the sum of the measured currents. [1], [A]
 
     Returns
     -------
-    VehicleParameters
-        The content of the file.
+    float
+        RMS of sum_k (i_m,k - o_k) / (1 + d_k) over all valid samples. [A]
     """
-    faults = recovery.faults.take(position)
-    sensor = bool(recovery.classification.sensor[position])
-    zeros = np.zeros(len(branches))
-    residual = JunctionResidual(
-        measured_a=junction_rms_a(vehicle, drift=zeros, offset_a=zeros),
-        corrected_a=junction_rms_a(vehicle, drift=faults.drift, offset_a=faults.offset_a),
-    )
-    helps = residual.corrected_a <= residual.measured_a
-    verdict: Verdict = "no sensor fault" if not sensor else "corrected" if helps else "cannot tell"
-    return VehicleParameters(
-        vehicle=vehicle.vehicle,
-        layout=FileReference(name=database.layout.name, sha256=database.layout.digest),
-        dbc=FileReference(name=database.layout.dbc_path.name, sha256=database.digest),
-        verdict=verdict,
-        branches={
-            name: BranchParameters(drift=float(faults.drift[k]), offset_a=float(faults.offset_a[k]), apply=helps)
-            for k, name in enumerate(branches)
-        },
-        hardware_fault=HardwareFault(
-            suspected=bool(recovery.classification.hardware[position]),
-            drift=float(faults.hardware_drift),
-            offset_a=_by_branch(branches, faults.hardware_offset_a),
-        ),
-        junction_residual=residual,
-        provenance=Provenance(
-            tool=f"calibrator {__version__}",
-            method=method.value,
-            created=created,
-            fleet=fleet,
-            fleet_size=fleet_size,
-            drives=list(vehicle.drives),
-            duration_s=round(vehicle.duration_s, 3),
-        ),
-    )
-
-
-def _by_branch(branches: Sequence[str], values: Array) -> dict[str, float]:
-    return dict(zip(branches, values.tolist(), strict=True))
+    weight = 1.0 / (1.0 + drift)
+    constant = float(weight @ offset_a)
+    mean_square = weight @ product_a2 @ weight - 2.0 * constant * float(weight @ mean_a) + constant**2
+    return float(np.sqrt(max(float(mean_square), 0.0)))

@@ -61,10 +61,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     branches: list[str]
     model_inputs: list[str]
     created: str
-    unity_vehicle: str
-    unity_duration_s: float
-    simulation_snr_db: dict[str, float]
-    """Median over vehicles of each branch's simulation SNR on held-out data. [dB]"""
+    details: dict[str, Any]
+    """What the method tells of its run: unity drive and simulation SNR, or reference, delays and hyper-parameters."""
     vehicles: int
     left_out: dict[str, str]
     notices: list[str]

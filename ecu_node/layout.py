@@ -18,6 +18,7 @@ from ecu_node.formula import formula_names, parse_formula
 
 __all__ = [
     "Branch",
+    "Contactor",
     "Derived",
     "EndToEnd",
     "Input",
@@ -77,6 +78,14 @@ class Derived(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     formula: str
 
 
+class Contactor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Which input tells that the contactors are open, so that no HV current flows."""
+
+    input: Name
+    open: Annotated[list[float], msgspec.Meta(min_length=1)]
+    """Values of the input that mean open."""
+
+
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Largest parameters that the node accepts."""
 
@@ -122,6 +131,7 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     input: list[Input] = []
     temperature: Name | None = None
     """Input that is the temperature of the current sensors. [degC]"""
+    contactor: Contactor | None = None
     derived: list[Derived] = []
     model_inputs: list[str] = []
     limits: Limits = Limits()
@@ -255,6 +265,8 @@ def _check_inputs(layout: Layout, refuse: Callable[[str], NoReturn]) -> None:
         if unknown:
             refuse(f"derived input {item.name}: {', '.join(unknown)} is no input or derived input declared above it")
         known.add(item.name)
+    if layout.contactor is not None and layout.contactor.input not in {item.name for item in layout.input}:
+        refuse(f"[contactor] input: {layout.contactor.input!r} is no [[input]]; declare the signal as one")
     if layout.temperature is not None and layout.temperature not in {item.name for item in layout.input}:
         refuse(f"temperature: {layout.temperature!r} is no [[input]]; declare the signal as one, or leave the key out")
     unknown = [name for name in layout.model_inputs if name not in known]

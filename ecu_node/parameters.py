@@ -19,6 +19,7 @@ from ecu_node.status import Reason
 
 __all__ = [
     "BranchParameters",
+    "Explanation",
     "FileReference",
     "HardwareFault",
     "JunctionResidual",
@@ -56,6 +57,19 @@ class BranchParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     sensor_model: Annotated[
         SensorModel | None, msgspec.Meta(description="null: linear; the node passes any other branch through")
     ] = None
+    delay_s: Annotated[
+        float | None, msgspec.Meta(description="how much later than the largest branch it is seen [s]; null: unknown")
+    ] = None
+    delay_sd_s: Annotated[_NotNegative | None, msgspec.Meta(description="standard deviation of the delay [s]")] = None
+    fault_probability: Annotated[
+        _Share | None, msgspec.Meta(description="probability that this sensor is faulty; null if the method gives none")
+    ] = None
+    harm_probability: Annotated[
+        _Share | None, msgspec.Meta(description="probability that correcting with these values makes it worse")
+    ] = None
+    identifiable: Annotated[
+        bool, msgspec.Meta(description="false: the branch moved too little for its gain to be told")
+    ] = True
 
 
 class HardwareFault(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -66,6 +80,17 @@ class HardwareFault(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     offset_a: Annotated[
         dict[str, float], msgspec.Meta(description="change of each branch current; the sum is 0 [A]")
     ] = {}
+    probability: Annotated[_Share | None, msgspec.Meta(description="null if the method gives none")] = None
+
+
+class Explanation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One way to explain a vehicle's recordings; several are given where the calibrator cannot tell."""
+
+    probability: _Share
+    drift: Annotated[dict[str, float], msgspec.Meta(description="of the sensors that it holds for faulty [1]")] = {}
+    offset_a: Annotated[dict[str, float], msgspec.Meta(description="of the same [A]")] = {}
+    hardware_drift: Annotated[float, msgspec.Meta(description="[1]")] = 0.0
+    hardware_offset_a: Annotated[dict[str, float], msgspec.Meta(description="[A]")] = {}
 
 
 class JunctionResidual(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -108,6 +133,12 @@ class VehicleParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     ] = None
     branches: Annotated[dict[str, BranchParameters], msgspec.Meta(min_length=1, max_length=16)]
     hardware_fault: HardwareFault
+    explanations: Annotated[
+        list[Explanation], msgspec.Meta(description="the most probable ones, where the calibrator cannot tell")
+    ] = []
+    deciding_evidence: Annotated[
+        str, msgspec.Meta(description="what would tell the explanations apart; empty if nothing has to")
+    ] = ""
     junction_residual: JunctionResidual
     provenance: Provenance
 

@@ -19,7 +19,7 @@ from calibrator.identification.identify import identify
 from calibrator.identification.state_space import StateSpaceModel, simulation_snr_db
 from ecu_node.database import VehicleDatabase
 
-__all__ = ["LEAD_IN_S", "VehicleModel", "junction_rms_a", "read_vehicle_model"]
+__all__ = ["LEAD_IN_S", "VehicleModel", "identify_vehicle", "read_vehicle_model"]
 
 TRAIN_SHARE = 0.8
 """Share of each drive that the model is identified on, section IV-C of [1]_. [1]"""
@@ -99,11 +99,40 @@ def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, datab
         align(load_drive(entry, database), database.layout, equipment.branches, inputs=equipment.inputs)
         for entry in entries
     ]
-    period_s = database.layout.period_s
+    names = tuple(entry.name for entry in entries)
+    return identify_vehicle(drives, period_s=database.layout.period_s, vehicle=entries[0].vehicle, names=names)
+
+
+def identify_vehicle(
+    drives: Sequence[Samples], *, period_s: float, vehicle: str, names: tuple[str, ...]
+) -> VehicleModel:
+    """Identify the model of one vehicle from its aligned drives.
+
+    Parameters
+    ----------
+    drives : sequence of Samples
+        Drives of one vehicle, with the same branches and inputs.
+    period_s : float
+        Distance of the samples. [s]
+    vehicle : str
+        Name of the vehicle.
+    names : tuple of str
+        Names of the drives.
+
+    Returns
+    -------
+    VehicleModel
+        The vehicle.
+
+    Raises
+    ------
+    DriveError
+        If there is too little valid data; the message says how much.
+    """
     duration_s = period_s * sum(int(drive.valid.sum()) for drive in drives)
     if duration_s < LEAST_DURATION_S:
         raise DriveError(
-            f"{duration_s:.1f} s of usable data in {len(entries)} drives; at least {LEAST_DURATION_S:.0f} s are needed"
+            f"{duration_s:.1f} s of usable data in {len(drives)} drives; at least {LEAST_DURATION_S:.0f} s are needed"
         )
     inputs, currents, training, held_out = _joined(drives, int(GAP_S / period_s))
     valid = training | held_out
@@ -114,8 +143,8 @@ def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, datab
     first_held_out = int(np.flatnonzero(longest.valid & ~_in_training(longest.valid))[0])
     start = max(0, first_held_out - int(LEAD_IN_S / period_s))
     return VehicleModel(
-        vehicle=entries[0].vehicle,
-        drives=tuple(entry.name for entry in entries),
+        vehicle=vehicle,
+        drives=names,
         duration_s=duration_s,
         model=model,
         snr_db=simulation_snr_db(currents[held_out], simulated[held_out]),
@@ -125,27 +154,6 @@ def read_vehicle_model(entries: Sequence[DriveFile], equipment: Equipment, datab
         held_out_inputs=_bridged(longest.inputs, longest.valid)[start:],
         lead_in=first_held_out - start,
     )
-
-
-def junction_rms_a(vehicle: VehicleModel, *, drift: Array, offset_a: Array) -> float:
-    """Root mean square of the Kirchhoff sum after correction with given sensor faults.
-
-    Parameters
-    ----------
-    vehicle : VehicleModel
-        Holds the moments of the measured currents.
-    drift, offset_a : ndarray of shape (K,)
-        Sensor faults to correct; zeros give the sum of the measured currents. [1], [A]
-
-    Returns
-    -------
-    float
-        RMS of sum_k (i_m,k - o_k) / (1 + d_k) over all valid samples. [A]
-    """
-    weight = 1.0 / (1.0 + drift)
-    constant = float(weight @ offset_a)
-    mean_square = weight @ vehicle.moment_a2 @ weight - 2.0 * constant * float(weight @ vehicle.mean_a) + constant**2
-    return float(np.sqrt(max(float(mean_square), 0.0)))
 
 
 def _in_training(valid: Mask) -> Mask:

@@ -1,7 +1,7 @@
 """Hyper-parameters of the posterior from the fleet itself, by expectation maximisation (empirical Bayes).
 
 Expectation: the states of each vehicle under the present hyper-parameters. Maximisation: share of hardware faults and
-numbers of faults from the weights of the states, magnitudes by a grid over the slab's bounds, and mean and covariance of
+numbers of faults from the weights of the states, magnitudes by a grid over the slab's bounds, mean and covariance of
 the model spread from the residuals that the states leave, with what the fitted parameters hide of them.
 
 The likelihood has several maxima (a cluster of faulty vehicles can stand for the reference), so it is climbed from
@@ -104,9 +104,12 @@ def estimate_hyperparameters(
     """
     chosen = rows.take(np.linspace(0, len(rows) - 1, min(len(rows), MOST_VEHICLES)).astype(np.int64))
     centres = _free_centres(rows.branches) if free is None else free
-    starts = [_climb(chosen, spread, _first_prior(rows.branches), given, centres, TRIAL_STEPS) for spread in spreads]
+    starts = [
+        _climb(chosen, spread, _first_prior(rows.branches), given=given, free=centres, steps=TRIAL_STEPS)
+        for spread in spreads
+    ]
     best = max(starts, key=lambda climb: climb.log_evidence)
-    return _climb(chosen, best.spread, best.prior, given, centres, STEPS)
+    return _climb(chosen, best.spread, best.prior, given=given, free=centres, steps=STEPS)
 
 
 def resampled_hyperparameters(
@@ -139,7 +142,9 @@ def resampled_hyperparameters(
     centres = _free_centres(rows.branches) if free is None else free
     rng = random_stream(Purpose.RESAMPLING, len(rows))
     samples = [rows.take(np.sort(rng.integers(len(rows), size=len(rows)))) for _ in range(RESAMPLINGS)]
-    return [_climb(sample, best.spread, best.prior, given, centres, RESAMPLED_STEPS) for sample in samples]
+    return [
+        _climb(sample, best.spread, best.prior, given=given, free=centres, steps=RESAMPLED_STEPS) for sample in samples
+    ]
 
 
 def initial_spreads(rows: FleetRows) -> list[ModelSpread]:
@@ -201,7 +206,7 @@ def trusted_spread(rows: FleetRows, trusted: Mask) -> ModelSpread:
 
 
 def _climb(
-    rows: FleetRows, spread: ModelSpread, prior: FaultPrior, given: FaultPrior | None, free: Array, steps: int
+    rows: FleetRows, spread: ModelSpread, prior: FaultPrior, *, given: FaultPrior | None, free: Array, steps: int
 ) -> Hyperparameters:
     prior = prior if given is None else given
     best: Hyperparameters | None = None

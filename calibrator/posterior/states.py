@@ -1,10 +1,11 @@
 """States: the explanations of each vehicle's evidence, with their weights.
 
 A state is a support, and a node where the support has pivots. Up to :data:`EXACT_BRANCHES` branches all supports are
-looked at. With more branches the sum over supports is approximate: all relative supports, of whose states the best go
-on (:data:`calibrator.posterior.joint_evidence.MOST_RELATIVE`); with each of these the constant supports of at most
-:data:`calibrator.posterior.supports.MOST_CONSTANT` parameters; and where a likely explanation has so many, its like with
-one parameter more, and so on.
+looked at. With more branches the sum over supports is approximate. All relative supports are looked at, and of their
+states the best go on (:data:`calibrator.posterior.joint_evidence.MOST_RELATIVE`). With each of these go the constant
+supports without hardware offsets, and those of at most :data:`calibrator.posterior.supports.MOST_CONSTANT` parameters.
+Where one of the latter size is a likely explanation, the best ones of its size (:data:`BEAM`) are grown by one
+parameter, and so on.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ __all__ = ["States", "enumerate_states", "mean_states"]
 
 MOST_STATES = 128
 """States kept per vehicle, the most probable ones. [1]"""
-BEAM = 16
+BEAM = 8
 """Constant supports of one size that are grown, the best ones. [1]"""
 GROWING = 3.0
 """None are if the best of them lies farther below the vehicle's best state (logarithm). [1]"""

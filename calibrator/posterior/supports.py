@@ -6,8 +6,8 @@ to the other unseen, as long as the hardware offsets still sum to zero. One hard
 the pivot: its value is taken from the nodes of the slab, the others follow.
 
 There are 2^(K + 1) relative and 2^(2K - 1) constant supports. The former are always all looked at. The latter are up to
-:data:`EXACT_BRANCHES`; with more branches those of at most :data:`MOST_CONSTANT` parameters are, and
-:mod:`calibrator.posterior.states` grows the best of them.
+:data:`EXACT_BRANCHES`; with more branches those without hardware offsets and those of at most :data:`MOST_CONSTANT`
+parameters are, and :mod:`calibrator.posterior.states` grows the best of them.
 """
 
 from collections.abc import Iterable
@@ -31,8 +31,8 @@ __all__ = [
 
 EXACT_BRANCHES = 3
 """Up to so many branches all supports are looked at."""
-MOST_CONSTANT = 3
-"""Nonzero constant parameters of the supports that are looked at in any case, with more branches than that."""
+MOST_CONSTANT = 4
+"""Nonzero constant parameters of the supports with hardware that are looked at, with more branches than that."""
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,12 @@ def constant_support(branches: int, active: Iterable[int]) -> Support:
 
 
 def constant_supports(branches: int, *, most: int | None = None) -> list[Support]:
-    """Supports of (o_h,1 .. o_h,K-1, o_1 .. o_K) with at most so many parameters, the smallest first; None: all."""
+    """Supports of (o_h,1 .. o_h,K-1, o_1 .. o_K), the smallest first; with hardware, of at most so many parameters."""
     size = 2 * branches - 1
-    counts = range((size if most is None else min(size, most)) + 1)
-    return [constant_support(branches, active) for active in _subsets(range(size), counts)]
+    limit = size if most is None else min(size, most)
+    few = _subsets(range(size), range(limit + 1))
+    sensors_only = _subsets(range(branches - 1, size), range(limit + 1, branches + 1))
+    return [constant_support(branches, active) for active in chain(few, sensors_only)]
 
 
 def grown_supports(branches: int, support: Iterable[int]) -> list[Support]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import msgspec
 
-__all__ = ["dumps", "left_out_text", "table"]
+__all__ = ["dumps", "left_out_text", "table", "undecided_text"]
 
 
 def dumps(value: Any) -> str:
@@ -23,6 +23,15 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         ).rstrip()
         for line in lines
     )
+
+
+def undecided_text(undecided: Mapping[str, str], most: int = 10) -> str:
+    """One line per vehicle of which nothing can be told, and what would decide; empty if there is none."""
+    if not undecided:
+        return ""
+    lines = [f"  {name}: {reason or 'no explanation stands out'}" for name, reason in list(undecided.items())[:most]]
+    more = [f"  and {len(undecided) - most} more, see their parameter files"] if len(undecided) > most else []
+    return "\n".join(["cannot tell:", *lines, *more])
 
 
 def left_out_text(left_out: Mapping[str, str]) -> str:

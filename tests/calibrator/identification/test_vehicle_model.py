@@ -8,7 +8,8 @@ from calibrator.drives.fleet_source import Equipment
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError
 from calibrator.faults import corrected_currents
-from calibrator.identification.vehicle_model import VehicleModel, junction_rms_a, read_vehicle_model
+from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_model
+from calibrator.parameter_files import junction_rms_a
 from ecu_node.database import VehicleDatabase
 
 EQUIPMENT = Equipment(branches=("battery", "motor"), inputs=("driving_current", "heater_current"), notices=())
@@ -98,6 +99,10 @@ def test_junction_rms_from_moments_equals_that_of_the_samples(database: VehicleD
     measured = np.column_stack([recorded.branches[name].value for name in EQUIPMENT.branches])
     drift, offset_a = np.array([0.1, -0.05]), np.array([2.0, -1.0])
     expected = np.sqrt(np.mean(corrected_currents(measured, drift=drift, offset_a=offset_a).sum(axis=1) ** 2))
-    assert junction_rms_a(vehicle, drift=drift, offset_a=offset_a) == pytest.approx(float(expected), rel=1e-3)
+    assert junction_rms_a(vehicle.mean_a, vehicle.moment_a2, drift=drift, offset_a=offset_a) == pytest.approx(
+        float(expected), rel=1e-3
+    )
     raw = np.sqrt(np.mean(measured.sum(axis=1) ** 2))
-    assert junction_rms_a(vehicle, drift=np.zeros(2), offset_a=np.zeros(2)) == pytest.approx(float(raw), rel=1e-3)
+    assert junction_rms_a(vehicle.mean_a, vehicle.moment_a2, drift=np.zeros(2), offset_a=np.zeros(2)) == pytest.approx(
+        float(raw), rel=1e-3
+    )

@@ -1,0 +1,97 @@
+"""How a fleet is calibrated, and what a method makes of it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from calibrator.artificial.truth import FleetTruth
+from calibrator.errors import FleetError
+from calibrator.options import Classifier, Method
+from ecu_node.parameters import VehicleParameters
+
+__all__ = ["HARM_LIMIT", "LEAST_VEHICLES", "CalibrationSettings", "FleetOutcome", "require_learning"]
+
+LEAST_VEHICLES = 2
+"""A single vehicle would be its own reference."""
+HARM_LIMIT = 0.001
+"""Default probability of making a branch worse up to which it is corrected. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationSettings:
+    """How a fleet is calibrated.
+
+    Attributes
+    ----------
+    method : Method
+        Estimator.
+    branches : tuple of str or None
+        Branches to use; None: those that the fleet has.
+    hold_out : frozenset of str
+        Vehicles that are calibrated, but from which nothing is learnt for the others.
+    trusted : frozenset of str
+        Vehicles whose sensors were found faultless on a bench; they carry the reference of the posterior.
+    harm_limit : float
+        Largest posterior probability of making a branch worse with which it is corrected. [1]
+    classifier : Classifier
+        Of the published method.
+    truth : FleetTruth or None
+        For the perfect classifier.
+    sparsity : float
+        Of the artificial fleet that the tree is trained on. [%]
+    magnitude : tuple of float
+        Of the same: range of drifts [1] and of offsets in fractions of full scale.
+    symmetric : bool
+        Whether the fleet is symmetric as in the paper, so that its mean has no error of its own.
+    unity : str or None
+        Vehicle whose held-out inputs are the unity drive; None: the one with the longest.
+    seed : int
+        Seed of the training fleet.
+    """
+
+    method: Method = Method.POSTERIOR
+    branches: tuple[str, ...] | None = None
+    hold_out: frozenset[str] = field(default_factory=frozenset)
+    trusted: frozenset[str] = field(default_factory=frozenset)
+    harm_limit: float = HARM_LIMIT
+    classifier: Classifier = Classifier.TREE
+    truth: FleetTruth | None = None
+    sparsity: float = 80.0
+    magnitude: tuple[float, float] = (0.05, 0.25)
+    symmetric: bool = False
+    unity: str | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetOutcome:
+    """What a method found.
+
+    Attributes
+    ----------
+    parameters : sequence of VehicleParameters
+        One per calibrated vehicle.
+    left_out : mapping of str to str
+        Why the other vehicles have none.
+    notices : tuple of str
+        What the user should know.
+    details : mapping of str to JSON values
+        For the record of the run.
+    """
+
+    parameters: Sequence[VehicleParameters]
+    left_out: Mapping[str, str]
+    notices: tuple[str, ...]
+    details: Mapping[str, Any]
+
+
+def require_learning(names: Sequence[str], settings: CalibrationSettings, left_out: Mapping[str, str]) -> list[bool]:
+    """Which vehicles the fleet learns from; FleetError if they are too few."""
+    learning = [name not in settings.hold_out for name in names]
+    if sum(learning) < LEAST_VEHICLES:
+        reasons = "".join(f"; {name}: {reason}" for name, reason in left_out.items())
+        raise FleetError(
+            f"{sum(learning)} usable vehicle to learn from, at least {LEAST_VEHICLES} are needed, "
+            f"as every vehicle is compared with its fleet{reasons}"
+        )
+    return learning

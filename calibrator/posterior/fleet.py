@@ -1,0 +1,217 @@
+"""The default method on a real fleet: drives -> summaries -> evidence -> posterior -> parameter files."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calibrator.calibration_settings import CalibrationSettings, FleetOutcome, require_learning
+from calibrator.drives.fleet_source import Equipment, FleetSource
+from calibrator.errors import FleetError
+from calibrator.evidence.readings import Readings, no_readings
+from calibrator.evidence.vehicle_summary import VehicleSummary, read_vehicle_summary
+from calibrator.parameter_files import RunIdentity, by_branch, junction_rms_a
+from calibrator.posterior.calibration import calibrate_posterior
+from calibrator.posterior.estimate import FleetPosterior
+from calibrator.posterior.explain import deciding_evidence, explanations
+from calibrator.posterior.verdict import Deployment, decide
+from calibrator.vehicles import read_vehicles
+from ecu_node.parameters import (
+    BranchParameters,
+    Explanation,
+    HardwareFault,
+    JunctionResidual,
+    VehicleParameters,
+)
+
+__all__ = ["calibrate_fleet_posterior"]
+
+UNTOLD = 0.05
+"""Probability of other explanations up to which they are not told. [1]"""
+
+
+def calibrate_fleet_posterior(
+    fleet: FleetSource, equipment: Equipment, identity: RunIdentity, settings: CalibrationSettings, *, workers: int
+) -> FleetOutcome:
+    """Calibrate a fleet by the sparse posterior.
+
+    Parameters
+    ----------
+    fleet, equipment : FleetSource, Equipment
+        The fleet, its branches and inputs.
+    identity : RunIdentity
+        For the parameter files.
+    settings : CalibrationSettings
+        How.
+    workers : int
+        Number of processes.
+
+    Returns
+    -------
+    FleetOutcome
+        Parameters of every vehicle that could be used.
+
+    Raises
+    ------
+    FleetError
+        If too few vehicles can be used, or a trusted one is not there.
+    """
+    vehicles, left_out = read_vehicles(read_vehicle_summary, fleet, equipment, identity.database, workers=workers)
+    names = [vehicle.vehicle for vehicle in vehicles]
+    learning = require_learning(names, settings, left_out)
+    missing = settings.trusted - set(names)
+    if missing:
+        raise FleetError(f"{fleet.path}: no usable vehicle {', '.join(sorted(missing))} to trust")
+    trusted = np.array([name in settings.trusted for name in names])
+    layout = identity.database.layout
+    posterior = calibrate_posterior(
+        [vehicle.summary for vehicle in vehicles],
+        full_scale_a=layout.full_scale_a,
+        branches=equipment.branches,
+        readings=_readings(vehicles),
+        trusted=trusted if trusted.any() else None,
+        learning=np.array(learning),
+    )
+    health = posterior.health
+    assert health is not None
+    doubtful = () if trusted.any() else health.doubtful
+    deployment = decide(posterior, layout, harm_limit=settings.harm_limit, doubtful=doubtful)
+    parameters = [
+        _parameters(vehicle, posterior, deployment, position=j, branches=equipment.branches, identity=identity)
+        for j, vehicle in enumerate(vehicles)
+    ]
+    return FleetOutcome(
+        parameters=parameters,
+        left_out=left_out,
+        notices=health.warnings,
+        details=_details(posterior, equipment.branches),
+    )
+
+
+def _readings(vehicles: Sequence[VehicleSummary]) -> Readings:
+    """Offsets that the sensors showed in zero-current windows."""
+    offset = np.stack([vehicle.zero_current.offset_a for vehicle in vehicles])
+    sd = np.stack([vehicle.zero_current.sd_a for vehicle in vehicles])
+    nothing = no_readings(*offset.shape)
+    return Readings(drift=nothing.drift, drift_sd=nothing.drift_sd, offset_a=offset, offset_sd_a=sd)
+
+
+def _parameters(
+    vehicle: VehicleSummary,
+    posterior: FleetPosterior,
+    deployment: Deployment,
+    *,
+    position: int,
+    branches: Sequence[str],
+    identity: RunIdentity,
+) -> VehicleParameters:
+    """Write down what was found for one vehicle."""
+    j = position
+    faults, corrected, zeros = posterior.faults.take(j), deployment.corrected[j], np.zeros(len(branches))
+    moments = (vehicle.summary.mean_a, vehicle.summary.mean_product_a2)
+    deployed = {"drift": np.where(corrected, faults.drift, 0.0), "offset_a": np.where(corrected, faults.offset_a, 0.0)}
+    undecided = deployment.verdicts[j] == "cannot tell" or posterior.confidence[j] < 1.0 - UNTOLD
+    told, decisive = _explanations(posterior, j, branches, identity) if undecided else ([], "")
+    return VehicleParameters(
+        vehicle=vehicle.vehicle,
+        layout=identity.layout,
+        dbc=identity.dbc,
+        verdict=deployment.verdicts[j],
+        confidence=_share(posterior.confidence[j]),
+        branches={
+            name: _branch(vehicle, posterior, (j, k), name=name, apply=bool(corrected[k]))
+            for k, name in enumerate(branches)
+        },
+        hardware_fault=HardwareFault(
+            suspected=bool(deployment.hardware[j]),
+            drift=float(faults.hardware_drift),
+            offset_a=by_branch(branches, faults.hardware_offset_a),
+            probability=_share(posterior.hardware_fault[j]),
+        ),
+        explanations=told,
+        deciding_evidence=decisive,
+        junction_residual=JunctionResidual(
+            measured_a=junction_rms_a(*moments, drift=zeros, offset_a=zeros),
+            corrected_a=junction_rms_a(*moments, **deployed),
+        ),
+        provenance=identity.provenance(
+            fleet_size=len(posterior), drives=vehicle.drives, duration_s=vehicle.summary.duration_s
+        ),
+    )
+
+
+def _branch(
+    vehicle: VehicleSummary, posterior: FleetPosterior, place: tuple[int, int], *, name: str, apply: bool
+) -> BranchParameters:
+    k = vehicle.delays.branches.index(name)
+    known = bool(vehicle.delays.known[k])
+    return BranchParameters(
+        drift=float(posterior.faults.drift[place]),
+        offset_a=float(posterior.faults.offset_a[place]),
+        drift_sd=float(posterior.drift_sd[place]),
+        offset_sd_a=float(posterior.offset_sd_a[place]),
+        apply=apply,
+        delay_s=float(vehicle.delays.delay_s[k]) if known else None,
+        delay_sd_s=float(vehicle.delays.sd_s[k]) if known else None,
+        fault_probability=_share(posterior.sensor_fault[place]),
+        harm_probability=_share(posterior.harm[place]),
+        identifiable=bool(posterior.identifiable[place]),
+    )
+
+
+def _explanations(
+    posterior: FleetPosterior, j: int, branches: Sequence[str], identity: RunIdentity
+) -> tuple[list[Explanation], str]:
+    """The competing explanations of one vehicle, and what would decide between them."""
+    full_scale_a = identity.database.layout.full_scale_a
+    names = [branches[k] for k in posterior.order]
+    found = explanations(posterior.states, j)
+    told = [
+        Explanation(
+            probability=_share(each.probability),
+            drift={name: float(d) for name, d in zip(names, each.drift, strict=True) if d},
+            offset_a={name: float(o * full_scale_a) for name, o in zip(names, each.offset, strict=True) if o},
+            hardware_drift=each.hardware_drift,
+            hardware_offset_a={
+                name: float(o * full_scale_a) for name, o in zip(names, each.hardware_offset, strict=True) if o
+            },
+        )
+        for each in found
+    ]
+    return told, deciding_evidence(found, names, full_scale_a) or _most_doubtful(posterior, j, branches, full_scale_a)
+
+
+def _most_doubtful(posterior: FleetPosterior, j: int, branches: Sequence[str], full_scale_a: float) -> str:
+    """Which sensor is known least where only one explanation is left."""
+    k = int(np.argmax(np.hypot(posterior.drift_sd[j], posterior.offset_sd_a[j] / full_scale_a)))
+    return (
+        f"more drives would decide: the {branches[k]} sensor's drift is known to +-{posterior.drift_sd[j, k]:.1%} and its "
+        f"offset to +-{posterior.offset_sd_a[j, k]:.1f} A only; record drives in which that current varies"
+    )
+
+
+def _details(posterior: FleetPosterior, branches: Sequence[str]) -> dict[str, object]:
+    health, learnt = posterior.health, posterior.hyperparameters
+    assert health is not None
+    prior, spread = learnt.prior, np.sqrt(np.diag(learnt.spread.covariance))
+    ordered = [branches[k] for k in posterior.order]
+    return {
+        "reference": {
+            "agreeing_share": dict(zip(branches, health.agreeing_share, strict=True)),
+            "mean_distance": dict(zip(branches, health.mean_distance, strict=True)),
+            "least_vehicles": health.least_vehicles,
+            "unmeasured_a": health.unmeasured_a,
+            "doubtful": [branches[k] for k in health.doubtful],
+        },
+        "hyperparameters": {
+            "hardware_share": prior.hardware_share,
+            "drift_magnitude": [prior.relative.low, prior.relative.high],
+            "offset_magnitude": [prior.constant.low, prior.constant.high],
+            "model_spread": by_branch(ordered, spread[: len(branches)]),
+            "log_evidence": learnt.log_evidence,
+        },
+    }
+
+
+def _share(value: float) -> float:
+    """A probability, free of rounding beyond its range."""
+    return float(np.clip(value, 0.0, 1.0))

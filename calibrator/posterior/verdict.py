@@ -1,0 +1,78 @@
+"""Verdict on each vehicle: which branches the node may correct, and what is said of the vehicle as a whole."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrator.drive import Array, Mask
+from calibrator.posterior.estimate import FleetPosterior
+from ecu_node.layout import Layout
+from ecu_node.parameters import Verdict
+
+__all__ = ["Deployment", "decide"]
+
+CONFIDENT = 0.95
+"""Posterior probability from which on the calibrator says what it found. [1]"""
+SUSPECTED = 0.5
+"""Probability of a hardware fault from which on it is reported. [1]"""
+
+
+@dataclass(frozen=True)
+class Deployment:
+    """Decision on N vehicles with K branches.
+
+    Attributes
+    ----------
+    corrected : ndarray of bool of shape (N, K)
+        Branches that the node is to correct.
+    verdicts : tuple of str
+        Of each vehicle.
+    hardware : ndarray of bool of shape (N,)
+        Whether a hardware fault is suspected.
+    """
+
+    corrected: Mask
+    verdicts: tuple[Verdict, ...]
+    hardware: Mask
+
+
+def decide(posterior: FleetPosterior, layout: Layout, *, harm_limit: float, doubtful: tuple[int, ...]) -> Deployment:
+    """Decide what is deployed.
+
+    A branch is corrected if its estimate is not zero, the probability that correction makes it worse is below the
+    limit, it is within the layout's limits, and the fleet reference is not in doubt for it.
+
+    Parameters
+    ----------
+    posterior : FleetPosterior
+        Of N vehicles.
+    layout : Layout
+        Holds the limits of drifts and offsets.
+    harm_limit : float
+        Largest probability of harm. [1]
+    doubtful : tuple of int
+        Branches for which the reference is in doubt.
+
+    Returns
+    -------
+    Deployment
+        The decision.
+    """
+    drift, offset_a = posterior.faults.drift, posterior.faults.offset_a
+    faulty = (drift != 0.0) | (offset_a != 0.0)
+    allowed = (np.abs(drift) <= layout.limits.drift) & (np.abs(offset_a) <= layout.offset_limit_a)
+    corrected = faulty & allowed & (posterior.harm < harm_limit)
+    corrected[:, list(doubtful)] = False
+    verdicts = tuple(
+        _verdict(corrected[j], faulty[j], float(posterior.confidence[j]), certain=not doubtful)
+        for j in range(len(posterior))
+    )
+    return Deployment(corrected, verdicts, np.asarray(posterior.hardware_fault > SUSPECTED))
+
+
+def _verdict(corrected: Array, faulty: Array, confidence: float, *, certain: bool) -> Verdict:
+    if corrected.any():
+        return "corrected"
+    if certain and not faulty.any() and confidence >= CONFIDENT:
+        return "no sensor fault"
+    return "cannot tell"
