@@ -105,6 +105,16 @@ def test_constant_evidence_with_a_pivot_is_that_of_many_draws() -> None:
     assert logsumexp(fit.log_evidence) == pytest.approx(expected, abs=0.2)
 
 
+@pytest.mark.parametrize("active", [(1,), (0, 1), (0, 1, 2)])
+def test_vague_rows_weigh_for_no_support(active: tuple[int, ...]) -> None:
+    R = covariance_of(3 * K - 1, 5.0)
+    fit = integrate_relative(
+        np.zeros((1, 1, 3 * K - 1)), relative_design(K), relative_support(*active), Noise.of(R[None]), SLAB
+    )
+    density = multivariate_normal(np.zeros(3 * K - 1), R).logpdf(np.zeros(3 * K - 1))
+    assert logsumexp(fit.log_evidence) == pytest.approx(density, abs=0.6)
+
+
 def test_estimates_and_deviations_are_those_of_weighted_least_squares() -> None:
     support, R = relative_support(0, 2), covariance_of(3 * K - 1, 0.005)
     X = relative_design(K)[:, [0, 2]]

@@ -1,0 +1,299 @@
+from collections import defaultdict
+from dataclasses import replace
+from itertools import product
+from math import comb
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal, norm
+
+from calibrator.drive import Array
+from calibrator.errors import FleetError
+from calibrator.evidence.rows import FleetRows, constant_design, relative_design
+from calibrator.posterior.fault_prior import FaultPrior
+from calibrator.posterior.slab import Slab
+from calibrator.posterior.states import MOST_STATES, States, enumerate_states, mean_states
+from calibrator.posterior.supports import Support, constant_supports, relative_supports
+from tests.calibrator.posterior.simulated_rows import (
+    Errors,
+    no_spread,
+    parameters_of,
+    prior_of,
+    random_faults,
+    rows_of,
+)
+
+SHARP = Errors(slope=1e-3, ratio=3e-4, intercept=5e-4, junction=3e-4)
+
+
+def paper_prior(branches: int, nonzero: int, *, low: float = 0.05) -> FaultPrior:
+    """Section IV-B: so many of 3K parameters; in half of the vehicles those of the hardware are set to zero."""
+    K, n = branches, nonzero
+    counts = np.zeros((2, 3 * K + 1))
+    for hardware in range(min(n, K) + 1):
+        share = comb(K, hardware) * comb(2 * K, n - hardware) / comb(3 * K, n) / 2.0
+        counts[0, n - hardware] += share
+        counts[int(hardware > 0), n] += share
+    hardware_share = float(counts[1].sum())
+    slab = Slab(low, 0.25)
+    return FaultPrior(
+        hardware_share=hardware_share,
+        counts=counts / counts.sum(axis=1, keepdims=True),
+        relative=slab,
+        constant=slab,
+    )
+
+
+def slab_mass(slab: Slab, value: float, sd: float) -> float:
+    """Probability of a Gaussian in both halves of the slab, times the density."""
+    positive = norm.cdf(slab.high, value, sd) - norm.cdf(slab.low, value, sd)
+    return slab.density * float(positive + norm.cdf(-slab.low, value, sd) - norm.cdf(-slab.high, value, sd))
+
+
+def block(y: Array, X: Array, R: Array, support: Support, slab: Slab, unit: Array | None) -> list[tuple[float, Array]]:
+    """Plain loop over the nodes of one support: log evidence, and parameters; drifts without unit, else offsets."""
+    found = []
+    fitted, pivots = list(support.fitted), list(support.pivots)
+    for node in slab.nodes(len(pivots)):
+        theta = np.zeros(X.shape[1])
+        theta[pivots] = np.log1p(node) if unit is None else node / unit[pivots]
+        left = y - X @ theta
+        log_evidence = -np.log(len(slab.nodes(len(pivots))))
+        if fitted:
+            C = np.linalg.inv(X[:, fitted].T @ np.linalg.inv(R) @ X[:, fitted])
+            theta[fitted] = C @ X[:, fitted].T @ np.linalg.inv(R) @ left
+            log_evidence += 0.5 * np.linalg.slogdet(2.0 * np.pi * C)[1]
+        change = np.exp(theta) if unit is None else unit
+        value = np.expm1(theta) if unit is None else theta * unit
+        for place, i in enumerate(fitted):
+            mass = slab_mass(slab, value[i], change[i] * np.sqrt(C[place, place]))
+            log_evidence += np.log(max(mass, 1e-300)) + np.log(change[i])
+        log_evidence += multivariate_normal(np.zeros(len(y)), R).logpdf(y - X @ theta)
+        found.append((float(log_evidence), value))
+    return found
+
+
+def brute_force(rows: FleetRows, prior: FaultPrior) -> list[tuple[float, Array]]:
+    """All explanations of one vehicle by plain loops, without bench readings: log weight, and parameters."""
+    K, told, told_constant = rows.branches, 2 * rows.branches - 1, rows.branches + 1
+    R = rows.covariance[0]
+    first, second = R[:told, :told], R[3 * K - 1 : 4 * K, 3 * K - 1 : 4 * K]
+    found = []
+    log_prior = prior.log_supports()
+    for support in relative_supports(K):
+        for log_relative, relative in block(
+            rows.relative[0, :told], relative_design(K)[:told], first, support, prior.relative, None
+        ):
+            factor = 1.0 + relative[1:]
+            seen = rows.constant[0, :told_constant] / np.append(factor, factor[0])
+            log_change = np.log(factor).sum() + np.log(factor[0])
+            unit = np.append(np.ones(K - 1), factor)
+            for constant in constant_supports(K):
+                count = len(support.active) + len(constant.active)
+                share = log_prior[int(support.hardware or constant.hardware), count]
+                if np.isneginf(share):
+                    continue
+                design = constant_design(K)[:told_constant]
+                for log_constant, values in block(seen, design, second, constant, prior.constant, unit):
+                    weight = share + log_relative + log_constant - log_change
+                    found.append((float(weight), np.append(relative, values)))
+    return found
+
+
+def every_parameter(states: States) -> Array:
+    return np.concatenate([states.relative, states.constant], axis=2)
+
+
+def first_parameters(states: States) -> Array:
+    return every_parameter(states)[:, 0]
+
+
+@pytest.mark.parametrize(("branches", "nonzero", "sparsity"), [(2, 1, 80.0), (2, 2, 60.0), (2, 4, 40.0), (3, 2, 80.0)])
+def test_best_support_without_noise_is_that_of_a_brute_force_search(
+    branches: int, nonzero: int, sparsity: float
+) -> None:
+    faults = random_faults(branches, vehicles=12, branches=branches, sparsity=sparsity)
+    rows, prior = rows_of(faults, errors=SHARP, noise=0.0), paper_prior(branches, nonzero)
+    states = enumerate_states(rows, prior, no_spread(branches))
+    for j in range(len(rows)):
+        every = brute_force(rows.take(slice(j, j + 1)), prior)
+        total: dict[tuple[bool, ...], float] = defaultdict(lambda: -np.inf)
+        for weight, values in every:
+            total[tuple(values != 0.0)] = np.logaddexp(total[tuple(values != 0.0)], weight)
+        best = max(total, key=total.__getitem__)
+        probability = np.exp(total[best] - logsumexp(list(total.values())))
+        of_best = np.all((every_parameter(states)[j] != 0.0) == best, axis=1)
+        assert states.weight[j, of_best].sum() == pytest.approx(probability, abs=0.01)
+        assert any(np.allclose(first_parameters(states)[j], values, atol=1e-6) for _, values in every)
+
+
+def test_evidence_with_noise_is_the_sum_over_all_explanations() -> None:
+    rows = rows_of(random_faults(4, vehicles=6, branches=2, sparsity=40.0), errors=Errors(), seed=3)
+    prior = prior_of(2)
+    states = enumerate_states(rows, prior, no_spread(2))
+    for j in range(len(rows)):
+        expected = logsumexp([weight for weight, _ in brute_force(rows.take(slice(j, j + 1)), prior)])
+        unknown = -0.5 * 4 * np.log(2.0 * np.pi * 100.0)
+        assert states.log_evidence[j] == pytest.approx(expected + unknown, abs=1e-3)
+
+
+@pytest.mark.parametrize("branches", [2, 3, 4])
+def test_sparse_faults_are_found(branches: int) -> None:
+    faults = random_faults(5, vehicles=60, branches=branches, sparsity=80.0)
+    states = enumerate_states(rows_of(faults), prior_of(branches), no_spread(branches))
+    truth = np.concatenate(parameters_of(faults), axis=1)
+    assert (np.abs(first_parameters(states) - truth).max(axis=1) < 0.01).mean() >= 0.95
+
+
+@pytest.mark.parametrize("sparsity", [60.0, 40.0])
+def test_weights_are_probabilities_for_fleets_that_the_prior_describes(sparsity: float) -> None:
+    nonzero = round((1.0 - sparsity / 100.0) * 6)
+    faults = random_faults(6, vehicles=600, branches=2, sparsity=sparsity)
+    states = enumerate_states(rows_of(faults, seed=6), paper_prior(2, nonzero), no_spread(2))
+    truth = np.concatenate(parameters_of(faults), axis=1) != 0.0
+    present = every_parameter(states) != 0.0
+    right = np.all(present == truth[:, None, :], axis=2)
+    of_best = np.all(present == present[:, :1], axis=2)
+    confidence, hit = np.sum(states.weight * of_best, axis=1), right[:, 0]
+    error = np.sqrt(np.sum(confidence * (1.0 - confidence))) / len(hit)
+    assert abs(hit.mean() - confidence.mean()) < 3.0 * error
+
+
+def test_errors_of_the_right_state_are_as_large_as_stated() -> None:
+    faults = random_faults(7, vehicles=400, branches=3, sparsity=80.0)
+    states = enumerate_states(rows_of(faults, seed=7), prior_of(3), no_spread(3))
+    truth = np.concatenate(parameters_of(faults), axis=1)
+    found, sd = first_parameters(states), np.concatenate([states.relative_sd[:, 0], states.constant_sd[:, 0]], axis=1)
+    right = np.all((found != 0.0) == (truth != 0.0), axis=1)
+    z = ((found - truth)[right] / np.where(sd[right] > 0.0, sd[right], 1.0))[truth[right] != 0.0]
+    assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=0.12)
+
+
+@pytest.mark.parametrize("branches", [2, 3, 4])
+def test_weights_sum_to_one_and_fall(branches: int) -> None:
+    rows = rows_of(random_faults(8, vehicles=20, branches=branches, sparsity=60.0))
+    states = enumerate_states(rows, prior_of(branches), no_spread(branches))
+    np.testing.assert_allclose(states.weight.sum(axis=1), 1.0)
+    assert (np.diff(states.weight, axis=1) <= 0.0).all()
+    assert states.weight.shape == (20, MOST_STATES)
+
+
+@pytest.mark.parametrize("branches", [2, 3, 5])
+def test_order_of_the_vehicles_does_not_matter(branches: int) -> None:
+    rows = rows_of(random_faults(9, vehicles=70, branches=branches, sparsity=70.0), seed=9)
+    order = np.random.default_rng(9).permutation(len(rows))
+    prior, spread = prior_of(branches), no_spread(branches)
+    plain, other = enumerate_states(rows, prior, spread), enumerate_states(rows.take(order), prior, spread)
+    np.testing.assert_allclose(other.log_evidence, plain.log_evidence[order], rtol=1e-9)
+    np.testing.assert_allclose(other.weight, plain.weight[order], atol=1e-9)
+    np.testing.assert_allclose(first_parameters(other), first_parameters(plain)[order], atol=1e-9)
+
+
+def test_order_of_the_branches_does_not_matter_except_for_the_first_and_last() -> None:
+    K, order = 4, [0, 2, 1, 3]
+    faults = random_faults(10, vehicles=20, branches=K, sparsity=80.0)
+    swapped = replace(
+        faults,
+        hardware_offset_a=faults.hardware_offset_a[:, order],
+        drift=faults.drift[:, order],
+        offset_a=faults.offset_a[:, order],
+    )
+    prior, spread = prior_of(K), no_spread(K)
+    plain = enumerate_states(rows_of(faults, noise=0.0), prior, spread)
+    other = enumerate_states(rows_of(swapped, noise=0.0), prior, spread)
+    np.testing.assert_allclose(other.log_evidence, plain.log_evidence, atol=1e-4)
+    np.testing.assert_allclose(other.drift[:, 0], plain.drift[:, 0][:, order], atol=1e-9)
+    np.testing.assert_allclose(other.offset[:, 0], plain.offset[:, 0][:, order], atol=1e-9)
+
+
+def test_another_full_scale_changes_nothing_but_the_unit() -> None:
+    K, unit = 2, 0.5
+    rows, prior = rows_of(random_faults(11, vehicles=30, branches=K, sparsity=60.0), seed=11), prior_of(K)
+    scale = np.concatenate([np.ones(3 * K - 1), np.full(2 * K + 1, unit)])
+    scaled = FleetRows(
+        relative=rows.relative, constant=unit * rows.constant, covariance=rows.covariance * np.outer(scale, scale)
+    )
+    slab = Slab(unit * prior.constant.low, unit * prior.constant.high)
+    plain = enumerate_states(rows, prior, no_spread(K))
+    other = enumerate_states(scaled, replace(prior, constant=slab), no_spread(K))
+    np.testing.assert_allclose(other.weight, plain.weight, atol=1e-9)
+    np.testing.assert_allclose(other.constant[:, 0], unit * plain.constant[:, 0], atol=1e-12)
+    np.testing.assert_allclose(other.relative[:, 0], plain.relative[:, 0], atol=1e-12)
+
+
+def test_a_mean_of_the_fleet_is_taken_out_first() -> None:
+    K = 2
+    rows = rows_of(random_faults(12, vehicles=20, branches=K, sparsity=100.0))
+    mean = np.zeros(5 * K)
+    mean[:K], mean[3 * K - 1] = 0.07, -0.03
+    moved = FleetRows(
+        relative=rows.relative + mean[: 3 * K - 1],
+        constant=rows.constant + mean[3 * K - 1 :],
+        covariance=rows.covariance,
+    )
+    plain = enumerate_states(rows, prior_of(K), no_spread(K))
+    other = enumerate_states(moved, prior_of(K), replace(no_spread(K), mean=mean))
+    np.testing.assert_allclose(other.weight[:, 0], plain.weight[:, 0], atol=1e-4)
+    assert not first_parameters(other).any()
+
+
+def test_rows_that_say_nothing_leave_the_prior() -> None:
+    vague = Errors(slope=5.0, ratio=5.0, intercept=5.0, junction=5.0)
+    rows, prior = rows_of(random_faults(13, vehicles=4, branches=2, sparsity=60.0), errors=vague), prior_of(2)
+    states = enumerate_states(rows, prior, no_spread(2))
+    values = np.concatenate([rows.relative, rows.constant], axis=1)
+    density = multivariate_normal(np.zeros(10), rows.covariance[0]).logpdf(values)
+    np.testing.assert_allclose(states.log_evidence, density, atol=0.6)
+    nothing = prior.counts[0, 0] * (1.0 - prior.hardware_share)
+    best = np.exp(np.log(states.weight[:, 0]) + states.log_evidence - density)
+    assert first_parameters(states).any(axis=1).sum() == 0
+    assert (best >= nothing * 0.99).all()
+
+
+def test_ever_smaller_errors_make_the_simplest_explanation_sure() -> None:
+    faults = random_faults(14, vehicles=20, branches=3, sparsity=89.0)
+    sure = [
+        enumerate_states(
+            rows_of(faults, errors=Errors(slope=s, ratio=s, intercept=s, junction=s), noise=0.0),
+            prior_of(3),
+            no_spread(3),
+        ).weight[:, 0]
+        for s in (0.02, 0.002)
+    ]
+    assert sure[1].mean() > sure[0].mean()
+    assert sure[1].min() > 0.95
+
+
+def test_impossible_rows_still_give_probabilities() -> None:
+    rows = rows_of(random_faults(15, vehicles=2, branches=2, sparsity=80.0), errors=SHARP)
+    rows.relative[0, :2], rows.constant[1, :2] = 3.0, -40.0
+    states = enumerate_states(rows, paper_prior(2, 1), no_spread(2))
+    np.testing.assert_allclose(states.weight.sum(axis=1), 1.0)
+    assert np.isfinite(states.log_evidence).all()
+
+
+def test_rows_that_are_not_finite_are_refused() -> None:
+    rows = rows_of(random_faults(16, vehicles=2, branches=2, sparsity=80.0))
+    with pytest.raises(FleetError, match="evidence is not finite; leave out the vehicles that have none"):
+        FleetRows(relative=rows.relative * np.nan, constant=rows.constant, covariance=rows.covariance)
+
+
+def test_mean_of_equal_posteriors_is_the_same_posterior() -> None:
+    rows = rows_of(random_faults(17, vehicles=5, branches=2, sparsity=60.0))
+    states = enumerate_states(rows, prior_of(2), no_spread(2))
+    both = mean_states([states, states])
+    np.testing.assert_allclose(both.weight.sum(axis=1), 1.0)
+    np.testing.assert_allclose(both.log_evidence, states.log_evidence)
+    np.testing.assert_allclose(first_parameters(both), first_parameters(states))
+    np.testing.assert_allclose(both.weight[:, :2].sum(axis=1), states.weight[:, 0], rtol=1e-3)
+    assert mean_states([states]) is states
+
+
+def test_counts_and_hardware_are_read_from_the_parameters() -> None:
+    faults = random_faults(18, vehicles=30, branches=2, sparsity=60.0)
+    states = enumerate_states(rows_of(faults), prior_of(2), no_spread(2))
+    for s, j in product(range(5), range(30)):
+        hardware = states.relative[j, s, 0] != 0.0 or states.constant[j, s, 0] != 0.0
+        assert states.hardware[j, s] == hardware
+        assert states.count[j, s] == np.sum(states.relative[j, s] != 0.0) + np.sum(states.constant[j, s] != 0.0)
