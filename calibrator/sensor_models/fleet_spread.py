@@ -16,8 +16,8 @@ __all__ = ["FleetSpread", "first_spread", "next_spread"]
 
 GUESS_VEHICLES = 5.0
 """Weight of the guess of the spread, in vehicles."""
-GUESS_OVER_SAMPLING = 2.0
-"""Guess of the spread over the usual sampling deviation: a model errs alike over a whole drive. [1]"""
+GUESS_OVER_SAMPLING = 0.5
+"""Guess of the spread over the usual deviation of a row, which holds the misfit of each vehicle already. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)

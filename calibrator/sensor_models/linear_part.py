@@ -10,10 +10,13 @@ import numpy as np
 
 from calibrator.evidence.summary import DriveSummary
 from calibrator.sensor_models.choice import LINEAR, SensorModelChoice
-from calibrator.sensor_models.families import FAMILIES, Family, SensorModel
+from calibrator.sensor_models.families import FAMILIES, Family, GainBySign, SensorModel, TemperatureDrift
 from calibrator.sensor_models.summary import SensorSummary
+from ecu_node.sensor_models import GainBySign as GainBySignParameters
+from ecu_node.sensor_models import SensorModel as SensorModelParameters
+from ecu_node.sensor_models import TemperatureDrift as TemperatureDriftParameters
 
-__all__ = ["chosen_sensor", "linear_summary"]
+__all__ = ["chosen_sensor", "linear_summary", "sensor_parameters"]
 
 
 def linear_summary(vehicle: SensorSummary, choices: Sequence[SensorModelChoice]) -> DriveSummary:
@@ -66,6 +69,39 @@ def chosen_sensor(choice: SensorModelChoice, drift: float) -> SensorModel | None
     if choice.model == LINEAR:
         return None
     return _family(choice.model).fitted(choice.excess, choice.reference, drift)
+
+
+def sensor_parameters(choice: SensorModelChoice, drift: float) -> tuple[float, SensorModelParameters | None]:
+    """Say a choice as the parameter file does.
+
+    Parameters
+    ----------
+    choice : SensorModelChoice
+        For one branch.
+    drift : float
+        Drift of its linear part. [1]
+
+    Returns
+    -------
+    drift : float
+        The branch's drift [1]: of a gain by sign the mean of both, of a temperature drift that at its reference.
+    sensor_model : GainBySign, TemperatureDrift or None
+        As :mod:`ecu_node.sensor_models` has them; None if the sensor is linear.
+    """
+    sensor = chosen_sensor(choice, drift)
+    if isinstance(sensor, GainBySign):
+        return 0.5 * (sensor.drift_positive + sensor.drift_negative), GainBySignParameters(
+            drift_positive=sensor.drift_positive,
+            drift_negative=sensor.drift_negative,
+            difference_sd=choice.excess_sd * (1.0 + sensor.drift_positive),
+        )
+    if isinstance(sensor, TemperatureDrift):
+        return drift, TemperatureDriftParameters(
+            drift_per_k=sensor.drift_per_k,
+            reference_c=sensor.reference_c,
+            drift_per_k_sd=choice.excess_sd * (1.0 + drift),
+        )
+    return drift, None
 
 
 def _family(name: str) -> Family:

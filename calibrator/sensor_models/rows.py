@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrator.drive import Array, Mask
-from calibrator.evidence.block_regression import BlockRegression
 from calibrator.sensor_models.families import Family
-from calibrator.sensor_models.instruments import Instruments
+from calibrator.sensor_models.instruments import InstrumentedFit, Instruments
 from calibrator.sensor_models.summary import SensorSummary
 
 __all__ = ["ExcessRows", "excess_rows", "usual_currents"]
@@ -89,11 +88,10 @@ def excess_rows(vehicle: SensorSummary, read_out: Array, family: Family, usual_a
     fits = [columns.fleet_row(k, read_out[:, k]) for k in range(K)]
     fits += [columns.junction_row(k) if own[k] else None for k in range(K)]
     known = np.array([fit is not None for fit in fits])
-    influence = np.stack([fit.influence[:, -1] if fit else np.zeros(columns.blocks) for fit in fits], axis=1)
     scale = np.concatenate([np.ones(K), -columns.gains]) * family.size
-    values = np.array([fit.estimate[-1] if fit else 0.0 for fit in fits]) / scale
-    influence = influence / scale
-    covariance = influence.T @ influence + np.diag(np.where(known, LEAST_SD**2, UNKNOWN_VARIANCE))
+    values = np.array([fit.estimate if fit else 0.0 for fit in fits]) / scale
+    covariance = _covariance(fits, columns.instruments) / np.outer(scale, scale)
+    covariance += np.diag(np.where(known, LEAST_SD**2, UNKNOWN_VARIANCE))
     design = np.concatenate([np.eye(K), likeness]) * known[:, None]
     return ExcessRows(values=values, covariance=covariance, design=design, reference=columns.reference)
 
@@ -140,13 +138,9 @@ class _Columns:
             gains=np.full(K, -1.0),
             largest=largest,
         )
-        fit = instruments.regress(columns.currents[:, largest], columns.junction_regressors())
-        columns.gains[columns.others] = fit.estimate[:-1]
+        found = instruments.coefficients(columns.currents[:, largest], columns.junction_regressors())
+        columns.gains[columns.others] = found[:-1]
         return columns
-
-    @property
-    def blocks(self) -> int:
-        return len(self.instruments.products)
 
     @property
     def others(self) -> list[int]:
@@ -155,21 +149,22 @@ class _Columns:
     def junction_regressors(self) -> Array:
         return np.column_stack([self.currents[:, self.others], self.constant])
 
-    def fleet_row(self, k: int, read_out: Array) -> BlockRegression | None:
+    def fleet_row(self, k: int, read_out: Array) -> InstrumentedFit | None:
         model = np.column_stack([self.inputs, self.constant]) @ read_out
         return self._row(k, self.currents[:, k], np.column_stack([model, self.constant]))
 
-    def junction_row(self, k: int) -> BlockRegression | None:
+    def junction_row(self, k: int) -> InstrumentedFit | None:
         return self._row(k, self.currents[:, self.largest], self.junction_regressors())
 
-    def _row(self, k: int, y: Array, x: Array) -> BlockRegression | None:
+    def _row(self, k: int, y: Array, x: Array) -> InstrumentedFit | None:
         """Regression with the column of branch k as the last regressor; None if it says nothing."""
         if not self._tells(k, x):
             return None
         return self.instruments.regress(y, np.column_stack([x, self.extra[:, k]]))
 
     def _tells(self, k: int, x: Array) -> bool:
-        return self.size * self.instruments.strength(self.extra[:, k], x) > LEAST_EFFECT * float(self.usual_a[k])
+        beyond = np.column_stack([x, self.currents[:, k]])
+        return self.size * self.instruments.strength(self.extra[:, k], beyond) > LEAST_EFFECT * float(self.usual_a[k])
 
     def likeness(self) -> Array:
         """What an excess of each branch adds to each junction row, shape (K, K)."""
@@ -180,9 +175,19 @@ class _Columns:
             if self._tells(row, x):
                 z = np.column_stack([x, self.extra[:, row]])
                 for k in range(K):
-                    share = self.instruments.regress(self.extra[:, k], z).estimate[-1]
+                    share = float(self.instruments.coefficients(self.extra[:, k], z)[-1])
                     likeness[row, k] = self.gains[k] * share / self.gains[row]
         return likeness
+
+
+def _covariance(fits: Sequence[InstrumentedFit | None], instruments: Instruments) -> Array:
+    """Covariance of the coefficients: by the spread of the blocks, and by misfit that all instruments share alike."""
+    B, Q, _ = instruments.products.shape
+    influence = np.stack([fit.influence if fit else np.zeros(B) for fit in fits])
+    misfit = np.stack([fit.misfit / np.sqrt(fit.freedom) if fit else np.zeros(Q) for fit in fits])
+    lever = np.stack([fit.lever if fit else np.zeros(Q) for fit in fits])
+    total = instruments.total
+    return np.asarray(influence @ influence.T + (misfit @ total @ misfit.T) * (lever @ total @ lever.T))
 
 
 def _rms_a(vehicle: SensorSummary) -> Array:
