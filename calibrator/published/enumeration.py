@@ -76,8 +76,8 @@ def _refuse_impossible(slopes: Array, intercepts: Array) -> None:
     if bad.any():
         j, k = (int(i) for i in np.argwhere(bad)[0])
         raise FleetError(
-            f"vehicle {j + 1}, branch {k + 1}: slope {slopes[j, k]:g} and intercept {intercepts[j, k]:g} of full scale; "
-            "expected finite values and a positive slope; leave the vehicle out"
+            f"vehicle {j + 1}, branch {k + 1}: slope {slopes[j, k]:g}, intercept {intercepts[j, k]:g} of full scale; "
+            "expected finite ones and a positive slope; leave the vehicle out"
         )
 
 
@@ -102,9 +102,8 @@ def _patterns(size: int) -> NDArray[np.float64]:
 
 def _scales(slopes: Array, hardware: Array) -> Array:
     """Kinks and stationary points t for each vertex with H of shape (N, V): shape (N, V, 2K + 2)."""
-    N, K = slopes.shape
-    kinks = np.sort(np.concatenate([np.ones((N, 1)), slopes], axis=1), axis=1)
-    lower = np.concatenate([np.zeros((N, 1)), kinks[:, :-1]], axis=1)
+    kinks = np.sort(np.concatenate([np.ones((len(slopes), 1)), slopes], axis=1), axis=1)
+    lower = np.concatenate([np.zeros((len(slopes), 1)), kinks[:, :-1]], axis=1)
     middle = (lower + kinks) / 2.0
     A = np.sum(slopes[:, None] * np.sign(slopes[:, None] - middle[:, :, None]), axis=2)[:, None]
     curb = np.sign(middle - 1.0)[:, None] + hardware[:, :, None]
