@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrator.drive import Array
+from calibrator.drive import Array, Mask
 from calibrator.evidence.fleet_model import FleetModel, regress_on_fleet
 from calibrator.evidence.junction_law import junction_law
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
@@ -30,7 +30,9 @@ class _Raw:
     blocks: int
 
 
-def collect_rows(summaries: Sequence[DriveSummary], model: FleetModel, *, full_scale_a: float) -> FleetRows:
+def collect_rows(
+    summaries: Sequence[DriveSummary], model: FleetModel, *, full_scale_a: float, learning: Mask | None = None
+) -> FleetRows:
     """Evidence of every vehicle of a fleet.
 
     Parameters
@@ -41,6 +43,8 @@ def collect_rows(summaries: Sequence[DriveSummary], model: FleetModel, *, full_s
         Of the same fleet.
     full_scale_a : float
         Full scale of the junction. [A]
+    learning : ndarray of bool of shape (N,) or None
+        Vehicles from which the fleet's usual correlation of the rows is learnt; None: all.
 
     Returns
     -------
@@ -48,7 +52,8 @@ def collect_rows(summaries: Sequence[DriveSummary], model: FleetModel, *, full_s
         Slopes and intercepts over the fleet model, and the junction law; no bench readings.
     """
     raw = [_of_vehicle(summary, model, full_scale_a) for summary in summaries]
-    usual = np.mean([_correlation(vehicle.covariance) for vehicle in raw], axis=0)
+    correlations = np.stack([_correlation(vehicle.covariance) for vehicle in raw])
+    usual = correlations.mean(axis=0) if learning is None else correlations[learning].mean(axis=0)
     values = np.stack([vehicle.values for vehicle in raw])
     return _rows(values, np.stack([_steadied(vehicle, usual) for vehicle in raw]))
 

@@ -58,7 +58,7 @@ def calibrate_posterior(
     ordered = [summary.take_branches(order) for summary in summaries]
     learnt = np.ones(N, bool) if learning is None else learning
     model = fit_fleet_model([summary for summary, use in zip(ordered, learnt, strict=True) if use])
-    rows = collect_rows(ordered, model, full_scale_a=full_scale_a)
+    rows = collect_rows(ordered, model, full_scale_a=full_scale_a, learning=learnt)
     known = no_readings(N, K) if readings is None else readings
     if trusted is not None:
         known = known.merged(trusted_readings(trusted, K, full_scale_a))

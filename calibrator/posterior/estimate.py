@@ -7,7 +7,7 @@ import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import FleetRows
-from calibrator.faults import Faults
+from calibrator.faults import Faults, Index
 from calibrator.posterior.decision import best_estimates, harm_probability, spread_points
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.health import ReferenceHealth
@@ -32,6 +32,10 @@ class Moments:
 
     mean_a: Array
     mean_square_a2: Array
+
+    def take(self, index: Index) -> "Moments":
+        """Return the moments of some of the vehicles."""
+        return Moments(mean_a=self.mean_a[index], mean_square_a2=self.mean_square_a2[index])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +125,8 @@ def estimate_fleet(
     hyperparameters = estimate_hyperparameters(learnt, starts, given=given, free=free)
     resampled = resampled_hyperparameters(learnt, hyperparameters, given=given, free=free)
     states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in resampled])
-    vehicles = [_of_vehicle(states, j, hyperparameters.prior, moments, full_scale_a) for j in range(len(rows))]
+    usual = moments if learning is None else moments.take(learning)
+    vehicles = [_of_vehicle(states, j, hyperparameters.prior, (moments, usual), full_scale_a) for j in range(len(rows))]
     return _joined(vehicles, rows, states, hyperparameters, full_scale_a)
 
 
@@ -133,22 +138,24 @@ class _Vehicle:
     harm: Array
 
 
-def _of_vehicle(states: States, j: int, prior: FaultPrior, moments: Moments, full_scale_a: float) -> _Vehicle:
+def _of_vehicle(
+    states: States, j: int, prior: FaultPrior, moments: tuple[Moments, Moments], full_scale_a: float
+) -> _Vehicle:
     points = spread_points(states, j)
     state, confidence = best_estimates(points, states, j, least=(prior.relative.low, prior.constant.low))
     drift, offset = states.drift[j, state], states.offset[j, state]
     variance = points.weight @ np.concatenate([points.drift - drift, points.offset - offset], axis=1) ** 2
-    mean, mean_square = _true_moments(moments, j, drift, offset * full_scale_a)
+    mean, mean_square = _true_moments(*moments, j, drift=drift, offset_a=offset * full_scale_a)
     harm = harm_probability(points, drift, offset, mean=mean / full_scale_a, mean_square=mean_square / full_scale_a**2)
     return _Vehicle(state, confidence, variance, harm)
 
 
-def _true_moments(moments: Moments, j: int, drift: Array, offset_a: Array) -> tuple[Array, Array]:
+def _true_moments(moments: Moments, fleet: Moments, j: int, *, drift: Array, offset_a: Array) -> tuple[Array, Array]:
     """Moments of the true currents on the vehicle's own drives and on the fleet's usual one, each of shape (2, K)."""
     mean, square = moments.mean_a[j], moments.mean_square_a2[j]
     own_mean = (mean - offset_a) / (1.0 + drift)
     own_square = np.maximum((square - 2.0 * offset_a * mean + offset_a**2) / (1.0 + drift) ** 2, own_mean**2)
-    usual_mean, usual_square = np.median(moments.mean_a, axis=0), np.median(moments.mean_square_a2, axis=0)
+    usual_mean, usual_square = np.median(fleet.mean_a, axis=0), np.median(fleet.mean_square_a2, axis=0)
     return np.stack([own_mean, usual_mean]), np.stack([own_square, np.maximum(usual_square, usual_mean**2)])
 
 

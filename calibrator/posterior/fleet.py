@@ -184,8 +184,8 @@ def _most_doubtful(posterior: FleetPosterior, j: int, branches: Sequence[str], f
     """Which sensor is known least where only one explanation is left."""
     k = int(np.argmax(np.hypot(posterior.drift_sd[j], posterior.offset_sd_a[j] / full_scale_a)))
     return (
-        f"more drives would decide: the {branches[k]} sensor's drift is known to +-{posterior.drift_sd[j, k]:.1%} and its "
-        f"offset to +-{posterior.offset_sd_a[j, k]:.1f} A only; record drives in which that current varies"
+        f"more drives would decide: the {branches[k]} sensor's drift is known to +-{posterior.drift_sd[j, k]:.1%} and "
+        f"its offset to +-{posterior.offset_sd_a[j, k]:.1f} A only; record drives in which that current varies"
     )
 
 

@@ -6,6 +6,10 @@ from calibrator.artificial.ground_truth import GroundTruth
 from ecu_node.database import VehicleDatabase
 
 
+NOT_MODELLED = {"contactor_state", "junction_box_temperature"}
+"""Inputs that the built-in vehicle does not have; its logs hold "not available" for them."""
+
+
 @pytest.fixture(scope="module")
 def trip() -> GroundTruth:
     return builtin_trip(np.random.default_rng(7), duration_s=300.0, name="trip")
@@ -17,7 +21,7 @@ def test_currents_obey_the_junction_law(trip: GroundTruth) -> None:
 
 def test_trip_has_the_branches_and_inputs_of_the_layout(trip: GroundTruth, database: VehicleDatabase) -> None:
     assert set(trip.currents_a) == set(database.layout.branch_names)
-    assert set(trip.inputs) == {item.name for item in database.layout.input}
+    assert set(trip.inputs) == {item.name for item in database.layout.input} - NOT_MODELLED
 
 
 def test_trip_is_as_long_as_asked_and_drives(trip: GroundTruth) -> None:
@@ -29,6 +33,8 @@ def test_trip_is_as_long_as_asked_and_drives(trip: GroundTruth) -> None:
 
 def test_values_fit_the_dbc(trip: GroundTruth, database: VehicleDatabase) -> None:
     for item in database.layout.input:
+        if item.name in NOT_MODELLED:
+            continue
         _, signal = database.signal(item.signal)
         assert signal.minimum is not None
         assert signal.maximum is not None
