@@ -44,6 +44,7 @@ def draw_faults(
     full_scale_a: float,
     balanced: bool = False,
     symmetric: bool = False,
+    sign_bias: float = 0.0,
 ) -> Faults:
     """Draw the fault parameters of a fleet, (20) and (22) in [1]_.
 
@@ -65,6 +66,8 @@ def draw_faults(
         No hardware faults in half of the vehicles.
     symmetric : bool
         Vehicles come in groups of four whose measured currents have the ideal current as their mean (22).
+    sign_bias : float
+        Faults are positive with probability 0.5 + sign_bias, 0 to 0.5: what a common cause does to a fleet. [1]
 
     Returns
     -------
@@ -74,12 +77,17 @@ def draw_faults(
     Raises
     ------
     FleetError
-        If a symmetric fleet is wanted whose size is no multiple of 4.
+        If a symmetric fleet is wanted whose size is no multiple of 4, or whose faults have a preferred sign; or if no
+        probability belongs to the bias.
     """
+    if not 0.0 <= sign_bias <= 0.5 or (symmetric and sign_bias):
+        raise FleetError(f"a sign bias of {sign_bias:g}: expected 0 to 0.5, and 0 for a symmetric fleet")
     if symmetric and vehicles % 4:
         raise FleetError(f"a symmetric fleet needs a multiple of 4 vehicles, not {vehicles}")
     n = vehicles // 4 if symmetric else vehicles
     values = _sparse_values(rng, n, 3 * branches, nonzero_count(branches, sparsity), magnitude)
+    if sign_bias:
+        values = np.where(rng.random(values.shape) < 2.0 * sign_bias, np.abs(values), values)
     if balanced:
         values[rng.permutation(n) < n // 2, :branches] = 0.0
     hardware_drift, hardware_offset, drift, offset = np.split(values, [1, branches, 2 * branches], axis=1)

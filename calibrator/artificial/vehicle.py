@@ -6,7 +6,7 @@ delay and noise, sampled by its own message at its own instants, quantised by th
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,15 +14,15 @@ import numpy as np
 
 from calibrator.artificial.ground_truth import GroundTruth
 from calibrator.artificial.truth import VehicleTruth
-from calibrator.drive import Array
+from calibrator.drive import Array, Channel, Drive
 from calibrator.errors import FleetError
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.random_streams import Purpose, random_stream
-from calibrator.recordings.canlog import FrameSeries, encode_message, write_candump
+from calibrator.recordings.canlog import FrameSeries, encode_message, sent_values, write_candump
 from ecu_node.database import AMPERE, VehicleDatabase, unit_factor
 from ecu_node.layout import Branch, split_signal
 
-__all__ = ["Disturbances", "Vehicle", "draw_disturbances", "vehicle_frames", "write_vehicle"]
+__all__ = ["Disturbances", "Vehicle", "draw_disturbances", "vehicle_drive", "vehicle_frames", "write_vehicle"]
 
 JITTER = 0.02
 """Standard deviation of a frame's instant in cycle times: a lightly loaded bus. [1]"""
@@ -116,8 +116,57 @@ def vehicle_frames(
     list of FrameSeries
         One series per message of the DBC that carries a branch of the vehicle or an input.
     """
+    return [
+        encode_message(database, sent.message, sent.time_s, sent.values)
+        for sent in _sent_messages(rng, database, vehicle, trip)
+    ]
+
+
+def vehicle_drive(rng: np.random.Generator, database: VehicleDatabase, vehicle: Vehicle, trip: GroundTruth) -> Drive:
+    """Drive that the frames of a vehicle would be read as, without making the frames.
+
+    Parameters
+    ----------
+    rng, database, vehicle, trip
+        As in :func:`vehicle_frames`; with the same chance the values are the same.
+
+    Returns
+    -------
+    Drive
+        Channels at the instants of their frames, in steps of their signals; named after vehicle and trip.
+    """
+    branches: dict[str, Channel] = {}
+    inputs: dict[str, Channel] = {}
+    for sent in _sent_messages(rng, database, vehicle, trip):
+        for signal_name, (kind, name) in sent.signals.items():
+            _, signal = database.signal(f"{sent.message}.{signal_name}")
+            unit = _signed_unit(database, name) if kind == "branch" else 1.0
+            value = sent_values(signal, sent.values[signal_name]) * unit
+            channel = Channel(time_s=sent.time_s, value=value, good=np.isfinite(value))
+            (branches if kind == "branch" else inputs)[name] = channel
+    return Drive(
+        vehicle=vehicle.name,
+        name=trip.name,
+        branches={name: branches[name] for name in vehicle.branches},
+        inputs=inputs,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sent:
+    """What a vehicle puts into one message on one trip: values by signal, and what each signal is."""
+
+    message: str
+    signals: Mapping[str, tuple[str, str]]
+    time_s: Array
+    values: Mapping[str, Array]
+
+
+def _sent_messages(
+    rng: np.random.Generator, database: VehicleDatabase, vehicle: Vehicle, trip: GroundTruth
+) -> Iterator[_Sent]:
+    """Values of each message before they are encoded."""
     i = _vehicle_currents(vehicle, trip)
-    series = []
     for message_name, signals in _signals_by_message(database, vehicle.branches, trip).items():
         time_s = _frame_times(rng, database, message_name, trip)
         values: dict[str, Array] = {}
@@ -130,8 +179,7 @@ def vehicle_frames(
                 values[signal_name] = measured / _signed_unit(database, name)
             else:
                 values[signal_name] = np.interp(time_s, trip.time_s, trip.inputs[name])
-        series.append(encode_message(database, message_name, time_s, values))
-    return series
+        yield _Sent(message=message_name, signals=signals, time_s=time_s, values=values)
 
 
 def write_vehicle(

@@ -39,12 +39,15 @@ class CommonDrive:
         Inputs of the vehicle model.
     full_scale_a : float
         Full scale of the junction. [A]
+    unseen : ndarray of shape (T', K)
+        Ideal currents of another drive, on which corrections are judged. [A]
     """
 
     name: str
     i_s: Array
     inputs: Array
     full_scale_a: float
+    unseen: Array
 
     def __post_init__(self) -> None:
         if self.i_s.ndim != 2 or len(self.i_s) != len(self.inputs):
@@ -93,6 +96,7 @@ def builtin_common_drive(*, branches: int = 2, seed: int = 0, duration_s: float 
     """
     trip = builtin_trip(random_stream(Purpose.COMMON_DRIVE, seed), duration_s=duration_s, name=f"builtin-{seed}")
     trip = with_branches(trip, BRANCHES[:branches], BALANCE)
+    unseen = builtin_trip(random_stream(Purpose.UNSEEN_TRIP, seed), duration_s=duration_s, name="unseen")
     x, voltage = trip.inputs, trip.inputs["voltage"]
     power = x["torque"] * x["speed"]
     inputs = (
@@ -103,4 +107,10 @@ def builtin_common_drive(*, branches: int = 2, seed: int = 0, duration_s: float 
         x["aircon_demand"] / voltage,
         x["low_voltage_demand"] / voltage,
     )
-    return CommonDrive(name=trip.name, i_s=trip.matrix_a(), inputs=np.stack(inputs, axis=1), full_scale_a=FULL_SCALE_A)
+    return CommonDrive(
+        name=trip.name,
+        i_s=trip.matrix_a(),
+        inputs=np.stack(inputs, axis=1),
+        full_scale_a=FULL_SCALE_A,
+        unseen=with_branches(unseen, BRANCHES[:branches], BALANCE).matrix_a(),
+    )

@@ -1,14 +1,44 @@
-"""Methods that experiments compare: evidence in, estimated faults and classification out."""
+"""Methods that experiments compare: a trial in, estimated faults out."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from calibrator.drive import Array, Mask
 from calibrator.experiments.trial import Trial
+from calibrator.faults import Faults
 from calibrator.published.classify import Classification, FaultTrees, classify_by_threshold, classify_by_truth
-from calibrator.published.recovery import Recovery, recover_fleet
+from calibrator.published.recovery import recover_fleet
 
-__all__ = ["PERFECT", "THRESHOLD", "TREE", "Method", "Published"]
+__all__ = ["PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "Estimate", "Method", "Posterior", "Published"]
+
+HARM_LIMIT = 0.001
+"""Probability of making a branch worse below which the default corrects it. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What a method says of N vehicles with K branches.
+
+    Attributes
+    ----------
+    faults : Faults
+        Estimate.
+    hardware : ndarray of bool of shape (N,)
+        Vehicles held to have a hardware fault.
+    corrected : ndarray of bool of shape (N, K)
+        Branches that would be corrected in the vehicle; the others pass through.
+    confidence : ndarray of shape (N,) or None
+        Probability of being recovered; None: the method does not say.
+    failed : int
+        Vehicles whose optimisation failed.
+    """
+
+    faults: Faults
+    hardware: Mask
+    corrected: Mask
+    confidence: Array | None
+    failed: int
 
 
 class Method(Protocol):
@@ -18,13 +48,13 @@ class Method(Protocol):
     def name(self) -> str:
         """Short name for tables."""
 
-    def recover(self, trial: Trial) -> Recovery:
+    def estimate(self, trial: Trial) -> Estimate:
         """Estimate the faults of all vehicles of a trial."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Published:
-    """The published method with one of its classifiers.
+    """The published method with one of its classifiers; whatever it finds is corrected.
 
     Attributes
     ----------
@@ -37,9 +67,45 @@ class Published:
     name: str
     classify: Callable[[Trial], Classification]
 
-    def recover(self, trial: Trial) -> Recovery:
+    def estimate(self, trial: Trial) -> Estimate:
         """Classify, then recover by the four cases."""
-        return recover_fleet(trial.evidence, self.classify(trial), full_scale_a=trial.full_scale_a)
+        recovery = recover_fleet(trial.evidence, self.classify(trial), full_scale_a=trial.full_scale_a)
+        return Estimate(
+            faults=recovery.faults,
+            hardware=recovery.classification.hardware,
+            corrected=_changed(recovery.faults),
+            confidence=None,
+            failed=len(recovery.failed),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Posterior:
+    """The default method; nobody tells it anything of the faults.
+
+    Attributes
+    ----------
+    name : str
+        As on the command line.
+    """
+
+    name: str = "posterior"
+
+    def estimate(self, trial: Trial) -> Estimate:
+        """Estimate, and correct the branches that are hardly ever made worse."""
+        posterior = trial.posterior()
+        return Estimate(
+            faults=posterior.faults,
+            hardware=posterior.hardware_fault > 0.5,
+            corrected=_changed(posterior.faults) & (posterior.harm < HARM_LIMIT),
+            confidence=posterior.confidence,
+            failed=0,
+        )
+
+
+def _changed(faults: Faults) -> Mask:
+    changed: Mask = (faults.drift != 0.0) | (faults.offset_a != 0.0)
+    return changed
 
 
 def _by_threshold(trial: Trial) -> Classification:
@@ -47,6 +113,7 @@ def _by_threshold(trial: Trial) -> Classification:
 
 
 def _by_tree(trial: Trial) -> Classification:
+    assert trial.training is not None
     evidence, faults = trial.training()
     return FaultTrees(evidence.features, faults).classify(trial.evidence.features)
 
@@ -58,3 +125,4 @@ def _by_truth(trial: Trial) -> Classification:
 THRESHOLD = Published(name="published/threshold", classify=_by_threshold)
 TREE = Published(name="published/tree", classify=_by_tree)
 PERFECT = Published(name="published/perfect", classify=_by_truth)
+POSTERIOR = Posterior()

@@ -1,22 +1,34 @@
-"""The four experiments of section V of [1]_, each a function of keyword arguments only.
+"""Experiments on one drive that all vehicles make: the four of section V of [1]_, and fleets that are not symmetric.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from calibrator.experiments.common_drive import CommonDrive
-from calibrator.experiments.judging import PaperFigures, law_settings, run_laws, with_sparsity
-from calibrator.experiments.methods import PERFECT, THRESHOLD, TREE, Method
+from calibrator.experiments.common_trial import artificial_trial, state_space_trial
+from calibrator.experiments.judging import Effort, PaperFigures, Setting, run_settings
+from calibrator.experiments.methods import PERFECT, POSTERIOR, THRESHOLD, TREE, Method
 from calibrator.experiments.result import ExperimentResult
-from calibrator.experiments.trial import FleetLaw, Trial, artificial_trial, state_space_trial
+from calibrator.experiments.trial import FleetLaw
 
-__all__ = ["classifier_experiment", "snr_experiment", "sparsity_experiment", "statespace_experiment"]
+__all__ = [
+    "asymmetry_experiment",
+    "classifier_experiment",
+    "snr_experiment",
+    "sparsity_experiment",
+    "statespace_experiment",
+]
 
 SPARSITIES = (20.0, 40.0, 60.0, 80.0)
 SNRS_DB = (-20.0, -10.0, 0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0)
+FLEET_SIZES = (20, 100, 400, 2000)
+SIGN_BIASES = (0.0, 0.2, 0.4, 0.5)
 DEFAULT_LAW = FleetLaw()
+DEFAULT_EFFORT = Effort()
+SPARSITY_LABEL = "sparsity S [%]"
 
 TABLE_1: PaperFigures = {
     (60.0, THRESHOLD.name): {"f2": 0.68, "recovery_rate": 0.84, "complexity": 0.93},
@@ -42,12 +54,10 @@ def classifier_experiment(
     *,
     drive: CommonDrive,
     law: FleetLaw = DEFAULT_LAW,
-    methods: Sequence[Method] = (THRESHOLD, TREE, PERFECT),
-    repetitions: int = 10,
-    seed: int = 0,
-    jobs: int = 1,
+    methods: Sequence[Method] = (THRESHOLD, TREE, PERFECT, POSTERIOR),
+    effort: Effort = DEFAULT_EFFORT,
 ) -> ExperimentResult:
-    """Effect of the classifier, table 1 of [1]_.
+    """Effect of the classifier, table 1 of [1]_; the default method needs none.
 
     Parameters
     ----------
@@ -57,30 +67,21 @@ def classifier_experiment(
         How fleets are drawn.
     methods : sequence of Method
         What to compare.
-    repetitions, seed, jobs : int
-        Trials, seed of the first, processes.
+    effort : Effort
+        Repetitions, seed, processes.
 
     Returns
     -------
     ExperimentResult
         One row per method.
     """
-    rows = run_laws(
-        drive,
-        {law.sparsity: law},
-        methods,
-        make_trial=_artificial,
-        repetitions=repetitions,
-        seed=seed,
-        jobs=jobs,
-        paper=TABLE_1,
-    )
+    setting = Setting(x=law.sparsity, make_trial=partial(artificial_trial, drive, law))
     return ExperimentResult(
         name="classifier",
         title="Effect of the classifier (table 1)",
-        x_label="sparsity S [%]",
-        settings=law_settings(drive, law, repetitions=repetitions, seed=seed),
-        rows=rows,
+        x_label=SPARSITY_LABEL,
+        settings=_record(drive, law, effort),
+        rows=run_settings([setting], methods, effort, paper=TABLE_1),
     )
 
 
@@ -88,11 +89,9 @@ def snr_experiment(
     *,
     drive: CommonDrive,
     law: FleetLaw = DEFAULT_LAW,
-    methods: Sequence[Method] = (PERFECT,),
+    methods: Sequence[Method] = (PERFECT, POSTERIOR),
     snrs_db: Sequence[float] = SNRS_DB,
-    repetitions: int = 10,
-    seed: int = 0,
-    jobs: int = 1,
+    effort: Effort = DEFAULT_EFFORT,
 ) -> ExperimentResult:
     """Effect of the simulation noise, figure 7 of [1]_: perfect classifier, SNR from -20 to 60 dB.
 
@@ -100,7 +99,7 @@ def snr_experiment(
     ----------
     snrs_db : sequence of float
         Signal-to-noise ratios (26). [dB]
-    drive, law, methods, repetitions, seed, jobs
+    drive, law, methods, effort
         As in :func:`classifier_experiment`.
 
     Returns
@@ -108,22 +107,13 @@ def snr_experiment(
     ExperimentResult
         Rows by SNR and method.
     """
-    rows = run_laws(
-        drive,
-        {snr: replace(law, snr_db=snr) for snr in snrs_db},
-        methods,
-        make_trial=_artificial,
-        repetitions=repetitions,
-        seed=seed,
-        jobs=jobs,
-        paper=FIGURE_7,
-    )
+    settings = [Setting(x=x, make_trial=partial(artificial_trial, drive, replace(law, snr_db=x))) for x in snrs_db]
     return ExperimentResult(
         name="snr",
         title="Effect of the simulation noise (figure 7)",
         x_label="SNR [dB]",
-        settings=law_settings(drive, law, repetitions=repetitions, seed=seed),
-        rows=rows,
+        settings=_record(drive, law, effort, "snr_db"),
+        rows=run_settings(settings, methods, effort, paper=FIGURE_7),
     )
 
 
@@ -131,11 +121,9 @@ def sparsity_experiment(
     *,
     drive: CommonDrive,
     law: FleetLaw = DEFAULT_LAW,
-    methods: Sequence[Method] = (TREE,),
+    methods: Sequence[Method] = (TREE, PERFECT, POSTERIOR),
     sparsities: Sequence[float] = SPARSITIES,
-    repetitions: int = 10,
-    seed: int = 0,
-    jobs: int = 1,
+    effort: Effort = DEFAULT_EFFORT,
 ) -> ExperimentResult:
     """Effect of the sparsity level, figure 8 of [1]_.
 
@@ -143,7 +131,7 @@ def sparsity_experiment(
     ----------
     sparsities : sequence of float
         Levels S. [%]
-    drive, law, methods, repetitions, seed, jobs
+    drive, law, methods, effort
         As in :func:`classifier_experiment`.
 
     Returns
@@ -151,22 +139,13 @@ def sparsity_experiment(
     ExperimentResult
         Rows by sparsity and method.
     """
-    rows = run_laws(
-        drive,
-        with_sparsity(law, sparsities),
-        methods,
-        make_trial=_artificial,
-        repetitions=repetitions,
-        seed=seed,
-        jobs=jobs,
-        paper=FIGURE_8,
-    )
+    settings = [Setting(x=x, make_trial=partial(artificial_trial, drive, replace(law, sparsity=x))) for x in sparsities]
     return ExperimentResult(
         name="sparsity",
         title="Effect of the sparsity level (figure 8)",
-        x_label="sparsity S [%]",
-        settings=law_settings(drive, law, repetitions=repetitions, seed=seed),
-        rows=rows,
+        x_label=SPARSITY_LABEL,
+        settings=_record(drive, law, effort, "sparsity"),
+        rows=run_settings(settings, methods, effort, paper=FIGURE_8),
     )
 
 
@@ -174,11 +153,9 @@ def statespace_experiment(
     *,
     drive: CommonDrive,
     law: FleetLaw = DEFAULT_LAW,
-    methods: Sequence[Method] = (TREE,),
+    methods: Sequence[Method] = (TREE, POSTERIOR),
     sparsities: Sequence[float] = SPARSITIES,
-    repetitions: int = 10,
-    seed: int = 0,
-    jobs: int = 1,
+    effort: Effort = DEFAULT_EFFORT,
 ) -> ExperimentResult:
     """End to end with state-space models, table 2 of [1]_; trees learn from artificial simulation.
 
@@ -186,7 +163,7 @@ def statespace_experiment(
     ----------
     sparsities : sequence of float
         Levels S. [%]
-    drive, law, methods, repetitions, seed, jobs
+    drive, law, methods, effort
         As in :func:`classifier_experiment`; the paper takes 500 vehicles.
 
     Returns
@@ -194,28 +171,75 @@ def statespace_experiment(
     ExperimentResult
         Rows by sparsity and method.
     """
-    rows = run_laws(
-        drive,
-        with_sparsity(law, sparsities),
-        methods,
-        make_trial=_state_space,
-        repetitions=repetitions,
-        seed=seed,
-        jobs=jobs,
-        paper=TABLE_2,
-    )
+    settings = [
+        Setting(x=x, make_trial=partial(state_space_trial, drive, replace(law, sparsity=x))) for x in sparsities
+    ]
     return ExperimentResult(
         name="statespace",
         title="End to end with state-space models (table 2)",
-        x_label="sparsity S [%]",
-        settings=law_settings(drive, law, repetitions=repetitions, seed=seed),
-        rows=rows,
+        x_label=SPARSITY_LABEL,
+        settings=_record(drive, law, effort, "sparsity"),
+        rows=run_settings(settings, methods, effort, paper=TABLE_2),
     )
 
 
-def _artificial(drive: CommonDrive, law: FleetLaw, seed: int) -> Trial:
-    return artificial_trial(drive, law, seed=seed)
+def asymmetry_experiment(
+    *,
+    drive: CommonDrive,
+    law: FleetLaw = DEFAULT_LAW,
+    methods: Sequence[Method] = (PERFECT, POSTERIOR),
+    fleet_sizes: Sequence[int] = FLEET_SIZES,
+    sign_biases: Sequence[float] = SIGN_BIASES,
+    effort: Effort = DEFAULT_EFFORT,
+) -> ExperimentResult:
+    """Fleets that are not symmetric, whose mean is therefore not the ideal vehicle.
+
+    Parameters
+    ----------
+    fleet_sizes : sequence of int
+        Sizes N.
+    sign_biases : sequence of float
+        Faults are positive with probability 0.5 + bias: 0 is no preference, 0.5 gives all faults one sign. [1]
+    drive, law, methods, effort
+        As in :func:`classifier_experiment`.
+
+    Returns
+    -------
+    ExperimentResult
+        Rows by bias, size and method.
+    """
+    settings = []
+    for bias in sign_biases:
+        for size in fleet_sizes:
+            one = replace(law, vehicles=size, symmetric=False, sign_bias=bias)
+            settings.append(Setting(x=size, series=f"{bias:g}", make_trial=partial(artificial_trial, drive, one)))
+    return ExperimentResult(
+        name="asymmetry",
+        title="Fleets that are not symmetric",
+        x_label="vehicles",
+        series_label="sign bias",
+        settings=_record(drive, replace(law, symmetric=False), effort, "vehicles"),
+        rows=run_settings(settings, methods, effort),
+    )
 
 
-def _state_space(drive: CommonDrive, law: FleetLaw, seed: int) -> Trial:
-    return state_space_trial(drive, law, seed=seed)
+def _record(drive: CommonDrive, law: FleetLaw, effort: Effort, varied: str = "") -> dict[str, float | int | str]:
+    """What is needed to repeat an experiment, without what it varies."""
+    record: dict[str, float | int | str] = {
+        "seed": effort.seed,
+        "repetitions": effort.repetitions,
+        "drive": drive.name,
+        "branches": drive.branches,
+        "samples": len(drive.i_s),
+        "unity_samples": len(drive.unity),
+        "full_scale_a": drive.full_scale_a,
+        "vehicles": law.vehicles,
+        "training_vehicles": law.training_vehicles,
+        "magnitude_lowest": law.magnitude[0],
+        "magnitude_highest": law.magnitude[1],
+        "snr_db": law.snr_db,
+        "sparsity": law.sparsity,
+        "balanced": str(law.balanced).lower(),
+        "symmetric": str(law.symmetric).lower(),
+    }
+    return {name: value for name, value in record.items() if name != varied}

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 
 import msgspec
 
-__all__ = ["ExperimentResult", "Figure", "Row"]
+from calibrator.errors import FleetError
+
+__all__ = ["Bin", "ExperimentResult", "Figure", "Row", "decode_result"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,7 +17,7 @@ class Figure:
     Attributes
     ----------
     mean, sd : float
-        Over repetitions; the deviation is 0 for a single one.
+        Over all vehicles of all repetitions, and standard deviation over repetitions; 0 for a single one.
     paper : float or None
         What the paper states, where it does.
     """
@@ -26,6 +28,26 @@ class Figure:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Bin:
+    """Vehicles with about the same confidence.
+
+    Attributes
+    ----------
+    low : float
+        Lower end of the tenth of the scale. [1]
+    count : int
+        Vehicles.
+    confidence, recovered : float
+        Their mean confidence, and the share that is recovered. [1]
+    """
+
+    low: float
+    count: int
+    confidence: float
+    recovered: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Row:
     """One method under one setting.
 
@@ -33,15 +55,21 @@ class Row:
     ----------
     x : float
         Value of what the experiment varies.
+    series : str
+        What else it varies; empty if nothing.
     method : str
         Name of the method.
     figures : mapping of str to Figure
-        By name: recovery_rate, recovery_rate_25, f2, complexity, failed.
+        By the names of :mod:`calibrator.experiments.outcome`, those that have a meaning here.
+    bins : tuple of Bin
+        Vehicles by confidence; empty for a method without one.
     """
 
     x: float
+    series: str = ""
     method: str
     figures: Mapping[str, Figure]
+    bins: tuple[Bin, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +80,8 @@ class ExperimentResult:
     ----------
     name, title : str
         Name on the command line, and what it shows.
-    x_label : str
-        What the experiment varies, with its unit.
+    x_label, series_label : str
+        What the experiment varies, with units; the latter is empty if rows have no series.
     settings : mapping
         Seed, repetitions, fleet law, drive.
     rows : tuple of Row
@@ -63,16 +91,51 @@ class ExperimentResult:
     name: str
     title: str
     x_label: str
+    series_label: str = ""
     settings: Mapping[str, float | int | str]
     rows: tuple[Row, ...]
 
-    def row(self, *, x: float, method: str) -> Row:
+    def row(self, *, x: float, method: str, series: str = "") -> Row:
         """Return the row of a method under a setting; KeyError if there is none."""
         for row in self.rows:
-            if row.x == x and row.method == method:
+            if row.x == x and row.method == method and row.series == series:
                 return row
-        raise KeyError(f"no row for x={x:g} and method '{method}'")
+        raise KeyError(f"no row for x={x:g}, series '{series}' and method '{method}'")
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Methods in the order of their first rows."""
+        return tuple(dict.fromkeys(row.method for row in self.rows))
 
     def to_json(self) -> bytes:
         """Encode as JSON, UTF-8."""
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
+
+
+def decode_result(record: bytes, where: str) -> ExperimentResult:
+    """Decode what :meth:`ExperimentResult.to_json` wrote.
+
+    Parameters
+    ----------
+    record : bytes
+        JSON.
+    where : str
+        The file, for the message.
+
+    Returns
+    -------
+    ExperimentResult
+        The result.
+
+    Raises
+    ------
+    FleetError
+        If it is no record of an experiment.
+    """
+    try:
+        return msgspec.json.decode(record, type=ExperimentResult)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise FleetError(
+            f"{where}: not a record of an experiment: {error}; expected what 'calibrator experiment --out' writes; "
+            "remove it, or run the experiment again"
+        ) from None

@@ -1,109 +1,187 @@
-"""Run an experiment by name: table on the console; page, JSON and picture in a folder."""
+"""Run experiments by name: tables on the console; pages, JSON and pictures in a folder."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
 from calibrator.errors import FleetError
+from calibrator.experiments.calibration_experiment import calibration_experiment
 from calibrator.experiments.common_drive import DURATION_S, CommonDrive, builtin_common_drive
+from calibrator.experiments.delay_experiment import delay_experiment
+from calibrator.experiments.judging import Effort
 from calibrator.experiments.paper_experiments import (
+    asymmetry_experiment,
     classifier_experiment,
     snr_experiment,
     sparsity_experiment,
     statespace_experiment,
 )
-from calibrator.experiments.picture import write_picture
+from calibrator.experiments.recorded_experiments import data_experiment, phase_experiment, real_experiment
+from calibrator.experiments.recorded_fleet import RecordedFleet, builtin_fleet, read_fleet
+from calibrator.experiments.recorded_trial import RecordedCase
+from calibrator.experiments.records import read_results, write_result
 from calibrator.experiments.result import ExperimentResult
-from calibrator.experiments.table import result_markdown, result_table
+from calibrator.experiments.table import result_table
 from calibrator.experiments.trial import FleetLaw
-from ecu_node.parameters import write_atomically
+from ecu_node.database import read_database
+from ecu_node.layout import read_layout
 
-__all__ = ["EXPERIMENTS", "run_experiment"]
+__all__ = ["CALIBRATION", "EXPERIMENTS", "RunOptions", "run_experiments"]
 
 REPETITIONS, QUICK_REPETITIONS = 10, 2
 QUICK_DURATION_S = 300.0
-JOBS = -1
-"""One process per core; repetitions do not depend on each other."""
+QUICK_TRIPS = 8
+QUICK_LAW = FleetLaw(vehicles=20, training_vehicles=400)
+CALIBRATION = "calibration"
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Experiment:
-    """An experiment and the size at which the paper runs it."""
+class RunOptions:
+    """How experiments are run.
 
-    run: Callable[..., ExperimentResult]
-    vehicles: int = 1000
-    duration_s: float = DURATION_S
-
-
-EXPERIMENTS = {
-    "classifier": _Experiment(run=classifier_experiment),
-    "snr": _Experiment(run=snr_experiment),
-    "sparsity": _Experiment(run=sparsity_experiment),
-    # 20 minutes: models are exact there, so a longer drive shows the same and takes three times as long.
-    "statespace": _Experiment(run=statespace_experiment, vehicles=500, duration_s=1200.0),
-}
-QUICK_LAW = FleetLaw(vehicles=40, training_vehicles=400)
-
-
-def run_experiment(
-    name: str,
-    *,
-    quick: bool = False,
-    seed: int = 0,
-    repetitions: int | None = None,
-    out: Path | None = None,
-    console: Console | None = None,
-    drive: CommonDrive | None = None,
-    jobs: int = JOBS,
-) -> ExperimentResult:
-    """Run one experiment.
-
-    Parameters
+    Attributes
     ----------
-    name : str
-        One of :data:`EXPERIMENTS`.
     quick : bool
-        Small fleets, a short drive and two repetitions: shows that it runs, not the figures.
+        Small fleets, short drives, few settings and two repetitions: shows that it runs, not the figures.
     seed : int
         Of the first repetition; the others follow.
     repetitions : int or None
         Trials per setting; None: 10, or 2 if quick.
-    out : Path or None
-        Folder for NAME.md, NAME.json and NAME.png, made if missing; None: nothing is written.
-    console : rich.console.Console or None
-        Where the table goes; None: nowhere.
-    drive : CommonDrive or None
-        The drive all vehicles make; None: of the built-in vehicle.
     jobs : int
-        Processes; -1: one per core.
+        Processes.
+    layout : Path
+        Layout of the recorded drives.
+    drives : Path or None
+        Drive store with the recorded drives; None: trips of the built-in vehicle take their place.
+    drive : CommonDrive or None
+        The drive that all vehicles of an experiment of the paper make; None: of the built-in vehicle.
+    """
+
+    quick: bool = False
+    seed: int = 0
+    repetitions: int | None = None
+    jobs: int = 1
+    layout: Path = Path("dbc/hv_powertrain.toml")
+    drives: Path | None = None
+    drive: CommonDrive | None = None
+
+    @property
+    def effort(self) -> Effort:
+        """Repetitions, seed and processes; FleetError if there is no repetition."""
+        usual = QUICK_REPETITIONS if self.quick else REPETITIONS
+        count = usual if self.repetitions is None else self.repetitions
+        if count < 1:
+            raise FleetError(f"an experiment needs at least 1 repetition, not {count}")
+        return Effort(repetitions=count, seed=self.seed, jobs=self.jobs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Common:
+    """An experiment on one drive of all vehicles, at the size of the paper."""
+
+    run: Callable[..., ExperimentResult]
+    vehicles: int = 1000
+    duration_s: float = DURATION_S
+    quick: Mapping[str, Any] = field(default_factory=dict)
+
+    def __call__(self, options: RunOptions) -> ExperimentResult:
+        drive = options.drive
+        if drive is None:
+            drive = builtin_common_drive(duration_s=QUICK_DURATION_S if options.quick else self.duration_s)
+        law = QUICK_LAW if options.quick else FleetLaw(vehicles=self.vehicles)
+        return self.run(drive=drive, law=law, effort=options.effort, **(self.quick if options.quick else {}))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Recorded:
+    """An experiment on recorded trips."""
+
+    run: Callable[..., ExperimentResult]
+    quick: Mapping[str, Any]
+
+    def __call__(self, options: RunOptions) -> ExperimentResult:
+        fleet = _recorded_fleet(options)
+        return self.run(fleet=fleet, effort=options.effort, **(self.quick if options.quick else {}))
+
+
+EXPERIMENTS: Mapping[str, Callable[[RunOptions], ExperimentResult]] = {
+    "classifier": _Common(run=classifier_experiment),
+    "snr": _Common(run=snr_experiment, quick={"snrs_db": (0.0, 20.0)}),
+    "sparsity": _Common(run=sparsity_experiment, quick={"sparsities": (60.0, 80.0)}),
+    # 20 minutes: models are exact there, so a longer drive shows the same and takes three times as long.
+    "statespace": _Common(
+        run=statespace_experiment, vehicles=500, duration_s=1200.0, quick={"sparsities": (60.0, 80.0)}
+    ),
+    "asymmetry": _Common(run=asymmetry_experiment, quick={"fleet_sizes": (20,), "sign_biases": (0.0, 0.4)}),
+    "real": _Recorded(run=real_experiment, quick={"cases": (RecordedCase(unmeasured_a=(3.0, 1.0)),)}),
+    "delay": _Recorded(run=delay_experiment, quick={"delays_ms": (0.0, 300.0)}),
+    "data": _Recorded(run=data_experiment, quick={"minutes": (2.0, 5.0), "fleet_sizes": (10,)}),
+    "phase": _Recorded(run=phase_experiment, quick={"sparsities": (60.0, 80.0), "magnitudes": ((0.05, 0.25),)}),
+}
+"""All but ``calibration``, which pools the others."""
+
+
+def run_experiments(
+    names: Sequence[str], options: RunOptions, *, out: Path | None = None, console: Console | None = None
+) -> list[ExperimentResult]:
+    """Run experiments one after the other.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of :data:`EXPERIMENTS`, or ``calibration``: pools the experiments run before it and those recorded in the
+        folder; if there are none, all others are run first.
+    options : RunOptions
+        How.
+    out : Path or None
+        Folder for NAME.md, NAME.json and NAME.png, made if missing, with an index page beside it; None: nothing is
+        written.
+    console : rich.console.Console or None
+        Where the tables go; None: nowhere.
 
     Returns
     -------
-    ExperimentResult
-        All figures.
+    list of ExperimentResult
+        One per name.
 
     Raises
     ------
     FleetError
-        If there is no such experiment, or the number of repetitions is not positive.
+        If there is no such experiment, the number of repetitions is not positive, or there are too few trips.
+    UserError
+        If layout or drives cannot be read.
     """
-    if name not in EXPERIMENTS:
-        raise FleetError(f"no experiment '{name}'; choose one of {', '.join(EXPERIMENTS)}")
-    count = repetitions if repetitions is not None else (QUICK_REPETITIONS if quick else REPETITIONS)
-    if count < 1:
-        raise FleetError(f"an experiment needs at least 1 repetition, not {count}")
-    experiment = EXPERIMENTS[name]
-    if drive is None:
-        drive = builtin_common_drive(duration_s=QUICK_DURATION_S if quick else experiment.duration_s)
-    law = QUICK_LAW if quick else FleetLaw(vehicles=experiment.vehicles)
-    result = experiment.run(drive=drive, law=law, repetitions=count, seed=seed, jobs=jobs)
-    if console is not None:
-        console.print(result_table(result))
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        write_atomically(out / f"{name}.json", result.to_json())
-        write_atomically(out / f"{name}.md", result_markdown(result).encode())
-        write_picture(result, out / f"{name}.png")
-    return result
+    known = (*EXPERIMENTS, CALIBRATION)
+    for name in names:
+        if name not in known:
+            raise FleetError(f"no experiment '{name}'; choose one of {', '.join(known)}")
+    done: list[ExperimentResult] = []
+    for name in names:
+        result = _calibration(done, options, out) if name == CALIBRATION else EXPERIMENTS[name](options)
+        done.append(result)
+        if console is not None:
+            console.print(result_table(result))
+        if out is not None:
+            write_result(out, result, known)
+    return done
+
+
+def _calibration(done: Sequence[ExperimentResult], options: RunOptions, out: Path | None) -> ExperimentResult:
+    recorded = read_results(out, tuple(EXPERIMENTS)) if out is not None else []
+    by_name = {result.name: result for result in (*recorded, *done)}
+    if not by_name:
+        by_name = {name: run(options) for name, run in EXPERIMENTS.items()}
+    return calibration_experiment(list(by_name.values()))
+
+
+def _recorded_fleet(options: RunOptions) -> RecordedFleet:
+    database = read_database(read_layout(options.layout))
+    if options.drives is not None:
+        fleet = read_fleet(options.drives, database)
+        return fleet.take(QUICK_TRIPS, duration_s=QUICK_DURATION_S) if options.quick else fleet
+    if options.quick:
+        return builtin_fleet(database, trips=QUICK_TRIPS, duration_s=QUICK_DURATION_S)
+    return builtin_fleet(database)

@@ -1,56 +1,108 @@
-"""Results of experiments as rich tables."""
+"""Results of experiments as tables: for the console, and as pages."""
+
+from collections.abc import Collection, Sequence
 
 from rich.markup import escape
 from rich.table import Table
 
-from calibrator.experiments.result import ExperimentResult, Figure
+from calibrator.experiments.result import ExperimentResult, Figure, Row
 
-__all__ = ["result_markdown", "result_table"]
+__all__ = ["headline", "markdown_table", "result_markdown", "result_table"]
 
-HEADINGS = {"recovery_rate": "10 %", "recovery_rate_25": "25 %", "f2": "f2", "complexity": "hardware"}
+HONESTY = {
+    "confidence": "confidence",
+    "sure": "> 0.95",
+    "sure_confidence": "their confidence",
+    "sure_recovered": "of them recovered",
+    "ece": "ECE",
+    "deployed": "deployed",
+    "harmed": "harmed",
+    "delay_rmse_ms": "delay error [ms]",
+}
+DETAILS = {"recovery_rate": "10 %", "recovery_rate_25": "25 %", "f2": "f2", "complexity": "hardware", **HONESTY}
+SHORT = ("confidence", "ece", "delay_rmse_ms")
+"""What fits on a console of 80 columns."""
 LEGEND = (
-    "Share recovered within 10 and 25 %, f2 of the hardware classification, share held to have hardware faults; "
-    "in brackets the paper."
+    "Share of vehicles recovered within 10 %: the paper's best printed figure, the published method (/ its "
+    "classifier), the default (posterior). Of the default: mean confidence, share of vehicles above 0.95, their mean "
+    "confidence and the share of them that is recovered, expected calibration error (tenths), share of the vehicles "
+    "with faulty sensors that is corrected in some branch, share of the corrected ones of which some branch gets "
+    "worse on an unseen drive."
 )
+SHORT_LEGEND = (
+    "Share of vehicles recovered within 10 %: the paper's best printed figure, the published method (/ its "
+    "classifier), the default (posterior), and of the default mean confidence and expected calibration error; --out "
+    "writes all figures."
+)
+DETAILS_LEGEND = (
+    "Recovered within 10 and 25 %, f2 of the hardware classification, share held to have hardware faults, and the "
+    "figures above, for each method; in brackets the paper."
+)
+NOTHING = "-"
+DEFAULT = "posterior"
 
 
-def result_table(result: ExperimentResult) -> Table:
-    """Table of a result: mean over repetitions, and in brackets what the paper states.
+def headline(result: ExperimentResult, honesty: Collection[str] = tuple(HONESTY)) -> tuple[list[str], list[list[str]]]:
+    """Paper, published method and default side by side.
 
     Parameters
     ----------
     result : ExperimentResult
         Of one experiment.
+    honesty : collection of str
+        Figures of the default that are shown besides.
 
     Returns
     -------
-    rich.table.Table
-        One row per setting and method.
+    header : list of str
+        Columns.
+    rows : list of list of str
+        One per setting.
     """
+    series = [result.series_label] if result.series_label else []
+    has_paper = any(figure.paper is not None for row in result.rows for figure in row.figures.values())
+    shown = [
+        name for name in HONESTY if name in honesty and any(name in row.figures for row in result.rows if row.bins)
+    ]
+    header = [*series, result.x_label, *(["paper"] if has_paper else []), *result.methods]
+    lines = []
+    for key in dict.fromkeys((row.series, row.x) for row in result.rows):
+        rows = {row.method: row for row in result.rows if (row.series, row.x) == key}
+        cells = [key[0]] if series else []
+        cells.append(f"{key[1]:g}")
+        if has_paper:
+            cells.append(_best_of_paper(list(rows.values())))
+        cells += [_cell(rows.get(method), "recovery_rate") for method in result.methods]
+        lines.append([*cells, *(_cell(rows.get(DEFAULT), name) for name in shown)])
+    return [*header, *(HONESTY[name] for name in shown)], lines
+
+
+def result_table(result: ExperimentResult) -> Table:
+    """Headline of a result for the console."""
     settings = result.settings
+    vehicles = f"{settings['vehicles']} vehicles, " if "vehicles" in settings else ""
     table = Table(
         box=None,
         pad_edge=False,
+        collapse_padding=True,
         title=result.title,
-        caption=f"{LEGEND} {settings['vehicles']} vehicles, {settings['repetitions']} repetitions, "
-        f"seed {settings['seed']}, drive {settings['drive']}.{_failures(result)}",
+        caption=f"{SHORT_LEGEND} {vehicles}{settings['repetitions']} repetitions, seed {settings['seed']}, "
+        f"drive {settings['drive']}.{_failures(result)}",
         caption_justify="left",
         title_justify="left",
     )
-    table.add_column(escape(result.x_label), justify="right")
-    table.add_column("method", no_wrap=True)
-    for heading in HEADINGS.values():
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in result.rows:
-        table.add_row(f"{row.x:g}", row.method, *(_cell(row.figures[name]) for name in HEADINGS))
+    header, rows = headline(result, SHORT)
+    for number, heading in enumerate(header):
+        first = number == 0 and bool(result.series_label)
+        text = escape(heading).replace("/", "/\n").replace(", ", ",\n")
+        table.add_column(text, justify="left" if first else "right", no_wrap=first)
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
 def result_markdown(result: ExperimentResult) -> str:
-    """Same table as a page, with what is needed to repeat it."""
-    header = [result.x_label, "method", *HEADINGS.values()]
-    rows = [[f"{row.x:g}", row.method, *(_cell(row.figures[name]) for name in HEADINGS)] for row in result.rows]
-    lines = [f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *rows)]
+    """Result as a page, with what is needed to repeat it."""
     settings = ", ".join(f"{name} {value}" for name, value in result.settings.items())
     return "\n".join(
         [
@@ -58,9 +110,13 @@ def result_markdown(result: ExperimentResult) -> str:
             "",
             f"Written by `calibrator experiment {result.name} --out FOLDER`. {LEGEND}{_failures(result)}",
             "",
-            *lines,
+            *markdown_table(*headline(result)),
             "",
             f"![{result.title}]({result.name}.png)",
+            "",
+            DETAILS_LEGEND,
+            "",
+            *markdown_table(*_details(result)),
             "",
             f"Settings: {settings}.",
             "",
@@ -68,13 +124,41 @@ def result_markdown(result: ExperimentResult) -> str:
     )
 
 
-def _cell(figure: Figure) -> str:
-    paper = "" if figure.paper is None else f" ({figure.paper:.2f})"
-    return f"{figure.mean:.3f}{paper}"
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table."""
+    return [f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *rows)]
+
+
+def _details(result: ExperimentResult) -> tuple[list[str], list[list[str]]]:
+    """All figures of all rows, the paper's in brackets."""
+    names = [name for name in DETAILS if any(name in row.figures for row in result.rows)]
+    series = [result.series_label] if result.series_label else []
+    lines = []
+    for row in result.rows:
+        label = [row.series] if series else []
+        figures = (_cell(row, name) + _paper(row.figures.get(name)) for name in names)
+        lines.append([*label, f"{row.x:g}", row.method, *figures])
+    return [*series, result.x_label, "method", *(DETAILS[name] for name in names)], lines
+
+
+def _cell(row: Row | None, name: str) -> str:
+    if row is None or name not in row.figures:
+        return NOTHING
+    return f"{row.figures[name].mean:.3f}"
+
+
+def _paper(figure: Figure | None) -> str:
+    return "" if figure is None or figure.paper is None else f" ({figure.paper:.2f})"
+
+
+def _best_of_paper(rows: Sequence[Row]) -> str:
+    figures = [row.figures["recovery_rate"].paper for row in rows]
+    known = [figure for figure in figures if figure is not None]
+    return f"{max(known):.2f}" if known else NOTHING
 
 
 def _failures(result: ExperimentResult) -> str:
     """Say where an optimisation failed; empty if none did."""
-    failed = {f"{row.x:g} {row.method}": row.figures["failed"].mean for row in result.rows}
-    named = [f"{name} {share:.3f}" for name, share in failed.items() if share]
+    failed = {f"{row.series} {row.x:g} {row.method}".strip(): row.figures.get("failed") for row in result.rows}
+    named = [f"{name} {figure.mean:.3f}" for name, figure in failed.items() if figure is not None and figure.mean]
     return f" Optimisation failed for a share of: {', '.join(named)}." if named else ""

@@ -15,7 +15,7 @@ from calibrator.drive import Array
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import write_atomically
 
-__all__ = ["FrameSeries", "encode_message", "write_candump"]
+__all__ = ["FrameSeries", "encode_message", "sent_values", "write_candump"]
 
 CLASSIC_BYTES = 8
 """Longer frames are CAN FD."""
@@ -79,6 +79,24 @@ def encode_message(
     return FrameSeries(
         arbitration_id=message.frame_id, extended=message.is_extended_frame, time_s=np.asarray(time_s), data=data
     )
+
+
+def sent_values(signal: Signal, values: Array) -> Array:
+    """Values of a signal as a reader of its frames sees them.
+
+    Parameters
+    ----------
+    signal : Signal
+        A signal of the DBC.
+    values : ndarray of shape (n,)
+        Finite physical values in the unit of the DBC.
+
+    Returns
+    -------
+    ndarray of shape (n,)
+        The same in steps of the signal and within its range.
+    """
+    return np.asarray(_raw_codes(signal, values) * float(signal.scale) + float(signal.offset))
 
 
 def write_candump(path: Path, series: Iterable[FrameSeries], *, start_s: float = 0.0, channel: str = "can0") -> int:

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from calibrator.artificial.ground_truth import GroundTruth
-from calibrator.artificial.vehicle import Disturbances, Vehicle, draw_disturbances, vehicle_frames, write_vehicle
+from calibrator.artificial.vehicle import (
+    Disturbances,
+    Vehicle,
+    draw_disturbances,
+    vehicle_drive,
+    vehicle_frames,
+    write_vehicle,
+)
 from calibrator.faults import Faults
 from calibrator.recordings.canlog import FrameSeries
 from ecu_node.database import VehicleDatabase
@@ -108,3 +115,19 @@ def test_truth_holds_the_moments_of_the_true_currents(database: VehicleDatabase,
     assert truth.drift == {"battery": 0.0, "motor": 0.2}
     assert (tmp_path / "logs" / "V1" / "drive.log.gz").is_file()
     assert (tmp_path / "unseen" / "V1" / "drive.log.gz").is_file()
+
+
+def test_drive_without_frames_is_what_the_frames_decode_to(database: VehicleDatabase) -> None:
+    v = vehicle(faults(0.2, 10.0), Disturbances(noise_a=1.0, delay_s=np.array([0.0, 0.2]), unmeasured_a=2.0))
+    drive = vehicle_drive(np.random.default_rng(3), database, v, trip())
+    series = frames(database, v)
+    for name, sign, message, signal in (
+        ("battery", 1.0, "HV_Battery", "BatteryCurrent"),
+        ("motor", -1.0, "HV_Motor", "MotorCurrent"),
+    ):
+        time_s, value = decoded(database, series, message, signal)
+        np.testing.assert_array_equal(drive.branches[name].time_s, time_s)
+        np.testing.assert_allclose(drive.branches[name].value, sign * value, atol=1e-9)
+        assert drive.branches[name].good.all()
+    _, speed = decoded(database, series, "VD_Motion", "VehicleSpeed")
+    np.testing.assert_allclose(drive.inputs["speed"].value, speed, atol=1e-9)

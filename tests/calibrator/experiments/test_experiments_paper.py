@@ -1,44 +1,33 @@
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
-from scipy.signal import lfilter
 
-from calibrator.drive import Array
-from calibrator.errors import DriveError, FleetError
+from calibrator.errors import DriveError
 from calibrator.experiments.common_drive import CommonDrive, builtin_common_drive
-from calibrator.experiments.judging import judge
-from calibrator.experiments.methods import PERFECT, THRESHOLD, TREE
+from calibrator.experiments.common_rows import common_rows, measured_moments
+from calibrator.experiments.common_trial import artificial_trial, noise_sd_a, state_space_trial
+from calibrator.experiments.judging import Effort
+from calibrator.experiments.methods import PERFECT, POSTERIOR, THRESHOLD, TREE
+from calibrator.experiments.outcome import figures_of, judge
 from calibrator.experiments.paper_experiments import (
+    asymmetry_experiment,
     classifier_experiment,
     snr_experiment,
     sparsity_experiment,
     statespace_experiment,
 )
-from calibrator.experiments.runner import run_experiment
-from calibrator.experiments.table import result_table
-from calibrator.experiments.trial import FleetLaw, artificial_trial, noise_sd_a, state_space_trial
+from calibrator.experiments.trial import FleetLaw
 from calibrator.faults import slopes_and_intercepts
+from tests.calibrator.experiments.small_trials import smooth_drive
 
 LAW = FleetLaw(vehicles=100, training_vehicles=1000)
-
-
-def smooth_drive(branches: int = 2, samples: int = 6000) -> CommonDrive:
-    """Currents that follow smooth random inputs through a lag; the last branch takes the balance."""
-    rng = np.random.default_rng(0)
-    inputs = lfilter([0.05], [1.0, -0.95], rng.normal(size=(samples, branches)), axis=0) * 200.0
-    free = lfilter([0.2], [1.0, -0.8], inputs[:, : branches - 1], axis=0) + 5.0
-    i_s: Array = np.column_stack([free, -free.sum(axis=1)])
-    return CommonDrive(name="smooth", i_s=i_s, inputs=inputs, full_scale_a=400.0)
 
 
 def test_artificial_trial_has_the_signal_to_noise_ratio_asked_for() -> None:
     drive = smooth_drive()
     law = replace(LAW, vehicles=400, snr_db=20.0)
-    trial = artificial_trial(drive, law, seed=0)
+    trial = artificial_trial(drive, law, 0)
     noise_a2 = np.mean(trial.evidence.slope_variances * np.sum((drive.unity - drive.unity.mean(axis=0)) ** 2, axis=0))
     assert noise_a2 == pytest.approx(0.01 * np.mean(drive.unity[:, 0] ** 2), rel=0.02)
     assert noise_sd_a(drive, 20.0) == pytest.approx(np.sqrt(noise_a2), rel=0.01)
@@ -47,21 +36,47 @@ def test_artificial_trial_has_the_signal_to_noise_ratio_asked_for() -> None:
 def test_trial_is_the_same_for_the_same_seed_and_differs_from_its_training_fleet() -> None:
     drive = smooth_drive()
     law = replace(LAW, training_vehicles=LAW.vehicles)
-    first, second = artificial_trial(drive, law, seed=3), artificial_trial(drive, law, seed=3)
+    first, second = artificial_trial(drive, law, 3), artificial_trial(drive, law, 3)
     np.testing.assert_array_equal(first.evidence.slopes, second.evidence.slopes)
+    assert first.training is not None
     training, _ = first.training()
     assert not np.array_equal(training.slopes, first.evidence.slopes)
 
 
 def test_state_space_models_of_a_symmetric_fleet_give_the_slopes_of_the_faults() -> None:
-    trial = state_space_trial(smooth_drive(), replace(LAW, vehicles=40), seed=0)
+    trial = state_space_trial(smooth_drive(), replace(LAW, vehicles=40), 0)
     a, b = slopes_and_intercepts(trial.truth)
     np.testing.assert_allclose(trial.evidence.slopes, a, atol=1e-5)
     np.testing.assert_allclose(trial.evidence.intercepts_a, b, atol=1e-3)
 
 
+@pytest.mark.parametrize("branches", [2, 3])
+def test_junction_rows_of_a_common_drive_are_those_of_the_faults(branches: int) -> None:
+    drive = smooth_drive(branches=branches)
+    trial = artificial_trial(drive, LAW, 0)
+    moments = measured_moments(drive.unity, trial.truth)
+    rows = common_rows(trial.evidence, moments, full_scale_a=drive.full_scale_a)
+    factor, offset = 1.0 + trial.truth.drift, trial.truth.offset_a / drive.full_scale_a
+    gains = np.log(factor[:, :1] / factor[:, 1:])
+    constant = factor[:, 0] * np.sum(offset / factor, axis=1)
+    np.testing.assert_allclose(rows.relative[:, branches : 2 * branches - 1], gains, atol=1e-9)
+    np.testing.assert_allclose(rows.constant[:, branches], constant, atol=1e-9)
+
+
+def test_moments_of_measured_currents_are_those_of_their_samples() -> None:
+    drive = smooth_drive(branches=3)
+    truth = artificial_trial(drive, LAW, 0).truth
+    moments = measured_moments(drive.unity, truth)
+    slope, intercept = slopes_and_intercepts(truth)
+    samples = slope[7] * drive.unity + intercept[7]
+    np.testing.assert_allclose(moments.mean_a[7], samples.mean(axis=0))
+    np.testing.assert_allclose(moments.mean_square_a2[7], np.mean(samples**2, axis=0))
+    np.testing.assert_allclose(moments.covariance_a2[7], np.cov(samples.T, bias=True))
+
+
 def test_perfect_classifier_beats_the_tree_and_the_tree_the_threshold() -> None:
-    result = classifier_experiment(drive=smooth_drive(), law=LAW, repetitions=3)
+    methods = (THRESHOLD, TREE, PERFECT)
+    result = classifier_experiment(drive=smooth_drive(), law=LAW, methods=methods, effort=Effort(repetitions=3))
     rates = [result.row(x=60.0, method=m.name).figures["f2"].mean for m in (PERFECT, TREE, THRESHOLD)]
     assert rates[0] == 1.0
     assert rates == sorted(rates, reverse=True)
@@ -71,8 +86,17 @@ def test_perfect_classifier_beats_the_tree_and_the_tree_the_threshold() -> None:
     assert perfect["failed"].mean == 0.0
 
 
+def test_default_without_a_classifier_recovers_as_many_as_the_published_method_with_a_perfect_one() -> None:
+    trial = artificial_trial(smooth_drive(), LAW, 0)
+    default, published = (figures_of(judge(m.estimate(trial), trial)) for m in (POSTERIOR, PERFECT))
+    assert default["recovery_rate"] > published["recovery_rate"] - 0.1
+    assert default["sure_recovered"] > 0.95
+    assert default["harmed"] < 0.05
+
+
 def test_sparser_faults_are_recovered_more_often() -> None:
-    result = sparsity_experiment(drive=smooth_drive(), law=LAW, methods=(PERFECT,), repetitions=2)
+    effort = Effort(repetitions=2)
+    result = sparsity_experiment(drive=smooth_drive(), law=LAW, methods=(PERFECT,), effort=effort)
     rates = [row.figures["recovery_rate"].mean for row in result.rows]
     assert [row.x for row in result.rows] == [20.0, 40.0, 60.0, 80.0]
     assert rates == sorted(rates)
@@ -80,73 +104,49 @@ def test_sparser_faults_are_recovered_more_often() -> None:
 
 
 def test_less_noise_recovers_more_and_noise_alone_recovers_nearly_nothing() -> None:
-    result = snr_experiment(drive=smooth_drive(), law=LAW, snrs_db=(-20.0, 10.0, 60.0), repetitions=2)
+    snrs_db, effort = (-20.0, 10.0, 60.0), Effort(repetitions=2)
+    result = snr_experiment(drive=smooth_drive(), law=LAW, methods=(PERFECT,), snrs_db=snrs_db, effort=effort)
     rates = [row.figures["recovery_rate"].mean for row in result.rows]
     assert rates[0] < 0.2
     assert rates[0] < rates[1] < rates[2]
 
 
 def test_state_space_experiment_recovers_sparse_faults() -> None:
-    law = replace(LAW, vehicles=40)
-    result = statespace_experiment(drive=smooth_drive(), law=law, sparsities=(80.0,), repetitions=1)
-    assert result.rows[0].figures["recovery_rate"].mean > 0.9
+    law, effort = replace(LAW, vehicles=40), Effort(repetitions=1)
+    result = statespace_experiment(drive=smooth_drive(), law=law, sparsities=(80.0,), effort=effort)
+    assert all(row.figures["recovery_rate"].mean > 0.9 for row in result.rows)
+    assert result.methods == (TREE.name, POSTERIOR.name)
+
+
+def test_fleet_that_is_not_symmetric_defeats_the_mean_and_not_the_default() -> None:
+    result = asymmetry_experiment(
+        drive=smooth_drive(), law=LAW, fleet_sizes=(60,), sign_biases=(0.4,), effort=Effort(repetitions=1)
+    )
+    published, default = (result.row(x=60.0, series="0.4", method=m.name) for m in (PERFECT, POSTERIOR))
+    assert published.figures["recovery_rate"].mean < 0.3
+    assert default.figures["recovery_rate"].mean > 0.8
 
 
 def test_three_branches_work_as_two_do() -> None:
-    trial = artificial_trial(smooth_drive(branches=3), replace(LAW, sparsity=80.0), seed=0)
-    assert judge(PERFECT.recover(trial), trial)["recovery_rate"] > 0.7
+    trial = artificial_trial(smooth_drive(branches=3), replace(LAW, sparsity=80.0), 0)
+    assert figures_of(judge(PERFECT.estimate(trial), trial))["recovery_rate"] > 0.7
 
 
-def test_result_survives_json() -> None:
-    result = classifier_experiment(drive=smooth_drive(), law=LAW, methods=(PERFECT,), repetitions=1, seed=7)
-    record = json.loads(result.to_json())
-    assert record["settings"]["seed"] == 7
-    assert record["rows"][0]["figures"]["f2"] == {"mean": 1.0, "sd": 0.0, "paper": 1.0}
-
-
-def test_table_shows_the_papers_figure_beside_ours() -> None:
-    result = snr_experiment(drive=smooth_drive(), law=LAW, snrs_db=(20.0,), repetitions=1)
-    console = Console(width=160)
-    with console.capture() as capture:
-        console.print(result_table(result))
-    assert "(0.91)" in capture.get()
-    assert "SNR [dB]" in capture.get()
-
-
-@pytest.mark.parametrize("name", ["classifier", "snr"])
-def test_runner_writes_page_record_and_picture(name: str, tmp_path: Path) -> None:
-    drive = smooth_drive(samples=2000)
-    result = run_experiment(name, quick=True, repetitions=1, out=tmp_path / "new", drive=drive, jobs=1)
-    page = (tmp_path / "new" / f"{name}.md").read_text()
-    assert f"calibrator experiment {name}" in page
-    assert page.count("\n| ") == 2 + len(result.rows)
-    assert json.loads((tmp_path / "new" / f"{name}.json").read_text())["settings"]["repetitions"] == 1
-    assert (tmp_path / "new" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_runner_takes_the_builtin_drive() -> None:
+def test_builtin_drive_has_the_branches_asked_for_and_an_unseen_drive() -> None:
     drive = builtin_common_drive(branches=3, seed=1, duration_s=120.0)
-    assert drive.i_s.shape[1] == 3
+    assert drive.i_s.shape[1] == drive.unseen.shape[1] == 3
     np.testing.assert_allclose(drive.i_s.sum(axis=1), 0.0, atol=1e-9)
-    result = run_experiment("classifier", quick=True, repetitions=1, jobs=1)
-    assert result.settings["drive"] == "builtin-0"
-
-
-def test_unknown_experiment_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(FleetError, match="no experiment 'noise'; choose one of classifier, snr, sparsity, statespace"):
-        run_experiment("noise")
-
-
-def test_no_repetition_is_refused() -> None:
-    with pytest.raises(FleetError, match="at least 1 repetition, not 0"):
-        run_experiment("snr", repetitions=0)
+    np.testing.assert_allclose(drive.unseen.sum(axis=1), 0.0, atol=1e-9)
+    assert not np.array_equal(drive.i_s[:500], drive.unseen[:500])
 
 
 def test_drive_that_breaks_the_junction_law_is_refused() -> None:
+    currents = np.ones((10, 2))
     with pytest.raises(DriveError, match="must sum to zero; the worst sum is 2 A"):
-        CommonDrive(name="broken", i_s=np.ones((10, 2)), inputs=np.ones((10, 1)), full_scale_a=400.0)
+        CommonDrive(name="broken", i_s=currents, inputs=np.ones((10, 1)), full_scale_a=400.0, unseen=currents)
 
 
 def test_drive_of_unequal_lengths_is_refused() -> None:
+    currents = np.zeros((10, 2))
     with pytest.raises(DriveError, match="do not fit"):
-        CommonDrive(name="broken", i_s=np.zeros((10, 2)), inputs=np.ones((9, 1)), full_scale_a=400.0)
+        CommonDrive(name="broken", i_s=currents, inputs=np.ones((9, 1)), full_scale_a=400.0, unseen=currents)

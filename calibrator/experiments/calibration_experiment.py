@@ -1,0 +1,105 @@
+"""Is the confidence honest: of the vehicles with a confidence of 0.9, is a share of 0.9 recovered?"""
+
+from collections.abc import Iterable, Sequence
+
+from calibrator.errors import FleetError
+from calibrator.experiments.methods import POSTERIOR
+from calibrator.experiments.outcome import BINS, calibration_error
+from calibrator.experiments.result import Bin, ExperimentResult, Figure, Row
+
+__all__ = ["ALL", "calibration_experiment", "pooled_bins"]
+
+ALL = "all together"
+NAME = "calibration"
+
+
+def calibration_experiment(results: Sequence[ExperimentResult]) -> ExperimentResult:
+    """Pool the confidences of the default method over experiments.
+
+    Parameters
+    ----------
+    results : sequence of ExperimentResult
+        Of other experiments; those in which the default has no confidence add nothing.
+
+    Returns
+    -------
+    ExperimentResult
+        One row per experiment, and one of all together; x is the number of vehicles.
+
+    Raises
+    ------
+    FleetError
+        If no experiment has a confidence.
+    """
+    rows_by_name = {
+        result.name: [row for row in result.rows if row.method == POSTERIOR.name and row.bins]
+        for result in results
+        if result.name != NAME
+    }
+    used = {name: rows for name, rows in rows_by_name.items() if rows}
+    if not used:
+        raise FleetError("no experiment has a confidence to check; run 'calibrator experiment all' first")
+    together = [row for rows in used.values() for row in rows]
+    seeds = {str(result.settings.get("repetitions", "?")) for result in results if result.name in used}
+    return ExperimentResult(
+        name=NAME,
+        title="Reliability of the confidence",
+        x_label="vehicles",
+        series_label="experiment",
+        settings={
+            "experiments": ", ".join(used),
+            "repetitions": " or ".join(sorted(seeds)),
+            "seed": " or ".join(sorted({str(r.settings.get("seed", "?")) for r in results if r.name in used})),
+            "drive": "those of the experiments",
+        },
+        rows=tuple(_row(name, rows) for name, rows in {**used, ALL: together}.items()),
+    )
+
+
+def pooled_bins(rows: Iterable[Row]) -> tuple[Bin, ...]:
+    """Bins of several rows together."""
+    bins = [b for row in rows for b in row.bins]
+    found = []
+    for low in (k / BINS for k in range(BINS)):
+        same = [b for b in bins if b.low == low]
+        count = sum(b.count for b in same)
+        if count:
+            confidence = sum(b.count * b.confidence for b in same) / count
+            recovered = sum(b.count * b.recovered for b in same) / count
+            found.append(Bin(low=low, count=count, confidence=confidence, recovered=recovered))
+    return tuple(found)
+
+
+def _row(name: str, rows: Sequence[Row]) -> Row:
+    bins = pooled_bins(rows)
+    vehicles = sum(b.count for b in bins)
+    figures = {
+        "recovery_rate": sum(b.count * b.recovered for b in bins) / vehicles,
+        "confidence": sum(b.count * b.confidence for b in bins) / vehicles,
+        **_sure(rows, vehicles),
+        "ece": calibration_error(bins),
+    }
+    return Row(
+        x=vehicles,
+        series=name,
+        method=POSTERIOR.name,
+        figures={key: Figure(mean=value, sd=0.0) for key, value in figures.items()},
+        bins=bins,
+    )
+
+
+def _sure(rows: Sequence[Row], vehicles: int) -> dict[str, float]:
+    """Share of vehicles above 0.95, their mean confidence and the share of them that is recovered."""
+    counts = [row.figures["sure"].mean * sum(b.count for b in row.bins) for row in rows]
+    total = sum(counts)
+    if not total:
+        return {"sure": 0.0}
+
+    def mean(name: str) -> float:
+        return sum(n * row.figures[name].mean for n, row in zip(counts, rows, strict=True) if n) / total
+
+    return {
+        "sure": total / vehicles,
+        "sure_confidence": mean("sure_confidence"),
+        "sure_recovered": mean("sure_recovered"),
+    }

@@ -1,0 +1,51 @@
+"""Small drives and trials for the tests of the experiments."""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.signal import lfilter
+
+from calibrator.artificial.ground_truth import GroundTruth
+from calibrator.drive import Array
+from calibrator.experiments.common_drive import CommonDrive
+from calibrator.experiments.recorded_fleet import RecordedFleet
+from ecu_node.database import read_database
+from ecu_node.layout import read_layout
+
+LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
+
+
+def smooth_drive(branches: int = 2, samples: int = 6000) -> CommonDrive:
+    """Currents that follow smooth random inputs through a lag; the last branch takes the balance."""
+    rng = np.random.default_rng(0)
+    inputs = _smooth(rng, (samples, branches)) * 200.0
+    free = lfilter([0.2], [1.0, -0.8], inputs[:, : branches - 1], axis=0) + 5.0
+    i_s: Array = np.column_stack([free, -free.sum(axis=1)])
+    return CommonDrive(name="smooth", i_s=i_s, inputs=inputs, full_scale_a=400.0, unseen=i_s[::-1])
+
+
+def small_fleet(trips: int = 12, samples: int = 3000) -> RecordedFleet:
+    """Trips of a car of which the model explains nearly all, with what it needs for two or three branches."""
+    made = tuple(_trip(np.random.default_rng(k), f"trip-{k}", samples) for k in range(trips))
+    return RecordedFleet(name="small", trips=made, database=read_database(read_layout(LAYOUT)))
+
+
+def _trip(rng: np.random.Generator, name: str, samples: int) -> GroundTruth:
+    speed = 40.0 + 60.0 * _smooth(rng, (samples,))
+    speed = np.maximum(speed, 0.0)
+    torque = 150.0 * _smooth(rng, (samples,))
+    voltage = 370.0 + 5.0 * _smooth(rng, (samples,))
+    heater = 3000.0 * (rng.random(samples // 200).repeat(200) > 0.5)
+    motor = (12.0 * torque * speed + 0.1 * torque**2) / voltage + 1.0 * _smooth(rng, (samples,))
+    auxiliary = heater / voltage
+    return GroundTruth(
+        name=name,
+        period_s=0.1,
+        currents_a={"battery": motor + auxiliary, "motor": -motor, "auxiliary": -auxiliary},
+        inputs={"voltage": voltage, "torque": torque, "speed": speed, "heater_demand": heater},
+    )
+
+
+def _smooth(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Random numbers that change within seconds, of a deviation of about a sixth."""
+    return np.asarray(lfilter([0.05], [1.0, -0.95], rng.normal(size=shape), axis=0))

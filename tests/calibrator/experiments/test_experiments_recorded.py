@@ -1,0 +1,126 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrator.drive import Array, Channel, Drive, Mask
+from calibrator.drives.store import write_drive
+from calibrator.errors import FleetError
+from calibrator.experiments.delayed_trial import delayed_trial
+from calibrator.experiments.joined_trial import joined_trial
+from calibrator.experiments.methods import PERFECT, POSTERIOR
+from calibrator.experiments.outcome import figures_of, judge
+from calibrator.experiments.recorded_fleet import RecordedFleet, builtin_fleet, read_fleet
+from calibrator.experiments.recorded_trial import NOISE, RecordedCase, record_vehicles, recorded_trial
+from ecu_node.database import read_database
+from ecu_node.layout import read_layout
+from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet
+
+
+@pytest.fixture(scope="module")
+def fleet() -> RecordedFleet:
+    return small_fleet()
+
+
+def test_trips_of_a_fleet_sum_to_zero_and_have_the_first_branches_of_the_layout(fleet: RecordedFleet) -> None:
+    for count in (2, 3):
+        trip = fleet.with_branches(count)[0]
+        assert tuple(trip.currents_a) == ("battery", "motor", "auxiliary")[:count]
+        np.testing.assert_allclose(trip.matrix_a().sum(axis=1), 0.0, atol=1e-9)
+
+
+def test_more_branches_than_the_trips_have_are_refused(fleet: RecordedFleet) -> None:
+    with pytest.raises(FleetError, match="4 currents asked for; these drives have 3"):
+        fleet.with_branches(4)
+
+
+def test_model_inputs_are_those_of_the_layout_that_the_trip_has(fleet: RecordedFleet) -> None:
+    trip = fleet.trips[0]
+    inputs = fleet.model_inputs(trip)
+    assert "low_voltage_current" not in inputs
+    power = trip.inputs["torque"] * trip.inputs["speed"] / trip.inputs["voltage"]
+    np.testing.assert_allclose(inputs["driving_current"], np.maximum(power, 0.0))
+
+
+def test_samples_obey_the_fault_model_within_noise_and_steps(fleet: RecordedFleet) -> None:
+    case = RecordedCase(branches=3, sparsity=60.0, unmeasured_a=(3.0, 1.0))
+    trips = fleet.with_branches(3)
+    vehicles = record_vehicles(fleet, case, trips, 0)
+    truth, noise_a = vehicles.truth, NOISE * fleet.full_scale_a
+    for j, samples in enumerate(vehicles.samples):
+        true = (samples.currents_a - truth.offset_a[j]) / (1.0 + truth.drift[j])
+        sums = true.sum(axis=1)
+        assert sums.mean() == pytest.approx(vehicles.unmeasured_a[j], abs=0.1)
+        assert sums.std() == pytest.approx(noise_a * np.sqrt(np.sum((1.0 + truth.drift[j]) ** -2)), rel=0.1)
+        steps = samples.currents_a / fleet.resolution_a(samples.branch_names)
+        np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)
+    assert vehicles.unmeasured_a.std() > 0.3
+
+
+def test_default_recovers_recorded_vehicles_that_defeat_the_published_method(fleet: RecordedFleet) -> None:
+    trial = recorded_trial(fleet, RecordedCase(), 0)
+    default, published = (figures_of(judge(m.estimate(trial), trial)) for m in (POSTERIOR, PERFECT))
+    assert default["recovery_rate"] >= 0.9
+    assert default["harmed"] == 0.0
+    assert published["recovery_rate"] < 0.6
+
+
+def test_corrections_are_judged_on_the_trip_of_the_next_vehicle(fleet: RecordedFleet) -> None:
+    case = RecordedCase(sparsity=100.0)
+    trial = recorded_trial(fleet, case, 0)
+    following = fleet.with_branches(2)[1].matrix_a()
+    np.testing.assert_allclose(trial.unseen.mean_a[0], following.mean(axis=0))
+    np.testing.assert_allclose(trial.unseen.mean_square_a2[0], np.mean(following**2, axis=0))
+
+
+def test_joined_trial_has_the_vehicles_and_minutes_asked_for(fleet: RecordedFleet) -> None:
+    trial = joined_trial(fleet, RecordedCase(), 0, vehicles=15, duration_s=120.0)
+    assert len(trial.truth) == 15
+    assert len(trial.evidence) == 15
+    with pytest.raises(FleetError, match="3 usable trips, at least 4 are needed"):
+        joined_trial(fleet, RecordedCase(), 0, vehicles=3, duration_s=120.0)
+
+
+def test_delays_are_found_and_taken_out(fleet: RecordedFleet) -> None:
+    few = fleet.take(6, duration_s=200.0)
+    trial = delayed_trial(few, RecordedCase(), 0, delay_max_s=0.3, compensate=True)
+    assert trial.delay_error_s is not None
+    assert trial.delay_error_s.shape == (6, 1)
+    assert figures_of(judge(POSTERIOR.estimate(trial), trial))["delay_rmse_ms"] < 5.0
+    left_in = delayed_trial(few, RecordedCase(), 0, delay_max_s=0.3, compensate=False)
+    assert left_in.delay_error_s is None
+    np.testing.assert_array_equal(left_in.truth.drift, trial.truth.drift)
+
+
+def test_trips_of_a_store_are_read_and_those_without_good_samples_left_out(
+    fleet: RecordedFleet, tmp_path: Path
+) -> None:
+    layout = read_layout(LAYOUT)
+    for number, trip in enumerate(fleet.trips[:5]):
+        good = np.full(100, number != 4)
+
+        def channel(values: Array, good: Mask = good) -> Channel:
+            return Channel(time_s=0.1 * np.arange(100.0), value=values[:100], good=good)
+
+        drive = Drive(
+            vehicle=trip.name,
+            name="d",
+            branches={name: channel(values) for name, values in trip.currents_a.items()},
+            inputs={name: channel(values) for name, values in trip.inputs.items()},
+        )
+        write_drive(tmp_path / "store", drive, layout)
+    read = read_fleet(tmp_path / "store", read_database(layout))
+    assert read.name == "4 drives of store (1 left out)"
+    assert len(read.trips) == 4
+
+
+def test_builtin_trips_stand_in_for_recordings_and_say_so() -> None:
+    made = builtin_fleet(read_database(read_layout(LAYOUT)), trips=4, duration_s=60.0)
+    assert made.name == "4 built-in trips, no recordings"
+    assert not np.array_equal(made.trips[0].matrix_a()[:400], made.trips[1].matrix_a()[:400])
+
+
+def test_fleet_of_too_few_trips_is_refused(fleet: RecordedFleet) -> None:
+    with pytest.raises(FleetError, match="small: 3 usable trips, at least 4 are needed"):
+        replace(fleet, trips=fleet.trips[:3])

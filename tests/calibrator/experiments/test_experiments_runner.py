@@ -1,0 +1,161 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from calibrator.errors import FleetError
+from calibrator.experiments.calibration_experiment import ALL, calibration_experiment
+from calibrator.experiments.delay_experiment import LEFT_IN, delay_experiment
+from calibrator.experiments.judging import Effort
+from calibrator.experiments.methods import PERFECT, POSTERIOR
+from calibrator.experiments.paper_experiments import classifier_experiment, snr_experiment
+from calibrator.experiments.recorded_experiments import data_experiment, phase_experiment, real_experiment
+from calibrator.experiments.recorded_fleet import RecordedFleet
+from calibrator.experiments.recorded_trial import RecordedCase
+from calibrator.experiments.records import read_results, write_result
+from calibrator.experiments.result import ExperimentResult, decode_result
+from calibrator.experiments.runner import EXPERIMENTS, RunOptions, run_experiments
+from calibrator.experiments.table import headline, result_markdown, result_table
+from calibrator.experiments.trial import FleetLaw
+from calibrator.options import ExperimentName
+from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, smooth_drive
+
+LAW = FleetLaw(vehicles=16, training_vehicles=400)
+ONCE = Effort(repetitions=1)
+
+
+@pytest.fixture(scope="module")
+def fleet() -> RecordedFleet:
+    return small_fleet(trips=6, samples=1800)
+
+
+@pytest.fixture(scope="module")
+def snr() -> ExperimentResult:
+    return snr_experiment(drive=smooth_drive(), law=LAW, snrs_db=(10.0, 20.0), effort=Effort(repetitions=2))
+
+
+def test_result_survives_json(snr: ExperimentResult) -> None:
+    assert decode_result(snr.to_json(), "here") == snr
+    record = json.loads(snr.to_json())
+    assert record["settings"]["repetitions"] == 2
+    assert record["rows"][2]["figures"]["recovery_rate"]["paper"] == 0.91
+
+
+def test_damaged_record_is_named() -> None:
+    with pytest.raises(FleetError, match=r"here\.json: not a record of an experiment: .*run the experiment again"):
+        decode_result(b'{"name": 3}', "here.json")
+
+
+def test_repetitions_do_not_depend_on_the_number_of_processes(snr: ExperimentResult) -> None:
+    effort = Effort(repetitions=2, jobs=2)
+    again = snr_experiment(drive=smooth_drive(), law=LAW, methods=[PERFECT], snrs_db=(10.0, 20.0), effort=effort)
+    assert again.rows == tuple(row for row in snr.rows if row.method == PERFECT.name)
+
+
+def test_headline_puts_paper_published_method_and_default_side_by_side(snr: ExperimentResult) -> None:
+    header, rows = headline(snr)
+    assert header[:5] == ["SNR [dB]", "paper", PERFECT.name, POSTERIOR.name, "confidence"]
+    assert [row[:2] for row in rows] == [["10", "-"], ["20", "0.91"]]
+    assert rows[1][3] == f"{snr.row(x=20.0, method=POSTERIOR.name).figures['recovery_rate'].mean:.3f}"
+
+
+def test_console_table_fits_80_columns(fleet: RecordedFleet) -> None:
+    classifier = classifier_experiment(drive=smooth_drive(samples=2000), law=LAW, effort=ONCE)
+    case = RecordedCase(unmeasured_a=(3.0, 1.0))
+    for result in (classifier, real_experiment(fleet=fleet, cases=[case], effort=ONCE)):
+        console = Console(width=80)
+        with console.capture() as capture:
+            console.print(result_table(result))
+        assert "…" not in capture.get()
+        assert "confidence" in capture.get()
+
+
+def test_page_holds_all_figures_of_all_methods(snr: ExperimentResult) -> None:
+    page = result_markdown(snr)
+    assert "`calibrator experiment snr --out FOLDER`" in page
+    assert page.count("\n| ") == 2 + 2 + 2 + len(snr.rows)
+    assert "(0.91)" in page
+    assert "harmed" in page
+
+
+def test_folder_gets_record_page_picture_and_an_index_of_all_results(snr: ExperimentResult, tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "results"
+    order = tuple(EXPERIMENTS)
+    write_result(folder, snr, order)
+    write_result(folder, replace(snr, name="classifier", title="Second"), order)
+    for name in ("snr", "classifier"):
+        assert (folder / f"{name}.md").is_file()
+        assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert [result.name for result in read_results(folder, order)] == ["classifier", "snr"]
+    index = (tmp_path / "new" / "results.md").read_text()
+    assert index.index("[Second](results/classifier.md)") < index.index("(results/snr.md)")
+    assert "2 repetitions, seed 0, drive smooth" in index
+
+
+def test_calibration_pools_the_confidences_of_the_default_alone(snr: ExperimentResult) -> None:
+    result = calibration_experiment([snr, replace(snr, name="sparsity")])
+    assert [row.series for row in result.rows] == ["snr", "sparsity", ALL]
+    one, _, both = result.rows
+    assert (one.x, both.x) == (64.0, 128.0)
+    assert both.figures["ece"].mean == pytest.approx(one.figures["ece"].mean)
+    rates = [row.figures["recovery_rate"].mean for row in snr.rows if row.method == POSTERIOR.name]
+    assert one.figures["recovery_rate"].mean == pytest.approx(sum(rates) / 2.0)
+    assert one.figures["sure_recovered"].mean <= 1.0
+
+
+def test_calibration_of_nothing_is_refused() -> None:
+    with pytest.raises(FleetError, match="no experiment has a confidence"):
+        calibration_experiment([])
+
+
+def test_calibration_takes_the_records_of_the_folder(snr: ExperimentResult, tmp_path: Path) -> None:
+    write_result(tmp_path / "results", snr, tuple(EXPERIMENTS))
+    (result,) = run_experiments(["calibration"], RunOptions(), out=tmp_path / "results")
+    assert result.settings["experiments"] == "snr"
+    assert (tmp_path / "results" / "calibration.png").is_file()
+
+
+def test_experiments_on_recorded_trips_write_their_pictures(fleet: RecordedFleet, tmp_path: Path) -> None:
+    results = (
+        real_experiment(fleet=fleet, cases=(RecordedCase(),), effort=ONCE),
+        phase_experiment(fleet=fleet, sparsities=(80.0,), magnitudes=((0.05, 0.25),), effort=ONCE),
+        data_experiment(fleet=fleet, minutes=(2.0,), fleet_sizes=(6,), effort=ONCE),
+    )
+    for result in results:
+        write_result(tmp_path / "results", result, tuple(EXPERIMENTS))
+        assert result.methods == (PERFECT.name, POSTERIOR.name)
+        assert (tmp_path / "results" / f"{result.name}.png").is_file()
+    same = [result.rows[1].figures["recovery_rate"] for result in results[:2]]
+    assert same[0] == same[1]
+
+
+def test_delay_experiment_shows_the_default_with_and_without_compensation(fleet: RecordedFleet) -> None:
+    result = delay_experiment(fleet=fleet, delays_ms=(0.0, 300.0), methods=(POSTERIOR,), effort=ONCE)
+    assert [(row.x, row.method) for row in result.rows] == [
+        (0.0, POSTERIOR.name), (0.0, LEFT_IN.name), (300.0, POSTERIOR.name), (300.0, LEFT_IN.name),
+    ]  # fmt: skip
+    assert result.row(x=300.0, method=POSTERIOR.name).figures["delay_rmse_ms"].mean < 5.0
+
+
+def test_runner_runs_quick_experiments_of_both_kinds(tmp_path: Path) -> None:
+    options = RunOptions(quick=True, repetitions=1, layout=LAYOUT, drive=smooth_drive(samples=2000))
+    snr, real = run_experiments(["snr", "real"], options, out=tmp_path / "results")
+    assert snr.settings["drive"] == "smooth"
+    assert real.settings["drive"] == "8 built-in trips, no recordings"
+    assert (tmp_path / "results.md").is_file()
+
+
+def test_every_experiment_has_a_name_on_the_command_line() -> None:
+    assert [*EXPERIMENTS, "calibration", "all"] == list(ExperimentName)
+
+
+def test_unknown_experiment_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(FleetError, match="no experiment 'noise'; choose one of classifier, snr, sparsity, statespace"):
+        run_experiments(["noise"], RunOptions())
+
+
+def test_no_repetition_is_refused() -> None:
+    with pytest.raises(FleetError, match="at least 1 repetition, not 0"):
+        run_experiments(["snr"], RunOptions(repetitions=0, drive=smooth_drive(samples=2000)))
