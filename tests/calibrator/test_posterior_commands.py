@@ -1,0 +1,123 @@
+"""The default method as a user types it: a fleet with delays and a load that no sensor measures."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from calibrator.artificial.truth import read_truth
+from calibrator.results import read_results, read_run
+from ecu_node.database import read_database
+from ecu_node.layout import read_layout
+from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
+
+LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
+DELAY_TOLERANCE_S = 0.005
+
+
+def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "calibrator", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("fleet") / "fleet"
+    run = calibrator(
+        *("simulate", "--vehicles", 20, "--currents", 2, "--sparsity", 80, "--delay", 150, "--unmeasured", 3, 1),
+        *("--minutes", 6, "--unseen-minutes", 1, "--seed", 5, "--layout", LAYOUT, "--out", out),
+    )
+    assert run.returncode == 0, run.stderr
+    return out
+
+
+@pytest.fixture(scope="module")
+def result(fleet: Path) -> Path:
+    out = fleet.parent / "result"
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out)
+    assert run.returncode == 0, run.stderr
+    return out
+
+
+@pytest.fixture(scope="module")
+def parameters(result: Path) -> list[VehicleParameters]:
+    return [read_parameters(path) for path in sorted((result / "params").iterdir())]
+
+
+def test_asymmetric_fleet_with_delays_and_an_unmeasured_load_is_recovered_and_nobody_is_harmed(
+    fleet: Path, result: Path
+) -> None:
+    run = calibrator("score", result, "--truth", fleet / "truth.json", "--json")
+    figures = json.loads(run.stdout)
+    assert figures["recovery_rate"] >= 0.9
+    assert figures["harmed_rate"] == 0.0
+
+
+def test_delay_of_the_motor_is_found_and_stands_in_the_parameter_file(
+    fleet: Path, parameters: list[VehicleParameters]
+) -> None:
+    truth = read_truth(fleet / "truth.json").vehicles
+    for item in parameters:
+        delays = {name: branch.delay_s for name, branch in item.branches.items()}
+        assert all(delay is not None for delay in delays.values())
+        found = (delays["motor"] or 0.0) - (delays["battery"] or 0.0)
+        actual = truth[item.vehicle].delay_s["motor"] - truth[item.vehicle].delay_s["battery"]
+        assert abs(found - actual) < DELAY_TOLERANCE_S
+
+
+def test_every_file_fits_its_vehicle_and_applies_only_what_hardly_harms(parameters: list[VehicleParameters]) -> None:
+    database = read_database(read_layout(LAYOUT))
+    for item in parameters:
+        check_fit(item, database, item.vehicle)
+        for branch in item.branches.values():
+            assert branch.harm_probability is not None
+            assert not branch.apply or branch.harm_probability < 0.001
+
+
+def test_a_vehicle_of_which_nothing_can_be_told_names_its_explanations(parameters: list[VehicleParameters]) -> None:
+    for item in parameters:
+        if item.verdict == "cannot tell":
+            assert item.explanations
+            assert item.deciding_evidence
+            assert not any(branch.apply for branch in item.branches.values())
+
+
+def test_unmeasured_load_is_estimated_from_the_fleet_and_named(fleet: Path, result: Path) -> None:
+    run = read_run(result)
+    truth = [vehicle.unmeasured_a for vehicle in read_truth(fleet / "truth.json").vehicles.values()]
+    assert run.details["reference"]["unmeasured_a"] == pytest.approx(sum(truth) / len(truth), abs=1.0)
+    assert any("load without a sensor" in notice for notice in run.notices)
+
+
+def test_a_stricter_harm_limit_corrects_no_more_branches(fleet: Path, result: Path, tmp_path: Path) -> None:
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "strict", "--harm-limit", 0)
+    assert run.returncode == 0, run.stderr
+    usual, strict = (
+        {(r["vehicle"], r["branch"]): r for r in read_results(out)} for out in (result, tmp_path / "strict")
+    )
+    assert not any(row["applied"] for row in strict.values())
+    assert any(row["applied"] for row in usual.values())
+
+
+def test_trusted_vehicles_are_taken_for_faultless(fleet: Path, tmp_path: Path) -> None:
+    truth = read_truth(fleet / "truth.json").vehicles
+    sound = [
+        name
+        for name, vehicle in truth.items()
+        if not any([*vehicle.drift.values(), *vehicle.offset_a.values(), vehicle.hardware_drift])
+        and not any(vehicle.hardware_offset_a.values())
+    ]
+    trusted = [part for name in sound for part in ("--trusted", name)]
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "result", *trusted)
+    assert run.returncode == 0, run.stderr
+    rows = [row for row in read_results(tmp_path / "result") if row["vehicle"] in sound]
+    assert all(row["drift"] == 0.0 and row["offset_a"] == 0.0 for row in rows)
+
+
+def test_a_vehicle_that_is_not_there_cannot_be_trusted(fleet: Path, tmp_path: Path) -> None:
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "result", "--trusted", "V999")
+    assert run.returncode == 1
+    assert "no vehicle V999 to trust" in run.stderr
+    assert not (tmp_path / "result").exists()
