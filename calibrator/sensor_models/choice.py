@@ -20,7 +20,7 @@ from calibrator.errors import FleetError
 from calibrator.evidence.fleet_model import fit_fleet_model
 from calibrator.sensor_models.families import Family
 from calibrator.sensor_models.fleet_spread import FleetSpread, first_spread, next_spread
-from calibrator.sensor_models.rows import ExcessRows, excess_rows, usual_currents
+from calibrator.sensor_models.rows import ExcessRows, excess_rows
 from calibrator.sensor_models.summary import SensorSummary
 
 __all__ = ["LEAST_LOG_BAYES", "LEAST_VEHICLES", "LINEAR", "SensorModelChoice", "choose_sensor_models"]
@@ -89,11 +89,7 @@ def choose_sensor_models(vehicles: Sequence[SensorSummary]) -> list[list[SensorM
     if len(vehicles) < LEAST_VEHICLES:
         return [[SensorModelChoice(log_bayes_factor=0.0)] * v.summary.branches for v in vehicles]
     read_out = fit_fleet_model([vehicle.summary for vehicle in vehicles]).read_out
-    usual_a = usual_currents(vehicles)
-    found = [
-        _of_family(family, [excess_rows(vehicle, read_out, family, usual_a) for vehicle in vehicles])
-        for family in vehicles[0].families
-    ]
+    found = [_of_family(family, excess_rows(vehicles, read_out, family)) for family in vehicles[0].families]
     return [
         [max(branch, key=lambda choice: choice.log_bayes_factor) for branch in zip(*vehicle, strict=True)]
         for vehicle in zip(*found, strict=True)

@@ -18,7 +18,7 @@ from calibrator.sensor_models.families import Family
 from calibrator.sensor_models.instruments import InstrumentedFit, Instruments
 from calibrator.sensor_models.summary import SensorSummary
 
-__all__ = ["ExcessRows", "excess_rows", "usual_currents"]
+__all__ = ["ExcessRows", "excess_rows"]
 
 UNKNOWN_VARIANCE = 1e4
 """Of a row that says nothing: a hundred times the usual excess. [1]"""
@@ -26,6 +26,8 @@ LEAST_EFFECT = 0.005
 """Least share of a branch's usual current that an excess of usual size must move it by, for a row to count. [1]"""
 MOST_LIKENESS = 1.5
 """An excess of another branch that moves a junction row more than this makes it a row about that branch. [1]"""
+FLEET_FREEDOM = 4.0
+"""Weight of the fleet's usual misfit against that of one vehicle, in instruments."""
 LEAST_SD = 0.005
 """Least deviation of a row: resolution of the signals and of their interpolation. [1]"""
 
@@ -57,30 +59,60 @@ class ExcessRows:
         return np.diag(self.covariance) < UNKNOWN_VARIANCE / 2.0
 
 
-def usual_currents(vehicles: Sequence[SensorSummary]) -> Array:
-    """Median over vehicles of the root mean square of each branch's current beyond its zero, shape (K,). [A]"""
-    return np.asarray(np.median([_rms_a(vehicle) for vehicle in vehicles], axis=0))
-
-
-def excess_rows(vehicle: SensorSummary, read_out: Array, family: Family, usual_a: Array) -> ExcessRows:
-    """Rows of one vehicle for one family.
+def excess_rows(vehicles: Sequence[SensorSummary], read_out: Array, family: Family) -> list[ExcessRows]:
+    """Rows of every vehicle of a fleet for one family.
 
     Parameters
     ----------
-    vehicle : SensorSummary
-        Of the vehicle.
+    vehicles : sequence of SensorSummary
+        One per vehicle.
     read_out : ndarray of shape (M + 1, K)
         Of the fleet model. [A]
     family : Family
-        The family, one of the summary's.
-    usual_a : ndarray of shape (K,)
-        Of the fleet, see :func:`usual_currents`. [A]
+        The family, one of the summaries'.
 
     Returns
     -------
-    ExcessRows
-        Of the vehicle.
+    list of ExcessRows
+        In the order of the vehicles.
     """
+    usual_a = np.median([_rms_a(vehicle) for vehicle in vehicles], axis=0)
+    raw = [_of_vehicle(vehicle, read_out, family, usual_a) for vehicle in vehicles]
+    power = np.stack([np.diag(one.misfit) for one in raw])
+    known = np.stack([one.known for one in raw])
+    usual_power = np.array([np.median(power[told, row]) if told.any() else 0.0 for row, told in enumerate(known.T)])
+    usual_correlation = np.mean([_correlation(one.misfit) for one in raw], axis=0)
+    return [one.rows(usual_power, usual_correlation) for one in raw]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Raw:
+    """Rows of one vehicle before its misfit is seen beside the fleet's."""
+
+    values: Array
+    sampling: Array
+    """Covariance by the spread between blocks. (2K, 2K)"""
+    misfit: Array
+    """Mean products of what the instruments show of the residuals, per degree of freedom. (2K, 2K)"""
+    lever: Array
+    """Mean products of the levers. (2K, 2K)"""
+    freedom: float
+    known: Mask
+    design: Array
+    reference: Array
+
+    def rows(self, usual_power: Array, usual_correlation: Array) -> ExcessRows:
+        """Rows, the misfit drawn towards the fleet's usual one: few instruments tell little of it."""
+        weight = self.freedom / (self.freedom + FLEET_FREEDOM)
+        sd = np.sqrt(weight * np.diag(self.misfit) + (1.0 - weight) * usual_power)
+        correlation = weight * _correlation(self.misfit) + (1.0 - weight) * usual_correlation
+        np.fill_diagonal(correlation, 1.0)
+        covariance = self.sampling + np.outer(sd, sd) * correlation * self.lever
+        covariance += np.diag(np.where(self.known, LEAST_SD**2, UNKNOWN_VARIANCE))
+        return ExcessRows(values=self.values, covariance=covariance, design=self.design, reference=self.reference)
+
+
+def _of_vehicle(vehicle: SensorSummary, read_out: Array, family: Family, usual_a: Array) -> _Raw:
     columns = _Columns.of(vehicle, family, usual_a)
     K = vehicle.summary.branches
     likeness = columns.likeness()
@@ -89,11 +121,27 @@ def excess_rows(vehicle: SensorSummary, read_out: Array, family: Family, usual_a
     fits += [columns.junction_row(k) if own[k] else None for k in range(K)]
     known = np.array([fit is not None for fit in fits])
     scale = np.concatenate([np.ones(K), -columns.gains]) * family.size
-    values = np.array([fit.estimate if fit else 0.0 for fit in fits]) / scale
-    covariance = _covariance(fits, columns.instruments) / np.outer(scale, scale)
-    covariance += np.diag(np.where(known, LEAST_SD**2, UNKNOWN_VARIANCE))
-    design = np.concatenate([np.eye(K), likeness]) * known[:, None]
-    return ExcessRows(values=values, covariance=covariance, design=design, reference=columns.reference)
+    B, Q, _ = vehicle.products.shape
+    influence = np.stack([fit.influence if fit else np.zeros(B) for fit in fits]) / scale[:, None]
+    misfit = np.stack([fit.misfit / np.sqrt(fit.freedom) if fit else np.zeros(Q) for fit in fits])
+    lever = np.stack([fit.lever if fit else np.zeros(Q) for fit in fits]) / scale[:, None]
+    total = columns.instruments.total
+    return _Raw(
+        values=np.array([fit.estimate if fit else 0.0 for fit in fits]) / scale,
+        sampling=influence @ influence.T,
+        misfit=misfit @ total @ misfit.T,
+        lever=lever @ total @ lever.T,
+        freedom=max((fit.freedom for fit in fits if fit), default=1.0),
+        known=known,
+        design=np.concatenate([np.eye(K), likeness]) * known[:, None],
+        reference=columns.reference,
+    )
+
+
+def _correlation(covariance: Array) -> Array:
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(sd > 0.0, sd, np.inf)
+    return np.asarray(covariance / np.outer(safe, safe))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,16 +226,6 @@ class _Columns:
                     share = float(self.instruments.coefficients(self.extra[:, k], z)[-1])
                     likeness[row, k] = self.gains[k] * share / self.gains[row]
         return likeness
-
-
-def _covariance(fits: Sequence[InstrumentedFit | None], instruments: Instruments) -> Array:
-    """Covariance of the coefficients: by the spread of the blocks, and by misfit that all instruments share alike."""
-    B, Q, _ = instruments.products.shape
-    influence = np.stack([fit.influence if fit else np.zeros(B) for fit in fits])
-    misfit = np.stack([fit.misfit / np.sqrt(fit.freedom) if fit else np.zeros(Q) for fit in fits])
-    lever = np.stack([fit.lever if fit else np.zeros(Q) for fit in fits])
-    total = instruments.total
-    return np.asarray(influence @ influence.T + (misfit @ total @ misfit.T) * (lever @ total @ lever.T))
 
 
 def _rms_a(vehicle: SensorSummary) -> Array:
