@@ -1,0 +1,82 @@
+"""Sensor models in the parameter file, and the temperature in the layout."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from msgspec.structs import replace
+
+from ecu_node.cli import main
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import LayoutError
+from ecu_node.layout import read_layout
+from ecu_node.parameters import UnfitError, VehicleParameters, parameter_schema, read_parameters, write_parameters
+from ecu_node.sensor_models import GainBySign, SensorModel, TemperatureDrift
+from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, as_document, parameters_for
+
+MODELS = (
+    GainBySign(drift_positive=0.1, drift_negative=-0.02, difference_sd=0.01),
+    TemperatureDrift(drift_per_k=0.002, reference_c=31.5),
+)
+
+
+def _bent(database: VehicleDatabase, model: SensorModel) -> VehicleParameters:
+    parameters = parameters_for(database, battery=(0.1, 1.0), motor=(0.05, 0.0))
+    battery = replace(parameters.branches["battery"], sensor_model=model)
+    return replace(parameters, branches={**parameters.branches, "battery": battery})
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_sensor_model_is_read_back_and_matches_the_schema(
+    database: VehicleDatabase, tmp_path: Path, model: SensorModel
+) -> None:
+    parameters = _bent(database, model)
+    write_parameters(parameters, tmp_path / "p.json")
+    assert read_parameters(tmp_path / "p.json") == parameters
+    document = json.loads((tmp_path / "p.json").read_text())
+    jsonschema.Draft202012Validator(parameter_schema()).validate(document)
+    assert document["branches"]["motor"]["sensor_model"] is None
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        {"kind": "cubic"},
+        {"drift_per_k": 0.1},
+        {"kind": "temperature"},
+        {"kind": "gain by sign", "drift_positive": 2.0, "drift_negative": 0.0},
+    ],
+)
+def test_what_is_no_sensor_model_is_refused(database: VehicleDatabase, tmp_path: Path, model: dict[str, Any]) -> None:
+    document = as_document(parameters_for(database, battery=(0.1, 1.0)))
+    document["branches"]["battery"]["sensor_model"] = model
+    (tmp_path / "p.json").write_text(json.dumps(document))
+    with pytest.raises(UnfitError, match=r"not a parameter file: .*sensor_model"):
+        read_parameters(tmp_path / "p.json")
+
+
+def test_a_branch_whose_sensor_is_not_linear_is_passed_through_and_said(
+    tmp_path: Path, make_database: Callable[..., VehicleDatabase], capsys: pytest.CaptureFixture[str]
+) -> None:
+    database = make_database(dbc=SMALL_DBC)
+    path = tmp_path / "bent.json"
+    write_parameters(_bent(database, MODELS[0]), path)
+    assert main(["check", "--params", str(path), "--layout", str(database.layout.path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert next(line for line in lines if line.startswith("battery")).endswith("A  passed through")
+    assert next(line for line in lines if line.startswith("motor")).endswith("A  corrected")
+    assert "warning: branch battery is passed through: its sensor model is not linear" in lines[-1]
+
+
+def test_the_projects_own_layout_names_its_temperature() -> None:
+    assert read_layout(LAYOUT).temperature == "junction_box_temperature"
+
+
+def test_a_temperature_that_is_no_input_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "layout.toml"
+    path.write_text(LAYOUT.read_text().replace('temperature = "junction_box_temperature"', 'temperature = "oil"'))
+    with pytest.raises(LayoutError, match=r"layout\.toml: temperature: 'oil' is no \[\[input\]\]; declare the signal"):
+        read_layout(path)
