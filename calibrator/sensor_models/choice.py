@@ -32,6 +32,8 @@ LEAST_LOG_BAYES = 9.2
 """Least logarithm of the Bayes factor with which a model is chosen: it turns 1 % into 99 %."""
 LEAST_VEHICLES = 8
 """Of fewer vehicles it cannot be told what belongs to the fleet model."""
+MOST_SIZES = 4.0
+"""Excess over its usual size beyond which it is no sensor's, but a zero or a branch that was misunderstood. [1]"""
 MOST_BRANCHES = 2
 """Branches of one vehicle that are not linear in the same way, at most. [1]"""
 DESIGN_ERROR = 0.05
@@ -146,7 +148,8 @@ def _choices(
             log_bayes_factor=log_factor,
         )
         linear = SensorModelChoice(log_bayes_factor=log_factor, undecided=not_linear and log_factor > 0.0)
-        choices.append(chosen if log_factor >= LEAST_LOG_BAYES else linear)
+        sensible = abs(excess[k]) <= MOST_SIZES
+        choices.append(chosen if sensible and log_factor >= LEAST_LOG_BAYES else linear)
     return choices
 
 
