@@ -160,6 +160,6 @@ def test_vehicles_that_are_not_alike_are_refused_in_one_line() -> None:
 
 def test_an_excess_that_no_sensor_has_is_not_believed() -> None:
     put: dict[tuple[int, int], SensorModel] = {(3, 0): GainBySign(drift_positive=0.9, drift_negative=-0.1)}
-    choice = choose_sensor_models(make_fleet(vehicles=12, put=put, seed=9).summaries())[3][0]
+    choice = choose_sensor_models(make_fleet(vehicles=30, put=put, seed=1).summaries())[3][0]
     assert choice.log_bayes_factor >= LEAST_LOG_BAYES
     assert (choice.model, choice.undecided) == (LINEAR, True)
