@@ -83,7 +83,7 @@ def _draw_bars(figure: Figure, result: ExperimentResult) -> None:
     axes.set_xticks(np.arange(len(keys)) + width * (len(result.methods) - 1) / 2.0, ticks, fontsize="x-small")
     axes.set(ylabel="recovery rate", ylim=(0.0, 1.02))
     axes.grid(visible=True, axis="y", alpha=0.3)
-    axes.legend(fontsize="small")
+    figure.legend(loc="outside right upper", fontsize="small")
 
 
 def _draw_phase(figure: Figure, result: ExperimentResult) -> None:

@@ -5,6 +5,9 @@ from collections.abc import Collection, Sequence
 from rich.markup import escape
 from rich.table import Table
 
+from calibrator.experiments.calibration_experiment import ALL, pooled_bins
+from calibrator.experiments.methods import POSTERIOR
+from calibrator.experiments.outcome import calibration_error
 from calibrator.experiments.result import ExperimentResult, Figure, Row
 
 __all__ = ["headline", "markdown_table", "result_markdown", "result_table"]
@@ -39,7 +42,7 @@ DETAILS_LEGEND = (
     "figures above, for each method; in brackets the paper."
 )
 NOTHING = "-"
-DEFAULT = "posterior"
+DEFAULT = POSTERIOR.name
 
 
 def headline(result: ExperimentResult, honesty: Collection[str] = tuple(HONESTY)) -> tuple[list[str], list[list[str]]]:
@@ -118,6 +121,7 @@ def result_markdown(result: ExperimentResult) -> str:
             "",
             *markdown_table(*_details(result)),
             "",
+            *_reliability(result),
             f"Settings: {settings}.",
             "",
         ]
@@ -139,6 +143,20 @@ def _details(result: ExperimentResult) -> tuple[list[str], list[list[str]]]:
         figures = (_cell(row, name) + _paper(row.figures.get(name)) for name in names)
         lines.append([*label, f"{row.x:g}", row.method, *figures])
     return [*series, result.x_label, "method", *(DETAILS[name] for name in names)], lines
+
+
+def _reliability(result: ExperimentResult) -> list[str]:
+    """Lines that compare the default's confidence with what became of it; none without a confidence."""
+    bins = pooled_bins(row for row in result.rows if row.method == DEFAULT and row.series != ALL)
+    if not bins:
+        return []
+    rows = [[f"{b.low:.1f}", f"{b.count}", f"{b.confidence:.3f}", f"{b.recovered:.3f}"] for b in bins]
+    return [
+        f"All settings together, by tenths of the default's confidence (ECE {calibration_error(bins):.3f}):",
+        "",
+        *markdown_table(["from", "vehicles", "mean confidence", "recovered"], rows),
+        "",
+    ]
 
 
 def _cell(row: Row | None, name: str) -> str:

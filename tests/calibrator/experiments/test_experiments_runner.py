@@ -75,7 +75,8 @@ def test_console_table_fits_80_columns(fleet: RecordedFleet) -> None:
 def test_page_holds_all_figures_of_all_methods(snr: ExperimentResult) -> None:
     page = result_markdown(snr)
     assert "`calibrator experiment snr --out FOLDER`" in page
-    assert page.count("\n| ") == 2 + 2 + 2 + len(snr.rows)
+    tenths = {b.low for row in snr.rows for b in row.bins}
+    assert page.count("\n| ") == 2 + 2 + 2 + len(snr.rows) + 2 + len(tenths)
     assert "(0.91)" in page
     assert "harmed" in page
 
