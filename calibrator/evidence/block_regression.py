@@ -20,6 +20,8 @@ ROUNDS = 3
 """rho depends on the estimate and the estimate, weakly, on rho. [1]"""
 LEAST_RHO = 1e-9
 """Of the mean square of y: a regression that fits exactly. [1]"""
+LEAST_VARIANCE = 1e-12
+"""Of y where it is zero throughout, so that the prior stays: below a microampere, in any unit that is used."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,14 +71,15 @@ def regress_blocks(
     """
     count, p = right.shape
     Z, y = gram.sum(axis=0), right.sum(axis=0)
-    rho = LEAST_RHO * power
+    least = max(LEAST_RHO * power, LEAST_VARIANCE)
+    rho = least
     for _ in range(ROUNDS):
         A = Z + rho * np.diag(prior_precision)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(A), np.finfo(float).tiny))
         inverse = np.linalg.pinv(A * np.outer(scale, scale), rcond=1e-12, hermitian=True) * np.outer(scale, scale)
         estimate = inverse @ (y + rho * prior_precision * prior_mean)
         scores = right - gram @ estimate
-        rho = max(float(np.mean(np.einsum("bp,pq,bq->b", scores, inverse, scores))) * count / p, LEAST_RHO * power)
+        rho = max(float(np.mean(np.einsum("bp,pq,bq->b", scores, inverse, scores))) * count / p, least)
     scores = scores - scores.mean(axis=0)
     influence = scores @ inverse * np.sqrt(count / max(count - 2.0, 1.0))
     prior_part = rho**2 * inverse @ np.diag(prior_precision) @ inverse

@@ -6,7 +6,8 @@ sum_k (i_m,k - o_k) / (1 + d_k) = l holds at every instant, so the first measure
 
 Least squares would draw the g of a small branch towards zero, as its measured current holds noise (errors in
 variables); the noise is therefore taken out of the second moments first. How much noise there is, is bounded by the
-fast changes of each current, and by what the junction law leaves unexplained.
+fast changes of each current; and all sensors' noise together by what the junction law leaves unexplained, which they
+share equally as far as the first bound allows.
 """
 
 import numpy as np
@@ -48,13 +49,23 @@ def junction_law(summary: DriveSummary) -> BlockRegression:
     prior_precision = np.append(np.full(K - 1, GAIN_SD**-2), 0.0)
     variance = np.diag(summary.mean_product_a2) - summary.mean_a**2
     bound = np.minimum(summary.noise_a2.mean(axis=0), MOST_NOISE * variance)
-    noise = np.zeros(K)
+    noise: Array = np.zeros(K)
     for _ in range(NOISE_ROUNDS):
         clean = gram - samples[:, None, None] * np.diag(np.append(noise[1:], 0.0))
         power = float(total[M, M] / total[-1, -1])
         fit = regress_blocks(clean, right, power, prior_mean=prior_mean, prior_precision=prior_precision)
-        noise = np.minimum(bound, _residual_a2(total, M, K, fit.estimate) / _weights(fit.estimate))
+        noise = _shared(_residual_a2(total, M, K, fit.estimate), bound, _weights(fit.estimate))
     return fit
+
+
+def _shared(residual_a2: float, bound_a2: Array, weights: Array) -> Array:
+    """Noise of each current, equal up to its bound, that adds up to the residual at most. [A^2]"""
+    order = np.argsort(bound_a2, kind="stable")
+    bound, weight = bound_a2[order], weights[order]
+    below = np.concatenate([[0.0], np.cumsum(weight * bound)[:-1]])
+    level = (residual_a2 - below) / np.cumsum(weight[::-1])[::-1]
+    reached = np.flatnonzero(level <= bound)
+    return np.minimum(bound_a2, level[reached[0]]) if reached.size else bound_a2
 
 
 def _weights(estimate: Array) -> Array:
