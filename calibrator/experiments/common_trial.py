@@ -44,8 +44,8 @@ def artificial_trial(drive: CommonDrive, law: FleetLaw, seed: int) -> Trial:
         Evidence of N vehicles on the unity drive.
     """
     streams = (Purpose.FAULTS, Purpose.SIMULATION_ERROR)
-    evidence, truth = _artificial_fleet(drive, law, law.vehicles, streams=streams, seed=seed)
-    return _trial(drive, law, evidence, truth, seed)
+    simulated, truth = _artificial_fleet(drive, law, law.vehicles, streams=streams, seed=seed)
+    return _trial(drive, law, simulated, truth, seed)
 
 
 def state_space_trial(drive: CommonDrive, law: FleetLaw, seed: int, *, order: int | None = None) -> Trial:
@@ -71,36 +71,42 @@ def state_space_trial(drive: CommonDrive, law: FleetLaw, seed: int, *, order: in
             order = choose_order(drive.inputs[:start], measured[:start])
         model = identify(drive.inputs[:start], measured[:start], order=order)
         simulated.append(model.simulate(drive.inputs, initial_state=model.x0)[start:])
-    return _trial(drive, law, _evidence(simulated, drive, truth), truth, seed)
+    return _trial(drive, law, simulated, truth, seed)
 
 
-def _trial(drive: CommonDrive, law: FleetLaw, evidence: FleetEvidence, truth: Faults, seed: int) -> Trial:
-    streams = (Purpose.TRAINING_FAULTS, Purpose.TRAINING_ERROR)
+def _trial(drive: CommonDrive, law: FleetLaw, simulated: Iterable[Array], truth: Faults, seed: int) -> Trial:
+    reference = fleet_mean(simulated)
+    evidence = _evidence(simulated, reference, drive, truth)
     return Trial(
         smallest_fault=law.magnitude[0],
         full_scale_a=drive.full_scale_a,
         truth=truth,
         unseen=unseen_drive(drive.unseen.mean(axis=0), np.mean(drive.unseen**2, axis=0), truth),
-        posterior=partial(_posterior, drive, evidence, truth),
+        posterior=partial(_posterior, drive, evidence, reference.mean(axis=0), truth),
         collect=lambda: evidence,
-        training=partial(_artificial_fleet, drive, law, law.training_vehicles, streams=streams, seed=seed),
+        training=partial(_training, drive, law, seed),
     )
 
 
-def _posterior(drive: CommonDrive, evidence: FleetEvidence, truth: Faults) -> FleetPosterior:
+def _posterior(drive: CommonDrive, evidence: FleetEvidence, reference_mean_a: Array, truth: Faults) -> FleetPosterior:
     """Default method on the simulations, and on the moments of what the vehicles measured on the unity drive."""
     measured = measured_moments(drive.unity, truth)
-    rows = common_rows(evidence, measured, full_scale_a=drive.full_scale_a)
+    rows = common_rows(evidence, reference_mean_a, measured, full_scale_a=drive.full_scale_a)
     moments = Moments(mean_a=measured.mean_a, mean_square_a2=measured.mean_square_a2)
     return estimate_fleet(rows, moments, full_scale_a=drive.full_scale_a)
 
 
 def _artificial_fleet(
     drive: CommonDrive, law: FleetLaw, vehicles: int, *, streams: tuple[Purpose, Purpose], seed: int
-) -> tuple[FleetEvidence, Faults]:
+) -> tuple[Iterable[Array], Faults]:
     truth = _draw(drive, law, vehicles, streams[0], seed)
-    simulated = _ArtificialSimulation(drive.unity, truth, noise_sd_a(drive, law.snr_db), streams[1], seed)
-    return _evidence(simulated, drive, truth), truth
+    return _ArtificialSimulation(drive.unity, truth, noise_sd_a(drive, law.snr_db), streams[1], seed), truth
+
+
+def _training(drive: CommonDrive, law: FleetLaw, seed: int) -> tuple[FleetEvidence, Faults]:
+    streams = (Purpose.TRAINING_FAULTS, Purpose.TRAINING_ERROR)
+    simulated, truth = _artificial_fleet(drive, law, law.training_vehicles, streams=streams, seed=seed)
+    return _evidence(simulated, fleet_mean(simulated), drive, truth), truth
 
 
 def _draw(drive: CommonDrive, law: FleetLaw, vehicles: int, stream: Purpose, seed: int) -> Faults:
@@ -109,9 +115,9 @@ def _draw(drive: CommonDrive, law: FleetLaw, vehicles: int, stream: Purpose, see
     )
 
 
-def _evidence(simulated: Iterable[Array], drive: CommonDrive, truth: Faults) -> FleetEvidence:
+def _evidence(simulated: Iterable[Array], reference: Array, drive: CommonDrive, truth: Faults) -> FleetEvidence:
     junction = np.array([junction_mean_square(measured) for measured in _measured(drive.unity, truth)])
-    return collect_evidence(simulated, fleet_mean(simulated), junction)
+    return collect_evidence(simulated, reference, junction)
 
 
 def _measured(i_s: Array, truth: Faults) -> Iterator[Array]:

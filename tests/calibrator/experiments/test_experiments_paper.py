@@ -55,12 +55,31 @@ def test_junction_rows_of_a_common_drive_are_those_of_the_faults(branches: int) 
     drive = smooth_drive(branches=branches)
     trial = artificial_trial(drive, LAW, 0)
     moments = measured_moments(drive.unity, trial.truth)
-    rows = common_rows(trial.evidence, moments, full_scale_a=drive.full_scale_a)
+    rows = common_rows(trial.evidence, drive.unity.mean(axis=0), moments, full_scale_a=drive.full_scale_a)
     factor, offset = 1.0 + trial.truth.drift, trial.truth.offset_a / drive.full_scale_a
     gains = np.log(factor[:, :1] / factor[:, 1:])
     constant = factor[:, 0] * np.sum(offset / factor, axis=1)
     np.testing.assert_allclose(rows.relative[:, branches : 2 * branches - 1], gains, atol=1e-9)
     np.testing.assert_allclose(rows.constant[:, branches], constant, atol=1e-9)
+
+
+def test_rows_over_the_densest_cluster_do_not_feel_that_the_fleet_is_not_symmetric() -> None:
+    drive = smooth_drive()
+    law = replace(LAW, vehicles=300, symmetric=False, sign_bias=0.4)
+    trial = artificial_trial(drive, law, 0)
+    a, b = slopes_and_intercepts(trial.truth)
+    reference_mean_a = np.median(
+        (a * drive.unity.mean(axis=0) + b - trial.evidence.intercepts_a) / trial.evidence.slopes, 0
+    )
+    moments = measured_moments(drive.unity, trial.truth)
+    rows = common_rows(trial.evidence, reference_mean_a, moments, full_scale_a=drive.full_scale_a)
+    sd = np.sqrt(np.einsum("nii->ni", rows.covariance))
+    assert np.abs(trial.evidence.slopes - a).max() > 10.0 * sd[:, :2].max()
+    slope_error = (rows.relative[:, :2] - np.log(a)) / sd[:, :2]
+    intercept_error = (rows.constant[:, :2] - b / drive.full_scale_a) / (a * sd[:, 5:7])
+    for error in (slope_error, intercept_error):
+        assert error.std() == pytest.approx(1.0, abs=0.1)
+        assert np.abs(error.mean(axis=0)).max() < 0.5
 
 
 def test_moments_of_measured_currents_are_those_of_their_samples() -> None:
