@@ -1,0 +1,147 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrator.drive import Array
+from calibrator.faults import Faults
+from calibrator.posterior.decision import Points, best_estimates, harm_probability, spread_points
+from calibrator.posterior.states import States, enumerate_states
+from calibrator.score import correction_error_rms
+from tests.calibrator.posterior.simulated_rows import faults_of, no_spread, prior_of, rows_of
+
+K = 2
+DRAWS = 100_000
+LEAST = (0.05, 0.05)
+
+
+def no_faults(vehicles: int) -> Faults:
+    return faults_of(np.zeros((vehicles, K + 1)), np.zeros((vehicles, 2 * K - 1)))
+
+
+def states_of(weight: Array, drift: Array, offset: Array, *, sd: float) -> States:
+    """One vehicle whose states have these weights (S,), drifts and offsets (S, K); each nonzero one has this sd."""
+    relative = np.concatenate([np.zeros((len(weight), 1)), drift], axis=1)[None]
+    constant = np.concatenate([np.zeros((len(weight), K - 1)), offset], axis=1)[None]
+    some = enumerate_states(rows_of(no_faults(1)), prior_of(K), no_spread(K))
+    return replace(
+        some,
+        weight=weight[None],
+        relative=relative,
+        relative_sd=sd * (relative != 0.0),
+        constant=constant,
+        constant_sd=sd * (constant != 0.0),
+    )
+
+
+TWO_EXPLANATIONS = (
+    np.array([0.7, 0.3]),
+    np.array([[0.12, 0.0], [0.0, -0.11]]),
+    np.array([[0.0, 0.1], [0.0, 0.1]]),
+)
+
+
+def drawn(states: States, seed: int = 0) -> Points:
+    """Plain draws from the same posterior."""
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(states.weight.shape[1], p=states.weight[0], size=DRAWS)
+    drift = states.drift[0, chosen] + states.relative_sd[0, chosen, 1:] * rng.normal(size=(DRAWS, K))
+    offset = states.offset[0, chosen] + states.constant_sd[0, chosen, K - 1 :] * rng.normal(size=(DRAWS, K))
+    return Points(np.full(DRAWS, 1.0 / DRAWS), drift, offset)
+
+
+@pytest.mark.parametrize("sd", [0.001, 0.004, 0.006, 0.01, 0.03])
+def test_confidence_is_the_probability_to_be_within_tolerance(sd: float) -> None:
+    states = states_of(*TWO_EXPLANATIONS, sd=sd)
+    state, confidence = best_estimates(spread_points(states, 0), states, 0, least=LEAST)
+    same, expected = best_estimates(drawn(states), states, 0, least=LEAST)
+    assert state == same == 0
+    assert confidence == pytest.approx(expected, abs=0.15)
+
+
+def test_sharp_states_give_their_own_weight() -> None:
+    states = states_of(*TWO_EXPLANATIONS, sd=1e-6)
+    state, confidence = best_estimates(spread_points(states, 0), states, 0, least=LEAST)
+    assert state == 0
+    assert confidence == pytest.approx(0.7)
+
+
+def test_states_within_tolerance_of_each_other_count_together() -> None:
+    weight = np.array([0.4, 0.3, 0.3])
+    drift = np.array([[0.2, 0.0], [0.0, 0.1], [0.0, 0.1004]])
+    states = states_of(weight, drift, np.zeros((3, K)), sd=1e-6)
+    state, confidence = best_estimates(spread_points(states, 0), states, 0, least=LEAST)
+    assert state in {1, 2}
+    assert confidence == pytest.approx(0.6)
+
+
+def test_small_faults_are_counted_with_the_fleets_smallest() -> None:
+    states = states_of(np.array([0.5, 0.5]), np.array([[0.0, 0.0], [0.004, 0.0]]), np.zeros((2, K)), sd=1e-7)
+    points = spread_points(states, 0)
+    assert best_estimates(points, states, 0, least=(0.05, 0.05))[1] == pytest.approx(1.0)
+    assert best_estimates(points, states, 0, least=(0.005, 0.05))[1] == pytest.approx(0.5)
+
+
+def test_points_have_the_mean_and_spread_of_the_states() -> None:
+    states = states_of(*TWO_EXPLANATIONS, sd=0.01)
+    points, plain = spread_points(states, 0), drawn(states)
+    assert points.weight.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(points.weight @ points.drift, plain.weight @ plain.drift, atol=0.003)
+    np.testing.assert_allclose(points.weight @ points.drift**2, plain.weight @ plain.drift**2, rtol=0.1)
+
+
+MEAN, SQUARE = np.array([[0.1, -0.1]]), np.array([[0.05, 0.05]])
+
+
+def harm(points: Points, drift: Array, offset: Array) -> Array:
+    return harm_probability(points, drift, offset, mean=MEAN, mean_square=SQUARE)
+
+
+@pytest.mark.parametrize("sd", [0.001, 0.05, 0.1])
+def test_harm_is_the_probability_that_correction_makes_it_worse(sd: float) -> None:
+    states = states_of(*TWO_EXPLANATIONS, sd=sd)
+    estimate = states.drift[0, 0], states.offset[0, 0]
+    np.testing.assert_allclose(harm(spread_points(states, 0), *estimate), harm(drawn(states), *estimate), atol=0.1)
+
+
+def test_harm_of_a_wrong_explanation_is_the_weight_of_the_others() -> None:
+    states = states_of(*TWO_EXPLANATIONS, sd=1e-6)
+    result = harm(spread_points(states, 0), states.drift[0, 0], np.zeros(K))
+    np.testing.assert_allclose(result, [0.3, 0.0], atol=1e-9)
+
+
+def test_harm_is_counted_by_the_errors_of_the_currents_themselves() -> None:
+    rng = np.random.default_rng(1)
+    i = rng.normal(0.1, 0.2, size=(20_000, K))
+    truth, estimate = (np.array([0.1, 0.0]), np.array([0.02, 0.0])), (np.array([0.05, 0.02]), np.array([0.0, 0.01]))
+    measured = (1.0 + truth[0]) * i + truth[1]
+    corrected = (measured - estimate[1]) / (1.0 + estimate[0])
+    worse = np.mean((corrected - i) ** 2, axis=0) > np.mean((measured - i) ** 2, axis=0)
+    points = Points(np.ones(1), truth[0][None], truth[1][None])
+    result = harm_probability(points, *estimate, mean=i.mean(axis=0)[None], mean_square=np.mean(i**2, axis=0)[None])
+    np.testing.assert_array_equal(result > 0.5, worse)
+    rms = correction_error_rms(
+        true_drift=truth[0],
+        true_offset_a=truth[1],
+        drift=estimate[0],
+        offset_a=estimate[1],
+        mean_a=i.mean(axis=0),
+        mean_square_a2=np.mean(i**2, axis=0),
+    )
+    np.testing.assert_allclose(rms, np.sqrt(np.mean((corrected - i) ** 2, axis=0)))
+
+
+def test_nothing_changed_does_no_harm() -> None:
+    states = states_of(*TWO_EXPLANATIONS, sd=0.05)
+    np.testing.assert_array_equal(harm(spread_points(states, 0), np.zeros(K), np.zeros(K)), 0.0)
+
+
+def test_harm_is_that_of_the_worst_drive() -> None:
+    points = Points(np.ones(1), np.array([[0.1, 0.0]]), np.array([[-0.02, 0.0]]))
+    estimate = np.array([0.1, 0.0]), np.array([0.01, 0.0])
+    large, small = np.array([[0.9, 0.9]]), np.array([[1e-6, 1e-6]])
+    none = np.zeros((1, K))
+    alone = [harm_probability(points, *estimate, mean=none, mean_square=square)[0] for square in (large, small)]
+    both = harm_probability(points, *estimate, mean=np.zeros((2, K)), mean_square=np.concatenate([large, small]))[0]
+    assert alone == [0.0, 1.0]
+    assert both == 1.0

@@ -1,0 +1,139 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrator.artificial.random_fleet import draw_faults
+from calibrator.errors import FleetError
+from calibrator.evidence.rows import FleetRows
+from calibrator.faults import Faults
+from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
+from calibrator.score import recovered
+from tests.calibrator.posterior.simulated_rows import (
+    FULL_SCALE_A,
+    Errors,
+    parameters_of,
+    prior_of,
+    random_faults,
+    rows_of,
+)
+
+K, VEHICLES = 2, 80
+
+
+def moments_of(vehicles: int, branches: int = K) -> Moments:
+    """Of usual drives: 60 A root mean square."""
+    return Moments(mean_a=np.full((vehicles, branches), 5.0), mean_square_a2=np.full((vehicles, branches), 3600.0))
+
+
+def estimate(faults: Faults, seed: int = 0, errors: Errors | None = None) -> FleetPosterior:
+    rows = rows_of(faults, seed=seed, errors=errors)
+    return estimate_fleet(rows, moments_of(len(faults), rows.branches), full_scale_a=FULL_SCALE_A)
+
+
+def share_recovered(posterior: FleetPosterior, truth: Faults) -> float:
+    return float(recovered(posterior.faults, truth, full_scale_a=FULL_SCALE_A, smallest_fault=0.05).mean())
+
+
+@pytest.fixture(scope="module")
+def truth() -> Faults:
+    return random_faults(1, vehicles=VEHICLES, branches=K, sparsity=66.0)
+
+
+@pytest.fixture(scope="module")
+def posterior(truth: Faults) -> FleetPosterior:
+    return estimate(truth, seed=1)
+
+
+def test_faults_of_a_lopsided_fleet_are_recovered(truth: Faults, posterior: FleetPosterior) -> None:
+    assert share_recovered(posterior, truth) > 0.85
+
+
+def test_confidence_is_the_share_recovered(truth: Faults, posterior: FleetPosterior) -> None:
+    right = recovered(posterior.faults, truth, full_scale_a=FULL_SCALE_A, smallest_fault=0.05)
+    assert posterior.confidence.mean() == pytest.approx(right.mean(), abs=0.1)
+    assert right[posterior.confidence > 0.95].mean() > 0.95
+
+
+def test_probabilities_of_faults_tell_the_faulty_from_the_others(truth: Faults, posterior: FleetPosterior) -> None:
+    faulty = (truth.drift != 0.0) | (truth.offset_a != 0.0)
+    assert posterior.sensor_fault[faulty].mean() > 0.85
+    assert posterior.sensor_fault[~faulty].mean() < 0.15
+    hardware = truth.has_hardware_fault
+    assert posterior.hardware_fault[hardware].mean() > posterior.hardware_fault[~hardware].mean() + 0.5
+
+
+def test_hyperparameters_are_those_that_the_fleet_was_drawn_with(truth: Faults, posterior: FleetPosterior) -> None:
+    learnt = posterior.hyperparameters
+    assert learnt.prior.hardware_share == pytest.approx(truth.has_hardware_fault.mean(), abs=0.15)
+    for slab, parameters in zip((learnt.prior.relative, learnt.prior.constant), parameters_of(truth), strict=True):
+        magnitudes = np.abs(parameters[parameters != 0.0])
+        assert slab.low == pytest.approx(magnitudes.min(), abs=0.015)
+        assert slab.high == pytest.approx(magnitudes.max(), abs=0.015)
+    assert np.abs(learnt.spread.mean).max() < 0.003
+    np.testing.assert_allclose(learnt.prior.counts.sum(axis=1), 1.0)
+
+
+def test_spread_between_faultless_vehicles_is_learnt() -> None:
+    wide = Errors(slope=0.010, ratio=0.0005, intercept=0.001, junction=0.0005)
+    faults = random_faults(2, vehicles=VEHICLES, branches=K, sparsity=66.0)
+    rows = rows_of(faults, seed=2, errors=wide)
+    stated = replace(rows, covariance=np.repeat(Errors().covariance(K)[None], VEHICLES, axis=0))
+    posterior = estimate_fleet(stated, moments_of(VEHICLES), full_scale_a=FULL_SCALE_A)
+    learnt = np.sqrt(np.diag(posterior.hyperparameters.spread.covariance))[:K]
+    np.testing.assert_allclose(learnt, np.sqrt(0.010**2 - 0.002**2), rtol=0.4)
+
+
+def test_a_given_prior_is_kept(truth: Faults) -> None:
+    prior = prior_of(K)
+    posterior = estimate_fleet(rows_of(truth), moments_of(VEHICLES), full_scale_a=FULL_SCALE_A, given=prior)
+    assert posterior.hyperparameters.prior == prior
+    assert share_recovered(posterior, truth) > 0.85
+
+
+def test_a_fleet_without_faults_gets_no_corrections() -> None:
+    none = draw_faults(
+        np.random.default_rng(3),
+        vehicles=40,
+        branches=K,
+        sparsity=100.0,
+        magnitude=(0.05, 0.25),
+        full_scale_a=FULL_SCALE_A,
+    )
+    posterior = estimate(none, seed=3)
+    assert np.abs(posterior.faults.drift).max() < 0.005
+    assert np.abs(posterior.faults.offset_a).max() < 0.005 * FULL_SCALE_A
+    assert posterior.sensor_fault.mean() < 0.1
+
+
+def test_an_error_of_the_reference_common_to_all_is_taken_out(truth: Faults, posterior: FleetPosterior) -> None:
+    rows = rows_of(truth, seed=1)
+    relative = rows.relative.copy()
+    relative[:, :K] += 0.03
+    moved = estimate_fleet(
+        FleetRows(relative=relative, constant=rows.constant, covariance=rows.covariance),
+        moments_of(VEHICLES),
+        full_scale_a=FULL_SCALE_A,
+    )
+    np.testing.assert_allclose(moved.hyperparameters.spread.mean[:K], 0.03, atol=0.003)
+    assert share_recovered(moved, truth) == pytest.approx(share_recovered(posterior, truth), abs=0.05)
+
+
+def test_what_is_sure_does_no_harm(truth: Faults, posterior: FleetPosterior) -> None:
+    deployed = (posterior.harm < 1e-3) & ((posterior.faults.drift != 0.0) | (posterior.faults.offset_a != 0.0))
+    before = np.hypot(truth.drift, truth.offset_a / FULL_SCALE_A)
+    left = np.hypot(posterior.faults.drift - truth.drift, (posterior.faults.offset_a - truth.offset_a) / FULL_SCALE_A)
+    assert deployed.sum() > 30
+    assert (left < before)[deployed].all()
+
+
+def test_deviations_are_those_of_the_errors(truth: Faults, posterior: FleetPosterior) -> None:
+    sure = posterior.confidence > 0.99
+    z = (posterior.faults.drift - truth.drift)[sure] / np.maximum(posterior.drift_sd[sure], 1e-4)
+    assert np.sqrt(np.mean(z[truth.drift[sure] != 0.0] ** 2)) < 2.0
+
+
+def test_evidence_of_the_wrong_shape_is_refused() -> None:
+    rows = rows_of(random_faults(5, vehicles=3, branches=K, sparsity=66.0))
+    with pytest.raises(FleetError, match="do not fit a covariance"):
+        replace(rows, covariance=rows.covariance[:2])
