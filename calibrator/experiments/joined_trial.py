@@ -1,8 +1,11 @@
-"""Trials of any number of vehicles with any length of driving, from pieces of recorded trips."""
+"""Trials of any number of vehicles with any length of driving, from runs of recorded trips."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
-from calibrator.artificial.ground_truth import cut_and_rejoin
+import numpy as np
+
+from calibrator.artificial.ground_truth import GroundTruth
 from calibrator.experiments.recorded_fleet import RecordedFleet
 from calibrator.experiments.recorded_trial import RecordedCase, recorded_trial
 from calibrator.experiments.trial import Trial
@@ -12,14 +15,15 @@ __all__ = ["joined_trial"]
 
 
 def joined_trial(fleet: RecordedFleet, case: RecordedCase, seed: int, *, vehicles: int, duration_s: float) -> Trial:
-    """Trial in which each vehicle drives random pieces of the trips.
+    """Trial in which each vehicle starts somewhere in a random trip, and goes on with the trips after it.
 
-    Pieces are cut at standstill and joined anew. Vehicles may share pieces, but not the order of all of them.
+    So a short drive is of one trip, with its own weather and traffic, as it is with a real vehicle. Vehicles may share
+    trips, but hardly ever their start.
 
     Parameters
     ----------
     fleet : RecordedFleet
-        The trips that pieces are taken from.
+        The trips; after the last comes the first.
     case : RecordedCase
         What is put on top of them.
     seed : int
@@ -35,8 +39,26 @@ def joined_trial(fleet: RecordedFleet, case: RecordedCase, seed: int, *, vehicle
         Of N vehicles.
     """
     samples = int(duration_s / fleet.period_s)
-    trips = []
-    for j in range(vehicles):
-        rng = random_stream(Purpose.CALIBRATION_TRIP, seed, j)
-        trips.append(cut_and_rejoin(rng, fleet.trips, duration_s=duration_s, name=f"joined-{j}").part(0, samples))
+    trips = [
+        _run(random_stream(Purpose.CALIBRATION_TRIP, seed, j), fleet.trips, samples, f"run-{j}")
+        for j in range(vehicles)
+    ]
     return recorded_trial(replace(fleet, trips=tuple(trips)), case, seed)
+
+
+def _run(rng: np.random.Generator, trips: Sequence[GroundTruth], samples: int, name: str) -> GroundTruth:
+    """So many samples from a random start on."""
+    k = int(rng.integers(len(trips)))
+    parts = [trips[k].part(int(rng.integers(len(trips[k]))), len(trips[k]))]
+    while sum(map(len, parts)) < samples:
+        k = (k + 1) % len(trips)
+        parts.append(trips[k])
+
+    common = [key for key in trips[0].inputs if all(key in trip.inputs for trip in trips)]
+    whole = GroundTruth(
+        name=name,
+        period_s=trips[0].period_s,
+        currents_a={key: np.concatenate([part.currents_a[key] for part in parts]) for key in trips[0].currents_a},
+        inputs={key: np.concatenate([part.inputs[key] for part in parts]) for key in common},
+    )
+    return whole.part(0, samples)

@@ -17,7 +17,7 @@ delay_rmse_ms                        root mean square error of the estimated del
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from calibrator.drive import Array, Mask
 from calibrator.experiments.methods import Estimate
 from calibrator.experiments.result import Bin
 from calibrator.experiments.trial import Trial
-from calibrator.faults import Faults
 from calibrator.score import f2_score, harmed, recovered
 
 __all__ = ["Outcome", "calibration_error", "confidence_bins", "figures_of", "judge", "pooled"]
@@ -92,7 +91,6 @@ def judge(estimate: Estimate, trial: Trial) -> Outcome:
         )
 
     nothing, count = np.zeros(0), len(trial.truth)
-    moments = {"mean_a": trial.unseen.mean_a, "mean_square_a2": trial.unseen.mean_square_a2}
     return Outcome(
         recovered=within(0.10),
         recovered_25=within(0.25),
@@ -101,7 +99,7 @@ def judge(estimate: Estimate, trial: Trial) -> Outcome:
         hardware=trial.truth.has_hardware_fault,
         faulty=trial.truth.has_sensor_fault,
         corrected=np.any(estimate.corrected, axis=1),
-        harmed=harmed(_deployed(estimate), trial.truth, **moments),
+        harmed=_harmed(estimate, trial),
         failed=np.full(count, estimate.failed / count),
         delay_error_s=nothing if trial.delay_error_s is None else trial.delay_error_s.ravel(),
     )
@@ -182,11 +180,15 @@ def _share(values: Array | Mask) -> float:
     return float(values.mean()) if values.size else float("nan")
 
 
-def _deployed(estimate: Estimate) -> Faults:
-    """Sensor parameters that would be applied."""
-    return Faults(
-        hardware_drift=estimate.faults.hardware_drift,
-        hardware_offset_a=estimate.faults.hardware_offset_a,
-        drift=np.where(estimate.corrected, estimate.faults.drift, 0.0),
-        offset_a=np.where(estimate.corrected, estimate.faults.offset_a, 0.0),
+def _harmed(estimate: Estimate, trial: Trial) -> Mask:
+    """Whether a branch gets worse, shape (N,); a drift of -1 or less, for which there is no correction, is harm."""
+    absurd = estimate.corrected & (estimate.faults.drift <= -1.0)
+    applied = estimate.corrected & ~absurd
+    deployed = replace(
+        estimate.faults,
+        drift=np.where(applied, estimate.faults.drift, 0.0),
+        offset_a=np.where(applied, estimate.faults.offset_a, 0.0),
     )
+    unseen = trial.unseen
+    worse = harmed(deployed, trial.truth, mean_a=unseen.mean_a, mean_square_a2=unseen.mean_square_a2)
+    return np.asarray(worse | absurd.any(axis=1))

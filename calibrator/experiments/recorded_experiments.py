@@ -31,6 +31,7 @@ SPARSITIES = (20.0, 40.0, 50.0, 60.0, 80.0)
 """With two branches 5, 4, 3, 2 and 1 of 6 parameters are not zero. [%]"""
 MINUTES = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
 FLEET_SIZES = (10, 30, 100)
+DATA_CASE = RecordedCase(sparsity=60.0)
 DEFAULT_EFFORT = Effort()
 SPARSITY_LABEL = "sparsity S [%]"
 
@@ -121,12 +122,12 @@ def data_experiment(
     methods: Sequence[Method] = METHODS,
     effort: Effort = DEFAULT_EFFORT,
 ) -> ExperimentResult:
-    """How much must be recorded: minutes of driving per vehicle, and number of vehicles; K = 2, S = 80.
+    """How much must be recorded: minutes of driving per vehicle, and number of vehicles; K = 2, S = 60.
 
     Parameters
     ----------
     minutes : sequence of float
-        Driving per vehicle: pieces of the trips, cut at standstill and joined anew. [min]
+        Driving per vehicle, from a random instant of the trips on. [min]
     fleet_sizes : sequence of int
         Numbers of vehicles N.
     fleet, methods, effort
@@ -140,14 +141,14 @@ def data_experiment(
     settings = []
     for size in fleet_sizes:
         for duration in minutes:
-            trial = partial(joined_trial, fleet, RecordedCase(), vehicles=size, duration_s=60.0 * duration)
+            trial = partial(joined_trial, fleet, DATA_CASE, vehicles=size, duration_s=60.0 * duration)
             settings.append(Setting(x=duration, series=str(size), make_trial=trial))
     return ExperimentResult(
         name="data",
         title="How much must be recorded",
         x_label="minutes per vehicle",
         series_label="vehicles",
-        settings=recorded_settings(fleet, effort),
+        settings={**recorded_settings(fleet, effort), "vehicles": "as named", "sparsity": DATA_CASE.sparsity},
         rows=run_settings(settings, methods, effort),
     )
 

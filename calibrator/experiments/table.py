@@ -83,7 +83,7 @@ def headline(result: ExperimentResult, honesty: Collection[str] = tuple(HONESTY)
 def result_table(result: ExperimentResult) -> Table:
     """Headline of a result for the console."""
     settings = result.settings
-    vehicles = f"{settings['vehicles']} vehicles, " if "vehicles" in settings else ""
+    vehicles = f"{settings['vehicles']} vehicles, " if isinstance(settings.get("vehicles"), int) else ""
     table = Table(
         box=None,
         pad_edge=False,

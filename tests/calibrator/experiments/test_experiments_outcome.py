@@ -93,6 +93,10 @@ def test_correction_of_a_sound_branch_counts_as_harm() -> None:
     assert (figures["recovery_rate"], figures["deployed"], figures["harmed"]) == (0.5, 1.0, 0.5)
 
 
+def test_drift_that_cannot_be_corrected_counts_as_harm_and_warns_of_nothing() -> None:
+    assert figures_of(judge(*two_vehicles(drift=0.1, harm_second=-1.0)))["harmed"] == 0.5
+
+
 def test_branch_that_passes_through_can_do_no_harm() -> None:
     estimate, trial = two_vehicles(drift=0.1, harm_second=0.2)
     only_first = replace(estimate, corrected=estimate.corrected & np.array([True, False]))
