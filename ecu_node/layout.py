@@ -134,6 +134,9 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     contactor: Contactor | None = None
     derived: list[Derived] = []
     model_inputs: list[str] = []
+    """What the model of one vehicle is driven by."""
+    fleet_inputs: list[str] = []
+    """What the model of the whole fleet is driven by; the model inputs where not given."""
     limits: Limits = Limits()
     status: StatusMessage | None = None
     e2e: EndToEnd | None = None
@@ -269,9 +272,10 @@ def _check_inputs(layout: Layout, refuse: Callable[[str], NoReturn]) -> None:
         refuse(f"[contactor] input: {layout.contactor.input!r} is no [[input]]; declare the signal as one")
     if layout.temperature is not None and layout.temperature not in {item.name for item in layout.input}:
         refuse(f"temperature: {layout.temperature!r} is no [[input]]; declare the signal as one, or leave the key out")
-    unknown = [name for name in layout.model_inputs if name not in known]
-    if unknown:
-        refuse(f"model_inputs: {', '.join(unknown)} is no [[input]] or [[derived]]")
+    for key, names in (("model_inputs", layout.model_inputs), ("fleet_inputs", layout.fleet_inputs)):
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            refuse(f"{key}: {', '.join(unknown)} is no [[input]] or [[derived]]")
 
 
 def _check_branch(branch: Branch, refuse: Callable[[str], NoReturn]) -> None:

@@ -74,16 +74,13 @@ def show(drives: str, out: Path) -> None:
     step(1, f"{VEHICLES} identical vehicles with faulty sensors drive, and log their CAN buses")
     run(
         *("calibrator", "simulate", "--drives", source, "--vehicles", VEHICLES, "--currents", BRANCHES),
-        *("--sparsity", 80, "--balanced", "--symmetric", "--minutes", MINUTES, "--unseen-minutes", 2),
+        *("--sparsity", 80, "--balanced", "--minutes", MINUTES, "--unseen-minutes", 2),
         *("--layout", LAYOUT, "--out", fleet),
     )
     truth = read_truth(fleet / "truth.json")
     vehicle = faulty_vehicle(truth)
     step(2, f"the calibrator learns each vehicle's sensors from these logs ({vehicle} is held out of the learning)")
-    run(
-        *("calibrator", "calibrate", fleet, "--layout", LAYOUT, "--method", "published", "--sparsity", 80),
-        *("--hold-out", vehicle, "--out", result),
-    )
+    run("calibrator", "calibrate", fleet, "--layout", LAYOUT, "--hold-out", vehicle, "--out", result)
     step(3, "because this fleet is artificial, the truth is known")
     run("calibrator", "score", result, "--truth", fleet / "truth.json")
     step(4, f"vehicle {vehicle} drives a trip that nobody has seen, with its node on the bus")

@@ -9,7 +9,7 @@ are not valid stay in place with NaN in all columns.
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,9 +61,17 @@ class Samples:
     valid: Mask
     masked: Mapping[str, int]
 
+    def with_inputs(self, names: Sequence[str]) -> "Samples":
+        """Return the same samples with those of the inputs that are among some names, in their order."""
+        kept = [self.input_names.index(name) for name in names if name in self.input_names]
+        chosen = tuple(self.input_names[i] for i in kept)
+        return replace(self, input_names=chosen, inputs=np.ascontiguousarray(self.inputs[:, kept]))
 
-def choose_inputs(layout: Layout, available: Collection[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Split the layout's model inputs into those that a fleet has and those that no drive of it has.
+
+def choose_inputs(
+    layout: Layout, available: Collection[str], *, names: Sequence[str] | None = None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Split inputs of the layout into those that a fleet has and those that no drive of it has.
 
     Parameters
     ----------
@@ -71,14 +79,17 @@ def choose_inputs(layout: Layout, available: Collection[str]) -> tuple[tuple[str
         The layout.
     available : collection of str
         Names of the recorded inputs of all drives of the fleet together.
+    names : sequence of str or None
+        Inputs and derived inputs wanted; None: the layout's model inputs.
 
     Returns
     -------
     kept, left_out : tuple of str
-        Model inputs whose recorded inputs are all available, and the others.
+        Those whose recorded inputs are all available, and the others.
     """
-    kept = tuple(name for name in layout.model_inputs if base_inputs(layout, [name]) <= set(available))
-    return kept, tuple(name for name in layout.model_inputs if name not in kept)
+    wanted = layout.model_inputs if names is None else names
+    kept = tuple(name for name in wanted if base_inputs(layout, [name]) <= set(available))
+    return kept, tuple(name for name in wanted if name not in kept)
 
 
 def base_inputs(layout: Layout, names: Collection[str]) -> set[str]:

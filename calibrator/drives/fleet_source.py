@@ -52,6 +52,7 @@ class Equipment:
 
     branches: tuple[str, ...]
     inputs: tuple[str, ...]
+    fleet_inputs: tuple[str, ...]
     notices: tuple[str, ...]
 
 
@@ -152,7 +153,9 @@ def probe_equipment(fleet: FleetSource, database: VehicleDatabase, branches: Seq
     seen = Counter(name for drive in drives for name in drive.branches)
     found = [name for name in layout.branch_names if 2 * seen[name] > len(drives)]
     chosen = _distinct(branches, layout) if branches is not None else tuple(found)
-    inputs, missing_inputs = choose_inputs(layout, {name for drive in drives for name in drive.inputs})
+    available = {name for drive in drives for name in drive.inputs}
+    inputs, missing_inputs = choose_inputs(layout, available)
+    fleet_inputs, _ = choose_inputs(layout, available, names=layout.fleet_inputs or layout.model_inputs)
     if len(chosen) < 2:
         raise FleetError(f"{fleet.path}: branches found: {', '.join(chosen) or 'none'}; a junction needs two or more")
     if not inputs:
@@ -163,7 +166,7 @@ def probe_equipment(fleet: FleetSource, database: VehicleDatabase, branches: Seq
         "model inputs not recorded, left out": missing_inputs,
     }
     notices = tuple(f"{text}: {', '.join(names)}" for text, names in texts.items() if names)
-    return Equipment(branches=chosen, inputs=inputs, notices=notices)
+    return Equipment(branches=chosen, inputs=inputs, fleet_inputs=fleet_inputs, notices=notices)
 
 
 def _distinct(branches: Sequence[str], layout: Layout) -> tuple[str, ...]:

@@ -73,7 +73,7 @@ def read_vehicle_summary(
     drives = [load_drive(entry, database) for entry in entries]
     delays = estimate_delays(drives, _largest_first(drives, equipment.branches))
     samples = [
-        align(without_delays(drive, delays.by_branch()), layout, equipment.branches, inputs=equipment.inputs)
+        align(without_delays(drive, delays.by_branch()), layout, equipment.branches, inputs=equipment.fleet_inputs)
         for drive in drives
     ]
     duration_s = layout.period_s * sum(int(part.valid.sum()) for part in samples)

@@ -7,7 +7,7 @@ from calibrator.artificial.vehicle import Disturbances, Vehicle, vehicle_drive
 from calibrator.drive import Array
 from calibrator.drives.align import Samples, align, choose_inputs
 from calibrator.drives.delays import estimate_delays, without_delays
-from calibrator.experiments.recorded_fleet import RecordedFleet
+from calibrator.experiments.recorded_fleet import RecordedFleet, all_inputs
 from calibrator.experiments.recorded_trial import (
     NOISE,
     RecordedCase,
@@ -81,5 +81,6 @@ def _record(
         delays = estimate_delays([drive], vehicle.branches)
         drive = without_delays(drive, delays.by_branch())
         found_s = delays.delay_s
-    inputs, _ = choose_inputs(fleet.database.layout, tuple(drive.inputs))
-    return align(drive, fleet.database.layout, vehicle.branches, inputs=inputs), (found_s - delay_s + delay_s[0])[1:]
+    layout = fleet.database.layout
+    inputs, _ = choose_inputs(layout, tuple(drive.inputs), names=all_inputs(layout))
+    return align(drive, layout, vehicle.branches, inputs=inputs), (found_s - delay_s + delay_s[0])[1:]

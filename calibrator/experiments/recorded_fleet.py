@@ -16,6 +16,7 @@ from calibrator.errors import FleetError
 from calibrator.random_streams import Purpose, random_stream
 from ecu_node.database import AMPERE, VehicleDatabase, unit_factor
 from ecu_node.formula import parse_formula
+from ecu_node.layout import Layout
 
 __all__ = ["RecordedFleet", "builtin_fleet", "read_fleet"]
 
@@ -104,15 +105,20 @@ class RecordedFleet:
             steps.append(float(signal.scale) * unit_factor(signal, AMPERE, f"branch {name}"))
         return np.array(steps)
 
-    def model_inputs(self, trip: GroundTruth) -> Mapping[str, Array]:
-        """Model inputs of the layout that a trip has, by name, each of shape (T,)."""
+    def inputs(self, trip: GroundTruth) -> Mapping[str, Array]:
+        """Inputs of the vehicles' and of the fleet's model that a trip has, by name, each of shape (T,)."""
         layout = self.database.layout
-        names, _ = choose_inputs(layout, tuple(trip.inputs))
+        names, _ = choose_inputs(layout, tuple(trip.inputs), names=all_inputs(layout))
         values = dict(trip.inputs)
         for item in layout.derived:
             if base_inputs(layout, [item.name]) <= values.keys():
                 values[item.name] = evaluate_formula(parse_formula(item.formula), values)
         return {name: values[name] for name in names}
+
+
+def all_inputs(layout: Layout) -> tuple[str, ...]:
+    """Inputs of the vehicles' and of the fleet's model, each once."""
+    return tuple(dict.fromkeys([*layout.model_inputs, *layout.fleet_inputs]))
 
 
 def read_fleet(store: Path, database: VehicleDatabase) -> RecordedFleet:

@@ -177,21 +177,24 @@ def trial_of_samples(
         full_scale_a=fleet.full_scale_a,
         truth=vehicles.truth,
         unseen=_next_trips(trips, vehicles),
-        posterior=partial(_posterior, vehicles.samples, fleet.period_s, fleet.full_scale_a),
-        collect=partial(_published_evidence, vehicles.samples, fleet.period_s),
+        posterior=partial(_posterior, vehicles.samples, fleet),
+        collect=partial(_published_evidence, vehicles.samples, fleet),
         delay_error_s=vehicles.delay_error_s,
     )
 
 
-def _posterior(samples: Sequence[Samples], period_s: float, full_scale_a: float) -> FleetPosterior:
-    summaries = [summarise([drive], period_s=period_s) for drive in samples]
-    return calibrate_posterior(summaries, full_scale_a=full_scale_a)
+def _posterior(samples: Sequence[Samples], fleet: RecordedFleet) -> FleetPosterior:
+    names = fleet.database.layout.fleet_inputs or fleet.database.layout.model_inputs
+    summaries = [summarise([drive.with_inputs(names)], period_s=fleet.period_s) for drive in samples]
+    return calibrate_posterior(summaries, full_scale_a=fleet.full_scale_a)
 
 
-def _published_evidence(samples: Sequence[Samples], period_s: float) -> FleetEvidence:
+def _published_evidence(samples: Sequence[Samples], fleet: RecordedFleet) -> FleetEvidence:
     """A model per vehicle, simulated on the longest held-out drive (2)."""
+    drives = [drive.with_inputs(fleet.database.layout.model_inputs) for drive in samples]
     vehicles = [
-        identify_vehicle([drive], period_s=period_s, vehicle=str(j), names=(str(j),)) for j, drive in enumerate(samples)
+        identify_vehicle([drive], period_s=fleet.period_s, vehicle=str(j), names=(str(j),))
+        for j, drive in enumerate(drives)
     ]
     unity = max(vehicles, key=lambda vehicle: len(vehicle.held_out_inputs) - vehicle.lead_in)
     simulated = [vehicle.model.simulate(unity.held_out_inputs)[unity.lead_in :] for vehicle in vehicles]
@@ -213,7 +216,7 @@ def _in_steps(values: Array, steps: Array) -> Array:
 
 
 def _as_samples(fleet: RecordedFleet, trip: GroundTruth, measured: Array) -> Samples:
-    inputs = fleet.model_inputs(trip)
+    inputs = fleet.inputs(trip)
     return Samples(
         branch_names=tuple(trip.currents_a),
         input_names=tuple(inputs),

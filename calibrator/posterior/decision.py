@@ -18,6 +18,8 @@ __all__ = ["Points", "best_estimates", "harm_probability", "spread_points"]
 
 POINTS_PER_STATE = 8
 """Points by which the spread of one state is told; a power of two for the quasi-random rule."""
+EQUALLY_GOOD = 1e-3
+"""Difference of confidence below which the more probable state is taken. [1]"""
 CANDIDATES = 48
 """States that are tried as estimates, the most probable ones."""
 
@@ -92,7 +94,7 @@ def best_estimates(points: Points, states: States, vehicle: int, *, least: tuple
     near = _near(points.drift, states.drift[vehicle, candidates], least[0])
     near &= _near(points.offset, states.offset[vehicle, candidates], least[1])
     covered = near @ points.weight
-    state = int(np.argmax(covered))
+    state = int(np.argmax(covered >= covered.max() - EQUALLY_GOOD))
     return state, float(covered[state])
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrator.drive import Array, Mask
+from calibrator.errors import FleetError
 from calibrator.evidence.rows import FleetRows
 from calibrator.faults import Faults, Index
 from calibrator.posterior.decision import best_estimates, harm_probability, spread_points
@@ -13,11 +14,10 @@ from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.health import ReferenceHealth
 from calibrator.posterior.hyperparameters import (
     Hyperparameters,
+    draw_hyperparameters,
     estimate_hyperparameters,
-    initial_spreads,
-    resampled_hyperparameters,
-    trusted_spread,
 )
+from calibrator.posterior.model_spread import initial_spreads, trusted_spread
 from calibrator.posterior.states import States, enumerate_states, mean_states
 
 __all__ = ["FleetPosterior", "Moments", "estimate_fleet"]
@@ -118,16 +118,31 @@ def estimate_fleet(
     FleetPosterior
         In the order of the rows.
     """
+    _require_fit(rows, moments, full_scale_a)
     starts, free = initial_spreads(rows if learning is None else rows.take(learning)), None
     if trusted is not None and trusted.any():
         starts, free = [trusted_spread(rows, trusted)], np.zeros(5 * rows.branches, bool)
     learnt = rows if learning is None else rows.take(learning)
     hyperparameters = estimate_hyperparameters(learnt, starts, given=given, free=free)
-    resampled = resampled_hyperparameters(learnt, hyperparameters, given=given, free=free)
-    states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in resampled])
+    drawn = draw_hyperparameters(learnt, hyperparameters, given=given, free=free)
+    states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in drawn])
     usual = moments if learning is None else moments.take(learning)
     vehicles = [_of_vehicle(states, j, hyperparameters.prior, (moments, usual), full_scale_a) for j in range(len(rows))]
     return _joined(vehicles, rows, states, hyperparameters, full_scale_a)
+
+
+def _require_fit(rows: FleetRows, moments: Moments, full_scale_a: float) -> None:
+    """Refuse an empty fleet, moments of another one, and a full scale that is none."""
+    if not len(rows):
+        raise FleetError("no vehicle to estimate the faults of")
+    expected = (len(rows), rows.branches)
+    if moments.mean_a.shape != expected or moments.mean_square_a2.shape != expected:
+        raise FleetError(
+            f"moments of shape {moments.mean_a.shape} and {moments.mean_square_a2.shape} do not fit the evidence: "
+            f"expected {expected}"
+        )
+    if not full_scale_a > 0.0:
+        raise FleetError(f"full scale must be positive, not {full_scale_a:g} A")
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,10 @@ from calibrator.drive import Array
 from calibrator.posterior.slab import Slab
 from calibrator.posterior.supports import log_support_counts
 
-__all__ = ["FaultPrior", "ModelSpread"]
+__all__ = ["OUTLIER_VARIANCE", "FaultPrior", "ModelSpread"]
+
+OUTLIER_VARIANCE = 100.0
+"""Variance of vehicles that differ more than the others, over theirs. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,16 +20,13 @@ class FaultPrior:
 
     Attributes
     ----------
-    hardware_share : float
-        Share of vehicles with a hardware fault. [1]
-    counts : ndarray of shape (2, 3K + 1)
-        Distribution of the number of nonzero parameters of vehicles without and with a hardware fault; rows sum to 1.
-        All supports of one number are equally likely.
+    counts : ndarray of shape (K + 1, 2K + 1)
+        Distribution of the numbers of nonzero hardware (rows) and sensor (columns) parameters of a vehicle; sums to 1.
+        All supports with the same numbers are equally likely.
     relative, constant : Slab
         Magnitudes of drifts, and of offsets in fractions of full scale.
     """
 
-    hardware_share: float
     counts: Array
     relative: Slab
     constant: Slab
@@ -34,15 +34,17 @@ class FaultPrior:
     @property
     def branches(self) -> int:
         """Number of branches K."""
-        return int(self.counts.shape[1] - 1) // 3
+        return int(self.counts.shape[0]) - 1
+
+    @property
+    def hardware_share(self) -> float:
+        """Share of vehicles with a hardware fault. [1]"""
+        return float(self.counts[1:].sum())
 
     def log_supports(self) -> Array:
-        """Logarithm of the probability of one support, shape (2, 3K + 1): by hardware fault, and by number."""
-        share = np.array([[1.0 - self.hardware_share], [self.hardware_share]])
-        possible = log_support_counts(self.branches)
+        """Logarithm of the probability of one support, shape (K + 1, 2K + 1), by the numbers of its parameters."""
         with np.errstate(divide="ignore"):
-            log_probability = np.log(share * self.counts)
-        return np.where(np.isneginf(possible), -np.inf, log_probability - np.where(np.isneginf(possible), 0, possible))
+            return np.asarray(np.log(self.counts) - log_support_counts(self.branches))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +57,10 @@ class ModelSpread:
         Centre of the fleet in each row: what is left of the error of the reference, and the mean unmeasured load. [1]
     covariance : ndarray of shape (5K, 5K)
         Over vehicles. [1]
+    outlier_share : float
+        Share of vehicles whose spread has :data:`OUTLIER_VARIANCE` times the variance. [1]
     """
 
     mean: Array
     covariance: Array
+    outlier_share: float = 0.0

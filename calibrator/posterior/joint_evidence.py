@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.drive import Array, Mask
+from calibrator.drive import Array
 from calibrator.evidence.rows import FleetRows, constant_design, relative_design
 from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
 from calibrator.posterior.gaussian_block import Noise, integrate_constant, integrate_relative
@@ -34,10 +34,8 @@ class _Candidates:
     ----------
     log_evidence : ndarray of shape (N, M)
         Of the relative rows, and of the change of scale of the constant ones; minus infinity where negligible.
-    count : ndarray of int, shape (N, M)
-        Number of nonzero parameters.
-    hardware : ndarray of bool, shape (N, M)
-        Whether d_h is among them.
+    hardware, sensor : ndarray of int, shape (N, M)
+        Numbers of nonzero hardware and sensor parameters.
     parameters, sd : ndarray of shape (N, M, K + 1)
         As in :class:`calibrator.posterior.gaussian_block.BlockFit`.
     constant_rows : ndarray of shape (N, M, 2K + 1)
@@ -47,8 +45,8 @@ class _Candidates:
     """
 
     log_evidence: Array
-    count: NDArray[np.int64]
-    hardware: Mask
+    hardware: NDArray[np.int64]
+    sensor: NDArray[np.int64]
     parameters: Array
     sd: Array
     constant_rows: Array
@@ -76,14 +74,17 @@ class JointEvidence:
         log_prior = prior.log_supports()
         states = _RelativeStates.of(rows.relative - spread.mean[:r], first, prior, log_prior)
         exact = rows.branches <= EXACT_BRANCHES
-        candidates = _candidates(rows.constant, spread.mean[r:], carry, states, exact=exact)
+        of_spread = np.diag(spread.covariance)[r : r + rows.branches + 1]
+        share = of_spread / np.diagonal(R, axis1=1, axis2=2)[:, r : r + rows.branches + 1]
+        candidates = _candidates(rows.constant, spread.mean[r:], carry, states, share, exact=exact)
         return cls(log_prior, prior, second, candidates, constant_design(rows.branches))
 
     def with_constant(self, support: Support) -> tuple[Array, StateArrays]:
         """Log weights (N, S) of the states with one constant support, and their parameters; S = 0 if impossible."""
         found = self.candidates
-        hardware = (found.hardware | support.hardware).astype(np.int64)
-        log_weight = found.log_evidence + self.log_prior[hardware, found.count + len(support.active)]
+        in_hardware = sum(i < self.prior.branches - 1 for i in support.active)
+        sensors = found.sensor + len(support.active) - in_hardware
+        log_weight = found.log_evidence + self.log_prior[found.hardware + in_hardware, sensors]
         if np.isneginf(log_weight).all():
             nothing, none = found.parameters[:, :0], found.scale[:, :0]
             return log_weight[:, :0], (nothing, nothing, none, none)
@@ -103,8 +104,8 @@ class _RelativeStates:
 
     log_evidence: Array
     best_share: Array
-    count: NDArray[np.int64]
-    hardware: Mask
+    hardware: NDArray[np.int64]
+    sensor: NDArray[np.int64]
     arrays: tuple[Array, Array, Array]
     """Parameters, deviations, residuals, of shape (N, S, .)."""
 
@@ -115,12 +116,14 @@ class _RelativeStates:
         design, supports = relative_design(K), relative_supports(K)
         fits = [integrate_relative(rows[:, None], design, support, noise, prior.relative) for support in supports]
         nodes = [fit.log_evidence.shape[2] for fit in fits]
-        shares = [log_prior[int(s.hardware) :, len(s.active) : len(s.active) + 2 * K].max() for s in supports]
+        hardware = [int(support.hardware) for support in supports]
+        sensor = [len(support.active) - h for support, h in zip(supports, hardware, strict=True)]
+        shares = [log_prior[h : h + K, n : n + K + 1].max() for h, n in zip(hardware, sensor, strict=True)]
         return cls(
             np.concatenate([fit.log_evidence[:, 0] for fit in fits], axis=1),
             np.repeat(shares, nodes),
-            np.repeat([len(support.active) for support in supports], nodes),
-            np.repeat([support.hardware for support in supports], nodes),
+            np.repeat(hardware, nodes),
+            np.repeat(sensor, nodes),
             (
                 np.concatenate([fit.parameters[:, 0] for fit in fits], axis=1),
                 np.concatenate([fit.sd[:, 0] for fit in fits], axis=1),
@@ -137,18 +140,24 @@ class _RelativeStates:
         return order, np.take_along_axis(np.where(kept, self.log_evidence, -np.inf), order, axis=1)
 
 
-def _candidates(rows: Array, mean: Array, carry: Array, states: _RelativeStates, *, exact: bool) -> _Candidates:
-    """What the relative states make of the constant rows (N, 2K + 1)."""
+def _candidates(
+    rows: Array, mean: Array, carry: Array, states: _RelativeStates, share: Array, *, exact: bool
+) -> _Candidates:
+    """What the relative states make of the constant rows (N, 2K + 1).
+
+    Where the model spread, which is one of true currents, is most of a row's variance (``share``, (N, K + 1)), the
+    density changes with the scale between measured and true currents; sampling errors are those of the measured ones.
+    """
     K = states.arrays[0].shape[2] - 1
     order, log_evidence = states.best(exact=exact)
     parameters, sd, residual = (np.take_along_axis(values, order[:, :, None], axis=1) for values in states.arrays)
     factor = 1.0 + parameters[:, :, 1:]
     seen = rows[:, None, :] / np.concatenate([factor, factor[..., :1], factor], axis=2)
-    log_change = np.log(factor).sum(axis=2) + np.log(factor[:, :, 0])
+    log_change = np.einsum("nmk,nk->nm", np.log(factor), share[:, :K]) + np.log(factor[:, :, 0]) * share[:, K:]
     return _Candidates(
         log_evidence=log_evidence - log_change,
-        count=states.count[order],
         hardware=states.hardware[order],
+        sensor=states.sensor[order],
         parameters=parameters,
         sd=sd,
         constant_rows=seen - mean - residual @ np.swapaxes(carry, 1, 2),

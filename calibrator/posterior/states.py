@@ -9,7 +9,7 @@ parameter, and so on.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import chain, islice
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy.special import logsumexp
 
 from calibrator.drive import Array
 from calibrator.evidence.rows import FleetRows
-from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
+from calibrator.posterior.fault_prior import OUTLIER_VARIANCE, FaultPrior, ModelSpread
 from calibrator.posterior.joint_evidence import JointEvidence, StateArrays
 from calibrator.posterior.supports import EXACT_BRANCHES, MOST_CONSTANT, Support, constant_supports, grown_supports
 
@@ -30,6 +30,8 @@ BEAM = 8
 """Constant supports of one size that are grown, the best ones. [1]"""
 GROWING = 3.0
 """None are if the best of them lies farther below the vehicle's best state (logarithm). [1]"""
+NEGLIGIBLE_SHARE = 1e-3
+"""Share of outliers below which none are looked for. [1]"""
 MOST_WAITING = 1024
 """States that are collected before the most probable ones are picked: picking costs more than fitting. [1]"""
 CHUNK, GROWN_CHUNK = 64, 16
@@ -50,6 +52,8 @@ class States:
         d_h, d_1 .. d_K, and standard deviations. [1]
     constant, constant_sd : ndarray of shape (N, S, 2K - 1)
         o_h,1 .. o_h,K-1, o_1 .. o_K in fractions of full scale, and standard deviations. [1]
+    outlier : ndarray of bool of shape (N, S)
+        Whether the vehicle differs from its fleet more than others do.
     """
 
     weight: Array
@@ -58,6 +62,7 @@ class States:
     relative_sd: Array
     constant: Array
     constant_sd: Array
+    outlier: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -80,12 +85,18 @@ class States:
     @property
     def hardware(self) -> NDArray[np.bool_]:
         """Whether a state has a hardware fault, shape (N, S)."""
-        return np.asarray((self.relative[:, :, 0] != 0.0) | np.any(self.constant[:, :, : self.branches - 1], axis=2))
+        return self.hardware_count > 0
 
     @property
-    def count(self) -> NDArray[np.int64]:
-        """Number of nonzero parameters of each state, shape (N, S)."""
-        return np.asarray(np.count_nonzero(self.relative, axis=2) + np.count_nonzero(self.constant, axis=2))
+    def hardware_count(self) -> NDArray[np.int64]:
+        """Number of nonzero hardware parameters of each state, shape (N, S)."""
+        offsets = self.constant[:, :, : self.branches - 1]
+        return np.asarray((self.relative[:, :, 0] != 0.0) + np.count_nonzero(offsets, axis=2))
+
+    @property
+    def sensor_count(self) -> NDArray[np.int64]:
+        """Number of nonzero sensor parameters of each state, shape (N, S)."""
+        return np.asarray(np.count_nonzero(self.drift, axis=2) + np.count_nonzero(self.offset, axis=2))
 
 
 def enumerate_states(rows: FleetRows, prior: FaultPrior, spread: ModelSpread) -> States:
@@ -106,8 +117,40 @@ def enumerate_states(rows: FleetRows, prior: FaultPrior, spread: ModelSpread) ->
         The most probable ones of each vehicle.
     """
     chunk = CHUNK if rows.branches <= EXACT_BRANCHES else GROWN_CHUNK
-    parts = [_enumerate(rows.take(slice(start, start + chunk)), prior, spread) for start in range(0, len(rows), chunk)]
+    usual, wide = (replace(spread, covariance=scale * spread.covariance) for scale in (1.0, OUTLIER_VARIANCE))
+    parts = []
+    for start in range(0, len(rows), chunk):
+        some = rows.take(slice(start, start + chunk))
+        part = _enumerate(some, prior, usual)
+        if spread.outlier_share > NEGLIGIBLE_SHARE:
+            part = _merged(part, _enumerate(some, prior, wide), spread.outlier_share)
+        parts.append(part)
     return States(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(States)))
+
+
+def _merged(usual: States, wide: States, share: float) -> States:
+    """Both explanations of how far a vehicle may differ from its fleet, each as probable as its evidence says."""
+    log_usual, log_wide = usual.log_evidence + np.log1p(-share), wide.log_evidence + np.log(share)
+    total = np.logaddexp(log_usual, log_wide)
+    weights = [usual.weight * np.exp(log_usual - total)[:, None], wide.weight * np.exp(log_wide - total)[:, None]]
+    weight, order = _largest(np.concatenate(weights, axis=1), MOST_STATES)
+    outlier = np.concatenate([np.zeros_like(usual.outlier), np.ones_like(wide.outlier)], axis=1)
+    return States(
+        weight / weight.sum(axis=1, keepdims=True),
+        total,
+        *_picked([usual, wide], order),
+        np.take_along_axis(outlier, order, axis=1),
+    )
+
+
+def _picked(several: Sequence[States], order: NDArray[np.int64]) -> tuple[Array, Array, Array, Array]:
+    """Parameters and deviations of chosen states out of several lists."""
+
+    def picked(name: str) -> Array:
+        every = np.concatenate([getattr(states, name) for states in several], axis=1)
+        return np.take_along_axis(every, order[:, :, None], axis=1)
+
+    return picked("relative"), picked("relative_sd"), picked("constant"), picked("constant_sd")
 
 
 def mean_states(several: Sequence[States]) -> States:
@@ -116,12 +159,14 @@ def mean_states(several: Sequence[States]) -> States:
         return several[0]
     every = np.concatenate([states.weight for states in several], axis=1) / len(several)
     weight, order = _largest(np.asarray(every), MOST_STATES)
-    arrays = []
-    for name in ("relative", "relative_sd", "constant", "constant_sd"):
-        both = np.concatenate([getattr(states, name) for states in several], axis=1)
-        arrays.append(np.take_along_axis(both, order[:, :, None], axis=1))
     log_evidence = logsumexp([states.log_evidence for states in several], axis=0) - np.log(len(several))
-    return States(weight / weight.sum(axis=1, keepdims=True), np.asarray(log_evidence), *arrays)
+    outlier = np.concatenate([states.outlier for states in several], axis=1)
+    return States(
+        weight / weight.sum(axis=1, keepdims=True),
+        np.asarray(log_evidence),
+        *_picked(several, order),
+        np.take_along_axis(outlier, order, axis=1),
+    )
 
 
 def _enumerate(rows: FleetRows, prior: FaultPrior, spread: ModelSpread) -> States:
@@ -188,7 +233,9 @@ class _Found:
         """What was found, in order of falling weight."""
         self._merge()
         weight = np.exp(self._log_weight - logsumexp(self._log_weight, axis=1, keepdims=True))
-        return States(weight, self._log_total, *self._arrays)
+        relative, relative_sd, constant, constant_sd = self._arrays
+        outlier = np.zeros(weight.shape, bool)
+        return States(weight, self._log_total, relative, relative_sd, constant, constant_sd, outlier)
 
     def _merge(self) -> None:
         """Keep the :data:`MOST_STATES` most probable ones."""

@@ -92,12 +92,10 @@ def grown_supports(branches: int, support: Iterable[int]) -> list[Support]:
 
 
 def log_support_counts(branches: int) -> NDArray[np.float64]:
-    """Logarithm of how many supports there are, shape (2, 3K + 1): by hardware fault, and number of parameters."""
-    K = branches
-    without = np.array([comb(2 * K, count) for count in range(3 * K + 1)], np.float64)
-    every = np.array([comb(3 * K, count) for count in range(3 * K + 1)], np.float64)
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.log(np.stack([without, every - without])))
+    """Logarithm of how many supports have so many hardware and sensor parameters, shape (K + 1, 2K + 1)."""
+    hardware = [comb(branches, count) for count in range(branches + 1)]
+    sensor = [comb(2 * branches, count) for count in range(2 * branches + 1)]
+    return np.asarray(np.log(np.outer(hardware, sensor)))
 
 
 def _subsets(items: Iterable[int], counts: Iterable[int]) -> Iterable[tuple[int, ...]]:

@@ -65,10 +65,8 @@ def _rows(rng: np.random.Generator, relative: Array, constant: Array) -> FleetRo
 
 
 def _prior(branches: int) -> FaultPrior:
-    counts = np.exp(-DECAY * np.tile(np.arange(3.0 * branches + 1.0), (2, 1)))
-    counts[0, 2 * branches + 1 :], counts[1, 0] = 0.0, 0.0
-    counts /= counts.sum(axis=1, keepdims=True)
-    return FaultPrior(hardware_share=0.5, counts=counts, relative=Slab(*MAGNITUDE), constant=Slab(*MAGNITUDE))
+    counts = np.exp(-DECAY * np.add.outer(np.arange(branches + 1.0), np.arange(2.0 * branches + 1.0)))
+    return FaultPrior(counts=counts / counts.sum(), relative=Slab(*MAGNITUDE), constant=Slab(*MAGNITUDE))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.artificial.ground_truth import GroundTruth
 from ecu_node.database import VehicleDatabase
 
-
 NOT_MODELLED = {"contactor_state", "junction_box_temperature"}
 """Inputs that the built-in vehicle does not have; its logs hold "not available" for them."""
 

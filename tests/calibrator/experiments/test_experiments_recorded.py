@@ -35,9 +35,9 @@ def test_more_branches_than_the_trips_have_are_refused(fleet: RecordedFleet) -> 
         fleet.with_branches(4)
 
 
-def test_model_inputs_are_those_of_the_layout_that_the_trip_has(fleet: RecordedFleet) -> None:
+def test_inputs_are_those_of_the_layout_that_the_trip_has(fleet: RecordedFleet) -> None:
     trip = fleet.trips[0]
-    inputs = fleet.model_inputs(trip)
+    inputs = fleet.inputs(trip)
     assert "low_voltage_current" not in inputs
     power = trip.inputs["torque"] * trip.inputs["speed"] / trip.inputs["voltage"]
     np.testing.assert_allclose(inputs["driving_current"], np.maximum(power, 0.0))

@@ -12,7 +12,8 @@ from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_m
 from calibrator.parameter_files import junction_rms_a
 from ecu_node.database import VehicleDatabase
 
-EQUIPMENT = Equipment(branches=("battery", "motor"), inputs=("driving_current", "heater_current"), notices=())
+INPUTS = ("driving_current", "heater_current")
+EQUIPMENT = Equipment(branches=("battery", "motor"), inputs=INPUTS, fleet_inputs=INPUTS, notices=())
 
 
 def channel(value: Array, good: Array | None = None) -> Channel:

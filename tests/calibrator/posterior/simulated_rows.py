@@ -81,11 +81,11 @@ def random_faults(seed: int, *, vehicles: int, branches: int, sparsity: float, l
 
 
 def prior_of(branches: int, *, decay: float = 0.7, hardware: float = 0.5, low: float = 0.05) -> FaultPrior:
-    """Counts that fall by a factor, the same with and without hardware faults."""
-    counts = np.exp(-decay * np.tile(np.arange(3.0 * branches + 1.0), (2, 1)))
-    counts[0, 2 * branches + 1 :], counts[1, 0] = 0.0, 0.0
-    counts /= counts.sum(axis=1, keepdims=True)
-    return FaultPrior(hardware_share=hardware, counts=counts, relative=Slab(low, 0.25), constant=Slab(low, 0.25))
+    """Counts that fall by a factor with each fault; so many vehicles have hardware faults."""
+    counts = np.exp(-decay * np.add.outer(np.arange(branches + 1.0), np.arange(2.0 * branches + 1.0)))
+    counts[0] *= (1.0 - hardware) / counts[0].sum()
+    counts[1:] *= hardware / counts[1:].sum()
+    return FaultPrior(counts=counts, relative=Slab(low, 0.25), constant=Slab(low, 0.25))
 
 
 def no_spread(branches: int) -> ModelSpread:

@@ -71,7 +71,7 @@ def test_hyperparameters_are_those_that_the_fleet_was_drawn_with(truth: Faults, 
         assert slab.low == pytest.approx(magnitudes.min(), abs=0.015)
         assert slab.high == pytest.approx(magnitudes.max(), abs=0.015)
     assert np.abs(learnt.spread.mean).max() < 0.003
-    np.testing.assert_allclose(learnt.prior.counts.sum(axis=1), 1.0)
+    np.testing.assert_allclose(learnt.prior.counts.sum(), 1.0)
 
 
 def test_spread_between_faultless_vehicles_is_learnt() -> None:

@@ -30,19 +30,13 @@ SHARP = Errors(slope=1e-3, ratio=3e-4, intercept=5e-4, junction=3e-4)
 def paper_prior(branches: int, nonzero: int, *, low: float = 0.05) -> FaultPrior:
     """Section IV-B: so many of 3K parameters; in half of the vehicles those of the hardware are set to zero."""
     K, n = branches, nonzero
-    counts = np.zeros((2, 3 * K + 1))
+    counts = np.zeros((K + 1, 2 * K + 1))
     for hardware in range(min(n, K) + 1):
         share = comb(K, hardware) * comb(2 * K, n - hardware) / comb(3 * K, n) / 2.0
         counts[0, n - hardware] += share
-        counts[int(hardware > 0), n] += share
-    hardware_share = float(counts[1].sum())
+        counts[hardware, n - hardware] += share
     slab = Slab(low, 0.25)
-    return FaultPrior(
-        hardware_share=hardware_share,
-        counts=counts / counts.sum(axis=1, keepdims=True),
-        relative=slab,
-        constant=slab,
-    )
+    return FaultPrior(counts=counts, relative=slab, constant=slab)
 
 
 def slab_mass(slab: Slab, value: float, sd: float) -> float:
@@ -87,16 +81,15 @@ def brute_force(rows: FleetRows, prior: FaultPrior) -> list[tuple[float, Array]]
         ):
             factor = 1.0 + relative[1:]
             seen = rows.constant[0, :told_constant] / np.append(factor, factor[0])
-            log_change = np.log(factor).sum() + np.log(factor[0])
             unit = np.append(np.ones(K - 1), factor)
             for constant in constant_supports(K):
-                count = len(support.active) + len(constant.active)
-                share = log_prior[int(support.hardware or constant.hardware), count]
+                hardware = int(support.hardware) + sum(i < K - 1 for i in constant.active)
+                share = log_prior[hardware, len(support.active) + len(constant.active) - hardware]
                 if np.isneginf(share):
                     continue
                 design = constant_design(K)[:told_constant]
                 for log_constant, values in block(seen, design, second, constant, prior.constant, unit):
-                    weight = share + log_relative + log_constant - log_change
+                    weight = share + log_relative + log_constant
                     found.append((float(weight), np.append(relative, values)))
     return found
 
@@ -244,8 +237,8 @@ def test_rows_that_say_nothing_leave_the_prior() -> None:
     states = enumerate_states(rows, prior, no_spread(2))
     values = np.concatenate([rows.relative, rows.constant], axis=1)
     density = multivariate_normal(np.zeros(10), rows.covariance[0]).logpdf(values)
-    np.testing.assert_allclose(states.log_evidence, density, atol=0.6)
-    nothing = prior.counts[0, 0] * (1.0 - prior.hardware_share)
+    np.testing.assert_allclose(states.log_evidence, density, atol=0.8)
+    nothing = prior.counts[0, 0]
     best = np.exp(np.log(states.weight[:, 0]) + states.log_evidence - density)
     assert first_parameters(states).any(axis=1).sum() == 0
     assert (best >= nothing * 0.99).all()
@@ -290,10 +283,12 @@ def test_mean_of_equal_posteriors_is_the_same_posterior() -> None:
     assert mean_states([states]) is states
 
 
-def test_counts_and_hardware_are_read_from_the_parameters() -> None:
+def test_counts_of_hardware_and_sensor_faults_are_read_from_the_parameters() -> None:
     faults = random_faults(18, vehicles=30, branches=2, sparsity=60.0)
     states = enumerate_states(rows_of(faults), prior_of(2), no_spread(2))
     for s, j in product(range(5), range(30)):
-        hardware = states.relative[j, s, 0] != 0.0 or states.constant[j, s, 0] != 0.0
-        assert states.hardware[j, s] == hardware
-        assert states.count[j, s] == np.sum(states.relative[j, s] != 0.0) + np.sum(states.constant[j, s] != 0.0)
+        hardware = int(states.relative[j, s, 0] != 0.0) + int(states.constant[j, s, 0] != 0.0)
+        assert states.hardware[j, s] == (hardware > 0)
+        assert states.hardware_count[j, s] == hardware
+        every = np.sum(states.relative[j, s] != 0.0) + np.sum(states.constant[j, s] != 0.0)
+        assert states.sensor_count[j, s] == every - hardware

@@ -70,9 +70,10 @@ def test_hardware_is_said_where_a_hardware_parameter_is_present(branches: int) -
 
 @BRANCHES
 def test_support_counts_are_those_of_all_pairs(branches: int) -> None:
-    counts = np.zeros((2, 3 * branches + 1))
+    counts = np.zeros((branches + 1, 2 * branches + 1))
     for first, second in product(relative_supports(branches), constant_supports(branches)):
-        counts[int(first.hardware or second.hardware), len(first.active) + len(second.active)] += 1
+        hardware = int(first.hardware) + sum(i < branches - 1 for i in second.active)
+        counts[hardware, len(first.active) + len(second.active) - hardware] += 1
     np.testing.assert_allclose(np.exp(log_support_counts(branches)), counts, rtol=1e-12)
 
 

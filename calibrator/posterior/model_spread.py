@@ -1,0 +1,227 @@
+"""Model spread: what vehicles without faults differ by, estimated from what the explanations of a fleet leave.
+
+A few vehicles differ more than the others (a stuck input, an odd trip). With a small probability the spread of a
+vehicle has :data:`OUTLIER_VARIANCE` times the variance; so they neither widen the spread nor pass for faulty.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from calibrator.drive import Array, Mask
+from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, constant_design, relative_design
+from calibrator.posterior.cluster import densest_clusters
+from calibrator.posterior.fault_prior import OUTLIER_VARIANCE, FaultPrior, ModelSpread
+from calibrator.posterior.states import States
+
+__all__ = ["drawn_spread", "free_centres", "initial_spreads", "next_spread", "trusted_spread"]
+
+USED_STATES = 24
+"""States of each vehicle that are looked at, the most probable ones. [1]"""
+SPREAD_VEHICLES = 5.0
+"""Weight of the guess of the model spread, in vehicles."""
+SPREAD_OVER_SAMPLING = 2.0
+"""Guess of the model spread over the usual sampling deviation: a model errs alike over a whole drive. [1]"""
+MOST_SPREAD = 0.02
+"""Of a start; wider clusters are made of faults. [1]"""
+LEAST_SPREAD = np.array([1e-5, 1e-6])
+"""Least model spread of relative and constant rows: far below any sensor's resolution. [1]"""
+OUTLIER_VEHICLES, GUESSED_OUTLIER_SHARE = 2.0, 0.05
+"""Weight of the guess of the share of vehicles that differ more, in vehicles, and that guess. [1]"""
+
+
+def initial_spreads(rows: FleetRows) -> list[ModelSpread]:
+    """Starts of the climb: the densest cluster of each row (narrow, and as wide as it is), the second, and the mean.
+
+    Parameters
+    ----------
+    rows : FleetRows
+        Evidence of the fleet.
+
+    Returns
+    -------
+    list of ModelSpread
+        Four starts.
+    """
+    K, r = rows.branches, rows.relative.shape[1]
+    values = np.concatenate([rows.relative, rows.constant], axis=1)
+    sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
+    mean, second, spread = np.zeros(5 * K), np.zeros(5 * K), np.zeros(5 * K)
+    for row in _informed_rows(K):
+        told = sd[:, row] < np.sqrt(UNKNOWN_VARIANCE) / 2.0
+        if not told.any():
+            continue
+        clusters = densest_clusters(values[told, row], sd[told, row], most=2)
+        mean[row], spread[row] = clusters[0].centre, clusters[0].spread
+        second[row] = clusters[1].centre if len(clusters) > 1 and row < K else mean[row]
+    ratios = slice(K, 2 * K - 1)
+    mean[ratios], second[ratios] = 0.0, 0.0
+    average = mean.copy()
+    average[:K], average[r : r + K] = rows.relative[:, :K].mean(axis=0), rows.constant[:, :K].mean(axis=0)
+    narrow = _guessed_spread(rows) + np.diag(_least_spread(K) ** 2)
+    wide = np.maximum(narrow, np.diag(np.minimum(spread, MOST_SPREAD) ** 2))
+    return [
+        ModelSpread(mean=centre, covariance=covariance, outlier_share=GUESSED_OUTLIER_SHARE)
+        for centre, covariance in ((mean, narrow), (mean, wide), (second, narrow), (average, narrow))
+    ]
+
+
+def trusted_spread(rows: FleetRows, trusted: Mask) -> ModelSpread:
+    """Start of the climb whose centre is that of trusted vehicles.
+
+    Parameters
+    ----------
+    rows : FleetRows
+        Evidence of the fleet.
+    trusted : ndarray of bool of shape (N,)
+        Vehicles without sensor faults.
+
+    Returns
+    -------
+    ModelSpread
+        Centres of slopes, intercepts and junction constant are the trusted vehicles'.
+    """
+    values = np.concatenate([rows.relative, rows.constant], axis=1)
+    mean = np.where(free_centres(rows.branches), np.median(values[trusted], axis=0), 0.0)
+    covariance = _guessed_spread(rows) + np.diag(_least_spread(rows.branches) ** 2)
+    return ModelSpread(mean=mean, covariance=covariance, outlier_share=GUESSED_OUTLIER_SHARE)
+
+
+def next_spread(rows: FleetRows, states: States, prior: FaultPrior, spread: ModelSpread, free: Array) -> ModelSpread:
+    """Mean and covariance of what is left of the rows once the states are taken out.
+
+    Parameters
+    ----------
+    rows : FleetRows
+        Evidence of N vehicles.
+    states : States
+        Their explanations under the present hyper-parameters.
+    prior, spread : FaultPrior, ModelSpread
+        The present hyper-parameters.
+    free : ndarray of bool, shape (5K,)
+        Rows whose centre is estimated.
+
+    Returns
+    -------
+    ModelSpread
+        The next one.
+    """
+    used = min(USED_STATES, states.weight.shape[1])
+    every = states.weight[:, :used] / states.weight[:, :used].sum(axis=1, keepdims=True)
+    residual = _residuals(rows, states, used)
+    parts = []
+    for wide, scale in ((False, 1.0), (True, OUTLIER_VARIANCE)):
+        weight = every * (states.outlier[:, :used] == wide)
+        if weight.sum() > 0.0:
+            scaled = replace(spread, covariance=scale * spread.covariance)
+            parts.append((weight / scale, *_left(rows, states, prior, scaled, residual)))
+    told = sum(float(weight.sum()) for weight, _, _ in parts)
+    centre = sum(np.einsum("ns,nsa->a", weight, left) for weight, left, _ in parts) / told
+    mean = np.where(free, centre, spread.mean)
+    scatter = np.zeros_like(spread.covariance)
+    for weight, left, hidden in parts:
+        deviation = left - mean
+        scatter += np.einsum("ns,nsa,nsb->ab", weight, deviation, deviation) + np.einsum("ns,nsab->ab", weight, hidden)
+    share = SPREAD_VEHICLES / (SPREAD_VEHICLES + len(rows))
+    covariance = (1.0 - share) * scatter / len(rows) + share * _guessed_spread(rows)
+    outliers = float(np.sum(every * states.outlier[:, :used]))
+    return ModelSpread(
+        mean=mean,
+        covariance=covariance + np.diag(_least_spread(rows.branches) ** 2),
+        outlier_share=(outliers + OUTLIER_VEHICLES * GUESSED_OUTLIER_SHARE) / (len(rows) + OUTLIER_VEHICLES),
+    )
+
+
+def _left(
+    rows: FleetRows, states: States, prior: FaultPrior, spread: ModelSpread, residual: Array
+) -> tuple[Array, Array]:
+    """Expected deviation of each vehicle (N, S, 5K), and its covariance (N, S, 5K, 5K)."""
+    covariance = spread.covariance
+    precision = np.linalg.inv(rows.covariance + covariance)
+    gain = covariance @ precision
+    left = spread.mean + np.einsum("nab,nsb->nsa", gain, residual - spread.mean)
+    hidden = covariance - gain @ covariance
+    return left, hidden[:, None] + _hidden_by_parameters(states, residual.shape[1], prior, precision, gain)
+
+
+def drawn_spread(rng: np.random.Generator, spread: ModelSpread, vehicles: float, free: Array) -> ModelSpread:
+    """Mean and covariance as so many vehicles without hardware faults tell them.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of chance.
+    spread : ModelSpread
+        The most likely one.
+    vehicles : float
+        Vehicles that tell it.
+    free : ndarray of bool, shape (5K,)
+        Rows whose centre was estimated.
+
+    Returns
+    -------
+    ModelSpread
+        One of those that the fleet allows.
+    """
+    degrees = int(np.ceil(vehicles + SPREAD_VEHICLES))
+    root = np.linalg.cholesky(spread.covariance)
+    normal = root @ rng.standard_normal((len(root), degrees))
+    covariance = normal @ normal.T / degrees + np.diag(np.diag(spread.covariance)) / degrees
+    mean = root @ rng.standard_normal(len(root)) / np.sqrt(max(vehicles, 1.0))
+    return replace(spread, mean=spread.mean + np.where(free, mean, 0.0), covariance=covariance)
+
+
+def _guessed_spread(rows: FleetRows) -> Array:
+    """Covariance of the model spread before anything is known: a multiple of the usual sampling covariance."""
+    informed = np.zeros(5 * rows.branches, bool)
+    informed[_informed_rows(rows.branches)] = True
+    told = np.diagonal(rows.covariance, axis1=1, axis2=2) < UNKNOWN_VARIANCE / 2.0
+    variance = np.ones(len(informed))
+    for row in np.flatnonzero(informed & told.any(axis=0)):
+        variance[row] = np.median(rows.covariance[told[:, row], row, row])
+    return np.diag(np.where(informed, SPREAD_OVER_SAMPLING**2 * variance, 0.0))
+
+
+def _residuals(rows: FleetRows, states: States, used: int) -> Array:
+    """Rows less what each state explains of them, shape (N, S, 5K)."""
+    K = rows.branches
+    relative, constant = states.relative[:, :used], states.constant[:, :used].copy()
+    factor = 1.0 + relative[:, :, 1:]
+    constant[:, :, K - 1 :] /= factor
+    first = rows.relative[:, None] - np.log1p(relative) @ relative_design(K).T
+    seen = rows.constant[:, None] / np.concatenate([factor, factor[..., :1], factor], axis=2)
+    return np.concatenate([first, seen - constant @ constant_design(K).T], axis=2)
+
+
+def _hidden_by_parameters(states: States, used: int, prior: FaultPrior, precision: Array, gain: Array) -> Array:
+    """Covariance of the spread that the fitted parameters of each state hide, shape (N, S, 5K, 5K)."""
+    K = states.branches
+    design = np.zeros((5 * K, 3 * K))
+    design[: 3 * K - 1, : K + 1] = relative_design(K)
+    design[3 * K - 1 :, K + 1 :] = constant_design(K)
+    active = np.concatenate([states.relative[:, :used] != 0.0, states.constant[:, :used] != 0.0], axis=2)
+    slab = np.concatenate([np.full(K + 1, prior.relative.high), np.full(2 * K - 1, prior.constant.high)])
+    information = np.einsum("ra,nrs,sb->nab", design, precision, design)[:, None] * (
+        active[..., :, None] & active[..., None, :]
+    )
+    C = np.linalg.inv(information + np.eye(3 * K) / slab**2) * active[..., None, :]
+    shown = (gain @ design)[:, None] * active[..., None, :]
+    return np.asarray(shown @ C @ np.swapaxes(shown, 2, 3))
+
+
+def _informed_rows(branches: int) -> list[int]:
+    """Slopes, gain ratios, intercepts and junction constant; bench readings have no centre of the fleet."""
+    K = branches
+    return [*range(2 * K - 1), *range(3 * K - 1, 4 * K)]
+
+
+def free_centres(branches: int) -> Array:
+    """Rows whose centre the fleet tells, shape (5K,): slopes, intercepts and junction constant."""
+    K = branches
+    free = np.zeros(5 * K, bool)
+    free[:K], free[3 * K - 1 : 4 * K] = True, True
+    return free
+
+
+def _least_spread(branches: int) -> Array:
+    return np.repeat(LEAST_SPREAD, [3 * branches - 1, 2 * branches + 1])
