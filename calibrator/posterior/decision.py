@@ -18,7 +18,7 @@ __all__ = ["Points", "best_estimates", "harm_probability", "spread_points"]
 
 POINTS_PER_STATE = 8
 """Points by which the spread of one state is told; a power of two for the quasi-random rule."""
-EQUALLY_GOOD = 1e-3
+EQUALLY_GOOD = 0.01
 """Difference of confidence below which the more probable state is taken. [1]"""
 CANDIDATES = 48
 """States that are tried as estimates, the most probable ones."""

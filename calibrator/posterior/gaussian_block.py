@@ -19,6 +19,8 @@ from calibrator.posterior.supports import Support
 
 __all__ = ["BlockFit", "Noise", "integrate_constant", "integrate_relative"]
 
+POSSIBLE_DRIFT = (-0.9, 9.0)
+"""Beyond it the scale between measured and true currents vanishes or explodes. [1]"""
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
@@ -74,7 +76,7 @@ def integrate_relative(rows: Array, design: Array, support: Support, noise: Nois
     Returns
     -------
     BlockFit
-        ``parameters`` are drifts.
+        ``parameters`` are drifts; those that no sensor has, of no weight, are cut to :data:`POSSIBLE_DRIFT`.
     """
     nodes = slab.nodes(len(support.pivots))
     log_evidence, theta, sd, residual = _fit(rows, design, support, noise, np.log1p(nodes))
@@ -82,7 +84,7 @@ def integrate_relative(rows: Array, design: Array, support: Support, noise: Nois
     sd = sd * (1.0 + drift)
     fitted = list(support.fitted)
     log_evidence += np.sum(slab.log_mass(drift[..., fitted], sd[..., fitted]) + theta[..., fitted], axis=-1)
-    return BlockFit(log_evidence, drift, sd, residual)
+    return BlockFit(log_evidence, np.clip(drift, *POSSIBLE_DRIFT), sd, residual)
 
 
 def integrate_constant(

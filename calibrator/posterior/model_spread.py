@@ -14,7 +14,7 @@ from calibrator.posterior.cluster import densest_clusters
 from calibrator.posterior.fault_prior import OUTLIER_VARIANCE, FaultPrior, ModelSpread
 from calibrator.posterior.states import States
 
-__all__ = ["drawn_spread", "free_centres", "initial_spreads", "next_spread", "trusted_spread"]
+__all__ = ["MOST_UNMEASURED", "drawn_spread", "free_centres", "initial_spreads", "next_spread", "trusted_spread"]
 
 USED_STATES = 24
 """States of each vehicle that are looked at, the most probable ones. [1]"""
@@ -26,12 +26,18 @@ MOST_SPREAD = 0.02
 """Of a start; wider clusters are made of faults. [1]"""
 LEAST_SPREAD = np.array([1e-5, 1e-6])
 """Least model spread of relative and constant rows: far below any sensor's resolution. [1]"""
+LAWFUL, LAWFUL_GAIN, LAWFUL_CONSTANT = 3.0, 0.001, 0.002
+"""Deviations up to which a vehicle obeys the junction law, and the least one of a gain ratio and the constant. [1]"""
+FEWEST_LAWFUL = 3
+"""Vehicles that make a cluster."""
+MOST_UNMEASURED = 0.03
+"""Largest load without a sensor that is looked for, over full scale; larger constants are offsets. [1]"""
 OUTLIER_VEHICLES, GUESSED_OUTLIER_SHARE = 2.0, 0.05
 """Weight of the guess of the share of vehicles that differ more, in vehicles, and that guess. [1]"""
 
 
 def initial_spreads(rows: FleetRows) -> list[ModelSpread]:
-    """Starts of the climb: the densest cluster of each row (narrow, and as wide as it is), the second, and the mean.
+    """Starts of the climb: clusters of each row, of all vehicles and of those that obey the junction law, and the mean.
 
     Parameters
     ----------
@@ -41,14 +47,33 @@ def initial_spreads(rows: FleetRows) -> list[ModelSpread]:
     Returns
     -------
     list of ModelSpread
-        Four starts.
+        Six starts.
     """
     K, r = rows.branches, rows.relative.shape[1]
+    mean, second, spread = _clusters(rows, np.ones(len(rows), bool))
+    lawful = _lawful(rows, mean[4 * K - 1])
+    lawful_mean, lawful_second, _ = _clusters(rows, lawful) if lawful.sum() >= FEWEST_LAWFUL else (mean, second, spread)
+    average = mean.copy()
+    average[:K], average[r : r + K] = rows.relative[:, :K].mean(axis=0), rows.constant[:, :K].mean(axis=0)
+    narrow = _guessed_spread(rows) + np.diag(_least_spread(K) ** 2)
+    wide = np.maximum(narrow, np.diag(np.minimum(spread, MOST_SPREAD) ** 2))
+    starts = [(mean, wide), *((centre, narrow) for centre in (mean, lawful_mean, lawful_second, second, average))]
+    return [
+        ModelSpread(mean=centre, covariance=covariance, outlier_share=GUESSED_OUTLIER_SHARE)
+        for centre, covariance in starts
+    ]
+
+
+def _clusters(rows: FleetRows, chosen: Mask) -> tuple[Array, Array, Array]:
+    """Densest and second densest centre of each row, and spread of the densest, among some vehicles; shape (5K,)."""
+    K = rows.branches
     values = np.concatenate([rows.relative, rows.constant], axis=1)
     sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
     mean, second, spread = np.zeros(5 * K), np.zeros(5 * K), np.zeros(5 * K)
     for row in _informed_rows(K):
-        told = sd[:, row] < np.sqrt(UNKNOWN_VARIANCE) / 2.0
+        told = chosen & (sd[:, row] < np.sqrt(UNKNOWN_VARIANCE) / 2.0)
+        if row == 4 * K - 1:
+            told &= np.abs(values[:, row]) < MOST_UNMEASURED
         if not told.any():
             continue
         clusters = densest_clusters(values[told, row], sd[told, row], most=2)
@@ -56,14 +81,16 @@ def initial_spreads(rows: FleetRows) -> list[ModelSpread]:
         second[row] = clusters[1].centre if len(clusters) > 1 and row < K else mean[row]
     ratios = slice(K, 2 * K - 1)
     mean[ratios], second[ratios] = 0.0, 0.0
-    average = mean.copy()
-    average[:K], average[r : r + K] = rows.relative[:, :K].mean(axis=0), rows.constant[:, :K].mean(axis=0)
-    narrow = _guessed_spread(rows) + np.diag(_least_spread(K) ** 2)
-    wide = np.maximum(narrow, np.diag(np.minimum(spread, MOST_SPREAD) ** 2))
-    return [
-        ModelSpread(mean=centre, covariance=covariance, outlier_share=GUESSED_OUTLIER_SHARE)
-        for centre, covariance in ((mean, narrow), (mean, wide), (second, narrow), (average, narrow))
-    ]
+    return mean, second, spread
+
+
+def _lawful(rows: FleetRows, constant: float) -> Mask:
+    """Vehicles whose measured currents obey the junction law: their sensors are hardly faulty, whatever they carry."""
+    K = rows.branches
+    sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
+    ratios = np.abs(rows.relative[:, K : 2 * K - 1]) < LAWFUL * np.maximum(sd[:, K : 2 * K - 1], LAWFUL_GAIN)
+    usual = np.abs(rows.constant[:, K] - constant) < LAWFUL * np.maximum(sd[:, 4 * K - 1], LAWFUL_CONSTANT)
+    return np.asarray(ratios.all(axis=1) & usual)
 
 
 def trusted_spread(rows: FleetRows, trusted: Mask) -> ModelSpread:
