@@ -41,7 +41,7 @@ class Cluster:
     gain: float
 
 
-def densest_clusters(values: Array, sd: Array, *, most: int = 1) -> list[Cluster]:
+def densest_clusters(values: Array, sd: Array, *, most: int = 1, farthest: float = np.inf) -> list[Cluster]:
     """Find the most likely clusters, the best first; later ones lie apart from those before.
 
     Parameters
@@ -50,13 +50,18 @@ def densest_clusters(values: Array, sd: Array, *, most: int = 1) -> list[Cluster
         Values, and standard deviations of their sampling errors, positive.
     most : int
         Number of clusters wanted.
+    farthest : float
+        Largest magnitude of a centre.
 
     Returns
     -------
     list of Cluster
-        At least one; fewer than wanted if there are not so many.
+        At least one, unless no value is near enough; fewer than wanted if there are not so many.
     """
-    centres = np.unique(np.quantile(values, np.linspace(0.0, 1.0, min(len(values), MOST_CENTRES)), method="nearest"))
+    near = values[np.abs(values) <= farthest]
+    if not near.size:
+        return []
+    centres = np.unique(np.quantile(near, np.linspace(0.0, 1.0, min(len(near), MOST_CENTRES)), method="nearest"))
     extent = float(np.ptp(values))
     narrowest = float(np.median(sd))
     if extent <= narrowest:

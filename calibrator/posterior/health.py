@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calibrator.drive import Array
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
 from calibrator.posterior.cluster import Cluster, densest_clusters
-from calibrator.posterior.model_spread import MOST_UNMEASURED
+from calibrator.posterior.model_spread import unmeasured_load
 
 __all__ = ["ReferenceHealth", "examine_reference"]
 
@@ -101,9 +101,9 @@ def examine_reference(rows: FleetRows, branches: Sequence[str], *, full_scale_a:
             f"{len(rows)} vehicles are few for a fleet in which {min(share):.0%} agree: at least {least} are needed "
             f"to trust its reference"
         )
-    constant, doubt = _usual_constant(rows)
-    unmeasured_a = constant * full_scale_a
-    if abs(constant) > max(LEAST_COMMON_OFFSET, SURE * doubt):
+    load = unmeasured_load(rows.constant[:, K], _sd(rows, 4 * K - 1))
+    unmeasured_a = load.centre * full_scale_a
+    if abs(load.centre) > max(LEAST_COMMON_OFFSET, SURE * _uncertainty(load, _sd(rows, 4 * K - 1))):
         warnings.append(
             f"the currents of most vehicles sum to {unmeasured_a:+.1f} A: a load without a sensor, as is taken here, "
             f"or an offset that most vehicles share"
@@ -130,17 +130,6 @@ def _cluster(rows: FleetRows, row: int) -> list[Cluster]:
     """The two densest clusters of a relative row among the vehicles that tell it."""
     told = _told(rows, row)
     return densest_clusters(rows.relative[told, row], _sd(rows, row)[told], most=2) if told.any() else []
-
-
-def _usual_constant(rows: FleetRows) -> tuple[float, float]:
-    """Densest cluster of the junction's constant among those that a load without a sensor can make, and its doubt."""
-    K = rows.branches
-    possible = np.abs(rows.constant[:, K]) < MOST_UNMEASURED
-    if not possible.any():
-        return 0.0, 0.0
-    sd = _sd(rows, 4 * K - 1)[possible]
-    found = densest_clusters(rows.constant[possible, K], sd)[0]
-    return found.centre, _uncertainty(found, sd)
 
 
 def _uncertainty(cluster: Cluster, sd: Array) -> float:

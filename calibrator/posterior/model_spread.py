@@ -10,11 +10,11 @@ import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, constant_design, relative_design
-from calibrator.posterior.cluster import densest_clusters
+from calibrator.posterior.cluster import Cluster, densest_clusters
 from calibrator.posterior.fault_prior import OUTLIER_VARIANCE, FaultPrior, ModelSpread
 from calibrator.posterior.states import States
 
-__all__ = ["MOST_UNMEASURED", "drawn_spread", "free_centres", "initial_spreads", "next_spread", "trusted_spread"]
+__all__ = ["drawn_spread", "free_centres", "initial_spreads", "next_spread", "trusted_spread", "unmeasured_load"]
 
 USED_STATES = 24
 """States of each vehicle that are looked at, the most probable ones. [1]"""
@@ -30,6 +30,8 @@ LAWFUL, LAWFUL_GAIN, LAWFUL_CONSTANT = 3.0, 0.001, 0.002
 """Deviations up to which a vehicle obeys the junction law, and the least one of a gain ratio and the constant. [1]"""
 FEWEST_LAWFUL = 3
 """Vehicles that make a cluster."""
+LEAST_AGREEING_LOAD = 0.15
+"""Share of the vehicles that must agree on a load without a sensor. [1]"""
 MOST_UNMEASURED = 0.03
 """Largest load without a sensor that is looked for, over full scale; larger constants are offsets. [1]"""
 OUTLIER_VEHICLES, GUESSED_OUTLIER_SHARE = 2.0, 0.05
@@ -73,7 +75,9 @@ def _clusters(rows: FleetRows, chosen: Mask) -> tuple[Array, Array, Array]:
     for row in _informed_rows(K):
         told = chosen & (sd[:, row] < np.sqrt(UNKNOWN_VARIANCE) / 2.0)
         if row == 4 * K - 1:
-            told &= np.abs(values[:, row]) < MOST_UNMEASURED
+            load = unmeasured_load(values[told, row], sd[told, row])
+            mean[row], second[row], spread[row] = load.centre, load.centre, load.spread
+            continue
         if not told.any():
             continue
         clusters = densest_clusters(values[told, row], sd[told, row], most=2)
@@ -82,6 +86,25 @@ def _clusters(rows: FleetRows, chosen: Mask) -> tuple[Array, Array, Array]:
     ratios = slice(K, 2 * K - 1)
     mean[ratios], second[ratios] = 0.0, 0.0
     return mean, second, spread
+
+
+def unmeasured_load(constant: Array, sd: Array) -> Cluster:
+    """Densest cluster of the junction's constant among those that a load without a sensor can make.
+
+    Parameters
+    ----------
+    constant, sd : ndarray of shape (N,)
+        Constants of N vehicles in fractions of full scale, and their standard deviations. [1]
+
+    Returns
+    -------
+    Cluster
+        At zero if too few vehicles agree for such a load to be taken for granted.
+    """
+    for found in densest_clusters(constant, sd, farthest=MOST_UNMEASURED):
+        if found.share >= LEAST_AGREEING_LOAD:
+            return found
+    return Cluster(centre=0.0, spread=0.0, share=0.0, gain=0.0)
 
 
 def _lawful(rows: FleetRows, constant: float) -> Mask:
