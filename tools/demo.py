@@ -27,12 +27,15 @@ from ecu_node.database import read_database
 from ecu_node.errors import UserError
 from ecu_node.layout import read_layout
 from ecu_node.node import choose_parameters, open_bus, serve
+from ecu_node.parameters import read_parameters
 from ecu_node.wiring import wire
 from replay import read_log, replay
 
 ROOT = Path(__file__).resolve().parent.parent
 LAYOUT = "dbc/hv_powertrain.toml"
 VEHICLES, BRANCHES = 44, 3
+HELD_OUT = 4
+"""Vehicles from which the fleet learns nothing; the first that may be corrected drives at the end."""
 MINUTES = 8
 """Length of the trip that each vehicle is calibrated on. [min]"""
 SECONDS = 40.0
@@ -78,9 +81,11 @@ def show(drives: str, out: Path) -> None:
         *("--layout", LAYOUT, "--out", fleet),
     )
     truth = read_truth(fleet / "truth.json")
-    vehicle = faulty_vehicle(truth)
-    step(2, f"the calibrator learns each vehicle's sensors from these logs ({vehicle} is held out of the learning)")
-    run("calibrator", "calibrate", fleet, "--layout", LAYOUT, "--hold-out", vehicle, "--out", result)
+    held_out = faulty_vehicles(truth)
+    step(2, f"the calibrator learns each vehicle's sensors from these logs ({', '.join(held_out)} are held out)")
+    options = [part for name in held_out for part in ("--hold-out", name)]
+    run("calibrator", "calibrate", fleet, "--layout", LAYOUT, *options, "--out", result)
+    vehicle = corrected_vehicle(result, held_out)
     step(3, "because this fleet is artificial, the truth is known")
     run("calibrator", "score", result, "--truth", fleet / "truth.json")
     step(4, f"vehicle {vehicle} drives a trip that nobody has seen, with its node on the bus")
@@ -119,13 +124,22 @@ def import_recordings(folder: str, out: Path) -> str:
     return str(out / "store")
 
 
-def faulty_vehicle(truth: FleetTruth) -> str:
-    """First vehicle with a faulty sensor and no hardware fault."""
-    for name, vehicle in truth.vehicles.items():
-        sound = not vehicle.hardware_drift and not any(vehicle.hardware_offset_a.values())
-        if sound and (any(vehicle.drift.values()) or any(vehicle.offset_a.values())):
+def faulty_vehicles(truth: FleetTruth) -> list[str]:
+    """First vehicles with a faulty sensor."""
+    faulty = [name for name, v in truth.vehicles.items() if any(v.drift.values()) or any(v.offset_a.values())]
+    if not faulty:
+        raise FleetError("no vehicle of the fleet has a faulty sensor; choose another seed")
+    return faulty[:HELD_OUT]
+
+
+def corrected_vehicle(result: Path, held_out: list[str]) -> str:
+    """First of the vehicles held out that may be corrected; what is said of those before it."""
+    for name in held_out:
+        found = read_parameters(result / "params" / f"{name}.json")
+        if found.verdict == "corrected":
             return name
-    raise FleetError("no vehicle of the fleet has only sensor faults; choose another seed")
+        say(f"{name}: {found.verdict}; {found.deciding_evidence}")
+    raise FleetError("none of the vehicles held out may be corrected; choose another seed")
 
 
 def record_live_drive(parameters: Path, vehicle: str, *, log: Path, recording: Path) -> None:
