@@ -21,8 +21,8 @@ __all__ = ["ReferenceHealth", "examine_reference"]
 
 LEAST_AGREEING = 5
 """Vehicles that must agree for their centre to be trusted."""
-LEAST_SHARE, LEAST_GAIN = 0.15, 3.0
-"""Share of the fleet, and log likelihood over no cluster, that a cluster needs. [1]"""
+LEAST_SHARE, LEAST_GAIN, MOST_SPREAD = 0.15, 3.0, 0.03
+"""Share of the fleet and log likelihood over no cluster that a cluster of slopes needs, and its largest spread. [1]"""
 SURE = 4.0
 """Standard deviations from which on a centre is off. [1]"""
 LEAST_COMMON_GAIN, LEAST_COMMON_OFFSET = 0.003, 0.001
@@ -168,7 +168,7 @@ def _no_cluster(
     """Branches in which no two vehicles agree."""
     texts = []
     for k, found in enumerate(slopes):
-        if vehicles > LEAST_AGREEING and (not found or found[0].share < LEAST_SHARE):
+        if vehicles > LEAST_AGREEING and not (found and _agree(found[0])):
             doubtful.add(k)
             texts.append(
                 f"no cluster of vehicles agrees in branch {branches[k]}: every sensor of it may be faulty; name "
@@ -194,6 +194,13 @@ def _second_clusters(slopes: Sequence[Sequence[Cluster]], branches: Sequence[str
         f"about {count} vehicles form a second cluster, {distances.mean():.1%} apart in branch {names}: a batch of "
         f"sensors, or a variant of the vehicle?"
     ]
+
+
+def _agree(cluster: Cluster) -> bool:
+    """Whether vehicles agree in a cluster of slopes, or merely lie near each other by chance."""
+    if cluster.share >= 1.0 - LEAST_SHARE:
+        return True
+    return cluster.share >= LEAST_SHARE and cluster.gain >= LEAST_GAIN and cluster.spread <= MOST_SPREAD
 
 
 def _is_apart(first: Cluster, second: Cluster) -> bool:

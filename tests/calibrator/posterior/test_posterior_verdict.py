@@ -1,0 +1,58 @@
+"""What is deployed: only what hardly harms, is within the limits, and rests on a reference that is not in doubt."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
+from calibrator.posterior.verdict import decide
+from ecu_node.database import VehicleDatabase
+from tests.calibrator.posterior.simulated_rows import FULL_SCALE_A, random_faults, rows_of
+
+LIMIT = 0.001
+
+
+@pytest.fixture(scope="module")
+def posterior() -> FleetPosterior:
+    faults = random_faults(1, vehicles=60, branches=2, sparsity=80.0)
+    moments = Moments(mean_a=np.full((60, 2), 10.0), mean_square_a2=np.full((60, 2), 2500.0))
+    return estimate_fleet(rows_of(faults), moments, full_scale_a=FULL_SCALE_A)
+
+
+def test_only_branches_with_a_fault_and_little_harm_are_corrected(
+    posterior: FleetPosterior, database: VehicleDatabase
+) -> None:
+    decision = decide(posterior, database.layout, harm_limit=LIMIT, doubtful=())
+    faulty = (posterior.faults.drift != 0.0) | (posterior.faults.offset_a != 0.0)
+    assert decision.corrected.any()
+    assert not (decision.corrected & ~faulty).any()
+    assert (posterior.harm[decision.corrected] < LIMIT).all()
+
+
+def test_verdicts_follow_from_what_is_corrected(posterior: FleetPosterior, database: VehicleDatabase) -> None:
+    decision = decide(posterior, database.layout, harm_limit=LIMIT, doubtful=())
+    for j, verdict in enumerate(decision.verdicts):
+        assert (verdict == "corrected") == bool(decision.corrected[j].any())
+        if verdict == "no sensor fault":
+            assert posterior.confidence[j] >= 0.95
+            assert not posterior.faults.drift[j].any()
+
+
+def test_a_doubtful_branch_is_corrected_nowhere_and_nobody_is_cleared(
+    posterior: FleetPosterior, database: VehicleDatabase
+) -> None:
+    decision = decide(posterior, database.layout, harm_limit=LIMIT, doubtful=(0,))
+    assert not decision.corrected[:, 0].any()
+    assert "no sensor fault" not in decision.verdicts
+
+
+def test_nothing_is_corrected_where_no_harm_is_allowed(posterior: FleetPosterior, database: VehicleDatabase) -> None:
+    assert not decide(posterior, database.layout, harm_limit=0.0, doubtful=()).corrected.any()
+
+
+def test_parameters_beyond_the_limits_of_the_layout_are_not_deployed(
+    posterior: FleetPosterior, database: VehicleDatabase
+) -> None:
+    wild = replace(posterior, faults=replace(posterior.faults, drift=np.full_like(posterior.faults.drift, 0.9)))
+    assert not decide(wild, database.layout, harm_limit=1.0, doubtful=()).corrected.any()
