@@ -127,7 +127,8 @@ def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8
     if bits < _WORD_BITS:
         word &= np.uint64((1 << bits) - 1)
     if signal.is_float:
-        return word.astype(f"u{bits // 8}").view(_FLOATS[bits]).astype(np.float64), complete
+        with np.errstate(invalid="ignore"):  # signalling NaN
+            return word.astype(f"u{bits // 8}").view(_FLOATS[bits]).astype(np.float64), complete
     if signal.is_signed:
         sign = np.uint64(1 << (bits - 1))
         return ((word ^ sign) - sign).view(np.int64), complete
