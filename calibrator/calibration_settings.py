@@ -33,6 +33,8 @@ class CalibrationSettings:
         Vehicles whose sensors were found faultless on a bench; they carry the reference of the posterior.
     harm_limit : float
         Largest posterior probability of making a branch worse with which it is corrected. [1]
+    sensor_models : bool
+        Whether the posterior looks for sensors that are not linear.
     classifier : Classifier
         Of the published method.
     truth : FleetTruth or None
@@ -54,6 +56,7 @@ class CalibrationSettings:
     hold_out: frozenset[str] = field(default_factory=frozenset)
     trusted: frozenset[str] = field(default_factory=frozenset)
     harm_limit: float = HARM_LIMIT
+    sensor_models: bool = False
     classifier: Classifier = Classifier.TREE
     truth: FleetTruth | None = None
     sparsity: float = 80.0

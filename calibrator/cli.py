@@ -177,6 +177,9 @@ def calibrate(
         list[str] | None,
         typer.Option("--trusted", help="Vehicle with bench-checked sensors: it carries the reference (posterior)."),
     ] = None,
+    sensor_models: Annotated[
+        bool, typer.Option("--sensor-models", help="Look for sensors that are not linear as well (posterior).")
+    ] = False,
     classifier: Annotated[
         Classifier, typer.Option("--classifier", help="Tells hardware faults (published).")
     ] = Classifier.TREE,
@@ -211,6 +214,7 @@ def calibrate(
         method=method,
         harm_limit=harm_limit,
         trusted=frozenset(trusted or ()),
+        sensor_models=sensor_models,
         classifier=classifier,
         truth=_truth_of(fleet, truth) if truth is not None else None,
         sparsity=sparsity,

@@ -1,6 +1,6 @@
 """Read all vehicles of a fleet in parallel; one bad vehicle never stops the fleet."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 from joblib import delayed
@@ -14,7 +14,7 @@ from calibrator.report.progress import progress_bar
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 
-__all__ = ["read_vehicles"]
+__all__ = ["ReadVehicle", "Vehicle", "read_each", "read_vehicles"]
 
 Vehicle = TypeVar("Vehicle")
 ReadVehicle = Callable[[Sequence[DriveFile], Equipment, VehicleDatabase], Vehicle]
@@ -50,21 +50,50 @@ def read_vehicles(
     FleetError
         If no vehicle can be used.
     """
-    tasks = (delayed(_read_one)(read, entries, equipment, database) for entries in fleet.vehicles.values())
-    vehicles: list[Vehicle] = []
-    left_out = dict(fleet.left_out)
-    with progress_bar("read drives", len(fleet.vehicles), "vehicles") as progress:
-        outcomes = in_processes(tasks, workers=workers)
-        for done, (name, (vehicle, error)) in enumerate(zip(fleet.vehicles, outcomes, strict=True), start=1):
-            if vehicle is None:
-                left_out[name] = error
-            else:
-                vehicles.append(vehicle)
-            progress(done)
-    if not vehicles:
+    found, errors = read_each(dict.fromkeys(fleet.vehicles, read), fleet, equipment, database, workers=workers)
+    left_out = {**fleet.left_out, **errors}
+    if not found:
         reason = next(iter(left_out.values()), "")
         raise FleetError(f"{fleet.path}: no vehicle has enough usable data; the first says: {reason}")
-    return vehicles, left_out
+    return list(found.values()), left_out
+
+
+def read_each(
+    readers: "Mapping[str, ReadVehicle[Vehicle]]",
+    fleet: FleetSource,
+    equipment: Equipment,
+    database: VehicleDatabase,
+    *,
+    workers: int,
+) -> tuple[dict[str, Vehicle], dict[str, str]]:
+    """Read some vehicles, each in its own way.
+
+    Parameters
+    ----------
+    readers : mapping of str to callable
+        Makes what is needed of a vehicle from its drives, by name of the vehicle; each can go to another process.
+    fleet, equipment, database, workers
+        As for :func:`read_vehicles`.
+
+    Returns
+    -------
+    found : dict of str to what the reader makes
+        The vehicles that can be used, in the order of the readers.
+    errors : dict of str to str
+        Why the others cannot, by name.
+    """
+    tasks = (delayed(_read_one)(read, fleet.vehicles[name], equipment, database) for name, read in readers.items())
+    found: dict[str, Vehicle] = {}
+    errors: dict[str, str] = {}
+    with progress_bar("read drives", len(readers), "vehicles") as progress:
+        outcomes = in_processes(tasks, workers=workers)
+        for done, (name, (vehicle, error)) in enumerate(zip(readers, outcomes, strict=True), start=1):
+            if vehicle is None:
+                errors[name] = error
+            else:
+                found[name] = vehicle
+            progress(done)
+    return found, errors
 
 
 def _read_one(

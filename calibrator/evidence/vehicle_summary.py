@@ -36,6 +36,8 @@ class VehicleSummary:
         Of its branches; the reference is the branch with the largest currents.
     zero_current : ZeroCurrent
         What the sensors showed while the contactors were open.
+    recorded : frozenset of str
+        Recorded inputs of which every drive has good samples.
     """
 
     vehicle: str
@@ -43,6 +45,7 @@ class VehicleSummary:
     summary: DriveSummary
     delays: BranchDelays
     zero_current: ZeroCurrent
+    recorded: frozenset[str]
 
 
 def read_vehicle_summary(
@@ -87,7 +90,12 @@ def read_vehicle_summary(
         summary=summarise(samples, period_s=layout.period_s),
         delays=delays,
         zero_current=zero_current_offsets(drives, equipment.branches, layout.contactor),
+        recorded=frozenset.intersection(*(_recorded(drive) for drive in drives)),
     )
+
+
+def _recorded(drive: Drive) -> frozenset[str]:
+    return frozenset(name for name, channel in drive.inputs.items() if channel.good.any())
 
 
 def _largest_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple[str, ...]:

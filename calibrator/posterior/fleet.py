@@ -1,6 +1,11 @@
-"""The default method on a real fleet: drives -> summaries -> evidence -> posterior -> parameter files."""
+"""The default method on a real fleet: drives -> summaries -> evidence -> posterior -> parameter files.
+
+If asked to, the drives are read a second time to find sensors that are not linear; if there are any, the posterior is
+computed anew from the linear parts of all sensors.
+"""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -13,7 +18,9 @@ from calibrator.parameter_files import RunIdentity, by_branch, junction_rms_a
 from calibrator.posterior.calibration import calibrate_posterior
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.explain import deciding_evidence, explanations
+from calibrator.posterior.second_pass import finding_notices, tell_sensors, without_sensor_models
 from calibrator.posterior.verdict import Deployment, decide
+from calibrator.sensor_models.fleet import all_linear, find_sensor_models
 from calibrator.vehicles import read_vehicles
 from ecu_node.parameters import (
     BranchParameters,
@@ -63,26 +70,45 @@ def calibrate_fleet_posterior(
         raise FleetError(f"{fleet.path}: no usable vehicle {', '.join(sorted(missing))} to trust")
     trusted = np.array([name in settings.trusted for name in names])
     layout = identity.database.layout
-    posterior = calibrate_posterior(
-        [vehicle.summary for vehicle in vehicles],
+    estimate = partial(
+        calibrate_posterior,
         full_scale_a=layout.full_scale_a,
         branches=equipment.branches,
         readings=_readings(vehicles),
         trusted=trusted if trusted.any() else None,
         learning=np.array(learning),
     )
+    posterior = estimate([vehicle.summary for vehicle in vehicles])
+    findings = all_linear(vehicles)
+    if settings.sensor_models:
+        findings = find_sensor_models(
+            vehicles,
+            posterior.faults.offset_a,
+            fleet,
+            equipment,
+            identity.database,
+            learning=np.array(learning),
+            trusted=trusted,
+            workers=workers,
+        )
+    if findings.not_linear.any():
+        posterior = estimate(findings.summaries)
     health = posterior.health
     assert health is not None
     doubtful = () if trusted.any() else health.doubtful
-    deployment = decide(posterior, layout, harm_limit=settings.harm_limit, doubtful=doubtful)
+    decision = decide(posterior, layout, harm_limit=settings.harm_limit, doubtful=doubtful)
+    deployment = without_sensor_models(decision, findings)
     parameters = [
-        _parameters(vehicle, posterior, deployment, position=j, branches=equipment.branches, identity=identity)
+        tell_sensors(
+            _parameters(vehicle, posterior, deployment, position=j, branches=equipment.branches, identity=identity),
+            findings.choices[j],
+        )
         for j, vehicle in enumerate(vehicles)
     ]
     return FleetOutcome(
         parameters=parameters,
         left_out=left_out,
-        notices=health.warnings,
+        notices=(*health.warnings, *finding_notices(names, findings, equipment.branches)),
         details=_details(posterior, equipment.branches),
     )
 

@@ -114,6 +114,7 @@ class Family(Protocol):
         ...
 
 
+@dataclass(frozen=True)
 class GainBySignFamily:
     """Gain differs by the sign of the current: charging and discharging, driving and recuperating."""
 
@@ -134,6 +135,7 @@ class GainBySignFamily:
         return GainBySign(drift_positive=(1.0 + drift) / (1.0 - excess) - 1.0, drift_negative=drift)
 
 
+@dataclass(frozen=True)
 class TemperatureFamily:
     """Drift changes with the temperature of the sensor."""
 

@@ -1,0 +1,168 @@
+"""Second pass over a fleet's drives: which sensors are not linear, and the summaries of their linear parts.
+
+The first pass has found delays and, with linear sensors, offsets. Both are used here: the delays are taken out before
+the drives are aligned, and the offsets are what the sensors show at 0 A.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from calibrator.drive import Array, DriveFile, Mask
+from calibrator.drives.align import align
+from calibrator.drives.delays import without_delays
+from calibrator.drives.fleet_source import Equipment, FleetSource, load_drive
+from calibrator.evidence.summary import DriveSummary
+from calibrator.evidence.vehicle_summary import VehicleSummary
+from calibrator.sensor_models.choice import LEAST_VEHICLES, LINEAR, SensorModelChoice, choose_sensor_models
+from calibrator.sensor_models.linear_part import linear_summary
+from calibrator.sensor_models.summary import SensorSummary, summarise_sensors
+from calibrator.vehicles import read_each
+from ecu_node.database import VehicleDatabase
+
+__all__ = ["SensorFindings", "all_linear", "find_sensor_models"]
+
+_LINEAR = SensorModelChoice(log_bayes_factor=0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorFindings:
+    """What the second pass found of N vehicles with K branches.
+
+    Attributes
+    ----------
+    choices : sequence of N sequences of K SensorModelChoice
+        Linear for vehicles that could not be looked at.
+    summaries : sequence of N DriveSummary
+        For the linear estimator: of the linear parts where a sensor is not linear, else those of the first pass.
+    notices : tuple of str
+        What the user should know.
+    """
+
+    choices: Sequence[Sequence[SensorModelChoice]]
+    summaries: Sequence[DriveSummary]
+    notices: tuple[str, ...] = ()
+
+    @property
+    def not_linear(self) -> Mask:
+        """Which sensors are not linear, shape (N, K)."""
+        return np.array([[choice.model != LINEAR for choice in row] for row in self.choices])
+
+    @property
+    def undecided(self) -> Mask:
+        """Which sensors may be the one that is not linear, though others may be as well, shape (N, K)."""
+        return np.array([[choice.undecided for choice in row] for row in self.choices])
+
+
+def all_linear(vehicles: Sequence[VehicleSummary]) -> SensorFindings:
+    """Findings without a second pass: the first pass as it is."""
+    summaries = [vehicle.summary for vehicle in vehicles]
+    return SensorFindings(choices=[[_LINEAR] * summary.branches for summary in summaries], summaries=summaries)
+
+
+def find_sensor_models(
+    vehicles: Sequence[VehicleSummary],
+    zero_a: Array,
+    fleet: FleetSource,
+    equipment: Equipment,
+    database: VehicleDatabase,
+    *,
+    learning: Mask,
+    trusted: Mask,
+    workers: int,
+) -> SensorFindings:
+    """Read the drives again and choose the sensor model of every branch.
+
+    Parameters
+    ----------
+    vehicles : sequence of N VehicleSummary
+        From the first pass.
+    zero_a : ndarray of shape (N, K)
+        Offsets found with linear sensors. [A]
+    fleet, equipment, database : FleetSource, Equipment, VehicleDatabase
+        The fleet, its branches and inputs, DBC and layout.
+    learning : ndarray of bool of shape (N,)
+        Vehicles from which others may learn.
+    trusted : ndarray of bool of shape (N,)
+        Vehicles whose sensors were found faultless on a bench, hence linear.
+    workers : int
+        Number of processes.
+
+    Returns
+    -------
+    SensorFindings
+        In the order of the vehicles. One that cannot be read again counts as linear, with a notice.
+    """
+    temperature, notices = _temperature(vehicles, equipment, database.layout.temperature)
+    readers = {
+        vehicle.vehicle: partial(
+            _read_sensors, delays=vehicle.delays.by_branch(), zero_a=zero_a[j], temperature=temperature
+        )
+        for j, vehicle in enumerate(vehicles)
+    }
+    found, errors = read_each(readers, fleet, equipment, database, workers=workers)
+    notices += [f"sensor models: {name} counts as linear: {reason}" for name, reason in errors.items()]
+    names = [vehicle.vehicle for vehicle in vehicles]
+    learners = [name for name, learns in zip(names, learning, strict=True) if learns and name in found]
+    if len(learners) < LEAST_VEHICLES:
+        return replace(all_linear(vehicles), notices=(*notices, _too_few(len(learners))))
+    chosen = _choose(found, learners)
+    linear = all_linear(vehicles).choices
+    choices = [
+        chosen[name] if name in chosen and not sound else row
+        for name, sound, row in zip(names, trusted, linear, strict=True)
+    ]
+    summaries = [
+        linear_summary(found[vehicle.vehicle], row) if any(c.model != LINEAR for c in row) else vehicle.summary
+        for vehicle, row in zip(vehicles, choices, strict=True)
+    ]
+    return SensorFindings(choices=choices, summaries=summaries, notices=tuple(notices))
+
+
+def _too_few(learners: int) -> str:
+    return (
+        f"sensor models: {learners} vehicles to learn from, at least {LEAST_VEHICLES} are needed; all count as linear"
+    )
+
+
+def _temperature(
+    vehicles: Sequence[VehicleSummary], equipment: Equipment, name: str | None
+) -> tuple[str | None, list[str]]:
+    """Input that is the temperature, if most vehicles have it, and what to say if not."""
+    if name is None:
+        return None, []
+    if name in equipment.fleet_inputs:
+        return None, [f"sensor models: {name} is a fleet input, so no drift with temperature is looked for"]
+    if 2 * sum(name in vehicle.recorded for vehicle in vehicles) <= len(vehicles):
+        return None, [f"sensor models: {name} was hardly recorded, so no drift with temperature is looked for"]
+    return name, []
+
+
+def _read_sensors(
+    entries: Sequence[DriveFile],
+    equipment: Equipment,
+    database: VehicleDatabase,
+    *,
+    delays: Mapping[str, float],
+    zero_a: Array,
+    temperature: str | None,
+) -> SensorSummary:
+    """Read the drives of one vehicle and summarise them with the columns of the families."""
+    layout = database.layout
+    inputs = (*equipment.fleet_inputs, *([temperature] if temperature is not None else []))
+    samples = [
+        align(without_delays(load_drive(entry, database), delays), layout, equipment.branches, inputs=inputs)
+        for entry in entries
+    ]
+    return summarise_sensors(samples, zero_a=zero_a, period_s=layout.period_s, temperature=temperature)
+
+
+def _choose(found: Mapping[str, SensorSummary], learners: Sequence[str]) -> dict[str, list[SensorModelChoice]]:
+    """Choices by vehicle; one that is held out is compared with the learners and does not change their choices."""
+    fleet = [found[name] for name in learners]
+    chosen = dict(zip(learners, choose_sensor_models(fleet), strict=True))
+    for name in found.keys() - chosen.keys():
+        chosen[name] = choose_sensor_models([*fleet, found[name]])[-1]
+    return chosen

@@ -1,0 +1,121 @@
+"""The second pass over a drive store: who counts as linear, who teaches whom, and who must not stop the fleet."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrator.drive import Array, Channel, Drive
+from calibrator.drives.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment
+from calibrator.drives.store import write_drive
+from calibrator.evidence.vehicle_summary import VehicleSummary, read_vehicle_summary
+from calibrator.sensor_models.choice import LINEAR
+from calibrator.sensor_models.families import GainBySign
+from calibrator.sensor_models.fleet import SensorFindings, find_sensor_models
+from calibrator.vehicles import read_vehicles
+from ecu_node.database import VehicleDatabase
+from tests.calibrator.sensor_models.sensor_fleets import PERIOD_S, SensorFleet, make_fleet
+
+VEHICLES, BENT = 12, 3
+VOLTAGE, SPEED = 400.0, 100.0
+Pass = tuple[list[VehicleSummary], Array, FleetSource, Equipment]
+
+
+@pytest.fixture(scope="module")
+def fleet() -> SensorFleet:
+    sensor = GainBySign(drift_positive=0.05, drift_negative=-0.1)
+    return make_fleet(vehicles=VEHICLES, put={(BENT, 0): sensor}, seed=1)
+
+
+@pytest.fixture
+def first_pass(fleet: SensorFleet, database: VehicleDatabase, tmp_path: Path) -> Pass:
+    """A store of the fleet, read once, with the true offsets as zeros."""
+    for j in range(VEHICLES):
+        write_drive(tmp_path, as_drive(fleet, j), database.layout)
+    source = find_fleet(tmp_path)
+    equipment = probe_equipment(source, database, None)
+    vehicles, _ = read_vehicles(read_vehicle_summary, source, equipment, database, workers=1)
+    return vehicles, fleet.faults.offset_a, source, equipment
+
+
+def as_drive(fleet: SensorFleet, j: int) -> Drive:
+    """Drive whose torque at constant speed and voltage gives the inputs of the fleet's samples."""
+    samples = fleet.samples[j]
+    driving, recuperation, _, temperature = samples.inputs.T
+    inputs = {
+        "voltage": np.full(len(driving), VOLTAGE),
+        "speed": np.full(len(driving), SPEED),
+        "torque": (driving + recuperation) * VOLTAGE / SPEED,
+        "junction_box_temperature": temperature,
+    }
+    time_s = PERIOD_S * np.arange(float(len(driving)))
+
+    def channel(value: Array) -> Channel:
+        return Channel(time_s=time_s, value=value, good=np.ones(len(value), bool))
+
+    return Drive(
+        vehicle=f"V{j:02d}",
+        name="d",
+        branches={name: channel(samples.currents_a[:, k]) for k, name in enumerate(("battery", "motor"))},
+        inputs={name: channel(value) for name, value in inputs.items()},
+    )
+
+
+def second_pass(
+    first: Pass, database: VehicleDatabase, *, held_out: int | None = None, trusted: int | None = None
+) -> SensorFindings:
+    numbers = np.arange(VEHICLES)
+    return find_sensor_models(*first, database, learning=numbers != held_out, trusted=numbers == trusted, workers=1)
+
+
+def found(findings: SensorFindings) -> set[tuple[int, int]]:
+    return {(j, k) for j, row in enumerate(findings.choices) for k, c in enumerate(row) if c.model != LINEAR}
+
+
+def test_it_is_found_and_only_its_summary_is_replaced(first_pass: Pass, database: VehicleDatabase) -> None:
+    findings = second_pass(first_pass, database)
+    assert found(findings) == {(BENT, 0)}
+    kept = [findings.summaries[j] is vehicle.summary for j, vehicle in enumerate(first_pass[0])]
+    assert [j for j, same in enumerate(kept) if not same] == [BENT]
+    assert findings.notices == ()
+
+
+def test_a_vehicle_that_is_held_out_is_judged_and_does_not_change_the_others(
+    first_pass: Pass, database: VehicleDatabase
+) -> None:
+    findings = second_pass(first_pass, database, held_out=BENT)
+    assert found(findings) == {(BENT, 0)}
+    first_pass[2].vehicles[f"V{BENT:02d}"][0].path.unlink()
+    without = second_pass(first_pass, database, held_out=BENT)
+    others = [j for j in range(VEHICLES) if j != BENT]
+    assert [findings.choices[j] for j in others] == [without.choices[j] for j in others]
+
+
+def test_the_sensors_of_a_trusted_vehicle_are_linear(first_pass: Pass, database: VehicleDatabase) -> None:
+    assert found(second_pass(first_pass, database, trusted=BENT)) == set()
+
+
+def test_a_vehicle_that_cannot_be_read_again_counts_as_linear_and_is_named(
+    first_pass: Pass, database: VehicleDatabase
+) -> None:
+    first_pass[2].vehicles["V07"][0].path.write_bytes(b"not a drive")
+    findings = second_pass(first_pass, database)
+    assert found(findings) == {(BENT, 0)}
+    assert findings.summaries[7] is first_pass[0][7].summary
+    assert [notice for notice in findings.notices if "V07" in notice and "counts as linear" in notice]
+
+
+def test_too_few_vehicles_all_count_as_linear_and_it_is_said(first_pass: Pass, database: VehicleDatabase) -> None:
+    vehicles, zero_a, source, equipment = first_pass
+    findings = find_sensor_models(
+        vehicles[:6],
+        zero_a[:6],
+        source,
+        equipment,
+        database,
+        learning=np.ones(6, bool),
+        trusted=np.zeros(6, bool),
+        workers=1,
+    )
+    assert found(findings) == set()
+    assert "6 vehicles to learn from, at least 8 are needed" in findings.notices[0]
