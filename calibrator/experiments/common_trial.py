@@ -15,6 +15,7 @@ from calibrator.experiments.trial import FleetLaw, Trial, unseen_drive
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.identification.identify import choose_order, identify
 from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
+from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean, junction_mean_square
 from calibrator.random_streams import Purpose, random_stream
 
@@ -88,12 +89,14 @@ def _trial(drive: CommonDrive, law: FleetLaw, simulated: Iterable[Array], truth:
     )
 
 
-def _posterior(drive: CommonDrive, evidence: FleetEvidence, reference_mean_a: Array, truth: Faults) -> FleetPosterior:
+def _posterior(
+    drive: CommonDrive, evidence: FleetEvidence, reference_mean_a: Array, truth: Faults, given: FaultPrior | None
+) -> FleetPosterior:
     """Default method on the simulations, and on the moments of what the vehicles measured on the unity drive."""
     measured = measured_moments(drive.unity, truth)
     rows = common_rows(evidence, reference_mean_a, measured, full_scale_a=drive.full_scale_a)
     moments = Moments(mean_a=measured.mean_a, mean_square_a2=measured.mean_square_a2)
-    return estimate_fleet(rows, moments, full_scale_a=drive.full_scale_a)
+    return estimate_fleet(rows, moments, full_scale_a=drive.full_scale_a, given=given)
 
 
 def _artificial_fleet(

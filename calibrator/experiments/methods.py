@@ -10,7 +10,7 @@ from calibrator.faults import Faults
 from calibrator.published.classify import Classification, FaultTrees, classify_by_threshold, classify_by_truth
 from calibrator.published.recovery import recover_fleet
 
-__all__ = ["PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "Estimate", "Method", "Posterior", "Published"]
+__all__ = ["CEILING", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "Estimate", "Method", "Posterior", "Published"]
 
 HARM_LIMIT = 0.001
 """Probability of making a branch worse below which the default corrects it. [1]"""
@@ -81,19 +81,22 @@ class Published:
 
 @dataclass(frozen=True, kw_only=True)
 class Posterior:
-    """The default method; nobody tells it anything of the faults.
+    """The default method.
 
     Attributes
     ----------
     name : str
         As on the command line.
+    knows_law : bool
+        Whether it is told how the faults were drawn, to show the ceiling; the default is told nothing.
     """
 
     name: str = "posterior"
+    knows_law: bool = False
 
     def estimate(self, trial: Trial) -> Estimate:
         """Estimate, and correct the branches that are hardly ever made worse."""
-        posterior = trial.posterior()
+        posterior = trial.posterior(trial.law if self.knows_law else None)
         return Estimate(
             faults=posterior.faults,
             hardware=posterior.hardware_fault > 0.5,
@@ -126,3 +129,4 @@ THRESHOLD = Published(name="published/threshold", classify=_by_threshold)
 TREE = Published(name="published/tree", classify=_by_tree)
 PERFECT = Published(name="published/perfect", classify=_by_truth)
 POSTERIOR = Posterior()
+CEILING = Posterior(name="posterior/law known", knows_law=True)

@@ -5,7 +5,7 @@ from functools import partial
 
 from calibrator.experiments.joined_trial import joined_trial
 from calibrator.experiments.judging import Effort, Setting, run_settings
-from calibrator.experiments.methods import PERFECT, POSTERIOR, Method
+from calibrator.experiments.methods import CEILING, PERFECT, POSTERIOR, Method
 from calibrator.experiments.recorded_fleet import RecordedFleet
 from calibrator.experiments.recorded_trial import NOISE, RecordedCase, recorded_trial
 from calibrator.experiments.result import ExperimentResult
@@ -13,6 +13,7 @@ from calibrator.experiments.result import ExperimentResult
 __all__ = ["data_experiment", "phase_experiment", "real_experiment", "recorded_settings"]
 
 METHODS: Sequence[Method] = (PERFECT, POSTERIOR)
+REAL_METHODS: Sequence[Method] = (PERFECT, POSTERIOR, CEILING)
 LOAD_A = (3.0, 1.0)
 """Control units and the like take 1 to 4 A that no branch measures. [A]"""
 REAL_CASES = (
@@ -40,7 +41,7 @@ def real_experiment(
     *,
     fleet: RecordedFleet,
     cases: Sequence[RecordedCase] = REAL_CASES,
-    methods: Sequence[Method] = METHODS,
+    methods: Sequence[Method] = REAL_METHODS,
     effort: Effort = DEFAULT_EFFORT,
 ) -> ExperimentResult:
     """Real drives: faults injected into recorded trips, each a vehicle of its own.

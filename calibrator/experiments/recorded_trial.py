@@ -15,12 +15,14 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.evidence.summary import summarise
+from calibrator.experiments.known_law import balanced_law
 from calibrator.experiments.recorded_fleet import RecordedFleet
 from calibrator.experiments.trial import Trial, UnseenDrive, unseen_drive
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.identification.vehicle_model import identify_vehicle
 from calibrator.posterior.calibration import calibrate_posterior
 from calibrator.posterior.estimate import FleetPosterior
+from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.random_streams import Purpose, random_stream
 
@@ -179,14 +181,15 @@ def trial_of_samples(
         unseen=_next_trips(trips, vehicles),
         posterior=partial(_posterior, vehicles.samples, fleet),
         collect=partial(_published_evidence, vehicles.samples, fleet),
+        law=balanced_law(case.branches, case.sparsity, case.magnitude),
         delay_error_s=vehicles.delay_error_s,
     )
 
 
-def _posterior(samples: Sequence[Samples], fleet: RecordedFleet) -> FleetPosterior:
+def _posterior(samples: Sequence[Samples], fleet: RecordedFleet, given: FaultPrior | None) -> FleetPosterior:
     names = fleet.database.layout.fleet_inputs or fleet.database.layout.model_inputs
     summaries = [summarise([drive.with_inputs(names)], period_s=fleet.period_s) for drive in samples]
-    return calibrate_posterior(summaries, full_scale_a=fleet.full_scale_a)
+    return calibrate_posterior(summaries, full_scale_a=fleet.full_scale_a, given=given)
 
 
 def _published_evidence(samples: Sequence[Samples], fleet: RecordedFleet) -> FleetEvidence:

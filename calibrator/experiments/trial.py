@@ -13,6 +13,7 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetPosterior
+from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.published.evidence import FleetEvidence
 
 __all__ = ["FleetLaw", "Trial", "UnseenDrive", "unseen_drive"]
@@ -96,7 +97,9 @@ class Trial:
     unseen : UnseenDrive
         Where corrections are judged.
     posterior : callable
-        Runs the default method.
+        Runs the default method, with a prior of the faults or, for None, one that it estimates.
+    law : FaultPrior or None
+        How the faults were drawn; only the method that is to show the ceiling may look.
     collect : callable
         Makes the evidence of the published method.
     training : callable or None
@@ -110,8 +113,9 @@ class Trial:
     full_scale_a: float
     truth: Faults
     unseen: UnseenDrive
-    posterior: Callable[[], FleetPosterior]
+    posterior: Callable[[FaultPrior | None], FleetPosterior]
     collect: Callable[[], FleetEvidence]
+    law: FaultPrior | None = None
     training: Callable[[], tuple[FleetEvidence, Faults]] | None = None
     delay_error_s: Array | None = None
 

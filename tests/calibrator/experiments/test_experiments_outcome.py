@@ -41,7 +41,7 @@ def two_vehicles(*, drift: float, harm_second: float) -> tuple[Estimate, Trial]:
         full_scale_a=400.0,
         truth=truth,
         unseen=unseen_drive(np.array([1.0, -1.0]), np.array([100.0, 100.0]), truth),
-        posterior=lambda: pytest.fail("not needed"),
+        posterior=lambda _: pytest.fail("not needed"),
         collect=lambda: pytest.fail("not needed"),
     )
     estimate = Estimate(

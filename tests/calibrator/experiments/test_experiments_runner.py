@@ -126,7 +126,7 @@ def test_experiments_on_recorded_trips_write_their_pictures(fleet: RecordedFleet
     )
     for result in results:
         write_result(tmp_path / "results", result, tuple(EXPERIMENTS))
-        assert result.methods == (PERFECT.name, POSTERIOR.name)
+        assert result.methods[:2] == (PERFECT.name, POSTERIOR.name)
         assert (tmp_path / "results" / f"{result.name}.png").is_file()
     same = [result.rows[1].figures["recovery_rate"] for result in results[:2]]
     assert same[0] == same[1]
