@@ -16,8 +16,8 @@ from ecu_node.database import VehicleDatabase
 
 __all__ = ["VehicleSummary", "read_vehicle_summary"]
 
-LEAST_DURATION_S = 60.0
-"""Valid data below which a vehicle is left out: a few changes of speed and load. [s]"""
+LEAST_DURATION_S = 120.0
+"""Valid data below which a vehicle is left out: fewer than four blocks do not tell how sure anything is. [s]"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,16 +4,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
+from calibrator.calibration_settings import HARM_LIMIT
 from calibrator.drive import Array, Mask
 from calibrator.experiments.trial import Trial
 from calibrator.faults import Faults
+from calibrator.posterior.estimate import FleetPosterior
 from calibrator.published.classify import Classification, FaultTrees, classify_by_threshold, classify_by_truth
 from calibrator.published.recovery import recover_fleet
 
 __all__ = ["CEILING", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "Estimate", "Method", "Posterior", "Published"]
-
-HARM_LIMIT = 0.001
-"""Probability of making a branch worse below which the default corrects it. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,10 +101,18 @@ class Posterior:
         return Estimate(
             faults=posterior.faults,
             hardware=posterior.hardware_fault > 0.5,
-            corrected=_changed(posterior.faults) & (posterior.harm < HARM_LIMIT),
+            corrected=_deployed(posterior),
             confidence=posterior.confidence,
             failed=0,
         )
+
+
+def _deployed(posterior: FleetPosterior) -> Mask:
+    """Branches that the default corrects, as the product does; the limits of a layout apart."""
+    corrected = _changed(posterior.faults) & posterior.identifiable & (posterior.harm < HARM_LIMIT)
+    if posterior.health is not None:
+        corrected[:, list(posterior.health.doubtful)] = False
+    return np.asarray(corrected)
 
 
 def _changed(faults: Faults) -> Mask:

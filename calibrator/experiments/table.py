@@ -1,12 +1,13 @@
 """Results of experiments as tables: for the console, and as pages."""
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 from rich.markup import escape
 from rich.table import Table
 
 from calibrator.experiments.calibration_experiment import ALL, pooled_bins
-from calibrator.experiments.methods import POSTERIOR
+from calibrator.experiments.methods import CEILING, POSTERIOR
 from calibrator.experiments.outcome import calibration_error
 from calibrator.experiments.result import ExperimentResult, Figure, Row
 
@@ -95,7 +96,7 @@ def result_table(result: ExperimentResult) -> Table:
         caption_justify="left",
         title_justify="left",
     )
-    header, rows = headline(result, SHORT)
+    header, rows = headline(_without_ceiling(result), SHORT)
     for number, heading in enumerate(header):
         first = number == 0 and bool(result.series_label)
         text = escape(heading).replace("/", "/\n").replace(", ", ",\n")
@@ -103,6 +104,11 @@ def result_table(result: ExperimentResult) -> Table:
     for row in rows:
         table.add_row(*row)
     return table
+
+
+def _without_ceiling(result: ExperimentResult) -> ExperimentResult:
+    """The result without the rows that only pages have room for."""
+    return replace(result, rows=tuple(row for row in result.rows if row.method != CEILING.name))
 
 
 def result_markdown(result: ExperimentResult) -> str:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibrator.drive import Mask
+from calibrator.errors import FleetError
 from calibrator.evidence.collect import collect_rows
 from calibrator.evidence.fleet_model import fit_fleet_model
 from calibrator.evidence.readings import Readings, no_readings, trusted_readings, with_readings
@@ -51,7 +52,14 @@ def calibrate_posterior(
     -------
     FleetPosterior
         In the order of the summaries, branches in theirs; with the health of the reference.
+
+    Raises
+    ------
+    FleetError
+        If there is no vehicle to learn from.
     """
+    if not summaries or (learning is not None and not learning.any()):
+        raise FleetError("no vehicle to learn the fleet's reference from")
     K, N = summaries[0].branches, len(summaries)
     names = [f"{k + 1}" for k in range(K)] if branches is None else branches
     order = _largest_first(summaries)

@@ -65,7 +65,7 @@ def densest_clusters(values: Array, sd: Array, *, most: int = 1, farthest: float
     extent = float(np.ptp(values))
     narrowest = float(np.median(sd))
     if extent <= narrowest:
-        return [Cluster(centre=float(np.median(values)), spread=0.0, share=1.0, gain=0.0)]
+        return [Cluster(centre=float(np.median(near)), spread=0.0, share=1.0, gain=0.0)]
     spreads = np.geomspace(narrowest / 4.0, max(extent / 4.0, narrowest), SPREADS)
     background = 0.5 * norm.pdf(values, values.mean(), values.std()) + 0.5 / (extent * (1.0 + 2.0 * MARGIN))
     found = [_at_spread(values, sd, centres, float(spread), background) for spread in spreads]

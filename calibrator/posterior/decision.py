@@ -16,7 +16,7 @@ from calibrator.score import TOLERANCE, correction_error_rms
 
 __all__ = ["Points", "best_estimates", "harm_probability", "spread_points"]
 
-POINTS_PER_STATE = 8
+POINTS_PER_STATE = 64
 """Points by which the spread of one state is told; a power of two for the quasi-random rule."""
 EQUALLY_GOOD = 0.01
 """Difference of confidence below which the more probable state is taken. [1]"""

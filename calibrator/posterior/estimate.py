@@ -159,10 +159,17 @@ def _of_vehicle(
     points = spread_points(states, j)
     state, confidence = best_estimates(points, states, j, least=(prior.relative.low, prior.constant.low))
     drift, offset = states.drift[j, state], states.offset[j, state]
-    variance = points.weight @ np.concatenate([points.drift - drift, points.offset - offset], axis=1) ** 2
+    variance = np.concatenate([_mean_square(states, j, "drift", drift), _mean_square(states, j, "offset", offset)])
     mean, mean_square = _true_moments(*moments, j, drift=drift, offset_a=offset * full_scale_a)
     harm = harm_probability(points, drift, offset, mean=mean / full_scale_a, mean_square=mean_square / full_scale_a**2)
     return _Vehicle(state, confidence, variance, harm)
+
+
+def _mean_square(states: States, j: int, name: str, estimate: Array) -> Array:
+    """Mean square of the posterior's distance from the estimate, shape (K,)."""
+    sd = states.relative_sd[j, :, 1:] if name == "drift" else states.constant_sd[j, :, states.branches - 1 :]
+    distance = getattr(states, name)[j] - estimate
+    return np.asarray(states.weight[j] @ (distance**2 + sd**2))
 
 
 def _true_moments(moments: Moments, fleet: Moments, j: int, *, drift: Array, offset_a: Array) -> tuple[Array, Array]:

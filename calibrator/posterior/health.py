@@ -97,9 +97,10 @@ def examine_reference(rows: FleetRows, branches: Sequence[str], *, full_scale_a:
     warnings += _no_cluster(slopes, branches, doubtful, len(rows)) + _second_clusters(slopes, branches, len(rows))
     least = ceil(LEAST_AGREEING / max(min(share), 1.0 / 1000.0))
     if len(rows) < least:
+        doubtful = set(range(K))
         warnings.append(
             f"{len(rows)} vehicles are few for a fleet in which {min(share):.0%} agree: at least {least} are needed "
-            f"to trust its reference"
+            f"to trust its reference; until then no branch is corrected"
         )
     load = unmeasured_load(rows.constant[:, K], _sd(rows, 4 * K - 1))
     unmeasured_a = load.centre * full_scale_a

@@ -39,8 +39,9 @@ class Deployment:
 def decide(posterior: FleetPosterior, layout: Layout, *, harm_limit: float, doubtful: tuple[int, ...]) -> Deployment:
     """Decide what is deployed.
 
-    A branch is corrected if its estimate is not zero, the probability that correction makes it worse is below the
-    limit, it is within the layout's limits, and the fleet reference is not in doubt for it.
+    A branch is corrected if its estimate is not zero, it moved enough for its gain to be told, the probability that
+    correction makes it worse is below the limit, it is within the layout's limits, and the fleet reference is not in
+    doubt for it.
 
     Parameters
     ----------
@@ -61,7 +62,7 @@ def decide(posterior: FleetPosterior, layout: Layout, *, harm_limit: float, doub
     drift, offset_a = posterior.faults.drift, posterior.faults.offset_a
     faulty = (drift != 0.0) | (offset_a != 0.0)
     allowed = (np.abs(drift) <= layout.limits.drift) & (np.abs(offset_a) <= layout.offset_limit_a)
-    corrected = faulty & allowed & (posterior.harm < harm_limit)
+    corrected = faulty & allowed & posterior.identifiable & (posterior.harm < harm_limit)
     corrected[:, list(doubtful)] = False
     verdicts = tuple(
         _verdict(corrected[j], faulty[j], float(posterior.confidence[j]), certain=not doubtful)
