@@ -133,13 +133,14 @@ def faulty_vehicles(truth: FleetTruth) -> list[str]:
 
 
 def corrected_vehicle(result: Path, held_out: list[str]) -> str:
-    """First of the vehicles held out that may be corrected; what is said of those before it."""
+    """First of the vehicles held out that may be corrected, after what is said of those before it; else the first."""
     for name in held_out:
         found = read_parameters(result / "params" / f"{name}.json")
         if found.verdict == "corrected":
             return name
         say(f"{name}: {found.verdict}; {found.deciding_evidence}")
-    raise FleetError("none of the vehicles held out may be corrected; choose another seed")
+    say(f"none of them may be corrected, so the node of {held_out[0]} passes the measured currents through")
+    return held_out[0]
 
 
 def record_live_drive(parameters: Path, vehicle: str, *, log: Path, recording: Path) -> None:

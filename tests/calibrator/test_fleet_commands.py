@@ -183,7 +183,7 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
     assert run.returncode == 0, run.stderr
     assert "Traceback" not in run.stderr
     left_out = json.loads(run.stdout)["run"]["left_out"]
-    assert "at least 60 s are needed" in left_out["short"]
+    assert "at least 120 s are needed" in left_out["short"]
     assert "drive.log" in left_out["empty"]
     assert "0x110" in left_out["no_branch"] or "branch" in left_out["no_branch"]
     assert "motor" in left_out["no_motor"]
