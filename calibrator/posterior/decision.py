@@ -88,7 +88,7 @@ def best_estimates(points: Points, states: States, vehicle: int, *, least: tuple
     state : int
         Position of the estimate among the vehicle's states.
     confidence : float
-        Posterior probability that drifts and offsets are both within 10 % of the estimate.
+        Posterior probability that the estimate's drifts and offsets are both recovered: within 10 % of the true norm.
     """
     candidates = slice(0, CANDIDATES)
     near = _near(points.drift, states.drift[vehicle, candidates], least[0])

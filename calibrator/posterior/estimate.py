@@ -47,7 +47,7 @@ class FleetPosterior:
     faults : Faults
         Estimates.
     confidence : ndarray of shape (N,)
-        Probability that the sensor faults are within 10 % of the estimate. [1]
+        Probability that the estimate is recovered: drifts and offsets each within 10 % of their true norm. [1]
     drift_sd : ndarray of shape (N, K)
         Root mean square of the posterior's distance from the estimate. [1]
     offset_sd_a : ndarray of shape (N, K)

@@ -20,7 +20,7 @@ TOLD_APART = 0.002
 
 @dataclass(frozen=True)
 class FaultExplanation:
-    """States of one support together.
+    """States of one support with the same signs together.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class FaultExplanation:
 
 
 def explanations(states: States, vehicle: int) -> list[FaultExplanation]:
-    """Most probable supports of one vehicle, each with its mean parameters.
+    """Most probable supports of one vehicle, signs told apart, each with its mean parameters.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def explanations(states: States, vehicle: int) -> list[FaultExplanation]:
     K = states.branches
     parameters = np.concatenate([states.relative[vehicle], states.constant[vehicle]], axis=1)
     weight = states.weight[vehicle]
-    supports, group = np.unique(parameters != 0.0, axis=0, return_inverse=True)
+    supports, group = np.unique(np.sign(parameters), axis=0, return_inverse=True)
     probability = np.bincount(group.ravel(), weight, len(supports))
     found: list[FaultExplanation] = []
     for g in np.argsort(-probability, kind="stable")[:MOST]:

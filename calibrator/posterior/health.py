@@ -42,7 +42,7 @@ class ReferenceHealth:
     agreeing_share : tuple of float
         Per branch: share of the vehicles in the densest cluster of slopes. [1]
     mean_distance : tuple of float
-        Per branch: mean slope of the fleet minus the cluster's; how far off the published reference (3) is. [1]
+        Per branch: mean of the log slopes minus the cluster's; how far off the published reference (3) is. [1]
     least_vehicles : int
         Smallest fleet of this kind whose reference can be trusted.
     unmeasured_a : float

@@ -21,7 +21,7 @@ __all__ = ["JointEvidence", "StateArrays"]
 StateArrays = tuple[Array, Array, Array, Array]
 """Relative parameters, their deviations, constant ones and theirs, of shapes (N, S, K + 1) and (N, S, 2K - 1)."""
 NEGLIGIBLE = 40.0
-"""Relative states so far below the best (logarithm) cannot matter for any constant support. [1]"""
+"""Relative states so far below the best (logarithm) are dropped: constant rows hardly ever make that good. [1]"""
 MOST_RELATIVE = 24
 """Relative states of a vehicle that are looked at with more branches than can be exact, the best ones. [1]"""
 
