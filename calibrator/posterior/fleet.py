@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from calibrator.calibration_settings import CalibrationSettings, FleetOutcome, require_learning
+from calibrator.drive import Mask
 from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
 from calibrator.evidence.readings import Readings, no_readings
@@ -32,6 +33,8 @@ from ecu_node.parameters import (
 
 __all__ = ["calibrate_fleet_posterior"]
 
+FEWEST_TRUSTED = 3
+"""Trusted vehicles that carry the reference of a fleet that is in doubt."""
 UNTOLD = 0.05
 """Probability of other explanations up to which they are not told. [1]"""
 
@@ -95,22 +98,39 @@ def calibrate_fleet_posterior(
         posterior = estimate(findings.summaries)
     health = posterior.health
     assert health is not None
-    doubtful = () if trusted.any() else health.doubtful
+    doubtful = () if trusted.sum() >= FEWEST_TRUSTED else health.doubtful
     decision = decide(posterior, layout, harm_limit=settings.harm_limit, doubtful=doubtful)
     deployment = without_sensor_models(decision, findings)
+    possible = np.abs(posterior.faults.drift) < 1.0
+    left_out |= _impossible(vehicles, possible, equipment.branches)
     parameters = [
         tell_sensors(
             _parameters(vehicle, posterior, deployment, position=j, branches=equipment.branches, identity=identity),
             findings.choices[j],
         )
         for j, vehicle in enumerate(vehicles)
+        if possible[j].all()
     ]
+    if not parameters:
+        raise FleetError(f"{fleet.path}: no vehicle can be calibrated; the first: {next(iter(left_out.values()))}")
     return FleetOutcome(
         parameters=parameters,
         left_out=left_out,
         notices=(*health.warnings, *finding_notices(names, findings, equipment.branches)),
         details=_details(posterior, equipment.branches),
     )
+
+
+def _impossible(vehicles: Sequence[VehicleSummary], possible: Mask, branches: Sequence[str]) -> dict[str, str]:
+    """Why vehicles whose currents no sensor can show have no parameters."""
+    return {
+        vehicle.vehicle: (
+            f"its {branches[int(np.argmin(possible[j]))]} current does not follow its inputs as in the rest of the "
+            f"fleet: parked, stuck, or another kind of vehicle? record a drive in which it is used"
+        )
+        for j, vehicle in enumerate(vehicles)
+        if not possible[j].all()
+    }
 
 
 def _readings(vehicles: Sequence[VehicleSummary]) -> Readings:

@@ -5,8 +5,8 @@ With y = X theta + e, e ~ N(0, R), and the slab's density on theta, the integral
     N(y - X theta_hat; 0, R) sqrt(det(2 pi C)) prod_i mass_i,   C = (X^T R^-1 X)^-1,
 
 mass_i being that of N(theta_hat_i, C_ii) under the slab. That is exact where all of the likelihood lies inside the
-slab; at its edges the correlation between parameters is left out. Pivots (see :mod:`calibrator.posterior.supports`) are set to
-the nodes of the slab in turn.
+slab; at its edges the correlation between parameters is left out. Pivots (see
+:mod:`calibrator.posterior.supports`) are set to the nodes of the slab in turn.
 """
 
 from dataclasses import dataclass

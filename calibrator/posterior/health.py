@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calibrator.drive import Array
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
 from calibrator.posterior.cluster import Cluster, densest_clusters
-from calibrator.posterior.model_spread import unmeasured_load
+from calibrator.posterior.model_spread import MOST_UNMEASURED, unmeasured_load
 
 __all__ = ["ReferenceHealth", "examine_reference"]
 
@@ -102,6 +102,7 @@ def examine_reference(rows: FleetRows, branches: Sequence[str], *, full_scale_a:
             f"{len(rows)} vehicles are few for a fleet in which {min(share):.0%} agree: at least {least} are needed "
             f"to trust its reference; until then no branch is corrected"
         )
+    warnings += _common_offset(rows, doubtful, full_scale_a)
     load = unmeasured_load(rows.constant[:, K], _sd(rows, 4 * K - 1))
     unmeasured_a = load.centre * full_scale_a
     if abs(load.centre) > max(LEAST_COMMON_OFFSET, SURE * _uncertainty(load, _sd(rows, 4 * K - 1))):
@@ -117,6 +118,22 @@ def examine_reference(rows: FleetRows, branches: Sequence[str], *, full_scale_a:
         doubtful=tuple(sorted(doubtful)),
         warnings=tuple(warnings),
     )
+
+
+def _common_offset(rows: FleetRows, doubtful: set[int], full_scale_a: float) -> list[str]:
+    """A constant of the junction law that most vehicles share and no load without a sensor makes."""
+    K = rows.branches
+    sd = _sd(rows, 4 * K - 1)
+    found = densest_clusters(rows.constant[:, K], sd)[0]
+    doubt = max(LEAST_COMMON_OFFSET, SURE * _uncertainty(found, sd))
+    if -doubt <= found.centre <= MOST_UNMEASURED + doubt or not _agree(found):
+        return []
+    doubtful.update(range(K))
+    return [
+        f"the currents of most vehicles sum to {found.centre * full_scale_a:+.1f} A, which no load without a sensor "
+        f"explains: an offset that most vehicles share (a batch of sensors), in any branch; until it is found none is "
+        f"corrected"
+    ]
 
 
 def _sd(rows: FleetRows, row: int) -> Array:

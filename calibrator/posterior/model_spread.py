@@ -14,7 +14,15 @@ from calibrator.posterior.cluster import Cluster, densest_clusters
 from calibrator.posterior.fault_prior import OUTLIER_VARIANCE, FaultPrior, ModelSpread
 from calibrator.posterior.states import States
 
-__all__ = ["drawn_spread", "free_centres", "initial_spreads", "next_spread", "trusted_spread", "unmeasured_load"]
+__all__ = [
+    "MOST_UNMEASURED",
+    "drawn_spread",
+    "free_centres",
+    "initial_spreads",
+    "next_spread",
+    "trusted_spread",
+    "unmeasured_load",
+]
 
 USED_STATES = 24
 """States of each vehicle that are looked at, the most probable ones. [1]"""
@@ -32,7 +40,7 @@ FEWEST_LAWFUL = 3
 """Vehicles that make a cluster."""
 LEAST_AGREEING_LOAD = 0.15
 """Share of the vehicles that must agree on a load without a sensor. [1]"""
-MOST_UNMEASURED = 0.03
+MOST_UNMEASURED = 0.015
 """Largest load without a sensor that is looked for, over full scale; larger constants are offsets. [1]"""
 OUTLIER_VEHICLES, GUESSED_OUTLIER_SHARE = 2.0, 0.05
 """Weight of the guess of the share of vehicles that differ more, in vehicles, and that guess. [1]"""
@@ -102,7 +110,7 @@ def unmeasured_load(constant: Array, sd: Array) -> Cluster:
         At zero if too few vehicles agree for such a load to be taken for granted.
     """
     for found in densest_clusters(constant, sd, farthest=MOST_UNMEASURED):
-        if found.share >= LEAST_AGREEING_LOAD:
+        if found.share >= LEAST_AGREEING_LOAD and found.centre > -LAWFUL_CONSTANT:
             return found
     return Cluster(centre=0.0, spread=0.0, share=0.0, gain=0.0)
 

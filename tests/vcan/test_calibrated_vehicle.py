@@ -37,7 +37,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     run(
         *("calibrator", "calibrate", fleet, "--layout", LAYOUT, "--out", fleet.parent / "result", "--workers", 1),
-        *("--classifier", "perfect", "--truth", fleet / "truth.json"),
+        *("--method", "published", "--classifier", "perfect", "--truth", fleet / "truth.json"),
     )
     return fleet
 

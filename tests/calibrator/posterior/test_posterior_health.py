@@ -49,6 +49,26 @@ def test_with_three_branches_the_batch_is_named_alone(branch: int) -> None:
     assert f"in branch {NAMES[branch]};" in health.warnings[0]
 
 
+def test_an_offset_that_most_vehicles_share_is_noticed_and_doubted() -> None:
+    fleet = random_faults(8, vehicles=60, branches=2, sparsity=80.0)
+    offset = fleet.offset_a.copy()
+    offset[:48, 1] += 8.0
+    health = examined(replace(fleet, offset_a=offset))
+    assert health.doubtful == (0, 1)
+    assert any("no load without a sensor explains" in text for text in health.warnings)
+
+
+def test_a_load_of_possible_size_is_taken_for_one() -> None:
+    fleet = random_faults(8, vehicles=60, branches=2, sparsity=80.0)
+    load = np.random.default_rng(2).normal(3.0, 1.0, 60)
+    rows = rows_of(fleet)
+    constant = rows.constant.copy()
+    constant[:, 2] += load * (1.0 + fleet.drift[:, 0]) / FULL_SCALE_A
+    health = examine_reference(replace(rows, constant=constant), NAMES[:2], full_scale_a=FULL_SCALE_A)
+    assert health.doubtful == ()
+    assert health.unmeasured_a == pytest.approx(3.0, abs=0.7)
+
+
 def test_two_variants_are_noticed_with_their_number() -> None:
     fleet = random_faults(3, vehicles=80, branches=2, sparsity=80.0)
     variant = np.arange(80) < 28
