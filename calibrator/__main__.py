@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 
-from calibrator.interrupts import INTERRUPTED, end_interrupted, importing
+from calibrator.interrupts import INTERRUPTED, MESSAGE, importing
 
 __all__ = ["main"]
 
@@ -25,7 +25,7 @@ def main() -> None:
         code = 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done or undone; threads only have to be joined
     if code == INTERRUPTED:
-        end_interrupted()
+        print(MESSAGE, file=sys.stderr)
     raise SystemExit(code)
 
 

@@ -7,12 +7,11 @@ import os
 import signal
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from contextlib import contextmanager
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
-__all__ = ["INTERRUPTED", "MESSAGE", "end_interrupted", "importing", "in_processes"]
+__all__ = ["INTERRUPTED", "MESSAGE", "importing", "in_processes"]
 
 INTERRUPTED = 130
 """Exit code that shells give to a program ended by SIGINT."""
@@ -60,16 +59,6 @@ def in_processes(tasks: Iterable[Any], *, workers: int) -> Iterator[Any]:
     return results
 
 
-def end_interrupted() -> NoReturn:
-    """End the program after Ctrl-C, workers first; waiting for one that was just being started may take for ever."""
-    with suppress(OSError):
-        for children in Path("/proc/self/task").glob("*/children"):
-            for process in children.read_text().split():
-                os.kill(int(process), signal.SIGTERM)
-    sys.stdout.flush()
-    _end(signal.SIGINT, None)
-
-
-def _end(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG001
+def _end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
     print(MESSAGE, file=sys.stderr, flush=True)
     os._exit(INTERRUPTED)
