@@ -9,19 +9,30 @@ from typing import Annotated
 
 import typer
 
+from calibrator.options import Classifier
+
 __all__ = [
+    "BalancedOption",
     "BranchesOption",
+    "ClassifierOption",
+    "CommonDriveOption",
     "CurrentsOption",
     "DelayOption",
     "DrivesOption",
+    "HarmLimitOption",
+    "HoldOutOption",
     "JsonOption",
     "LayoutOption",
     "MagnitudeOption",
     "MinutesOption",
     "NoiseOption",
     "SeedOption",
+    "SensorModelsOption",
     "SparsityOption",
     "SymmetricOption",
+    "TrustedOption",
+    "TruthOption",
+    "UnityOption",
     "UnmeasuredOption",
     "UnseenMinutesOption",
     "VehiclesOption",
@@ -125,4 +136,32 @@ MinutesOption = Annotated[
 UnseenMinutesOption = Annotated[
     float,
     typer.Option("--unseen-minutes", min=0.1, max=MAX_MINUTES, callback=_finite, help="Length of each unseen trip."),
+]
+CommonDriveOption = Annotated[bool, typer.Option("--common-drive", help="One trip for all vehicles.")]
+BalancedOption = Annotated[bool, typer.Option("--balanced", help="No hardware faults in half of the vehicles.")]
+HarmLimitOption = Annotated[
+    float,
+    typer.Option(
+        "--harm-limit",
+        min=0,
+        max=1,
+        callback=_finite,
+        help="Correct a branch if harm is less probable (posterior).",
+    ),
+]
+TrustedOption = Annotated[
+    list[str] | None,
+    typer.Option("--trusted", help="Vehicle with bench-checked sensors: it carries the reference (posterior)."),
+]
+SensorModelsOption = Annotated[
+    bool, typer.Option("--sensor-models", help="Look for sensors that are not linear as well (posterior).")
+]
+ClassifierOption = Annotated[Classifier, typer.Option("--classifier", help="Tells hardware faults (published).")]
+TruthOption = Annotated[Path | None, typer.Option("--truth", help="truth.json, for the perfect classifier.")]
+HoldOutOption = Annotated[
+    list[str] | None,
+    typer.Option("--hold-out", help="Calibrate this vehicle, but learn nothing from it for others."),
+]
+UnityOption = Annotated[
+    str | None, typer.Option("--unity", help="Vehicle whose held-out data is the unity drive (published).")
 ]

@@ -3,33 +3,21 @@
 Libraries swallow exceptions of their own imports, or turn them into others; workers would each print a traceback.
 """
 
-import os
 import signal
-import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from types import FrameType
+from contextlib import AbstractContextManager
 from typing import Any
+
+from ecu_node.interrupts import INTERRUPTED, ending_at_interrupt
 
 __all__ = ["INTERRUPTED", "MESSAGE", "importing", "in_processes"]
 
-INTERRUPTED = 130
-"""Exit code that shells give to a program ended by SIGINT."""
 MESSAGE = "calibrator: interrupted; nothing unfinished was kept"
 
 
-@contextmanager
-def importing() -> Iterator[None]:
+def importing() -> AbstractContextManager[None]:
     """While the block imports what a command needs, Ctrl-C ends the program at once; nothing is open yet."""
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.SIG_IGN:
-        yield
-        return
-    signal.signal(signal.SIGINT, _end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+    return ending_at_interrupt(MESSAGE)
 
 
 def in_processes(tasks: Iterable[Any], *, workers: int) -> Iterator[Any]:
@@ -57,8 +45,3 @@ def in_processes(tasks: Iterable[Any], *, workers: int) -> Iterator[Any]:
     finally:
         signal.signal(signal.SIGINT, before)
     return results
-
-
-def _end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
-    print(MESSAGE, file=sys.stderr, flush=True)
-    os._exit(INTERRUPTED)

@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0 done, 1 failed. Wrong use ends in SystemExit(2), Ctrl-C during start-up ends the process with 130.
     """
     try:
-        with ending_at_interrupt():
+        with ending_at_interrupt("ecu-node: interrupted"):
             try:
                 return _main(argv)
             finally:

@@ -18,19 +18,19 @@ INTERRUPTED = 130
 
 
 @contextmanager
-def ending_at_interrupt() -> Iterator[None]:
+def ending_at_interrupt(message: str) -> Iterator[None]:
     """Within the block SIGINT ends the process with one line and :data:`INTERRUPTED`, unless it is ignored."""
+
+    def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+        os.write(sys.stderr.fileno(), f"{message}\n".encode())
+        os._exit(INTERRUPTED)
+
     before = signal.getsignal(signal.SIGINT)
     if before is signal.SIG_IGN:
         yield
         return
-    signal.signal(signal.SIGINT, _end)
+    signal.signal(signal.SIGINT, end)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def _end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
-    os.write(sys.stderr.fileno(), b"ecu-node: interrupted\n")
-    os._exit(INTERRUPTED)

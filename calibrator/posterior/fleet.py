@@ -21,7 +21,7 @@ from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.explain import deciding_evidence, explanations
 from calibrator.posterior.second_pass import finding_notices, tell_sensors, without_sensor_models
 from calibrator.posterior.verdict import Deployment, decide
-from calibrator.sensor_models.fleet import all_linear, find_sensor_models
+from calibrator.sensor_models.fleet import SensorFindings, all_linear, find_sensor_models
 from calibrator.vehicles import read_vehicles
 from ecu_node.parameters import (
     BranchParameters,
@@ -68,14 +68,10 @@ def calibrate_fleet_posterior(
     vehicles, left_out = read_vehicles(read_vehicle_summary, fleet, equipment, identity.database, workers=workers)
     names = [vehicle.vehicle for vehicle in vehicles]
     learning = require_learning(names, settings, left_out)
-    missing = settings.trusted - set(names)
-    if missing:
-        raise FleetError(f"{fleet.path}: no usable vehicle {', '.join(sorted(missing))} to trust")
-    trusted = np.array([name in settings.trusted for name in names])
-    layout = identity.database.layout
+    trusted = _trusted(names, settings.trusted, fleet)
     estimate = partial(
         calibrate_posterior,
-        full_scale_a=layout.full_scale_a,
+        full_scale_a=identity.database.layout.full_scale_a,
         branches=equipment.branches,
         readings=_readings(vehicles),
         trusted=trusted if trusted.any() else None,
@@ -99,18 +95,9 @@ def calibrate_fleet_posterior(
     health = posterior.health
     assert health is not None
     doubtful = () if trusted.sum() >= FEWEST_TRUSTED else health.doubtful
-    decision = decide(posterior, layout, harm_limit=settings.harm_limit, doubtful=doubtful)
-    deployment = without_sensor_models(decision, findings)
-    possible = np.abs(posterior.faults.drift) < 1.0
-    left_out |= _impossible(vehicles, possible, equipment.branches)
-    parameters = [
-        tell_sensors(
-            _parameters(vehicle, posterior, deployment, position=j, branches=equipment.branches, identity=identity),
-            findings.choices[j],
-        )
-        for j, vehicle in enumerate(vehicles)
-        if possible[j].all()
-    ]
+    decision = decide(posterior, identity.database.layout, harm_limit=settings.harm_limit, doubtful=doubtful)
+    left_out |= _impossible(vehicles, posterior, equipment.branches)
+    parameters = _parameter_files(vehicles, posterior, decision, findings, equipment=equipment, identity=identity)
     if not parameters:
         raise FleetError(f"{fleet.path}: no vehicle can be calibrated; the first: {next(iter(left_out.values()))}")
     return FleetOutcome(
@@ -121,8 +108,45 @@ def calibrate_fleet_posterior(
     )
 
 
-def _impossible(vehicles: Sequence[VehicleSummary], possible: Mask, branches: Sequence[str]) -> dict[str, str]:
+def _trusted(names: Sequence[str], wanted: frozenset[str], fleet: FleetSource) -> Mask:
+    """Which vehicles are trusted; FleetError if one that should be cannot be used."""
+    missing = wanted - set(names)
+    if missing:
+        raise FleetError(f"{fleet.path}: no usable vehicle {', '.join(sorted(missing))} to trust")
+    return np.array([name in wanted for name in names])
+
+
+def _parameter_files(
+    vehicles: Sequence[VehicleSummary],
+    posterior: FleetPosterior,
+    decision: Deployment,
+    findings: SensorFindings,
+    *,
+    equipment: Equipment,
+    identity: RunIdentity,
+) -> list[VehicleParameters]:
+    """One per vehicle whose currents a sensor can show."""
+    deployment, possible = without_sensor_models(decision, findings), _possible(posterior)
+    return [
+        tell_sensors(
+            _parameters(vehicle, posterior, deployment, position=j, branches=equipment.branches, identity=identity),
+            findings.choices[j],
+        )
+        for j, vehicle in enumerate(vehicles)
+        if possible[j].all()
+    ]
+
+
+def _possible(posterior: FleetPosterior) -> Mask:
+    """Branches whose drift a sensor can have, shape (N, K)."""
+    return np.asarray(np.abs(posterior.faults.drift) < 1.0)
+
+
+def _impossible(
+    vehicles: Sequence[VehicleSummary], posterior: FleetPosterior, branches: Sequence[str]
+) -> dict[str, str]:
     """Why vehicles whose currents no sensor can show have no parameters."""
+    possible = _possible(posterior)
     return {
         vehicle.vehicle: (
             f"its {branches[int(np.argmin(possible[j]))]} current does not follow its inputs as in the rest of the "

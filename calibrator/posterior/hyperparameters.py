@@ -17,7 +17,7 @@ from scipy.special import logsumexp
 from calibrator.drive import Array
 from calibrator.evidence.rows import FleetRows
 from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
-from calibrator.posterior.model_spread import drawn_spread, free_centres, next_spread
+from calibrator.posterior.model_spread import USED_STATES, drawn_spread, free_centres, next_spread
 from calibrator.posterior.slab import Slab
 from calibrator.posterior.states import States, enumerate_states
 from calibrator.random_streams import Purpose, random_stream
@@ -38,7 +38,6 @@ MOST_VEHICLES = 300
 """Vehicles that hyper-parameters are learnt from; more change them less than the faults themselves. [1]"""
 MOST_DRAWN, DRAWS = 200, 16
 """Fleet size up to which hyper-parameters are drawn, and how often."""
-USED_STATES = 24
 PSEUDO_VEHICLES = 1.0
 """Weight of the guesses of the shares of faults, in vehicles."""
 GUESSED_HARDWARE_SHARE = 0.3

@@ -16,6 +16,7 @@ from calibrator.posterior.states import States
 
 __all__ = [
     "MOST_UNMEASURED",
+    "USED_STATES",
     "drawn_spread",
     "free_centres",
     "initial_spreads",
