@@ -1,6 +1,7 @@
-"""What all tests share: real data where it is, the rule for skipped tests, and a guard against open buses."""
+"""What all tests share: real data where it is, the rule for skipped tests, a guard against open buses, and Ctrl-C."""
 
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,11 @@ def no_bus_left_open() -> Iterator[None]:
     for bus in left:
         bus.shutdown()
     assert not left, f"buses left open: {left}"
+
+
+def pytest_configure() -> None:
+    """Heed Ctrl-C, and let programs started by tests heed it: a shell that starts jobs in the background ignores it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -8,7 +8,7 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.evidence.fleet_model import FleetModel, regress_on_fleet
 from calibrator.evidence.junction_law import junction_law
-from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
+from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, LineMeans
 from calibrator.evidence.summary import DriveSummary
 
 __all__ = ["collect_rows"]
@@ -23,9 +23,15 @@ LEAST_SD = np.array([5e-5, 1e-5])
 
 @dataclass(frozen=True)
 class _Raw:
-    """Rows of one vehicle: a (K), -g (K - 1), b / full scale (K), c / full scale (1)."""
+    """Rows of one vehicle: a (K), -g (K - 1), b (K), c (1), the latter two over full scale.
+
+    ``means`` (2, K) are those of the fleet model's and the measured currents over full scale. ``covariance`` is of the
+    ratios and of what the lines are at these means: b + a mean, and c and what the other currents make of it. At zero,
+    ratios and constants are correlated by the distance of the means, and no average over vehicles would respect that.
+    """
 
     values: Array
+    means: Array
     covariance: Array
     blocks: int
 
@@ -54,8 +60,11 @@ def collect_rows(
     raw = [_of_vehicle(summary, model, full_scale_a) for summary in summaries]
     correlations = np.stack([_correlation(vehicle.covariance) for vehicle in raw])
     usual = correlations.mean(axis=0) if learning is None else correlations[learning].mean(axis=0)
-    values = np.stack([vehicle.values for vehicle in raw])
-    return _rows(values, np.stack([_steadied(vehicle, usual) for vehicle in raw]))
+    covariance = np.stack([_steadied(vehicle, usual) for vehicle in raw])
+    means = LineMeans(
+        model=np.stack([vehicle.means[0] for vehicle in raw]), measured=np.stack([vehicle.means[1] for vehicle in raw])
+    )
+    return _rows(np.stack([vehicle.values for vehicle in raw]), means, covariance)
 
 
 def _of_vehicle(summary: DriveSummary, model: FleetModel, full_scale_a: float) -> _Raw:
@@ -69,7 +78,20 @@ def _of_vehicle(summary: DriveSummary, model: FleetModel, full_scale_a: float) -
         covariance[part, part] += fit.prior_covariance
     order = [*range(0, 2 * K, 2), *range(2 * K, 3 * K - 1), *range(1, 2 * K, 2), 3 * K - 1]
     unit = np.concatenate([np.ones(K), -np.ones(K - 1), np.full(K + 1, 1.0 / full_scale_a)])
-    return _Raw(estimate[order] * unit, covariance[order][:, order] * np.outer(unit, unit), len(influence))
+    inputs = summary.total[-1, : summary.inputs] / summary.total[-1, -1]
+    means = np.stack([np.append(inputs, 1.0) @ model.read_out, summary.mean_a]) / full_scale_a
+    lever = np.zeros((K + 1, 2 * K - 1))
+    lever[:K, :K], lever[K, K:] = np.diag(means[0]), -means[1, 1:]
+    covariance = _turned(covariance[order][:, order] * np.outer(unit, unit), lever)
+    return _Raw(estimate[order] * unit, means, covariance, len(influence))
+
+
+def _turned(covariance: Array, lever: Array) -> Array:
+    """Covariance of ratios r and constants + lever r, from that of ratios and constants; (..., 3K, 3K)."""
+    turn = np.zeros(covariance.shape)
+    turn[..., :, :] = np.eye(covariance.shape[-1])
+    turn[..., -lever.shape[-2] :, : lever.shape[-1]] = lever
+    return np.asarray(turn @ covariance @ np.swapaxes(turn, -1, -2))
 
 
 def _correlation(covariance: Array) -> Array:
@@ -87,25 +109,30 @@ def _steadied(vehicle: _Raw, usual: Array) -> Array:
     return np.asarray(correlation * np.outer(sd, sd))
 
 
-def _rows(values: Array, covariance: Array) -> FleetRows:
-    """Logarithms of the ratios, constants as seen in true currents, and rows without bench readings."""
+def _rows(values: Array, means: LineMeans, covariance: Array) -> FleetRows:
+    """Logarithms of the ratios, constants as seen in true currents, and rows without bench readings.
+
+    A ratio that says nothing becomes 1, and the constants turn with it.
+    """
     N, K = len(values), values.shape[1] // 3
-    ratios = values[:, : 2 * K - 1]
+    ratios, constants = values[:, : 2 * K - 1], values[:, 2 * K - 1 :].copy()
     told = ratios > LEAST_GAIN
     safe = np.where(told, ratios, 1.0)
+    constants[:, :K] += (ratios - safe)[:, :K] * means.model
+    constants[:, K] -= np.sum((ratios - safe)[:, K:] * means.measured[:, 1:], axis=1)
     derivative = np.concatenate([1.0 / safe, 1.0 / safe[:, :K], 1.0 / safe[:, :1]], axis=1)
     covariance = covariance * derivative[:, :, None] * derivative[:, None, :]
+    covariance += np.diag(np.repeat(LEAST_SD, [2 * K - 1, K + 1]) ** 2)
     vehicle, row = np.nonzero(~told)
     covariance[vehicle, row, :], covariance[vehicle, :, row] = 0.0, 0.0
     covariance[vehicle, row, row] = UNKNOWN_VARIANCE
+    none = np.zeros((N, K))
+    relative = np.concatenate([np.log(safe), none], axis=1)
     full = np.zeros((N, 5 * K, 5 * K))
     place = np.array([*range(2 * K - 1), *range(3 * K - 1, 4 * K)])
-    full[:, place[:, None], place] = covariance + np.diag(np.repeat(LEAST_SD, [2 * K - 1, K + 1]) ** 2)
+    full[:, place[:, None], place] = _turned(covariance, means.lever(relative))
     for readings in (range(2 * K - 1, 3 * K - 1), range(4 * K, 5 * K)):
         full[:, readings, readings] = UNKNOWN_VARIANCE
-    none = np.zeros((N, K))
     return FleetRows(
-        relative=np.concatenate([np.log(safe), none], axis=1),
-        constant=np.concatenate([values[:, 2 * K - 1 :], none], axis=1),
-        covariance=full,
+        relative=relative, constant=np.concatenate([constants, none], axis=1), covariance=full, means=means
     )

@@ -30,6 +30,8 @@ SLOPE_SD = 0.4
 """Prior deviation of a slope from 1: a branch that hardly moves counts as faultless. [1]"""
 LEAST_SD = 1e-5
 """Of slopes and intercepts where a model fits exactly. [1], [A]"""
+TINY_A2 = 1e-12
+"""Of a fleet that stands still. [A^2]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,16 +109,17 @@ def regress_on_fleet(summary: DriveSummary, read_out: Array) -> list[BlockRegres
 def _on_junction_law(read_out: Array, totals: Sequence[Array]) -> Array:
     """Read-outs that sum to zero: ideal currents do, whatever the inputs.
 
-    What is left over of the inputs is shared by the branches as their currents' power. What is left over of the
+    What is left over of the inputs is shared by the branches as their currents' variance. What is left over of the
     constants is the mean load that no branch measures: it is taken from the source, as it does not grow with others.
     """
-    K = read_out.shape[1]
     M = len(read_out) - 1
     mean = np.mean(totals, axis=0)
-    power = np.diag(mean)[M : M + K]
-    source = int(np.argmax(mean[-1, M : M + K]))
+    u = [*range(M), -1]
+    mean_a = mean[-1, u] @ read_out
+    variance_a2 = np.diag(read_out.T @ mean[np.ix_(u, u)] @ read_out) - mean_a**2
+    source = int(np.argmax(mean_a))
     excess = read_out.sum(axis=1)
-    projected = read_out - np.outer(np.append(excess[:-1], 0.0), power / power.sum())
+    projected = read_out - np.outer(np.append(excess[:-1], 0.0), variance_a2 / max(variance_a2.sum(), TINY_A2))
     projected[-1, source] -= excess[-1]
     return projected
 

@@ -47,8 +47,7 @@ def junction_law(summary: DriveSummary) -> BlockRegression:
     samples, total = summary.moments[:, -1, -1], summary.total
     prior_mean = np.append(-np.ones(K - 1), 0.0)
     prior_precision = np.append(np.full(K - 1, GAIN_SD**-2), 0.0)
-    variance = np.diag(summary.mean_product_a2) - summary.mean_a**2
-    bound = np.minimum(summary.noise_a2.mean(axis=0), MOST_NOISE * variance)
+    bound = np.minimum(summary.noise_a2.mean(axis=0), MOST_NOISE * summary.variance_a2)
     noise: Array = np.zeros(K)
     for _ in range(NOISE_ROUNDS):
         clean = gram - samples[:, None, None] * np.diag(np.append(noise[1:], 0.0))

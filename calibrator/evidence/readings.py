@@ -4,7 +4,7 @@ A zero-current window (contactors open) shows the offset itself; a bench check s
 Gaussian row of the evidence.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -109,4 +109,4 @@ def with_readings(rows: FleetRows, readings: Readings, *, full_scale_a: float) -
     covariance[:, offset_row, offset_row] = np.where(
         offset_read, (readings.offset_sd_a / full_scale_a) ** 2, UNKNOWN_VARIANCE
     )
-    return FleetRows(relative=relative, constant=constant, covariance=covariance)
+    return replace(rows, relative=relative, constant=constant, covariance=covariance)

@@ -12,6 +12,9 @@ a, b are slopes and intercepts over the fleet reference; g, c those of the first
 q, l are what the vehicle and its drives differ from the fleet without any fault: the model spread. A row that says
 nothing has the value 0 and a variance of :data:`UNKNOWN_VARIANCE`.
 
+b and c are where lines meet zero. They turn with the ratios about the means of their data, which are known far better
+(:class:`LineMeans`): the rows are linear in the errors of the ratios as far as the covariance tells, and exact beyond.
+
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
@@ -23,10 +26,63 @@ from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.faults import Index
 
-__all__ = ["UNKNOWN_VARIANCE", "FleetRows", "constant_design", "relative_design"]
+__all__ = ["UNKNOWN_VARIANCE", "FleetRows", "LineMeans", "constant_design", "relative_design"]
 
 UNKNOWN_VARIANCE = 100.0
 """Of a row that says nothing: ten times full scale, or a factor of 20 000. [1]"""
+MOST_TURN = 3.0
+"""Largest logarithm by which a ratio can be off."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineMeans:
+    """Means of the data that slopes, gain ratios and constants were fitted to, in fractions of full scale.
+
+    Attributes
+    ----------
+    model, measured : ndarray of shape (N, K)
+        Of the fleet model's currents and of the measured ones.
+    """
+
+    model: Array
+    measured: Array
+
+    def take(self, index: Index) -> "LineMeans":
+        """Return the means of some of the vehicles."""
+        return LineMeans(model=self.model[index], measured=self.measured[index])
+
+    def lever(self, relative: Array) -> Array:
+        """What an error of log a and log(-g) makes of b and c as seen in true currents, shape (N, K + 1, 2K - 1)."""
+        N, K = self.model.shape
+        lever = np.zeros((N, K + 1, 2 * K - 1))
+        lever[:, range(K), range(K)] = -self.model
+        lever[:, K, K:] = self.measured[:, 1:] * np.exp(-relative[:, 1:K])
+        return lever
+
+    def beyond_linear(self, relative: Array, parameters: Array, residual: Array) -> Array:
+        """What is missing from b and c if they are taken to be linear in the errors of the ratios.
+
+        Parameters
+        ----------
+        relative : ndarray of shape (N, 3K - 1)
+            Relative rows.
+        parameters : ndarray of shape (N, S, K + 1)
+            d_h, d_1 .. d_K of S states.
+        residual : ndarray of shape (N, S, 3K - 1)
+            What these leave of the relative rows.
+
+        Returns
+        -------
+        ndarray of shape (N, S, K + 1)
+            To be added to the constants as seen in true currents.
+        """
+        K = self.model.shape[1]
+        x = residual[:, :, : 2 * K - 1]
+        turned = np.expm1(np.minimum(x, MOST_TURN))
+        slopes = (1.0 + parameters[:, :, :1]) * self.model[:, None] * turned[:, :, :K]
+        ratios = turned[:, :, K:] * self.measured[:, None, 1:] / (1.0 + parameters[:, :, 2:])
+        exact = np.concatenate([slopes, -ratios.sum(axis=2, keepdims=True)], axis=2)
+        return np.asarray(exact + x @ np.swapaxes(self.lever(relative), 1, 2))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,11 +98,14 @@ class FleetRows:
     covariance : ndarray of shape (N, 5K, 5K)
         Of the sampling error of both, relative rows first; of the constant rows as seen in true currents, that is
         divided by 1 + d. [1]
+    means : LineMeans or None
+        About which the constants turn with the ratios; None: they do not.
     """
 
     relative: Array
     constant: Array
     covariance: Array
+    means: LineMeans | None = None
 
     def __post_init__(self) -> None:
         N, rows = len(self.relative), self.relative.shape[1] + self.constant.shape[1]
@@ -69,8 +128,32 @@ class FleetRows:
     def take(self, index: Index) -> "FleetRows":
         """Return the evidence of some of the vehicles."""
         return FleetRows(
-            relative=self.relative[index], constant=self.constant[index], covariance=self.covariance[index]
+            relative=self.relative[index],
+            constant=self.constant[index],
+            covariance=self.covariance[index],
+            means=None if self.means is None else self.means.take(index),
         )
+
+    def constant_seen(self, parameters: Array, residual: Array) -> Array:
+        """Constant rows as seen in true currents, if the relative parameters are known.
+
+        Parameters
+        ----------
+        parameters : ndarray of shape (N, S, K + 1)
+            d_h, d_1 .. d_K of S states.
+        residual : ndarray of shape (N, S, 3K - 1)
+            What these leave of the relative rows.
+
+        Returns
+        -------
+        ndarray of shape (N, S, 2K + 1)
+            Linear in the errors of the relative rows, as the covariance tells.
+        """
+        factor = 1.0 + parameters[:, :, 1:]
+        seen = self.constant[:, None] / np.concatenate([factor, factor[:, :, :1], factor], axis=2)
+        if self.means is not None:
+            seen[:, :, : self.branches + 1] += self.means.beyond_linear(self.relative, parameters, residual)
+        return np.asarray(seen)
 
 
 def relative_design(branches: int) -> Array:

@@ -78,6 +78,11 @@ class DriveSummary:
         total = self.total
         return np.asarray(total[self.inputs : -1, self.inputs : -1] / total[-1, -1])
 
+    @property
+    def variance_a2(self) -> Array:
+        """Variance of the measured currents, which no offset changes, shape (K,). [A^2]"""
+        return np.asarray(np.diag(self.mean_product_a2) - self.mean_a**2)
+
     def take_branches(self, order: Sequence[int]) -> "DriveSummary":
         """Return the same summary for some branches, in another order, without extra columns."""
         columns = [*range(self.inputs), *(self.inputs + k for k in order), self.inputs + self.branches]

@@ -99,11 +99,11 @@ def _recorded(drive: Drive) -> frozenset[str]:
 
 
 def _largest_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple[str, ...]:
-    """Branches by falling current; the order asked for where a drive lacks one, as is noticed later."""
+    """Branches by falling variance; the order asked for where a drive lacks one, as is noticed later."""
 
-    def power(name: str) -> float:
+    def variance_a2(name: str) -> float:
         channels = [drive.branches[name] for drive in drives if name in drive.branches]
         values: list[Array] = [channel.value[channel.good] for channel in channels]
-        return float(np.mean(np.concatenate(values) ** 2)) if sum(map(len, values)) else 0.0
+        return float(np.var(np.concatenate(values))) if sum(map(len, values)) else 0.0
 
-    return tuple(sorted(branches, key=power, reverse=True))
+    return tuple(sorted(branches, key=variance_a2, reverse=True))

@@ -81,9 +81,9 @@ def calibrate_posterior(
 
 
 def _largest_first(summaries: Sequence[DriveSummary]) -> list[int]:
-    """Branches by falling current: the junction law is written for the first, and small ones are drowned in noise."""
-    power = np.median([np.diag(summary.mean_product_a2) for summary in summaries], axis=0)
-    return [int(k) for k in np.argsort(-power, kind="stable")]
+    """Branches by falling variance: the junction law is written for the first, and small ones are drowned in noise."""
+    variance = np.median([summary.variance_a2 for summary in summaries], axis=0)
+    return [int(k) for k in np.argsort(-variance, kind="stable")]
 
 
 def _in_own_order(posterior: FleetPosterior, health: ReferenceHealth, order: list[int]) -> FleetPosterior:

@@ -76,7 +76,7 @@ class JointEvidence:
         exact = rows.branches <= EXACT_BRANCHES
         of_spread = np.diag(spread.covariance)[r : r + rows.branches + 1]
         share = of_spread / np.diagonal(R, axis1=1, axis2=2)[:, r : r + rows.branches + 1]
-        candidates = _candidates(rows.constant, spread.mean[r:], carry, states, share, exact=exact)
+        candidates = _candidates(rows, spread.mean[r:], carry, states, share, exact=exact)
         return cls(log_prior, prior, second, candidates, constant_design(rows.branches))
 
     def with_constant(self, support: Support) -> tuple[Array, StateArrays]:
@@ -141,18 +141,18 @@ class _RelativeStates:
 
 
 def _candidates(
-    rows: Array, mean: Array, carry: Array, states: _RelativeStates, share: Array, *, exact: bool
+    rows: FleetRows, mean: Array, carry: Array, states: _RelativeStates, share: Array, *, exact: bool
 ) -> _Candidates:
-    """What the relative states make of the constant rows (N, 2K + 1).
+    """What the relative states make of the constant rows.
 
     Where the model spread, which is one of true currents, is most of a row's variance (``share``, (N, K + 1)), the
     density changes with the scale between measured and true currents; sampling errors are those of the measured ones.
     """
-    K = states.arrays[0].shape[2] - 1
+    K = rows.branches
     order, log_evidence = states.best(exact=exact)
     parameters, sd, residual = (np.take_along_axis(values, order[:, :, None], axis=1) for values in states.arrays)
     factor = 1.0 + parameters[:, :, 1:]
-    seen = rows[:, None, :] / np.concatenate([factor, factor[..., :1], factor], axis=2)
+    seen = rows.constant_seen(parameters, residual)
     log_change = np.einsum("nmk,nk->nm", np.log(factor), share[:, :K]) + np.log(factor[:, :, 0]) * share[:, K:]
     return _Candidates(
         log_evidence=log_evidence - log_change,

@@ -248,7 +248,7 @@ def _residuals(rows: FleetRows, states: States, used: int) -> Array:
     factor = 1.0 + relative[:, :, 1:]
     constant[:, :, K - 1 :] /= factor
     first = rows.relative[:, None] - np.log1p(relative) @ relative_design(K).T
-    seen = rows.constant[:, None] / np.concatenate([factor, factor[..., :1], factor], axis=2)
+    seen = rows.constant_seen(relative, first)
     return np.concatenate([first, seen - constant @ constant_design(K).T], axis=2)
 
 
