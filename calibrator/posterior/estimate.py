@@ -9,7 +9,7 @@ from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.evidence.rows import FleetRows
 from calibrator.faults import Faults, Index
-from calibrator.posterior.decision import best_estimates, harm_probability, spread_points
+from calibrator.posterior.decision import best_estimates, branch_points, harm_probability, spread_points
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.health import ReferenceHealth
 from calibrator.posterior.hyperparameters import (
@@ -124,7 +124,8 @@ def estimate_fleet(
         starts, free = [trusted_spread(rows, trusted)], np.zeros(5 * rows.branches, bool)
     learnt = rows if learning is None else rows.take(learning)
     hyperparameters = estimate_hyperparameters(learnt, starts, given=given, free=free)
-    drawn = draw_hyperparameters(learnt, hyperparameters, given=given, free=free)
+    carriers = None if trusted is None else int(trusted.sum())
+    drawn = draw_hyperparameters(learnt, hyperparameters, given=given, carriers=carriers or None)
     states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in drawn])
     usual = moments if learning is None else moments.take(learning)
     vehicles = [_of_vehicle(states, j, hyperparameters.prior, (moments, usual), full_scale_a) for j in range(len(rows))]
@@ -156,12 +157,14 @@ class _Vehicle:
 def _of_vehicle(
     states: States, j: int, prior: FaultPrior, moments: tuple[Moments, Moments], full_scale_a: float
 ) -> _Vehicle:
-    points = spread_points(states, j)
-    state, confidence = best_estimates(points, states, j, least=(prior.relative.low, prior.constant.low))
+    state, confidence = best_estimates(
+        spread_points(states, j), states, j, least=(prior.relative.low, prior.constant.low)
+    )
     drift, offset = states.drift[j, state], states.offset[j, state]
     variance = np.concatenate([_mean_square(states, j, "drift", drift), _mean_square(states, j, "offset", offset)])
     mean, mean_square = _true_moments(*moments, j, drift=drift, offset_a=offset * full_scale_a)
-    harm = harm_probability(points, drift, offset, mean=mean / full_scale_a, mean_square=mean_square / full_scale_a**2)
+    mean, mean_square = mean / full_scale_a, mean_square / full_scale_a**2
+    harm = harm_probability(branch_points(states, j), drift, offset, mean=mean, mean_square=mean_square)
     return _Vehicle(state, confidence, variance, harm)
 
 

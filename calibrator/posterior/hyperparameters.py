@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from calibrator.drive import Array
@@ -91,7 +92,7 @@ def estimate_hyperparameters(
     Hyperparameters
         The most likely.
     """
-    chosen = rows.take(np.linspace(0, len(rows) - 1, min(len(rows), MOST_VEHICLES)).astype(np.int64))
+    chosen = rows.take(_some(rows))
     centres = free_centres(rows.branches) if free is None else free
     starts = [
         _climb(chosen, spread, _first_prior(rows.branches), given=given, free=centres, steps=TRIAL_STEPS)
@@ -102,7 +103,7 @@ def estimate_hyperparameters(
 
 
 def draw_hyperparameters(
-    rows: FleetRows, best: Hyperparameters, *, given: FaultPrior | None = None, free: Array | None = None
+    rows: FleetRows, best: Hyperparameters, *, given: FaultPrior | None = None, carriers: int | None = None
 ) -> list[Hyperparameters]:
     """Hyper-parameters that explain the fleet about as well as the best ones.
 
@@ -113,30 +114,37 @@ def draw_hyperparameters(
 
     Parameters
     ----------
-    rows, given, free
+    rows, given
         As in :func:`estimate_hyperparameters`.
     best : Hyperparameters
         Of the whole fleet.
+    carriers : int or None
+        Trusted vehicles that alone tell the centres; None: all do.
 
     Returns
     -------
     list of Hyperparameters
-        :data:`DRAWS` of them; the best alone for a fleet of more than :data:`MOST_DRAWN` vehicles.
+        :data:`DRAWS` of them; the best alone if more than :data:`MOST_DRAWN` vehicles tell it.
     """
-    if len(rows) > MOST_DRAWN:
+    if min(len(rows), carriers or len(rows)) > MOST_DRAWN:
         return [best]
-    centres = free_centres(rows.branches) if free is None else free
     rng = random_stream(Purpose.HYPERPARAMETERS, len(rows))
     states = enumerate_states(rows, best.prior, best.spread)
     sound = float(np.sum(states.weight * ~states.hardware))
     return [
         Hyperparameters(
             prior=given if given is not None else _drawn_prior(rng, states, best.prior),
-            spread=drawn_spread(rng, best.spread, sound, centres),
+            spread=drawn_spread(rng, best.spread, sound, carriers or sound),
             log_evidence=best.log_evidence,
         )
         for _ in range(DRAWS)
     ]
+
+
+def _some(rows: FleetRows) -> NDArray[np.int64]:
+    """At most :data:`MOST_VEHICLES`, evenly over the slopes of the first branch, in whatever order they are given."""
+    order = np.argsort(rows.relative[:, 0], kind="stable")
+    return np.sort(order[np.linspace(0, len(rows) - 1, min(len(rows), MOST_VEHICLES)).astype(np.int64)])
 
 
 def _climb(

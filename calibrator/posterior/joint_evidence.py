@@ -5,7 +5,7 @@ scale, and what the relative parameters leave of their rows tells of the constan
 support, and a node where it has a pivot) fixes both.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,10 @@ __all__ = ["JointEvidence", "StateArrays"]
 
 StateArrays = tuple[Array, Array, Array, Array]
 """Relative parameters, their deviations, constant ones and theirs, of shapes (N, S, K + 1) and (N, S, 2K - 1)."""
-NEGLIGIBLE = 40.0
+NEGLIGIBLE = 25.0
 """Relative states so far below the best (logarithm) are dropped: constant rows hardly ever make that good. [1]"""
+FEW_RELATIVE = 16
+"""Relative states of a vehicle up to which it does not matter how many. [1]"""
 MOST_RELATIVE = 24
 """Relative states of a vehicle that are looked at with more branches than can be exact, the best ones. [1]"""
 
@@ -78,6 +80,26 @@ class JointEvidence:
         share = of_spread / np.diagonal(R, axis1=1, axis2=2)[:, r : r + rows.branches + 1]
         candidates = _candidates(rows, spread.mean[r:], carry, states, share, exact=exact)
         return cls(log_prior, prior, second, candidates, constant_design(rows.branches))
+
+    def __len__(self) -> int:
+        return len(self.candidates.log_evidence)
+
+    def by_size(self) -> list[tuple[NDArray[np.int64], "JointEvidence"]]:
+        """The same evidence in parts of vehicles with about as many relative states each, and which vehicles they are.
+
+        All vehicles of a part are given as many states as the one that has most.
+        """
+        found = self.candidates
+        count = np.isfinite(found.log_evidence).sum(axis=1)
+        size = np.maximum(np.ceil(np.log2(count / FEW_RELATIVE)), 0.0)
+        return [
+            (which, self._take(which, most=int(count[which].max())))
+            for which in (np.flatnonzero(size == each) for each in np.unique(size))
+        ]
+
+    def _take(self, which: NDArray[np.int64], *, most: int) -> "JointEvidence":
+        states = {name: values[which, :most] for name, values in vars(self.candidates).items()}
+        return replace(self, noise=self.noise.take(which), candidates=_Candidates(**states))
 
     def with_constant(self, support: Support) -> tuple[Array, StateArrays]:
         """Log weights (N, S) of the states with one constant support, and their parameters; S = 0 if impossible."""

@@ -203,7 +203,7 @@ def _left(
     return left, hidden[:, None] + _hidden_by_parameters(states, residual.shape[1], prior, precision, gain)
 
 
-def drawn_spread(rng: np.random.Generator, spread: ModelSpread, vehicles: float, free: Array) -> ModelSpread:
+def drawn_spread(rng: np.random.Generator, spread: ModelSpread, vehicles: float, carriers: float) -> ModelSpread:
     """Mean and covariance as so many vehicles without hardware faults tell them.
 
     Parameters
@@ -213,9 +213,9 @@ def drawn_spread(rng: np.random.Generator, spread: ModelSpread, vehicles: float,
     spread : ModelSpread
         The most likely one.
     vehicles : float
-        Vehicles that tell it.
-    free : ndarray of bool, shape (5K,)
-        Rows whose centre was estimated.
+        Vehicles that tell the covariance.
+    carriers : float
+        Vehicles that tell the mean.
 
     Returns
     -------
@@ -226,7 +226,8 @@ def drawn_spread(rng: np.random.Generator, spread: ModelSpread, vehicles: float,
     root = np.linalg.cholesky(spread.covariance)
     normal = root @ rng.standard_normal((len(root), degrees))
     covariance = normal @ normal.T / degrees + np.diag(np.diag(spread.covariance)) / degrees
-    mean = root @ rng.standard_normal(len(root)) / np.sqrt(max(vehicles, 1.0))
+    mean = root @ rng.standard_normal(len(root)) / np.sqrt(max(carriers, 1.0))
+    free = free_centres(len(root) // 5)
     return replace(spread, mean=spread.mean + np.where(free, mean, 0.0), covariance=covariance)
 
 

@@ -18,6 +18,8 @@ POINTS_PER_SIGN = 8
 POINTS_IN_SPACE = 64
 """Nodes of the quasi-random rule where the evidence leaves more directions open. [1]"""
 LEAST_DEVIATION = 1e-12
+NEVER = 9.0
+"""Deviations from a half of the slab at which there is nothing of it. [1]"""
 
 
 @dataclass(frozen=True)
@@ -45,10 +47,16 @@ class Slab:
         """
         spread = np.maximum(sd, LEAST_DEVIATION)
         half, centre, magnitude = (self.high - self.low) / 2.0, (self.high + self.low) / 2.0, np.abs(mean)
-        mass = np.zeros(np.broadcast_shapes(magnitude.shape, spread.shape))
-        for distance in (np.abs(magnitude - centre), magnitude + centre):
-            mass += ndtr((half - distance) / spread) - ndtr(-(half + distance) / spread)
+        near, far = np.abs(magnitude - centre), magnitude + centre
+        mass = ndtr((half - near) / spread) - ndtr(-(half + near) / spread)
+        if spread.size and spread.max() * NEVER > self.low:
+            mass += ndtr((half - far) / spread) - ndtr(-(half + far) / spread)
         return np.asarray(np.log(np.maximum(mass, np.finfo(float).tiny) * self.density))
+
+    def spacing(self, dimensions: int) -> float:
+        """Distance between neighbouring nodes. [1]"""
+        count = 2 * POINTS_PER_SIGN if dimensions <= 1 else POINTS_IN_SPACE
+        return float(2.0 * (self.high - self.low) / count ** (1.0 / max(dimensions, 1)))
 
     def nodes(self, dimensions: int) -> Array:
         """Equally weighted points of the prior, shape (Q, dimensions); one point without coordinates for 0."""

@@ -1,11 +1,11 @@
 """States: the explanations of each vehicle's evidence, with their weights.
 
-A state is a support, and a node where the support has pivots. Up to :data:`EXACT_BRANCHES` branches all supports are
-looked at. With more branches the sum over supports is approximate. All relative supports are looked at, and of their
-states the best go on (:data:`calibrator.posterior.joint_evidence.MOST_RELATIVE`). With each of these go the constant
-supports without hardware offsets, and those of at most :data:`calibrator.posterior.supports.MOST_CONSTANT` parameters.
-Where one of the latter size is a likely explanation, the best ones of its size (:data:`BEAM`) are grown by one
-parameter, and so on.
+A state is a support, and a node where the rows leave directions of it open. Up to :data:`EXACT_BRANCHES` branches all
+supports are looked at. With more branches the sum over supports is approximate. All relative supports are looked at,
+and of their states the best go on (:data:`calibrator.posterior.joint_evidence.MOST_RELATIVE`). With each of these go
+the constant supports without hardware offsets, and those of at most
+:data:`calibrator.posterior.supports.MOST_CONSTANT` parameters. Where one of the latter size is a likely explanation,
+the best ones of its size (:data:`BEAM`) are grown by one parameter, and so on.
 """
 
 from collections.abc import Sequence
@@ -18,14 +18,15 @@ from scipy.special import logsumexp
 
 from calibrator.drive import Array
 from calibrator.evidence.rows import FleetRows
+from calibrator.faults import Index
 from calibrator.posterior.fault_prior import OUTLIER_VARIANCE, FaultPrior, ModelSpread
 from calibrator.posterior.joint_evidence import JointEvidence, StateArrays
 from calibrator.posterior.supports import EXACT_BRANCHES, MOST_CONSTANT, Support, constant_supports, grown_supports
 
 __all__ = ["States", "enumerate_states", "mean_states"]
 
-MOST_STATES = 128
-"""States kept per vehicle, the most probable ones. [1]"""
+MOST_STATES, MOST_AVERAGED = 128, 512
+"""States kept per vehicle, the most probable ones, under one set of hyper-parameters and under several. [1]"""
 BEAM = 8
 """Constant supports of one size that are grown, the best ones. [1]"""
 GROWING = 3.0
@@ -66,6 +67,10 @@ class States:
 
     def __len__(self) -> int:
         return len(self.weight)
+
+    def take(self, index: Index) -> "States":
+        """Return the states of some of the vehicles."""
+        return States(*(getattr(self, f.name)[index] for f in fields(States)))
 
     @property
     def branches(self) -> int:
@@ -125,6 +130,11 @@ def enumerate_states(rows: FleetRows, prior: FaultPrior, spread: ModelSpread) ->
         if spread.outlier_share > NEGLIGIBLE_SHARE:
             part = _merged(part, _enumerate(some, prior, wide), spread.outlier_share)
         parts.append(part)
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[States]) -> States:
+    """States of several lots of vehicles, one after the other."""
     return States(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(States)))
 
 
@@ -158,7 +168,7 @@ def mean_states(several: Sequence[States]) -> States:
     if len(several) == 1:
         return several[0]
     every = np.concatenate([states.weight for states in several], axis=1) / len(several)
-    weight, order = _largest(np.asarray(every), MOST_STATES)
+    weight, order = _largest(np.asarray(every), MOST_AVERAGED)
     log_evidence = logsumexp([states.log_evidence for states in several], axis=0) - np.log(len(several))
     outlier = np.concatenate([states.outlier for states in several], axis=1)
     return States(
@@ -170,14 +180,19 @@ def mean_states(several: Sequence[States]) -> States:
 
 
 def _enumerate(rows: FleetRows, prior: FaultPrior, spread: ModelSpread) -> States:
-    evidence = JointEvidence.of(rows, prior, spread)
-    K = rows.branches
-    found = _Found(len(rows), K)
-    most = None if K <= EXACT_BRANCHES else MOST_CONSTANT
-    for support in constant_supports(K, most=most):
+    parts = JointEvidence.of(rows, prior, spread).by_size()
+    found = _joined([_with_constants(evidence, rows.branches) for _, evidence in parts])
+    return found.take(np.argsort(np.concatenate([which for which, _ in parts])))
+
+
+def _with_constants(evidence: JointEvidence, branches: int) -> States:
+    """All relative states with all constant supports."""
+    found = _Found(len(evidence), branches)
+    most = None if branches <= EXACT_BRANCHES else MOST_CONSTANT
+    for support in constant_supports(branches, most=most):
         found.add(*evidence.with_constant(support))
     if most is not None:
-        _grow(found, evidence, K, most)
+        _grow(found, evidence, branches, most)
     return found.states()
 
 

@@ -1,9 +1,6 @@
-"""Supports: which fault parameters are not zero, and which of them the rows leave open.
+"""Supports: which fault parameters are not zero.
 
-Relative parameters are (d_h, d_1 .. d_K), constant ones (o_h,1 .. o_h,K-1, o_1 .. o_K). If all relative parameters are
-there, a common factor can move from d_h to the drifts unseen. If o_h,k and o_k are there, an offset can move from one
-to the other unseen, as long as the hardware offsets still sum to zero. One hardware parameter of each such direction is
-the pivot: its value is taken from the nodes of the slab, the others follow.
+Relative parameters are (d_h, d_1 .. d_K), constant ones (o_h,1 .. o_h,K-1, o_1 .. o_K).
 
 There are 2^(K + 1) relative and 2^(2K - 1) constant supports. The former are always all looked at. The latter are up to
 :data:`EXACT_BRANCHES`; with more branches those without hardware offsets and those of at most :data:`MOST_CONSTANT`
@@ -43,37 +40,24 @@ class Support:
     ----------
     active : tuple of int
         Positions of the parameters that are not zero, in rising order.
-    pivots : tuple of int
-        Those of them whose value the rows leave open.
     hardware : bool
         Whether a hardware parameter is among them.
     """
 
     active: tuple[int, ...]
-    pivots: tuple[int, ...]
     hardware: bool
-
-    @property
-    def fitted(self) -> tuple[int, ...]:
-        """Active parameters that the rows determine."""
-        return tuple(i for i in self.active if i not in self.pivots)
 
 
 def relative_supports(branches: int) -> list[Support]:
     """All supports of (d_h, d_1 .. d_K), the smallest first."""
     size = branches + 1
-    return [
-        Support(active, (0,) if len(active) == size else (), 0 in active)
-        for active in _subsets(range(size), range(size + 1))
-    ]
+    return [Support(active, 0 in active) for active in _subsets(range(size), range(size + 1))]
 
 
 def constant_support(branches: int, active: Iterable[int]) -> Support:
     """Support of (o_h,1 .. o_h,K-1, o_1 .. o_K) with these parameters not zero."""
-    K, chosen = branches, tuple(sorted(active))
-    both = tuple(k for k in range(K - 1) if k in chosen and K - 1 + k in chosen)
-    last_sensor = 2 * K - 2 in chosen
-    return Support(chosen, both if last_sensor else both[1:], any(i < K - 1 for i in chosen))
+    chosen = tuple(sorted(active))
+    return Support(chosen, any(i < branches - 1 for i in chosen))
 
 
 def constant_supports(branches: int, *, most: int | None = None) -> list[Support]:
