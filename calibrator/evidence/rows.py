@@ -134,6 +134,42 @@ class FleetRows:
             means=None if self.means is None else self.means.take(index),
         )
 
+    def intercept_covariance(self) -> Array:
+        """Of b at the means, where it does not turn with the slopes, shape (N, K, K)."""
+        K = self.branches
+        a, b = slice(0, K), slice(3 * K - 1, 4 * K - 1)
+        of_b = self.covariance[:, b, b]
+        if self.means is None:
+            return np.asarray(of_b)
+        turn = -self.means.lever(self.relative)[:, :K, :K]
+        across = turn @ self.covariance[:, a, b]
+        return np.asarray(
+            of_b + across + np.swapaxes(across, 1, 2) + turn @ self.covariance[:, a, a] @ np.swapaxes(turn, 1, 2)
+        )
+
+    def dispersed(self, dispersion: Array | float) -> tuple[Array, Array]:
+        """Covariance if the variance of the intercepts is larger.
+
+        Parameters
+        ----------
+        dispersion : ndarray of shape (K,), or float
+            Factor on their variance at the means, at least 1. [1]
+
+        Returns
+        -------
+        whole : ndarray of shape (N, 5K, 5K)
+            Of all rows.
+        intercepts : ndarray of shape (N, K, K)
+            Of b at the means.
+        """
+        K = self.branches
+        own = self.intercept_covariance()
+        more = np.sqrt(np.broadcast_to(np.asarray(dispersion) - 1.0, K))
+        added = own * np.outer(more, more)
+        whole = self.covariance.copy()
+        whole[:, 3 * K - 1 : 4 * K - 1, 3 * K - 1 : 4 * K - 1] += added
+        return whole, own + added
+
     def constant_seen(self, parameters: Array, residual: Array) -> Array:
         """Constant rows as seen in true currents, if the relative parameters are known.
 

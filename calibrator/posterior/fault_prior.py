@@ -59,8 +59,12 @@ class ModelSpread:
         Over vehicles. [1]
     outlier_share : float
         Share of vehicles whose spread has :data:`OUTLIER_VARIANCE` times the variance. [1]
+    dispersion : ndarray of shape (K,), or float
+        Variance of each intercept over what its drives' blocks tell, at least 1: a model errs alike for longer than a
+        block. [1]
     """
 
     mean: Array
     covariance: Array
     outlier_share: float = 0.0
+    dispersion: Array | float = 1.0

@@ -69,7 +69,7 @@ class JointEvidence:
     def of(cls, rows: FleetRows, prior: FaultPrior, spread: ModelSpread) -> "JointEvidence":
         """Work out the relative states."""
         r = rows.relative.shape[1]
-        R = rows.covariance + spread.covariance
+        R = rows.dispersed(spread.dispersion)[0] + spread.covariance
         first = Noise.of(R[:, :r, :r])
         carry = R[:, r:, :r] @ first.precision
         second = Noise.of(R[:, r:, r:] - carry @ R[:, :r, r:])

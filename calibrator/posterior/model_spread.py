@@ -29,6 +29,8 @@ USED_STATES = 24
 """States of each vehicle that are looked at, the most probable ones. [1]"""
 SPREAD_VEHICLES = 5.0
 """Weight of the guess of the model spread, in vehicles."""
+GUESSED_DISPERSION = 2.0
+"""Guess of the variance of intercepts over what their blocks tell. [1]"""
 SPREAD_OVER_SAMPLING = 2.0
 """Guess of the model spread over the usual sampling deviation: a model errs alike over a whole drive. [1]"""
 MOST_SPREAD = 0.02
@@ -70,7 +72,12 @@ def initial_spreads(rows: FleetRows) -> list[ModelSpread]:
     wide = np.maximum(narrow, np.diag(np.minimum(spread, MOST_SPREAD) ** 2))
     starts = [(mean, wide), *((centre, narrow) for centre in (mean, lawful_mean, lawful_second, second, average))]
     return [
-        ModelSpread(mean=centre, covariance=covariance, outlier_share=GUESSED_OUTLIER_SHARE)
+        ModelSpread(
+            mean=centre,
+            covariance=covariance,
+            outlier_share=GUESSED_OUTLIER_SHARE,
+            dispersion=GUESSED_DISPERSION,
+        )
         for centre, covariance in starts
     ]
 
@@ -143,7 +150,9 @@ def trusted_spread(rows: FleetRows, trusted: Mask) -> ModelSpread:
     values = np.concatenate([rows.relative, rows.constant], axis=1)
     mean = np.where(free_centres(rows.branches), np.median(values[trusted], axis=0), 0.0)
     covariance = _guessed_spread(rows) + np.diag(_least_spread(rows.branches) ** 2)
-    return ModelSpread(mean=mean, covariance=covariance, outlier_share=GUESSED_OUTLIER_SHARE)
+    return ModelSpread(
+        mean=mean, covariance=covariance, outlier_share=GUESSED_OUTLIER_SHARE, dispersion=GUESSED_DISPERSION
+    )
 
 
 def next_spread(rows: FleetRows, states: States, prior: FaultPrior, spread: ModelSpread, free: Array) -> ModelSpread:
@@ -187,6 +196,7 @@ def next_spread(rows: FleetRows, states: States, prior: FaultPrior, spread: Mode
     return ModelSpread(
         mean=mean,
         covariance=covariance + np.diag(_least_spread(rows.branches) ** 2),
+        dispersion=_next_dispersion(rows, states, prior, replace(spread, mean=mean), residual),
         outlier_share=(outliers + OUTLIER_VEHICLES * GUESSED_OUTLIER_SHARE) / (len(rows) + OUTLIER_VEHICLES),
     )
 
@@ -196,11 +206,27 @@ def _left(
 ) -> tuple[Array, Array]:
     """Expected deviation of each vehicle (N, S, 5K), and its covariance (N, S, 5K, 5K)."""
     covariance = spread.covariance
-    precision = np.linalg.inv(rows.covariance + covariance)
+    precision = np.linalg.inv(rows.dispersed(spread.dispersion)[0] + covariance)
     gain = covariance @ precision
     left = spread.mean + np.einsum("nab,nsb->nsa", gain, residual - spread.mean)
     hidden = covariance - gain @ covariance
     return left, hidden[:, None] + _hidden_by_parameters(states, residual.shape[1], prior, precision, gain)
+
+
+def _next_dispersion(rows: FleetRows, states: States, prior: FaultPrior, spread: ModelSpread, residual: Array) -> Array:
+    """Expected squares of the intercepts' own errors over what blocks tell of them, on average over usual vehicles."""
+    K, used = rows.branches, residual.shape[1]
+    b = slice(3 * K - 1, 4 * K - 1)
+    weight = states.weight[:, :used] * ~states.outlier[:, :used]
+    whole, own = rows.dispersed(spread.dispersion)
+    precision = np.linalg.inv(whole + spread.covariance)
+    gain = own @ precision[:, b]
+    error = np.einsum("nab,nsb->nsa", gain, residual - spread.mean)
+    hidden = (own - gain[:, :, b] @ own)[:, None] + _hidden_by_parameters(states, used, prior, precision, gain)
+    stated = np.diagonal(rows.intercept_covariance(), axis1=1, axis2=2)[:, None]
+    ratio = (error**2 + np.diagonal(hidden, axis1=2, axis2=3)) / stated
+    told, guess = np.sum(weight), SPREAD_VEHICLES * GUESSED_DISPERSION
+    return np.asarray(np.maximum((np.einsum("ns,nsk->k", weight, ratio) + guess) / (told + SPREAD_VEHICLES), 1.0))
 
 
 def drawn_spread(rng: np.random.Generator, spread: ModelSpread, vehicles: float, carriers: float) -> ModelSpread:

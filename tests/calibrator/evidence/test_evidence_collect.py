@@ -36,15 +36,18 @@ def expected_rows(faults: Faults) -> Array:
     return np.concatenate([np.log1p(relative) @ relative_design(K).T, constant @ constant_design(K).T], axis=1)
 
 
-def seen_rows(rows: FleetRows, faults: Faults) -> Array:
-    factor = 1.0 + faults.drift
-    scale = np.concatenate([factor, factor[:, :1], factor], axis=1)
-    return np.concatenate([rows.relative, rows.constant / scale], axis=1)
+def errors(rows: FleetRows, faults: Faults) -> Array:
+    """Rows less what they are without error, as seen in true currents, shape (N, 5K)."""
+    expected = expected_rows(faults)
+    relative = rows.relative - expected[:, : 3 * K - 1]
+    parameters = np.column_stack([faults.hardware_drift, faults.drift])
+    seen = rows.constant_seen(parameters[:, None], relative[:, None])[:, 0]
+    return np.concatenate([relative, seen - expected[:, 3 * K - 1 :]], axis=1)
 
 
 def standardised(rows: FleetRows, faults: Faults) -> Array:
     """Errors of the told rows through the root of their precision: N(0, 1) each, and independent, if all is right."""
-    error = (seen_rows(rows, faults) - expected_rows(faults))[:, TOLD]
+    error = errors(rows, faults)[:, TOLD]
     L = np.linalg.cholesky(rows.covariance[:, TOLD][:, :, TOLD])
     return np.linalg.solve(L, error[..., None])[..., 0]
 
@@ -66,7 +69,7 @@ def test_rows_are_as_right_over_the_model_learnt_from_the_fleet() -> None:
     faults = random_faults(2, 100)
     summaries = summaries_of(faults, seed=2)
     rows = collect_rows(summaries, fit_fleet_model(summaries), full_scale_a=FULL_SCALE_A)
-    error = (seen_rows(rows, faults) - expected_rows(faults))[:, TOLD]
+    error = errors(rows, faults)[:, TOLD]
     assert np.abs(np.median(error[:, : 2 * K - 1], axis=0)).max() < 0.003
     assert np.abs(np.median(error[:, 2 * K - 1 :], axis=0)).max() < 0.002
     assert np.abs(error).max() < 0.05
