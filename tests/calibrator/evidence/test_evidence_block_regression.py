@@ -43,7 +43,7 @@ def test_covariance_is_that_of_the_sandwich_over_blocks() -> None:
     theta = np.linalg.lstsq(z, y, rcond=None)[0]
     bread = np.linalg.inv(z.T @ z)
     scores = ((y - z @ theta)[:, None] * z).reshape(BLOCKS, LENGTH, 2).sum(axis=1)
-    sandwich = bread @ scores.T @ scores @ bread * BLOCKS / (BLOCKS - 2)
+    sandwich = bread @ scores.T @ scores @ bread * BLOCKS / (BLOCKS - 4)
     fit = regress(z, y)
     np.testing.assert_allclose(fit.influence.T @ fit.influence, sandwich, rtol=1e-6)
     np.testing.assert_allclose(fit.sd, np.sqrt(np.diag(sandwich)), rtol=1e-6)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from calibrator.errors import FleetError
-from calibrator.evidence.rows import FleetRows, constant_design, relative_design
+from calibrator.evidence.rows import FleetRows, LineMeans, constant_design, relative_design
 
 BRANCHES = pytest.mark.parametrize("branches", [2, 3, 5])
 
@@ -55,3 +55,60 @@ def test_a_covariance_that_is_not_finite_is_refused() -> None:
     rows = some_rows(2, 2)
     with pytest.raises(FleetError, match="evidence is not finite"):
         FleetRows(relative=rows.relative, constant=rows.constant, covariance=rows.covariance + np.inf)
+
+
+@BRANCHES
+def test_constants_turn_with_their_ratios_about_the_means(branches: int) -> None:
+    """Whatever the errors of slopes and gain ratios, given the truth the constants are exact."""
+    K, rng = branches, np.random.default_rng(branches)
+    d_h, d, o, o_h = 0.1, *rng.uniform(-0.2, 0.2, (3, K))
+    o_h -= o_h.mean()
+    true = rng.uniform(-0.1, 0.1, K)
+    true -= true.mean()
+    measured = (1.0 + d) * ((1.0 + d_h) * true + o_h) + o
+    error = rng.normal(0.0, 0.3, 2 * K - 1)
+    relative = relative_design(K) @ np.log1p(np.append(d_h, d))
+    relative[: 2 * K - 1] += error
+    b = measured - np.exp(relative[:K]) * true
+    c = measured[0] + np.exp(relative[K : 2 * K - 1]) @ measured[1:]
+    rows = FleetRows(
+        relative=relative[None],
+        constant=np.concatenate([b, [c], np.zeros(K)])[None],
+        covariance=np.eye(5 * K)[None],
+        means=LineMeans(model=true[None], measured=measured[None]),
+    )
+    assert rows.means is not None
+    residual = np.concatenate([error, np.zeros(K)])
+    seen = rows.constant_seen(np.append(d_h, d)[None, None], residual[None, None])[0, 0, : K + 1]
+    linear = rows.means.lever(rows.relative)[0] @ error
+    expected = np.append(o_h + o / (1.0 + d), np.sum(o / (1.0 + d)))
+    np.testing.assert_allclose(seen - linear, expected, atol=1e-12)
+
+
+def test_intercepts_at_the_means_do_not_turn_with_the_slopes() -> None:
+    K = 2
+    means = LineMeans(model=np.array([[0.3, -0.3]]), measured=np.array([[0.4, -0.2]]))
+    relative, own = np.zeros((1, 3 * K - 1)), np.array([[4e-6, 1e-6], [1e-6, 9e-6]])
+    turn = np.eye(5 * K)
+    turn[3 * K - 1 : 4 * K, : 2 * K - 1] = means.lever(relative)[0]
+    at_means = np.diag(np.full(5 * K, 1e-4))
+    at_means[3 * K - 1 : 4 * K - 1, 3 * K - 1 : 4 * K - 1] = own
+    rows = FleetRows(
+        relative=relative, constant=np.zeros((1, 2 * K + 1)), covariance=(turn @ at_means @ turn.T)[None], means=means
+    )
+    np.testing.assert_allclose(rows.intercept_covariance()[0], own, atol=1e-18)
+    whole, intercepts = rows.dispersed(np.array([4.0, 1.0]))
+    np.testing.assert_allclose(np.diag(intercepts[0]), [16e-6, 9e-6])
+    np.testing.assert_allclose(
+        np.diag(whole[0] - rows.covariance[0])[3 * K - 1 :], [12e-6, 0.0, 0.0, 0.0, 0.0], atol=1e-18
+    )
+    assert (np.linalg.eigvalsh(whole[0]) > 0.0).all()
+
+
+def test_means_are_taken_with_their_vehicles() -> None:
+    means = LineMeans(model=np.arange(4.0).reshape(2, 2), measured=np.arange(4.0, 8.0).reshape(2, 2))
+    rows = FleetRows(**{**vars(some_rows(2, 2)), "means": means})
+    taken = rows.take(np.array([1])).means
+    assert taken is not None
+    np.testing.assert_array_equal(taken.model, [[2.0, 3.0]])
+    np.testing.assert_array_equal(taken.measured, [[6.0, 7.0]])

@@ -2,10 +2,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from calibrator.drive import Array
 from calibrator.faults import Faults
-from calibrator.posterior.decision import Points, best_estimates, harm_probability, spread_points
+from calibrator.posterior.decision import Points, best_estimates, branch_points, harm_probability, spread_points
 from calibrator.posterior.states import States, enumerate_states
 from calibrator.score import correction_error_rms
 from tests.calibrator.posterior.simulated_rows import faults_of, no_spread, prior_of, rows_of
@@ -101,7 +102,28 @@ def harm(points: Points, drift: Array, offset: Array) -> Array:
 def test_harm_is_the_probability_that_correction_makes_it_worse(sd: float) -> None:
     states = states_of(*TWO_EXPLANATIONS, sd=sd)
     estimate = states.drift[0, 0], states.offset[0, 0]
-    np.testing.assert_allclose(harm(spread_points(states, 0), *estimate), harm(drawn(states), *estimate), atol=0.1)
+    np.testing.assert_allclose(harm(branch_points(states, 0), *estimate), harm(drawn(states), *estimate), atol=0.005)
+
+
+@pytest.mark.parametrize("deviations", [1.0, 2.0, 3.0, 3.7])
+def test_harm_in_the_tails_is_told_to_a_thousandth(deviations: float) -> None:
+    """A drift of so many standard deviations, and a current that shows nothing else: worse if it is below half."""
+    estimate = 0.1
+    sd = estimate / (2.0 + estimate) / deviations * (1.0 + 0.5 * estimate)
+    states = states_of(np.array([1.0]), np.array([[estimate, 0.0]]), np.zeros((1, K)), sd=sd)
+    result = harm_probability(
+        branch_points(states, 0), np.array([estimate, 0.0]), np.zeros(K), mean=np.zeros((1, K)), mean_square=SQUARE
+    )
+    # |d - estimate| / (1 + estimate) > |d|: between -1 and estimate / (2 + estimate)
+    expected = norm.cdf(estimate / (2.0 + estimate), estimate, sd) - norm.cdf(-1.0, estimate, sd)
+    assert result[0] == pytest.approx(expected, abs=0.001)
+
+
+def test_states_too_unlikely_to_look_at_count_as_harmful() -> None:
+    weight = np.array([1.0 - 2e-8, 1e-8, 1e-8])
+    drift = np.array([[0.1, 0.0], [0.1, 0.0], [0.1, 0.0]])
+    states = states_of(weight, drift, np.zeros((3, K)), sd=1e-6)
+    assert harm(branch_points(states, 0), drift[0], np.zeros(K))[0] == pytest.approx(2e-8)
 
 
 def test_harm_of_a_wrong_explanation_is_the_weight_of_the_others() -> None:

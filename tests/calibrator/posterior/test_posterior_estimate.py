@@ -8,6 +8,8 @@ from calibrator.errors import FleetError
 from calibrator.evidence.rows import FleetRows
 from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
+from calibrator.posterior.hyperparameters import draw_hyperparameters, estimate_hyperparameters
+from calibrator.posterior.model_spread import trusted_spread
 from calibrator.score import recovered
 from tests.calibrator.posterior.simulated_rows import (
     FULL_SCALE_A,
@@ -82,6 +84,49 @@ def test_spread_between_faultless_vehicles_is_learnt() -> None:
     posterior = estimate_fleet(stated, moments_of(VEHICLES), full_scale_a=FULL_SCALE_A)
     learnt = np.sqrt(np.diag(posterior.hyperparameters.spread.covariance))[:K]
     np.testing.assert_allclose(learnt, np.sqrt(0.010**2 - 0.002**2), rtol=0.4)
+
+
+def test_intercepts_that_err_more_than_blocks_tell_are_believed_less() -> None:
+    """Three times the stated deviation in the first branch's intercept, in proportion to what is stated."""
+    faults = random_faults(3, vehicles=200, branches=K, sparsity=66.0)
+    rng = np.random.default_rng(3)
+    rows = rows_of(faults, seed=3)
+    scale = rng.uniform(0.3, 3.0, len(faults))
+    intercepts = slice(3 * K - 1, 4 * K - 1)
+    covariance = rows.covariance.copy()
+    covariance[:, intercepts, intercepts] *= (scale**2)[:, None, None]
+    error = np.sqrt(covariance[:, 3 * K - 1, 3 * K - 1]) * rng.normal(size=len(faults))
+    constant = rows.constant.copy()
+    constant[:, 0] += np.sqrt(9.0 - 1.0) * error * (1.0 + faults.drift[:, 0])
+    stated = replace(rows, constant=constant, covariance=covariance)
+    learnt = estimate_fleet(stated, moments_of(len(faults)), full_scale_a=FULL_SCALE_A).hyperparameters.spread
+    first, second = np.broadcast_to(learnt.dispersion, K)
+    assert 3.0 < first < 13.0
+    assert 1.0 <= second < 2.5
+
+
+def test_what_a_large_fleet_teaches_does_not_depend_on_its_order() -> None:
+    faults = random_faults(4, vehicles=330, branches=K, sparsity=66.0)
+    rows, order = rows_of(faults, seed=4), np.random.default_rng(4).permutation(330)
+    plain, mixed = (
+        estimate_fleet(some, moments_of(330), full_scale_a=FULL_SCALE_A) for some in (rows, rows.take(order))
+    )
+    np.testing.assert_allclose(mixed.confidence, plain.confidence[order], atol=1e-6)
+    np.testing.assert_allclose(mixed.hyperparameters.spread.mean, plain.hyperparameters.spread.mean, atol=1e-9)
+
+
+def test_trusted_vehicles_tell_the_reference_as_well_as_their_number_does(truth: Faults) -> None:
+    rows = rows_of(truth, seed=1)
+    trusted = np.zeros(VEHICLES, bool)
+    trusted[np.flatnonzero(~truth.has_hardware_fault & ~(truth.drift.any(axis=1) | truth.offset_a.any(axis=1)))[:3]] = (
+        True
+    )
+    best = estimate_hyperparameters(rows, [trusted_spread(rows, trusted)], free=np.zeros(5 * K, bool))
+    few, many = (
+        np.std([each.spread.mean[0] for each in draw_hyperparameters(rows, best, carriers=carriers)])
+        for carriers in (3, None)
+    )
+    assert few > 2.0 * many > 0.0
 
 
 def test_a_given_prior_is_kept(truth: Faults) -> None:

@@ -84,14 +84,14 @@ def test_constant_evidence_is_that_of_a_fine_grid(active: tuple[int, ...]) -> No
     assert fit.log_evidence[0, 0] == pytest.approx(log_mean_likelihood(y, means, R), abs=0.02)
 
 
-@pytest.mark.parametrize("sd", [0.01, 0.03])
-def test_relative_evidence_with_a_pivot_is_that_of_many_draws(sd: float) -> None:
+@pytest.mark.parametrize(("sd", "open_directions"), [(0.01, 1), (0.03, 2), (0.1, 3)])
+def test_relative_evidence_with_pivots_is_that_of_many_draws(sd: float, open_directions: int) -> None:
     support, R = relative_support(0, 1, 2), covariance_of(3 * K - 1, sd)
     y = np.zeros(3 * K - 1)
     y[: 2 * K - 1] = relative_design(K)[: 2 * K - 1] @ np.log1p([0.1, -0.12, 0.15])
     fit = integrate_relative(y[None, None], relative_design(K), support, Noise.of(R[None]), SLAB)
     expected = relative_truth(y, support, R, slab_draws(1, 3))
-    assert fit.log_evidence.shape[2] == len(SLAB.nodes(1))
+    assert fit.log_evidence.shape[2] == len(SLAB.nodes(open_directions))
     assert logsumexp(fit.log_evidence) == pytest.approx(expected, abs=0.2)
 
 
@@ -151,5 +151,37 @@ def test_vehicles_and_sets_of_rows_do_not_touch_each_other() -> None:
                 SLAB,
                 scale=scale[j : j + 1, s : s + 1],
             )
-            np.testing.assert_allclose(together.log_evidence[j, s], alone.log_evidence[0, 0], rtol=1e-10)
-            np.testing.assert_allclose(together.parameters[j, s], alone.parameters[0, 0], rtol=1e-10)
+            nodes = alone.log_evidence.shape[2]
+            np.testing.assert_allclose(together.log_evidence[j, s, :nodes], alone.log_evidence[0, 0], rtol=1e-10)
+            np.testing.assert_allclose(together.parameters[j, s, :nodes], alone.parameters[0, 0], rtol=1e-10)
+            assert np.isneginf(together.log_evidence[j, s, nodes:]).all()
+    assert together.log_evidence.shape[2] == 64
+
+
+def test_a_reading_of_one_sensor_closes_the_direction_of_its_offsets() -> None:
+    """o_h, o_1 and o_2 of two branches: without a reading one direction is open, with one of o_1 none is."""
+    design, support = constant_design(K), constant_support(K, (0, 1, 2))
+    y, R = design @ np.array([0.1, -0.12, 0.15]), covariance_of(2 * K + 1, 0.001)
+    y[-K:] = 0.0
+    read, exact = y.copy(), R.copy()
+    read[K + 1], exact[K + 1, K + 1] = -0.12, 1e-8
+    one = np.ones((1, 1, 2 * K - 1))
+    blind = integrate_constant(y[None, None], design, support, Noise.of(R[None]), SLAB, scale=one)
+    seen = integrate_constant(read[None, None], design, support, Noise.of(exact[None]), SLAB, scale=one)
+    assert blind.log_evidence.shape[2] == len(SLAB.nodes(1))
+    assert seen.log_evidence.shape[2] == 1
+    np.testing.assert_allclose(seen.parameters[0, 0, 0], [0.1, -0.12, 0.15], atol=1e-6)
+    C = np.linalg.inv(design.T @ np.linalg.inv(exact) @ design)
+    volume = 0.5 * np.linalg.slogdet(2.0 * np.pi * C)[1] + 3.0 * np.log(SLAB.density)
+    left = read - design @ [0.1, -0.12, 0.15]
+    density = -0.5 * (np.linalg.slogdet(2.0 * np.pi * exact)[1] + left @ np.linalg.inv(exact) @ left)
+    assert seen.log_evidence[0, 0, 0] == pytest.approx(density + volume, abs=1e-6)
+
+
+def test_pivots_deviate_as_far_as_their_nodes_lie_apart_and_what_follows_them_as_well() -> None:
+    support, R = relative_support(0, 1, 2), covariance_of(3 * K - 1, 1e-5)
+    y = np.zeros(3 * K - 1)
+    y[: 2 * K - 1] = relative_design(K)[: 2 * K - 1] @ np.log1p([0.1, -0.12, 0.15])
+    fit = integrate_relative(y[None, None], relative_design(K), support, Noise.of(R[None]), SLAB)
+    apart = SLAB.spacing(1) / np.sqrt(12.0)
+    np.testing.assert_allclose(fit.sd[0, 0] / (1.0 + fit.parameters[0, 0]), apart, rtol=1e-4)

@@ -10,13 +10,16 @@ from scipy.stats import multivariate_normal, norm
 
 from calibrator.drive import Array
 from calibrator.errors import FleetError
-from calibrator.evidence.rows import FleetRows, constant_design, relative_design
+from calibrator.evidence.readings import no_readings, with_readings
+from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, constant_design, relative_design
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.slab import Slab
 from calibrator.posterior.states import MOST_STATES, States, enumerate_states, mean_states
 from calibrator.posterior.supports import Support, constant_supports, relative_supports
 from tests.calibrator.posterior.simulated_rows import (
+    FULL_SCALE_A,
     Errors,
+    faults_of,
     no_spread,
     parameters_of,
     prior_of,
@@ -45,10 +48,22 @@ def slab_mass(slab: Slab, value: float, sd: float) -> float:
     return slab.density * float(positive + norm.cdf(-slab.low, value, sd) - norm.cdf(-slab.high, value, sd))
 
 
+def open_directions(support: Support, X: Array) -> list[int]:
+    """The first parameters without which the others are determined by the rows."""
+    pivots: list[int] = []
+    while True:
+        kept = [i for i in support.active if i not in pivots]
+        rank = np.linalg.matrix_rank(X[:, kept]) if kept else 0
+        if rank == len(kept):
+            return pivots
+        pivots.append(next(i for i in kept if np.linalg.matrix_rank(X[:, [k for k in kept if k != i]]) == rank))
+
+
 def block(y: Array, X: Array, R: Array, support: Support, slab: Slab, unit: Array | None) -> list[tuple[float, Array]]:
     """Plain loop over the nodes of one support: log evidence, and parameters; drifts without unit, else offsets."""
     found = []
-    fitted, pivots = list(support.fitted), list(support.pivots)
+    pivots = open_directions(support, X)
+    fitted = [i for i in support.active if i not in pivots]
     for node in slab.nodes(len(pivots)):
         theta = np.zeros(X.shape[1])
         theta[pivots] = np.log1p(node) if unit is None else node / unit[pivots]
@@ -256,6 +271,44 @@ def test_ever_smaller_errors_make_the_simplest_explanation_sure() -> None:
     ]
     assert sure[1].mean() > sure[0].mean()
     assert sure[1].min() > 0.95
+
+
+@pytest.mark.parametrize("branches", [2, 3])
+def test_exact_readings_of_the_offsets_make_no_false_drifts(branches: int) -> None:
+    """A hardware offset and a sensor offset in one branch, both known once the sensors were read without a current."""
+    K = branches
+    relative, constant = np.zeros((1, K + 1)), np.zeros((1, 2 * K - 1))
+    constant[0, 0], constant[0, K - 1] = 0.113, -0.171
+    truth = faults_of(relative, constant)
+    readings = replace(no_readings(1, K), offset_a=truth.offset_a, offset_sd_a=np.full((1, K), 1e-4 * FULL_SCALE_A))
+    rows = with_readings(rows_of(truth, seed=2), readings, full_scale_a=FULL_SCALE_A)
+    states = enumerate_states(rows, prior_of(K), no_spread(K))
+    false_drift = (states.relative[0] != 0.0).any(axis=1)
+    assert states.weight[0, false_drift].sum() < 0.05
+    np.testing.assert_allclose(states.constant[0, 0], constant[0], atol=0.003)
+    assert states.weight[0, 0] > 0.9
+
+
+def test_a_drift_that_no_row_tells_keeps_its_prior() -> None:
+    """The third branch hardly moves: whether its sensor drifts, and how far, is as open as before."""
+    K = 3
+    rows = rows_of(faults_of(np.zeros((1, K + 1)), np.zeros((1, 2 * K - 1))), noise=0.0)
+    covariance = rows.covariance.copy()
+    for row in (K - 1, 2 * K - 2):
+        covariance[:, row, row] = UNKNOWN_VARIANCE
+    prior = prior_of(K)
+    states = enumerate_states(replace(rows, covariance=covariance), prior, no_spread(K))
+    drift, weight = states.drift[0, :, 2], states.weight[0]
+    alone = (states.hardware_count[0] == 0) & (states.sensor_count[0] == 1) & (drift != 0.0)
+    log_share = prior.log_supports()
+    expected = np.exp(log_share[0, 1] - logsumexp([log_share[0, 0], log_share[0, 1]]))
+    nothing = (states.hardware_count[0] == 0) & (states.sensor_count[0] == 0)
+    found = weight[alone].sum() / (weight[alone].sum() + weight[nothing].sum())
+    assert found == pytest.approx(expected, rel=0.05)
+    magnitudes = np.abs(drift[alone])
+    assert magnitudes.min() < 0.07
+    assert magnitudes.max() > 0.23
+    assert np.sum(weight[alone] * np.sign(drift[alone])) == pytest.approx(0.0, abs=1e-3)
 
 
 def test_impossible_rows_still_give_probabilities() -> None:
