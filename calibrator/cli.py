@@ -34,6 +34,7 @@ from calibrator.command_options import (
     UnseenMinutesOption,
     VehiclesOption,
     WorkersOption,
+    require_own_options,
 )
 from calibrator.errors import LogError
 from calibrator.folders import require_new_folder, require_possible_folder
@@ -174,6 +175,7 @@ def simulate(
 
 @app.command()
 def calibrate(
+    context: typer.Context,
     fleet: Annotated[Path, typer.Argument(help="Drive store, or folder with a folder of logs per vehicle.")],
     layout: LayoutOption,
     out: Annotated[Path, typer.Option("--out", help="Folder of the result, new or empty.")],
@@ -196,14 +198,15 @@ def calibrate(
     """Estimate the sensor faults of every vehicle and write its parameter file.
 
     The default method, posterior, says how sure it is and corrects a branch only if that hardly harms. The options
-    classifier to seed are for the published method, which is kept as a reference: its classifier 'tree' is trained on
-    an artificial fleet of this --sparsity, --magnitude and --seed.
+    classifier, truth, sparsity, magnitude, symmetric, unity and seed are for the published method, which is kept as a
+    reference: its classifier 'tree' is trained on an artificial fleet of this --sparsity, --magnitude and --seed.
     """
     with importing():
         from calibrator.fleet import CalibrationSettings, calibrate_fleet
 
     if (classifier is Classifier.PERFECT) != (truth is not None):
         raise typer.BadParameter("--classifier perfect and --truth FILE belong together", param_hint="--classifier")
+    require_own_options(context, method)
     settings = CalibrationSettings(
         method=method,
         harm_limit=harm_limit,

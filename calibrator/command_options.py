@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from calibrator.options import Classifier
+from calibrator.options import Classifier, Method
 
 __all__ = [
     "BalancedOption",
@@ -37,8 +37,14 @@ __all__ = [
     "UnseenMinutesOption",
     "VehiclesOption",
     "WorkersOption",
+    "require_own_options",
 ]
 
+OWN_OPTIONS = {
+    Method.POSTERIOR: ("harm_limit", "trusted", "sensor_models"),
+    Method.PUBLISHED: ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity"),
+}
+"""What only one method heeds."""
 MAX_VEHICLES = 100_000
 MAX_CURRENTS = 16
 MAX_SEED = 2**32 - 1
@@ -165,3 +171,26 @@ HoldOutOption = Annotated[
 UnityOption = Annotated[
     str | None, typer.Option("--unity", help="Vehicle whose held-out data is the unity drive (published).")
 ]
+
+
+def require_own_options(context: typer.Context, method: Method) -> None:
+    """Refuse options that were given for another method: without a word, they would be ignored.
+
+    Parameters
+    ----------
+    context : typer.Context
+        Of the command.
+    method : Method
+        That is used.
+
+    Raises
+    ------
+    typer.BadParameter
+        Naming the first such option.
+    """
+    for other, names in OWN_OPTIONS.items():
+        sources = {name: context.get_parameter_source(name) for name in names}
+        given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+        if other is not method and given:
+            option = f"--{given[0].replace('_', '-')}"
+            raise typer.BadParameter(f"belongs to --method {other.value}, not {method.value}", param_hint=option)

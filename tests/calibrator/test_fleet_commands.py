@@ -202,6 +202,12 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
         (("calibrate", ".", "--layout", "none.toml", "--out", "x"), 1, "none.toml: cannot read the layout"),
         (("score", "nowhere", "--truth", "none.json"), 1, "none.json: cannot read the truth"),
         (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--classifier", "perfect"), 2, "belong together"),
+        (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--symmetric"), 2, "belongs to --method published, not"),
+        (
+            ("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--method", "published", "--trusted", "V001"),
+            2,
+            "belongs to --method posterior, not published",
+        ),
         (("simulate", "--vehicles", "0", "--layout", LAYOUT, "--out", "x"), 2, "--vehicles"),
         (("simulate", "--vehicles", "3", "--symmetric", "--layout", LAYOUT, "--out", "x"), 1, "multiple of 4"),
         (
@@ -273,7 +279,7 @@ def test_perfect_classifier_refuses_the_truth_of_another_fleet_before_the_work(
     assert calibrator("import", log, "--layout", LAYOUT, "--out", store).returncode == 0
     for source in (fleet, fleet / "logs", store):
         run = calibrator(
-            *("calibrate", source, "--layout", LAYOUT, "--out", tmp_path / "x"),
+            *("calibrate", source, "--layout", LAYOUT, "--method", "published", "--out", tmp_path / "x"),
             *("--classifier", "perfect", "--truth", other_fleet / "truth.json"),
         )
         assert run.returncode == 1
