@@ -15,6 +15,8 @@ __all__ = ["collect_rows"]
 
 LEAST_GAIN = 0.3
 """Slopes and gain ratios below are no sensor's, but those of a branch that hardly moved. [1]"""
+FEWEST_BLOCKS = 3
+"""Of a vehicle; fewer tell no variance."""
 FLEET_BLOCKS = 20.0
 """Weight of the fleet's usual correlation of rows against that of one vehicle, in blocks."""
 LEAST_SD = np.array([5e-5, 1e-5])
@@ -72,7 +74,7 @@ def _of_vehicle(summary: DriveSummary, model: FleetModel, full_scale_a: float) -
     slopes, law = regress_on_fleet(summary, model.read_out), junction_law(summary)
     estimate = np.concatenate([*(fit.estimate for fit in slopes), law.estimate])
     influence = np.concatenate([*(fit.influence for fit in slopes), law.influence], axis=1)
-    covariance = influence.T @ influence
+    covariance = influence.T @ influence if len(influence) >= FEWEST_BLOCKS else UNKNOWN_VARIANCE * np.eye(3 * K)
     for k, fit in enumerate([*slopes, law]):
         part = slice(2 * k, 2 * k + len(fit.estimate))
         covariance[part, part] += fit.prior_covariance

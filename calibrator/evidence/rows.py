@@ -134,6 +134,29 @@ class FleetRows:
             means=None if self.means is None else self.means.take(index),
         )
 
+    def constant_turn(self, parameters: Array) -> Array:
+        """Derivative of :meth:`constant_seen` by the logarithms of the relative parameters, without hardware offsets.
+
+        Parameters
+        ----------
+        parameters : ndarray of shape (N, S, K + 1)
+            d_h, d_1 .. d_K of S states.
+
+        Returns
+        -------
+        ndarray of shape (N, S, 2K + 1, K + 1)
+            The residual of the relative rows falls as the parameters rise.
+        """
+        K, (N, S, _) = self.branches, parameters.shape
+        turn = np.zeros((N, S, 2 * K + 1, K + 1))
+        if self.means is None:
+            return turn
+        true = (1.0 + parameters[:, :, :1]) * self.means.model[:, None]
+        turn[:, :, range(K), range(1, K + 1)] = turn[:, :, :K, 0] = turn[:, :, K, 1:] = -true
+        lever = self.means.lever(self.relative) @ relative_design(K)[: 2 * K - 1]
+        turn[:, :, : K + 1] -= lever[:, None]
+        return turn
+
     def intercept_covariance(self) -> Array:
         """Of b at the means, where it does not turn with the slopes, shape (N, K, K)."""
         K = self.branches
@@ -159,8 +182,8 @@ class FleetRows:
         -------
         whole : ndarray of shape (N, 5K, 5K)
             Of all rows.
-        intercepts : ndarray of shape (N, K, K)
-            Of b at the means.
+        added : ndarray of shape (N, K, K)
+            What of it is added to the intercepts, independent of everything else.
         """
         K = self.branches
         own = self.intercept_covariance()
@@ -168,7 +191,7 @@ class FleetRows:
         added = own * np.outer(more, more)
         whole = self.covariance.copy()
         whole[:, 3 * K - 1 : 4 * K - 1, 3 * K - 1 : 4 * K - 1] += added
-        return whole, own + added
+        return whole, added
 
     def constant_seen(self, parameters: Array, residual: Array) -> Array:
         """Constant rows as seen in true currents, if the relative parameters are known.

@@ -74,7 +74,7 @@ def read_vehicle_summary(
     """
     layout = database.layout
     drives = [load_drive(entry, database) for entry in entries]
-    delays = estimate_delays(drives, _largest_first(drives, equipment.branches))
+    delays = estimate_delays(drives, _most_moving_first(drives, equipment.branches))
     samples = [
         align(without_delays(drive, delays.by_branch()), layout, equipment.branches, inputs=equipment.fleet_inputs)
         for drive in drives
@@ -98,7 +98,7 @@ def _recorded(drive: Drive) -> frozenset[str]:
     return frozenset(name for name, channel in drive.inputs.items() if channel.good.any())
 
 
-def _largest_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple[str, ...]:
+def _most_moving_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple[str, ...]:
     """Branches by falling variance; the order asked for where a drive lacks one, as is noticed later."""
 
     def variance_a2(name: str) -> float:

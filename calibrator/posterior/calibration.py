@@ -62,7 +62,7 @@ def calibrate_posterior(
         raise FleetError("no vehicle to learn the fleet's reference from")
     K, N = summaries[0].branches, len(summaries)
     names = [f"{k + 1}" for k in range(K)] if branches is None else branches
-    order = _largest_first(summaries)
+    order = _most_moving_first(summaries)
     ordered = [summary.take_branches(order) for summary in summaries]
     learnt = np.ones(N, bool) if learning is None else learning
     model = fit_fleet_model([summary for summary, use in zip(ordered, learnt, strict=True) if use])
@@ -80,7 +80,7 @@ def calibrate_posterior(
     return _in_own_order(posterior, health, order)
 
 
-def _largest_first(summaries: Sequence[DriveSummary]) -> list[int]:
+def _most_moving_first(summaries: Sequence[DriveSummary]) -> list[int]:
     """Branches by falling variance: the junction law is written for the first, and small ones are drowned in noise."""
     variance = np.median([summary.variance_a2 for summary in summaries], axis=0)
     return [int(k) for k in np.argsort(-variance, kind="stable")]

@@ -2,26 +2,29 @@
 
 The states become weighted points (each state spread by its standard deviations). The estimate is the state near which,
 within the tolerance of "recovered", the most weight lies; that weight is the confidence. A branch is corrected if the
-weight of the points for which correction makes it worse is below the harm limit. What matters for that are tails, and
-one branch alone, so it is told by many more points of two dimensions each.
+probability that correction makes it worse is below the harm limit. With alpha = (1 + d) / (1 + d_hat) - 1 and
+beta = (o - o_hat) / (1 + d_hat), it does where
+
+    alpha^2 E[i^2] + 2 alpha beta E[i] + beta^2  >  d^2 E[i^2] + 2 d o E[i] + o^2,
+
+which is quadratic in d and in o: the probability is known in the one that matters more, for each value of the other.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm, qmc
 
 from calibrator.drive import Array, Mask
 from calibrator.posterior.states import States
-from calibrator.score import TOLERANCE, correction_error_rms
+from calibrator.score import TOLERANCE
 
-__all__ = ["Points", "best_estimates", "branch_points", "harm_probability", "spread_points"]
+__all__ = ["Points", "best_estimates", "harm_probability", "spread_points"]
 
-POINTS_PER_STATE, TAIL_POINTS = 64, 1024
-"""Points by which the spread of one state is told, and its tails; powers of two for the quasi-random rule."""
-LIKELY, UNLIKELY = 1e-2, 1e-7
-"""Weight of a state from which on its tails matter, and below which it counts as harmful without a look. [1]"""
+POINTS_PER_STATE = 64
+"""Points by which the spread of one state is told; a power of two for the quasi-random rule."""
+FARTHEST, STEPS = 6.0, 96
+"""Standard deviations of the parameter that matters less up to which harm is integrated, and in how many steps."""
 EQUALLY_GOOD = 0.01
 """Difference of confidence below which the more probable state is taken. [1]"""
 CANDIDATES = 48
@@ -35,7 +38,7 @@ class Points:
     Attributes
     ----------
     weight : ndarray of shape (P,)
-        Sums to 1, less what was left out.
+        Sums to 1 at most.
     drift, offset : ndarray of shape (P, K)
         Of the sensors; offsets in fractions of full scale. [1]
     """
@@ -60,49 +63,12 @@ def spread_points(states: States, vehicle: int) -> Points:
     Points
         :data:`POINTS_PER_STATE` of each state.
     """
-    chosen = np.arange(states.weight.shape[1])
-    return _points(states, vehicle, chosen, _normal(2 * states.branches, POINTS_PER_STATE))
-
-
-def branch_points(states: States, vehicle: int) -> Points:
-    """Points of the posterior of each branch of one vehicle; between branches they say nothing.
-
-    Parameters
-    ----------
-    states : States
-        Of the fleet.
-    vehicle : int
-        Which vehicle.
-
-    Returns
-    -------
-    Points
-        :data:`TAIL_POINTS` of each likely state, :data:`POINTS_PER_STATE` of the others.
-    """
-    weight = states.weight[vehicle]
-    lots = [
-        _points(states, vehicle, np.flatnonzero(chosen), np.repeat(_normal(2, count), states.branches, axis=1))
-        for chosen, count in (
-            (weight >= LIKELY, TAIL_POINTS),
-            ((weight < LIKELY) & (weight >= UNLIKELY), POINTS_PER_STATE),
-        )
-    ]
-    return Points(*(np.concatenate([getattr(lot, name) for lot in lots]) for name in ("weight", "drift", "offset")))
-
-
-def _normal(dimensions: int, count: int) -> Array:
-    """Quasi-random points of independent standard normal distributions, shape (count, dimensions)."""
-    uniform = qmc.Sobol(dimensions, scramble=True, rng=0).random(count)
-    return np.asarray(norm.ppf(uniform))
-
-
-def _points(states: States, vehicle: int, chosen: NDArray[np.int64], normal: Array) -> Points:
-    """Chosen states of one vehicle, spread as the columns of ``normal`` say: K for drifts, K for offsets."""
-    K, count = states.branches, len(normal)
-    drift, offset = states.drift[vehicle, chosen], states.offset[vehicle, chosen]
-    drift_sd, offset_sd = states.relative_sd[vehicle, chosen, 1:], states.constant_sd[vehicle, chosen, K - 1 :]
+    K = states.branches
+    drift, offset = states.drift[vehicle], states.offset[vehicle]
+    drift_sd, offset_sd = states.relative_sd[vehicle, :, 1:], states.constant_sd[vehicle, :, K - 1 :]
+    normal = norm.ppf(qmc.Sobol(2 * K, scramble=True, rng=0).random(POINTS_PER_STATE))
     return Points(
-        np.repeat(states.weight[vehicle, chosen] / count, count),
+        np.repeat(states.weight[vehicle] / POINTS_PER_STATE, POINTS_PER_STATE),
         (drift[:, None] + drift_sd[:, None] * normal[:, :K]).reshape(-1, K),
         (offset[:, None] + offset_sd[:, None] * normal[:, K:]).reshape(-1, K),
     )
@@ -137,13 +103,17 @@ def best_estimates(points: Points, states: States, vehicle: int, *, least: tuple
     return state, float(covered[state])
 
 
-def harm_probability(points: Points, drift: Array, offset: Array, *, mean: Array, mean_square: Array) -> Array:
+def harm_probability(
+    states: States, vehicle: int, drift: Array, offset: Array, *, mean: Array, mean_square: Array
+) -> Array:
     """Probability that correcting makes each branch worse.
 
     Parameters
     ----------
-    points : Points
-        Of the vehicle.
+    states : States
+        Of the fleet.
+    vehicle : int
+        Which vehicle.
     drift, offset : ndarray of shape (K,)
         Estimate; offsets in fractions of full scale. [1]
     mean, mean_square : ndarray of shape (M, K)
@@ -152,26 +122,61 @@ def harm_probability(points: Points, drift: Array, offset: Array, *, mean: Array
     Returns
     -------
     ndarray of shape (K,)
-        Of the drive on which it is largest, points left out counted as worse; 0 where the estimate is zero, as nothing
-        is changed.
+        Of the drive on which it is largest, with the weight of the states that were left out; 0 where the estimate is
+        zero, as nothing is changed.
     """
-
-    def error(with_drift: Array, with_offset: Array) -> Array:
-        return correction_error_rms(
-            true_drift=points.drift[:, None],
-            true_offset_a=points.offset[:, None],
-            drift=with_drift,
-            offset_a=with_offset,
-            mean_a=mean,
-            mean_square_a2=mean_square,
-        )
-
-    nothing = np.zeros_like(drift)
-    worse = error(drift, offset) > error(nothing, nothing)
-    left_out = max(1.0 - points.weight.sum(), 0.0)
-    probability = np.minimum(np.einsum("p,pmk->mk", points.weight, worse).max(axis=0) + left_out, 1.0)
+    K, weight = states.branches, states.weight[vehicle]
+    d, d_sd = states.drift[vehicle, :, None], states.relative_sd[vehicle, :, None, 1:]
+    o, o_sd = states.offset[vehicle, :, None], states.constant_sd[vehicle, :, None, K - 1 :]
+    z = np.linspace(-FARTHEST, FARTHEST, STEPS + 1)
+    share, z = norm.pdf(z) / norm.pdf(z).sum(), z[:, None]
+    worst = np.full(K, max(1.0 - float(weight.sum()), 0.0))
+    worse = []
+    for m, s in zip(mean, mean_square, strict=True):
+        in_offset = _positive_quadratic(*_in_offset(d + d_sd * z, drift, offset, (m, s)), o, o_sd)
+        in_drift = _positive_quadratic(*_in_drift(o + o_sd * z, drift, offset, (m, s)), d, d_sd)
+        worse.append(np.where(d_sd * np.sqrt(s) > o_sd, in_drift, in_offset))
+    worst += np.einsum("s,q,msqk->mk", weight, share, np.stack(worse)).max(axis=0)
     changed = (drift != 0.0) | (offset != 0.0)
-    return np.asarray(np.where(changed, probability, 0.0))
+    return np.asarray(np.where(changed, np.minimum(worst, 1.0), 0.0))
+
+
+Coefficients = tuple[Array, Array, Array]
+
+
+def _in_offset(d: Array, drift: Array, offset: Array, moments: tuple[Array, Array]) -> Coefficients:
+    """Mean square error with correction less that without, as a polynomial in the offset; falling powers."""
+    (m, s), unit = moments, 1.0 + drift
+    away = (d - drift) / unit
+    linear = 2.0 * (away * m / unit - offset / unit**2 - d * m)
+    constant = (away**2 - d**2) * s - 2.0 * away * m * offset / unit + (offset / unit) ** 2
+    return 1.0 / unit**2 - 1.0, linear, constant
+
+
+def _in_drift(o: Array, drift: Array, offset: Array, moments: tuple[Array, Array]) -> Coefficients:
+    """The same as a polynomial in the drift."""
+    (m, s), unit = moments, 1.0 + drift
+    away = (o - offset) / unit
+    linear = 2.0 * (away * m / unit - drift * s / unit**2 - o * m)
+    constant = (drift / unit) ** 2 * s - 2.0 * drift / unit * away * m + away**2 - o**2
+    return (1.0 / unit**2 - 1.0) * s, linear, constant
+
+
+def _positive_quadratic(square: Array, linear: Array, constant: Array, mean: Array, sd: Array) -> Array:
+    """Probability that square x^2 + linear x + constant is positive for x ~ N(mean, sd^2), which may be 0."""
+    a, b = (square * mean + linear) * mean + constant, 2.0 * square * mean + linear
+    # In t = x - mean: square t^2 + b t + a. Roots by the form that does not cancel.
+    discriminant = b**2 - 4.0 * square * a
+    q = -0.5 * (b + np.where(b < 0.0, -1.0, 1.0) * np.sqrt(np.maximum(discriminant, 0.0)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = np.where(square == 0.0, np.inf, q / square), np.where(q == 0.0, 0.0, a / q)
+        lower, upper = np.minimum(first, second), np.maximum(first, second)
+        below, above = norm.cdf(lower / sd), norm.sf(upper / sd)
+        on_line = np.where(b > 0.0, norm.sf(second / sd), norm.cdf(second / sd))
+    outside = below + above
+    curved = np.where(discriminant <= 0.0, square > 0.0, np.where(square > 0.0, outside, 1.0 - outside))
+    straight = np.where(b == 0.0, a > 0.0, on_line)
+    return np.where(sd > 0.0, np.where(square == 0.0, straight, curved), a > 0.0)
 
 
 def _near(points: Array, candidates: Array, least: float) -> Mask:

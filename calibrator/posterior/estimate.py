@@ -9,7 +9,7 @@ from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.evidence.rows import FleetRows
 from calibrator.faults import Faults, Index
-from calibrator.posterior.decision import best_estimates, branch_points, harm_probability, spread_points
+from calibrator.posterior.decision import best_estimates, harm_probability, spread_points
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.health import ReferenceHealth
 from calibrator.posterior.hyperparameters import (
@@ -124,8 +124,8 @@ def estimate_fleet(
         starts, free = [trusted_spread(rows, trusted)], np.zeros(5 * rows.branches, bool)
     learnt = rows if learning is None else rows.take(learning)
     hyperparameters = estimate_hyperparameters(learnt, starts, given=given, free=free)
-    carriers = None if trusted is None else int(trusted.sum())
-    drawn = draw_hyperparameters(learnt, hyperparameters, given=given, carriers=carriers or None)
+    carriers = rows.take(trusted) if trusted is not None and trusted.any() else None
+    drawn = draw_hyperparameters(learnt, hyperparameters, given=given, carriers=carriers)
     states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in drawn])
     usual = moments if learning is None else moments.take(learning)
     vehicles = [_of_vehicle(states, j, hyperparameters.prior, (moments, usual), full_scale_a) for j in range(len(rows))]
@@ -164,7 +164,7 @@ def _of_vehicle(
     variance = np.concatenate([_mean_square(states, j, "drift", drift), _mean_square(states, j, "offset", offset)])
     mean, mean_square = _true_moments(*moments, j, drift=drift, offset_a=offset * full_scale_a)
     mean, mean_square = mean / full_scale_a, mean_square / full_scale_a**2
-    harm = harm_probability(branch_points(states, j), drift, offset, mean=mean, mean_square=mean_square)
+    harm = harm_probability(states, j, drift, offset, mean=mean, mean_square=mean_square)
     return _Vehicle(state, confidence, variance, harm)
 
 

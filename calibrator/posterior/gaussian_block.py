@@ -14,7 +14,7 @@ slab in turn, and the others follow.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,15 +36,24 @@ LOG_2PI = float(np.log(2.0 * np.pi))
 
 @dataclass(frozen=True)
 class Noise:
-    """Gaussian noise of the rows of N vehicles: precision (N, r, r) and log-determinant (N,) of the covariance."""
+    """Gaussian noise of the rows of N vehicles, the same for all S sets of rows of a vehicle or one for each.
+
+    Attributes
+    ----------
+    precision : ndarray of shape (N, 1, r, r) or (N, S, r, r)
+        Inverse covariance.
+    log_determinant : ndarray of shape (N, 1) or (N, S)
+        Of the covariance.
+    """
 
     precision: Array
     log_determinant: Array
 
     @classmethod
     def of(cls, covariance: Array) -> "Noise":
-        """From covariances of shape (N, r, r)."""
-        return cls(np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1])
+        """From covariances of shape (N, r, r) or (N, S, r, r)."""
+        each = covariance if covariance.ndim == 4 else covariance[:, None]
+        return cls(np.linalg.inv(each), np.linalg.slogdet(each)[1])
 
     def take(self, index: Index) -> "Noise":
         """Return the noise of some of the vehicles."""
@@ -59,16 +68,21 @@ class BlockFit:
     ----------
     log_evidence : ndarray of shape (N, S, Q)
         Logarithm of the integral, each node with its share; minus infinity where a vehicle has fewer nodes.
-    parameters, sd : ndarray of shape (N, S, Q, P)
-        Estimates and standard deviations; zero where not active. Pivots deviate as far as their nodes lie apart.
+    parameters : ndarray of shape (N, S, Q, P)
+        Estimates; zero where not active.
+    covariance : ndarray of shape (N, S, Q, P, P)
+        Of the parameters that the rows are linear in; pivots deviate as far as their nodes lie apart.
     residual : ndarray of shape (N, S, Q, r)
         y - X theta.
+    information : ndarray of shape (N, S, r, r)
+        What the residual says of anything else that the rows are linear in.
     """
 
     log_evidence: Array
     parameters: Array
-    sd: Array
+    covariance: Array
     residual: Array
+    information: Array
 
 
 def integrate_relative(rows: Array, design: Array, support: Support, noise: Noise, slab: Slab) -> BlockFit:
@@ -90,16 +104,18 @@ def integrate_relative(rows: Array, design: Array, support: Support, noise: Nois
     Returns
     -------
     BlockFit
-        ``parameters`` are drifts; those that no sensor has, of no weight, are cut to :data:`POSSIBLE_DRIFT`.
+        ``parameters`` are drifts, ``covariance`` is of their logarithms; those that no sensor has, of no weight, are
+        cut to :data:`POSSIBLE_DRIFT`.
     """
 
     def integrate(which: Places, pivots: list[int], fitted: list[int]) -> BlockFit:
-        nodes, apart = np.log1p(slab.nodes(len(pivots))), slab.spacing(len(pivots))
-        fit, sd_at_node = _fit(rows[which], design, (pivots, fitted), noise.take(which), (nodes, apart))
+        drifts = slab.nodes(len(pivots))
+        nodes = _Nodes(pivots, fitted, np.log1p(drifts), slab.cell_sd(len(pivots)) / (1.0 + drifts))
+        fit, sd_at_node = _fit(rows[which], design, noise.take(which), nodes)
         drift, change = np.expm1(fit.parameters), fit.parameters[..., fitted]
-        mass = slab.log_mass(drift[..., fitted], sd_at_node[..., fitted] * (1.0 + drift[..., fitted]))
+        mass = slab.log_mass(drift[..., fitted], sd_at_node * (1.0 + drift[..., fitted]))
         log_evidence = fit.log_evidence + np.sum(mass + change, axis=-1)
-        return BlockFit(log_evidence, np.clip(drift, *POSSIBLE_DRIFT), fit.sd * (1.0 + drift), fit.residual)
+        return replace(fit, log_evidence=log_evidence, parameters=np.clip(drift, *POSSIBLE_DRIFT))
 
     return _each(integrate, design, support, noise, slab)
 
@@ -123,17 +139,18 @@ def integrate_constant(
     Returns
     -------
     BlockFit
-        ``parameters`` are o_h and o.
+        ``parameters`` are o_h and o, ``covariance`` is of o_h and omega.
     """
 
     def integrate(which: Places, pivots: list[int], fitted: list[int]) -> BlockFit:
-        nodes, apart = slab.nodes(len(pivots)), slab.spacing(len(pivots))
-        fit, sd_at_node = _fit(rows[which], design, (pivots, fitted), noise.take(which), (nodes, apart))
+        offsets = slab.nodes(len(pivots))
+        nodes = _Nodes(pivots, fitted, offsets, np.full(offsets.shape, slab.cell_sd(len(pivots))))
+        fit, sd_at_node = _fit(rows[which], design, noise.take(which), nodes)
         unit = scale[which][:, :, None]
         offset, change = fit.parameters * unit, np.log(unit[..., fitted])
-        mass = slab.log_mass(offset[..., fitted], sd_at_node[..., fitted] * unit[..., fitted])
+        mass = slab.log_mass(offset[..., fitted], sd_at_node * unit[..., fitted])
         log_evidence = fit.log_evidence + np.sum(mass + change, axis=-1)
-        return BlockFit(log_evidence, offset, fit.sd * unit, fit.residual)
+        return replace(fit, log_evidence=log_evidence, parameters=offset)
 
     return _each(integrate, design, support, noise, slab)
 
@@ -148,7 +165,7 @@ def _each(
     """Integrate all vehicles, those with the same pivots together."""
     active = np.array(support.active, np.int64)
     X = design[:, active]
-    pivots = _pivots(X.T @ noise.precision @ X, slab.spacing(1))
+    pivots = _pivots(X.T @ noise.precision[:, 0] @ X, slab)
     patterns, which = np.unique(pivots, axis=0, return_inverse=True)
     places = [np.flatnonzero(which.ravel() == i) for i in range(len(patterns))]
     fits = [integrate(j, list(active[p]), list(active[~p])) for j, p in zip(places, patterns, strict=True)]
@@ -156,31 +173,33 @@ def _each(
 
 
 def _put_together(fits: Sequence[BlockFit], places: Sequence[Places]) -> BlockFit:
-    most = max(fit.log_evidence.shape[2] for fit in fits)
-    N, S = sum(map(len, places)), fits[0].log_evidence.shape[1]
-    log_evidence = np.full((N, S, most), -np.inf)
-    others = [
-        np.zeros((N, S, most, width)) for width in (fits[0].parameters.shape[3],) * 2 + fits[0].residual.shape[3:]
-    ]
-    for fit, which in zip(fits, places, strict=True):
-        nodes = fit.log_evidence.shape[2]
-        log_evidence[which, :, :nodes] = fit.log_evidence
-        for whole, part in zip(others, (fit.parameters, fit.sd, fit.residual), strict=True):
-            whole[which, :, :nodes] = part
-    return BlockFit(log_evidence, *others)
+    most, N = max(fit.log_evidence.shape[2] for fit in fits), sum(map(len, places))
+
+    def whole(name: str, empty: float) -> Array:
+        parts: list[Array] = [getattr(fit, name) for fit in fits]
+        shape = list(parts[0].shape)
+        nodes = [slice(0, part.shape[2]) for part in parts] if name != "information" else [slice(None)] * len(parts)
+        shape[0], shape[2] = N, most if name != "information" else shape[2]
+        found = np.full(shape, empty)
+        for part, j, q in zip(parts, places, nodes, strict=True):
+            found[j, :, q] = part
+        return found
+
+    return BlockFit(**{f.name: whole(f.name, -np.inf if f.name == "log_evidence" else 0.0) for f in fields(BlockFit)})
 
 
-def _pivots(information: Array, widest: float) -> Mask:
+def _pivots(information: Array, slab: Slab) -> Mask:
     """Which of the active parameters are pivots, shape (N, P): the first that is open, until none is.
 
-    A direction is open where its parameters' deviations are wider than the nodes lie apart.
+    A direction is open where its parameters' deviations are wider than nodes would lie apart with one pivot more.
     """
     N, P = information.shape[:2]
     pivots = np.zeros((N, P), bool)
     for _ in range(P):
         kept = ~pivots[:, :, None] & ~pivots[:, None, :]
         C = np.linalg.inv(np.where(kept, information, 0.0) + np.eye(P) * np.where(pivots, 1.0, TINY)[:, None])
-        open_ = (np.diagonal(C, axis1=1, axis2=2) > widest**2) & ~pivots
+        widest = np.array([slab.spacing(count + 1) for count in range(P + 1)])[pivots.sum(axis=1)]
+        open_ = (np.diagonal(C, axis1=1, axis2=2) > widest[:, None] ** 2) & ~pivots
         if not open_.any():
             break
         vehicles = np.flatnonzero(open_.any(axis=1))
@@ -188,31 +207,41 @@ def _pivots(information: Array, widest: float) -> Mask:
     return pivots
 
 
-def _fit(
-    rows: Array, design: Array, chosen: tuple[list[int], list[int]], noise: Noise, at: tuple[Array, float]
-) -> tuple[BlockFit, Array]:
-    """Generalised least squares, without the slab's mass; and deviations as if the pivots were known.
+@dataclass(frozen=True)
+class _Nodes:
+    """Positions of pivots and fitted parameters; values (Q, p) of the pivots and how far each stands for others."""
 
-    ``chosen`` are pivots and fitted parameters, ``at`` the nodes and how far they lie apart.
-    """
-    (pivots, fitted), (nodes, apart) = chosen, at
+    pivots: list[int]
+    fitted: list[int]
+    values: Array
+    sd: Array
+
+
+def _fit(rows: Array, design: Array, noise: Noise, nodes: _Nodes) -> tuple[BlockFit, Array]:
+    """Generalised least squares, without the slab's mass; and the fitted ones' deviations if the pivots were known."""
     N, S, r = rows.shape
-    Q, P = len(nodes), design.shape[1]
-    X, X_p = design[:, fitted], design[:, pivots]
-    y = rows[:, :, None, :] - nodes @ X_p.T
-    theta, sd, sd_at_node = (np.zeros((N, S, Q, P)) for _ in range(3))
-    theta[..., pivots], sd[..., pivots] = nodes, apart / np.sqrt(12.0)
-    constant = -0.5 * (noise.log_determinant + r * LOG_2PI)
-    if fitted:
-        weighted = noise.precision @ X
-        C = np.linalg.inv(X.T @ weighted)
-        estimate = np.matmul(y, (weighted @ C)[:, None])
-        variance = np.diagonal(C, axis1=1, axis2=2)
-        follow = C @ np.swapaxes(weighted, 1, 2) @ X_p
-        theta[..., fitted] = estimate
-        sd_at_node[..., fitted] = np.sqrt(variance)[:, None, None]
-        sd[..., fitted] = np.sqrt(variance + apart**2 / 12.0 * np.sum(follow**2, axis=2))[:, None, None]
-        y = y - estimate @ X.T
-        constant += 0.5 * (np.linalg.slogdet(C)[1] + len(fitted) * LOG_2PI)
-    misfit = np.sum(np.matmul(y, noise.precision[:, None]) * y, axis=-1)
-    return BlockFit(constant[:, None, None] - 0.5 * misfit - np.log(Q), theta, sd, y), sd_at_node
+    Q, P = len(nodes.values), design.shape[1]
+    X, X_p = design[:, nodes.fitted], design[:, nodes.pivots]
+    y = rows[:, :, None, :] - nodes.values @ X_p.T
+    weighted = noise.precision @ X
+    C = np.linalg.inv(X.T @ weighted)
+    estimate = np.matmul(y, weighted @ C)
+    y = y - estimate @ X.T
+    theta = np.zeros((N, S, Q, P))
+    theta[..., nodes.pivots], theta[..., nodes.fitted] = nodes.values, estimate
+    constant = 0.5 * (np.linalg.slogdet(C)[1] + (len(nodes.fitted) - r) * LOG_2PI - noise.log_determinant)
+    misfit = np.sum(np.matmul(y, noise.precision) * y, axis=-1)
+    moved = np.zeros((*C.shape[:2], P, len(nodes.pivots)))
+    moved[:, :, nodes.pivots] = np.eye(len(nodes.pivots))
+    moved[:, :, nodes.fitted] = -C @ np.swapaxes(weighted, 2, 3) @ X_p
+    spread = moved[:, :, None] * nodes.sd[:, None, :]
+    covariance = spread @ np.swapaxes(spread, 3, 4)
+    covariance[..., np.array(nodes.fitted, np.int64)[:, None], nodes.fitted] += C[:, :, None]
+    fit = BlockFit(
+        log_evidence=constant[:, :, None] - 0.5 * misfit - np.log(Q),
+        parameters=theta,
+        covariance=covariance,
+        residual=y,
+        information=noise.precision - weighted @ C @ np.swapaxes(weighted, 2, 3),
+    )
+    return fit, np.sqrt(np.diagonal(C, axis1=2, axis2=3))[:, :, None]

@@ -2,14 +2,15 @@
 
 Expectation: the states of each vehicle under the present hyper-parameters. Maximisation: share of hardware faults and
 numbers of faults from the weights of the states, magnitudes by a grid over the slab's bounds, mean and covariance of
-the model spread from the residuals that the states leave, with what the fitted parameters hide of them.
+the model spread, and the dispersion of the intercepts, from the residuals that the states leave, with what the fitted
+parameters hide of them.
 
 The likelihood has several maxima (a cluster of faulty vehicles can stand for the reference), so it is climbed from
 several starts and the highest is taken.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,13 @@ from scipy.special import logsumexp
 from calibrator.drive import Array
 from calibrator.evidence.rows import FleetRows
 from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
-from calibrator.posterior.model_spread import USED_STATES, drawn_spread, free_centres, next_spread
+from calibrator.posterior.model_spread import (
+    USED_STATES,
+    centre_covariance,
+    drawn_spread,
+    free_centres,
+    next_spread,
+)
 from calibrator.posterior.slab import Slab
 from calibrator.posterior.states import States, enumerate_states
 from calibrator.random_streams import Purpose, random_stream
@@ -33,12 +40,14 @@ WIDEST = Slab(0.002, 0.45)
 """Any fault that a sensor of a running vehicle can have. [1]"""
 TRIAL_STEPS, STEPS = 4, 12
 """Steps of each start, and of the best one after that."""
-CONVERGED = 0.01
+CONVERGED = 0.005
 """Gain of log evidence per vehicle below which the climb ends."""
 MOST_VEHICLES = 300
 """Vehicles that hyper-parameters are learnt from; more change them less than the faults themselves. [1]"""
 MOST_DRAWN, DRAWS = 200, 16
 """Fleet size up to which hyper-parameters are drawn, and how often."""
+MEDIAN_SHARE = 2.0 / np.pi
+"""Vehicles of a mean as sure as the median of one: efficiency of the median. [1]"""
 PSEUDO_VEHICLES = 1.0
 """Weight of the guesses of the shares of faults, in vehicles."""
 GUESSED_HARDWARE_SHARE = 0.3
@@ -103,14 +112,14 @@ def estimate_hyperparameters(
 
 
 def draw_hyperparameters(
-    rows: FleetRows, best: Hyperparameters, *, given: FaultPrior | None = None, carriers: int | None = None
+    rows: FleetRows, best: Hyperparameters, *, given: FaultPrior | None = None, carriers: FleetRows | None = None
 ) -> list[Hyperparameters]:
     """Hyper-parameters that explain the fleet about as well as the best ones.
 
     A small fleet does not fix them; the posterior is averaged over these, as taking one set for true would make it
     surer than it may be. Shares are drawn from Dirichlet distributions, bounds of the slabs outwards by exponential
     ones, mean and covariance of the model spread from a normal and a Wishart distribution, each as so many vehicles
-    tell them.
+    tell them; the dispersion stays.
 
     Parameters
     ----------
@@ -118,23 +127,27 @@ def draw_hyperparameters(
         As in :func:`estimate_hyperparameters`.
     best : Hyperparameters
         Of the whole fleet.
-    carriers : int or None
-        Trusted vehicles that alone tell the centres; None: all do.
+    carriers : FleetRows or None
+        Evidence of the trusted vehicles that alone tell the centres; None: all do.
 
     Returns
     -------
     list of Hyperparameters
-        :data:`DRAWS` of them; the best alone if more than :data:`MOST_DRAWN` vehicles tell it.
+        :data:`DRAWS` of them. For a fleet of more than :data:`MOST_DRAWN` vehicles the best alone, whose model spread
+        then holds the uncertainty of the centre as well.
     """
-    if min(len(rows), carriers or len(rows)) > MOST_DRAWN:
-        return [best]
+    telling = rows if carriers is None else carriers
+    states = enumerate_states(rows, best.prior, best.spread) if len(rows) <= MOST_DRAWN else None
+    sound = 1.0 - best.prior.hardware_share
+    doubt = centre_covariance(telling, best.spread, share=sound if carriers is None else MEDIAN_SHARE)
+    if states is None:
+        return [replace(best, spread=replace(best.spread, covariance=best.spread.covariance + doubt))]
     rng = random_stream(Purpose.HYPERPARAMETERS, len(rows))
-    states = enumerate_states(rows, best.prior, best.spread)
-    sound = float(np.sum(states.weight * ~states.hardware))
+    vehicles = float(np.sum(states.weight * ~states.hardware))
     return [
         Hyperparameters(
             prior=given if given is not None else _drawn_prior(rng, states, best.prior),
-            spread=drawn_spread(rng, best.spread, sound, carriers or sound),
+            spread=drawn_spread(rng, best.spread, vehicles, doubt),
             log_evidence=best.log_evidence,
         )
         for _ in range(DRAWS)
@@ -143,8 +156,8 @@ def draw_hyperparameters(
 
 def _some(rows: FleetRows) -> NDArray[np.int64]:
     """At most :data:`MOST_VEHICLES`, evenly over the slopes of the first branch, in whatever order they are given."""
-    order = np.argsort(rows.relative[:, 0], kind="stable")
-    return np.sort(order[np.linspace(0, len(rows) - 1, min(len(rows), MOST_VEHICLES)).astype(np.int64)])
+    order = np.lexsort(np.concatenate([rows.constant, rows.relative[:, ::-1]], axis=1).T)
+    return np.asarray(order[np.linspace(0, len(rows) - 1, min(len(rows), MOST_VEHICLES)).astype(np.int64)])
 
 
 def _climb(

@@ -1,11 +1,14 @@
 """Joint evidence of relative and constant parameters: first the relative rows, then the constant rows given those.
 
-The constant rows depend on the relative parameters in two ways: they are seen in measured currents, which the drifts
-scale, and what the relative parameters leave of their rows tells of the constant rows' errors. A relative state (a
-support, and a node where it has a pivot) fixes both.
+A relative state (a support, and a node where it has a pivot) makes the constant rows what they are in true currents,
+and what it leaves of the relative rows tells of the constant rows' errors. How uncertain the state's own parameters are
+widens the noise of the constant rows; what these leave then moves the parameters. With theta the relative ones, C their
+covariance, and G what a change of theta makes of the constant rows y (whose noise is S),
+
+    y ~ N(X omega, S + G C G^T),    theta moves by -C G^T (S + G C G^T)^-1 (y - X omega).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +16,7 @@ from numpy.typing import NDArray
 from calibrator.drive import Array
 from calibrator.evidence.rows import FleetRows, constant_design, relative_design
 from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
-from calibrator.posterior.gaussian_block import Noise, integrate_constant, integrate_relative
+from calibrator.posterior.gaussian_block import BlockFit, Noise, integrate_constant, integrate_relative
 from calibrator.posterior.supports import EXACT_BRANCHES, Support, relative_supports
 
 __all__ = ["JointEvidence", "StateArrays"]
@@ -24,6 +27,8 @@ NEGLIGIBLE = 25.0
 """Relative states so far below the best (logarithm) are dropped: constant rows hardly ever make that good. [1]"""
 FEW_RELATIVE = 16
 """Relative states of a vehicle up to which it does not matter how many. [1]"""
+MOST_MOVED = 1.0
+"""Largest logarithm by which constant rows can move a drift. [1]"""
 MOST_RELATIVE = 24
 """Relative states of a vehicle that are looked at with more branches than can be exact, the best ones. [1]"""
 
@@ -38,10 +43,14 @@ class _Candidates:
         Of the relative rows, and of the change of scale of the constant ones; minus infinity where negligible.
     hardware, sensor : ndarray of int, shape (N, M)
         Numbers of nonzero hardware and sensor parameters.
-    parameters, sd : ndarray of shape (N, M, K + 1)
-        As in :class:`calibrator.posterior.gaussian_block.BlockFit`.
+    parameters : ndarray of shape (N, M, K + 1)
+        d_h, d_1 .. d_K.
+    covariance : ndarray of shape (N, M, K + 1, K + 1)
+        Of their logarithms.
     constant_rows : ndarray of shape (N, M, 2K + 1)
         As seen in true currents, less what the relative rows tell of them.
+    turn : ndarray of shape (N, M, 2K + 1, K + 1)
+        Derivative of these by the logarithms, without hardware offsets.
     scale : ndarray of shape (N, M, 2K - 1)
         1 for o_h, 1 + d_k for o_k.
     """
@@ -50,36 +59,37 @@ class _Candidates:
     hardware: NDArray[np.int64]
     sensor: NDArray[np.int64]
     parameters: Array
-    sd: Array
+    covariance: Array
     constant_rows: Array
+    turn: Array
     scale: Array
 
 
 @dataclass(frozen=True)
 class JointEvidence:
-    """Rows and prior of N vehicles, with their relative states."""
+    """Rows and prior of N vehicles, with their relative states; ``constant_covariance`` (N, 2K + 1, 2K + 1) is S."""
 
     log_prior: Array
     prior: FaultPrior
-    noise: Noise
+    constant_covariance: Array
     candidates: _Candidates
     design: Array
+    _noises: dict[tuple[int, ...], tuple[Array, Noise]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, rows: FleetRows, prior: FaultPrior, spread: ModelSpread) -> "JointEvidence":
         """Work out the relative states."""
-        r = rows.relative.shape[1]
+        r, K = rows.relative.shape[1], rows.branches
         R = rows.dispersed(spread.dispersion)[0] + spread.covariance
         first = Noise.of(R[:, :r, :r])
-        carry = R[:, r:, :r] @ first.precision
-        second = Noise.of(R[:, r:, r:] - carry @ R[:, :r, r:])
+        carry = R[:, r:, :r] @ first.precision[:, 0]
+        second = R[:, r:, r:] - carry @ R[:, :r, r:]
         log_prior = prior.log_supports()
         states = _RelativeStates.of(rows.relative - spread.mean[:r], first, prior, log_prior)
-        exact = rows.branches <= EXACT_BRANCHES
-        of_spread = np.diag(spread.covariance)[r : r + rows.branches + 1]
-        share = of_spread / np.diagonal(R, axis1=1, axis2=2)[:, r : r + rows.branches + 1]
-        candidates = _candidates(rows, spread.mean[r:], carry, states, share, exact=exact)
-        return cls(log_prior, prior, second, candidates, constant_design(rows.branches))
+        of_spread = np.diag(spread.covariance)[r : r + K + 1]
+        share = np.minimum(of_spread / np.diagonal(second, axis1=1, axis2=2)[:, : K + 1], 1.0)
+        candidates = _candidates(rows, spread.mean[r:], carry, states, share)
+        return cls(log_prior, prior, second, candidates, constant_design(K))
 
     def __len__(self) -> int:
         return len(self.candidates.log_evidence)
@@ -99,7 +109,12 @@ class JointEvidence:
 
     def _take(self, which: NDArray[np.int64], *, most: int) -> "JointEvidence":
         states = {name: values[which, :most] for name, values in vars(self.candidates).items()}
-        return replace(self, noise=self.noise.take(which), candidates=_Candidates(**states))
+        return replace(
+            self,
+            constant_covariance=self.constant_covariance[which],
+            candidates=_Candidates(**states),
+            _noises={},
+        )
 
     def with_constant(self, support: Support) -> tuple[Array, StateArrays]:
         """Log weights (N, S) of the states with one constant support, and their parameters; S = 0 if impossible."""
@@ -110,14 +125,47 @@ class JointEvidence:
         if np.isneginf(log_weight).all():
             nothing, none = found.parameters[:, :0], found.scale[:, :0]
             return log_weight[:, :0], (nothing, nothing, none, none)
+        turn, noise = self._noise(support)
         fit = integrate_constant(
-            found.constant_rows, self.design, support, self.noise, self.prior.constant, scale=found.scale
+            found.constant_rows, self.design, support, noise, self.prior.constant, scale=found.scale
         )
         N, M, Q = fit.log_evidence.shape
-        relative, relative_sd = (np.repeat(values, Q, axis=1) for values in (found.parameters, found.sd))
-        constant, constant_sd = (values.reshape(N, M * Q, -1) for values in (fit.parameters, fit.sd))
+        moved, relative_sd = _moved(found.covariance, turn, noise, fit)
+        factor = (1.0 + found.parameters[:, :, None]) * np.exp(moved)
+        stretch = np.concatenate([np.ones((N, M, Q, self.prior.branches - 1)), np.exp(moved[..., 1:])], axis=3)
+        offset_sd = np.sqrt(np.diagonal(fit.covariance, axis1=3, axis2=4)) * found.scale[:, :, None]
+        arrays = (factor - 1.0, relative_sd * factor, fit.parameters * stretch, offset_sd * stretch)
+        relative, relative_sd, constant, constant_sd = (values.reshape(N, M * Q, -1) for values in arrays)
         total = (log_weight[:, :, None] + fit.log_evidence).reshape(N, M * Q)
         return total, (relative, relative_sd, constant, constant_sd)
+
+    def _noise(self, support: Support) -> tuple[Array, Noise]:
+        """Derivative of the constant rows by the relative logarithms, and their noise; the same for many supports.
+
+        Where a branch has a hardware offset and no sensor offset, its drift scales that as well.
+        """
+        K, found = self.prior.branches, self.candidates
+        hardware = [k for k in range(K - 1) if k in support.active]
+        scaled = tuple(k for k in [*hardware, *([K - 1] if hardware else [])] if K - 1 + k not in support.active)
+        if scaled not in self._noises:
+            turn = found.turn.copy()
+            for k in scaled:
+                turn[:, :, k, 1 + k] -= found.constant_rows[:, :, k]
+                turn[:, :, K, 1 + k] -= found.constant_rows[:, :, k]
+            added = turn @ found.covariance @ np.swapaxes(turn, 2, 3)
+            self._noises[scaled] = turn, Noise.of(self.constant_covariance[:, None] + added)
+        return self._noises[scaled]
+
+
+def _moved(covariance: Array, turn: Array, noise: Noise, fit: BlockFit) -> tuple[Array, Array]:
+    """How far the constant rows move the relative logarithms, and the deviations then; both (N, M, Q, K + 1)."""
+    gain = covariance @ np.swapaxes(turn, 2, 3)
+    moved = -np.matmul(fit.residual, np.swapaxes(gain @ noise.precision, 2, 3))
+    variance = np.diagonal(covariance, axis1=2, axis2=3) - np.einsum(
+        "nmar,nmrs,nmas->nma", gain, fit.information, gain, optimize=True
+    )
+    sd = np.sqrt(np.maximum(variance, 0.0))
+    return np.clip(moved, -MOST_MOVED, MOST_MOVED), np.broadcast_to(sd[:, :, None], moved.shape)
 
 
 @dataclass(frozen=True)
@@ -128,8 +176,9 @@ class _RelativeStates:
     best_share: Array
     hardware: NDArray[np.int64]
     sensor: NDArray[np.int64]
-    arrays: tuple[Array, Array, Array]
-    """Parameters, deviations, residuals, of shape (N, S, .)."""
+    parameters: Array
+    covariance: Array
+    residual: Array
 
     @classmethod
     def of(cls, rows: Array, noise: Noise, prior: FaultPrior, log_prior: Array) -> "_RelativeStates":
@@ -146,11 +195,9 @@ class _RelativeStates:
             np.repeat(shares, nodes),
             np.repeat(hardware, nodes),
             np.repeat(sensor, nodes),
-            (
-                np.concatenate([fit.parameters[:, 0] for fit in fits], axis=1),
-                np.concatenate([fit.sd[:, 0] for fit in fits], axis=1),
-                np.concatenate([fit.residual[:, 0] for fit in fits], axis=1),
-            ),
+            np.concatenate([fit.parameters[:, 0] for fit in fits], axis=1),
+            np.concatenate([fit.covariance[:, 0] for fit in fits], axis=1),
+            np.concatenate([fit.residual[:, 0] for fit in fits], axis=1),
         )
 
     def best(self, *, exact: bool) -> tuple[NDArray[np.int64], Array]:
@@ -162,17 +209,16 @@ class _RelativeStates:
         return order, np.take_along_axis(np.where(kept, self.log_evidence, -np.inf), order, axis=1)
 
 
-def _candidates(
-    rows: FleetRows, mean: Array, carry: Array, states: _RelativeStates, share: Array, *, exact: bool
-) -> _Candidates:
+def _candidates(rows: FleetRows, mean: Array, carry: Array, states: _RelativeStates, share: Array) -> _Candidates:
     """What the relative states make of the constant rows.
 
     Where the model spread, which is one of true currents, is most of a row's variance (``share``, (N, K + 1)), the
     density changes with the scale between measured and true currents; sampling errors are those of the measured ones.
     """
     K = rows.branches
-    order, log_evidence = states.best(exact=exact)
-    parameters, sd, residual = (np.take_along_axis(values, order[:, :, None], axis=1) for values in states.arrays)
+    order, log_evidence = states.best(exact=K <= EXACT_BRANCHES)
+    vehicles = np.arange(len(rows))[:, None]
+    parameters, residual = states.parameters[vehicles, order], states.residual[vehicles, order]
     factor = 1.0 + parameters[:, :, 1:]
     seen = rows.constant_seen(parameters, residual)
     log_change = np.einsum("nmk,nk->nm", np.log(factor), share[:, :K]) + np.log(factor[:, :, 0]) * share[:, K:]
@@ -181,7 +227,8 @@ def _candidates(
         hardware=states.hardware[order],
         sensor=states.sensor[order],
         parameters=parameters,
-        sd=sd,
+        covariance=states.covariance[vehicles, order],
         constant_rows=seen - mean - residual @ np.swapaxes(carry, 1, 2),
+        turn=rows.constant_turn(parameters) + (carry @ relative_design(K))[:, None],
         scale=np.concatenate([np.ones((*factor.shape[:2], K - 1)), factor], axis=2),
     )

@@ -17,6 +17,7 @@ from calibrator.posterior.states import States
 __all__ = [
     "MOST_UNMEASURED",
     "USED_STATES",
+    "centre_covariance",
     "drawn_spread",
     "free_centres",
     "initial_spreads",
@@ -29,8 +30,8 @@ USED_STATES = 24
 """States of each vehicle that are looked at, the most probable ones. [1]"""
 SPREAD_VEHICLES = 5.0
 """Weight of the guess of the model spread, in vehicles."""
-GUESSED_DISPERSION = 2.0
-"""Guess of the variance of intercepts over what their blocks tell. [1]"""
+GUESSED_DISPERSION, FIRST_DISPERSION = 2.0, 4.0
+"""Guess of the variance of intercepts over what their blocks tell, and where the climb starts: it falls fast. [1]"""
 SPREAD_OVER_SAMPLING = 2.0
 """Guess of the model spread over the usual sampling deviation: a model errs alike over a whole drive. [1]"""
 MOST_SPREAD = 0.02
@@ -76,7 +77,7 @@ def initial_spreads(rows: FleetRows) -> list[ModelSpread]:
             mean=centre,
             covariance=covariance,
             outlier_share=GUESSED_OUTLIER_SHARE,
-            dispersion=GUESSED_DISPERSION,
+            dispersion=FIRST_DISPERSION,
         )
         for centre, covariance in starts
     ]
@@ -151,7 +152,7 @@ def trusted_spread(rows: FleetRows, trusted: Mask) -> ModelSpread:
     mean = np.where(free_centres(rows.branches), np.median(values[trusted], axis=0), 0.0)
     covariance = _guessed_spread(rows) + np.diag(_least_spread(rows.branches) ** 2)
     return ModelSpread(
-        mean=mean, covariance=covariance, outlier_share=GUESSED_OUTLIER_SHARE, dispersion=GUESSED_DISPERSION
+        mean=mean, covariance=covariance, outlier_share=GUESSED_OUTLIER_SHARE, dispersion=FIRST_DISPERSION
     )
 
 
@@ -176,7 +177,7 @@ def next_spread(rows: FleetRows, states: States, prior: FaultPrior, spread: Mode
     """
     used = min(USED_STATES, states.weight.shape[1])
     every = states.weight[:, :used] / states.weight[:, :used].sum(axis=1, keepdims=True)
-    residual = _residuals(rows, states, used)
+    residual = _residuals(rows, states, used, spread.mean)
     parts = []
     for wide, scale in ((False, 1.0), (True, OUTLIER_VARIANCE)):
         weight = every * (states.outlier[:, :used] == wide)
@@ -214,23 +215,48 @@ def _left(
 
 
 def _next_dispersion(rows: FleetRows, states: States, prior: FaultPrior, spread: ModelSpread, residual: Array) -> Array:
-    """Expected squares of the intercepts' own errors over what blocks tell of them, on average over usual vehicles."""
+    """1 and the expected square of what intercepts err more than blocks tell, over what these tell; usual vehicles."""
     K, used = rows.branches, residual.shape[1]
     b = slice(3 * K - 1, 4 * K - 1)
     weight = states.weight[:, :used] * ~states.outlier[:, :used]
-    whole, own = rows.dispersed(spread.dispersion)
+    whole, added = rows.dispersed(spread.dispersion)
     precision = np.linalg.inv(whole + spread.covariance)
-    gain = own @ precision[:, b]
+    gain = added @ precision[:, b]
     error = np.einsum("nab,nsb->nsa", gain, residual - spread.mean)
-    hidden = (own - gain[:, :, b] @ own)[:, None] + _hidden_by_parameters(states, used, prior, precision, gain)
+    hidden = (added - gain[:, :, b] @ added)[:, None] + _hidden_by_parameters(states, used, prior, precision, gain)
     stated = np.diagonal(rows.intercept_covariance(), axis1=1, axis2=2)[:, None]
-    ratio = (error**2 + np.diagonal(hidden, axis1=2, axis2=3)) / stated
-    told, guess = np.sum(weight), SPREAD_VEHICLES * GUESSED_DISPERSION
-    return np.asarray(np.maximum((np.einsum("ns,nsk->k", weight, ratio) + guess) / (told + SPREAD_VEHICLES), 1.0))
+    more = (error**2 + np.diagonal(hidden, axis1=2, axis2=3)) / stated
+    guess = SPREAD_VEHICLES * (GUESSED_DISPERSION - 1.0)
+    return np.asarray(1.0 + (np.einsum("ns,nsk->k", weight, more) + guess) / (weight.sum() + SPREAD_VEHICLES))
 
 
-def drawn_spread(rng: np.random.Generator, spread: ModelSpread, vehicles: float, carriers: float) -> ModelSpread:
-    """Mean and covariance as so many vehicles without hardware faults tell them.
+def centre_covariance(rows: FleetRows, spread: ModelSpread, *, share: float = 1.0) -> Array:
+    """Covariance of the centre that vehicles tell.
+
+    Parameters
+    ----------
+    rows : FleetRows
+        Evidence of these vehicles.
+    spread : ModelSpread
+        Of vehicles without fault.
+    share : float
+        Of the vehicles without hardware faults, which tell it. [1]
+
+    Returns
+    -------
+    ndarray of shape (5K, 5K)
+        Model spread and sampling errors together; zero in rows that have no centre.
+    """
+    precision = np.linalg.inv(rows.dispersed(spread.dispersion)[0] + spread.covariance)
+    free = free_centres(rows.branches)
+    covariance = np.linalg.inv(precision.sum(axis=0)) / max(share, 1.0 / len(rows))
+    return np.asarray(np.where(np.outer(free, free), covariance, 0.0))
+
+
+def drawn_spread(
+    rng: np.random.Generator, spread: ModelSpread, vehicles: float, centre_covariance: Array
+) -> ModelSpread:
+    """Mean and covariance as a fleet leaves them open.
 
     Parameters
     ----------
@@ -240,8 +266,8 @@ def drawn_spread(rng: np.random.Generator, spread: ModelSpread, vehicles: float,
         The most likely one.
     vehicles : float
         Vehicles that tell the covariance.
-    carriers : float
-        Vehicles that tell the mean.
+    centre_covariance : ndarray of shape (5K, 5K)
+        Of the mean.
 
     Returns
     -------
@@ -252,9 +278,9 @@ def drawn_spread(rng: np.random.Generator, spread: ModelSpread, vehicles: float,
     root = np.linalg.cholesky(spread.covariance)
     normal = root @ rng.standard_normal((len(root), degrees))
     covariance = normal @ normal.T / degrees + np.diag(np.diag(spread.covariance)) / degrees
-    mean = root @ rng.standard_normal(len(root)) / np.sqrt(max(carriers, 1.0))
-    free = free_centres(len(root) // 5)
-    return replace(spread, mean=spread.mean + np.where(free, mean, 0.0), covariance=covariance)
+    values, vectors = np.linalg.eigh(centre_covariance)
+    error = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
+    return replace(spread, mean=spread.mean + error, covariance=covariance)
 
 
 def _guessed_spread(rows: FleetRows) -> Array:
@@ -263,19 +289,22 @@ def _guessed_spread(rows: FleetRows) -> Array:
     informed[_informed_rows(rows.branches)] = True
     told = np.diagonal(rows.covariance, axis1=1, axis2=2) < UNKNOWN_VARIANCE / 2.0
     variance = np.ones(len(informed))
+    sharp = rows.covariance.copy()
+    intercepts = slice(3 * rows.branches - 1, 4 * rows.branches - 1)
+    sharp[:, intercepts, intercepts] = rows.intercept_covariance()
     for row in np.flatnonzero(informed & told.any(axis=0)):
-        variance[row] = np.median(rows.covariance[told[:, row], row, row])
+        variance[row] = np.median(sharp[told[:, row], row, row])
     return np.diag(np.where(informed, SPREAD_OVER_SAMPLING**2 * variance, 0.0))
 
 
-def _residuals(rows: FleetRows, states: States, used: int) -> Array:
-    """Rows less what each state explains of them, shape (N, S, 5K)."""
+def _residuals(rows: FleetRows, states: States, used: int, mean: Array) -> Array:
+    """Rows less what each state explains of them, shape (N, S, 5K); ``mean`` is the fleet's centre so far."""
     K = rows.branches
     relative, constant = states.relative[:, :used], states.constant[:, :used].copy()
     factor = 1.0 + relative[:, :, 1:]
     constant[:, :, K - 1 :] /= factor
     first = rows.relative[:, None] - np.log1p(relative) @ relative_design(K).T
-    seen = rows.constant_seen(relative, first)
+    seen = rows.constant_seen(relative, first - mean[: first.shape[2]])
     return np.concatenate([first, seen - constant @ constant_design(K).T], axis=2)
 
 

@@ -58,6 +58,10 @@ class Slab:
         count = 2 * POINTS_PER_SIGN if dimensions <= 1 else POINTS_IN_SPACE
         return float(2.0 * (self.high - self.low) / count ** (1.0 / max(dimensions, 1)))
 
+    def cell_sd(self, dimensions: int) -> float:
+        """Standard deviation of what one node stands for: a uniform distribution as wide as nodes lie apart. [1]"""
+        return float(self.spacing(dimensions) / np.sqrt(12.0))
+
     def nodes(self, dimensions: int) -> Array:
         """Equally weighted points of the prior, shape (Q, dimensions); one point without coordinates for 0."""
         if dimensions == 0:

@@ -46,7 +46,7 @@ class States:
     Attributes
     ----------
     weight : ndarray of shape (N, S)
-        Posterior probability; each row sums to 1.
+        Posterior probability; each row sums to 1, less the states that were dropped.
     log_evidence : ndarray of shape (N,)
         Logarithm of the probability of the vehicle's rows, all states together.
     relative, relative_sd : ndarray of shape (N, S, K + 1)
@@ -146,7 +146,7 @@ def _merged(usual: States, wide: States, share: float) -> States:
     weight, order = _largest(np.concatenate(weights, axis=1), MOST_STATES)
     outlier = np.concatenate([np.zeros_like(usual.outlier), np.ones_like(wide.outlier)], axis=1)
     return States(
-        weight / weight.sum(axis=1, keepdims=True),
+        weight,
         total,
         *_picked([usual, wide], order),
         np.take_along_axis(outlier, order, axis=1),
@@ -172,7 +172,7 @@ def mean_states(several: Sequence[States]) -> States:
     log_evidence = logsumexp([states.log_evidence for states in several], axis=0) - np.log(len(several))
     outlier = np.concatenate([states.outlier for states in several], axis=1)
     return States(
-        weight / weight.sum(axis=1, keepdims=True),
+        weight,
         np.asarray(log_evidence),
         *_picked(several, order),
         np.take_along_axis(outlier, order, axis=1),
@@ -247,7 +247,7 @@ class _Found:
     def states(self) -> States:
         """What was found, in order of falling weight."""
         self._merge()
-        weight = np.exp(self._log_weight - logsumexp(self._log_weight, axis=1, keepdims=True))
+        weight = np.exp(self._log_weight - self._log_total[:, None])
         relative, relative_sd, constant, constant_sd = self._arrays
         outlier = np.zeros(weight.shape, bool)
         return States(weight, self._log_total, relative, relative_sd, constant, constant_sd, outlier)

@@ -97,8 +97,8 @@ def test_intercepts_at_the_means_do_not_turn_with_the_slopes() -> None:
         relative=relative, constant=np.zeros((1, 2 * K + 1)), covariance=(turn @ at_means @ turn.T)[None], means=means
     )
     np.testing.assert_allclose(rows.intercept_covariance()[0], own, atol=1e-18)
-    whole, intercepts = rows.dispersed(np.array([4.0, 1.0]))
-    np.testing.assert_allclose(np.diag(intercepts[0]), [16e-6, 9e-6])
+    whole, added = rows.dispersed(np.array([4.0, 1.0]))
+    np.testing.assert_allclose(np.diag(added[0]), [12e-6, 0.0])
     np.testing.assert_allclose(
         np.diag(whole[0] - rows.covariance[0])[3 * K - 1 :], [12e-6, 0.0, 0.0, 0.0, 0.0], atol=1e-18
     )

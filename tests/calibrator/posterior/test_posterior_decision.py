@@ -6,7 +6,7 @@ from scipy.stats import norm
 
 from calibrator.drive import Array
 from calibrator.faults import Faults
-from calibrator.posterior.decision import Points, best_estimates, branch_points, harm_probability, spread_points
+from calibrator.posterior.decision import Points, best_estimates, harm_probability, spread_points
 from calibrator.posterior.states import States, enumerate_states
 from calibrator.score import correction_error_rms
 from tests.calibrator.posterior.simulated_rows import faults_of, no_spread, prior_of, rows_of
@@ -94,41 +94,77 @@ def test_points_have_the_mean_and_spread_of_the_states() -> None:
 MEAN, SQUARE = np.array([[0.1, -0.1]]), np.array([[0.05, 0.05]])
 
 
-def harm(points: Points, drift: Array, offset: Array) -> Array:
-    return harm_probability(points, drift, offset, mean=MEAN, mean_square=SQUARE)
+def harm(states: States, drift: Array, offset: Array, *, mean: Array = MEAN, square: Array = SQUARE) -> Array:
+    return harm_probability(states, 0, drift, offset, mean=mean, mean_square=square)
+
+
+def plain_harm(points: Points, drift: Array, offset: Array) -> Array:
+    """Share of points for which the corrected current is farther from the true one; one drive."""
+    nothing = np.zeros(K)
+    corrected, measured = (
+        correction_error_rms(
+            true_drift=points.drift,
+            true_offset_a=points.offset,
+            drift=with_drift,
+            offset_a=with_offset,
+            mean_a=MEAN[0],
+            mean_square_a2=SQUARE[0],
+        )
+        for with_drift, with_offset in ((drift, offset), (nothing, nothing))
+    )
+    return np.asarray(points.weight @ (corrected > measured))
 
 
 @pytest.mark.parametrize("sd", [0.001, 0.05, 0.1])
 def test_harm_is_the_probability_that_correction_makes_it_worse(sd: float) -> None:
     states = states_of(*TWO_EXPLANATIONS, sd=sd)
+    for chosen in (0, 1):
+        estimate = states.drift[0, chosen], states.offset[0, chosen]
+        np.testing.assert_allclose(harm(states, *estimate), plain_harm(drawn(states), *estimate), atol=0.005)
+
+
+@pytest.mark.parametrize("ratio", [0.01, 1.0, 100.0])
+def test_harm_of_drift_and_offset_together_is_that_of_plain_draws(ratio: float) -> None:
+    """Whichever of both is the less certain."""
+    states = states_of(np.array([1.0]), np.array([[0.1, -0.08]]), np.array([[0.03, -0.02]]), sd=0.02)
+    states = replace(
+        states, constant_sd=states.constant_sd * np.sqrt(ratio), relative_sd=states.relative_sd / np.sqrt(ratio)
+    )
     estimate = states.drift[0, 0], states.offset[0, 0]
-    np.testing.assert_allclose(harm(branch_points(states, 0), *estimate), harm(drawn(states), *estimate), atol=0.005)
+    np.testing.assert_allclose(harm(states, *estimate), plain_harm(drawn(states), *estimate), atol=0.006)
 
 
 @pytest.mark.parametrize("deviations", [1.0, 2.0, 3.0, 3.7])
-def test_harm_in_the_tails_is_told_to_a_thousandth(deviations: float) -> None:
-    """A drift of so many standard deviations, and a current that shows nothing else: worse if it is below half."""
-    estimate = 0.1
-    sd = estimate / (2.0 + estimate) / deviations * (1.0 + 0.5 * estimate)
+@pytest.mark.parametrize("estimate", [0.1, -0.1, 0.02])
+def test_harm_in_the_tails_of_a_drift_is_exact(estimate: float, deviations: float) -> None:
+    """Without a mean current: |d - estimate| / (1 + estimate) > |d| between -1 and estimate / (2 + estimate), or so."""
+    edge = estimate / (2.0 + estimate)
+    sd = abs(estimate - edge) / deviations
     states = states_of(np.array([1.0]), np.array([[estimate, 0.0]]), np.zeros((1, K)), sd=sd)
-    result = harm_probability(
-        branch_points(states, 0), np.array([estimate, 0.0]), np.zeros(K), mean=np.zeros((1, K)), mean_square=SQUARE
-    )
-    # |d - estimate| / (1 + estimate) > |d|: between -1 and estimate / (2 + estimate)
-    expected = norm.cdf(estimate / (2.0 + estimate), estimate, sd) - norm.cdf(-1.0, estimate, sd)
-    assert result[0] == pytest.approx(expected, abs=0.001)
+    result = harm(states, np.array([estimate, 0.0]), np.zeros(K), mean=np.zeros((1, K)))
+    inside = norm.cdf(edge, estimate, sd) - norm.cdf(-1.0, estimate, sd)
+    outside = norm.sf(edge, estimate, sd) + norm.cdf(-1.0, estimate, sd)
+    assert result[0] == pytest.approx(inside if estimate > 0.0 else outside, rel=1e-6)
 
 
-def test_states_too_unlikely_to_look_at_count_as_harmful() -> None:
-    weight = np.array([1.0 - 2e-8, 1e-8, 1e-8])
-    drift = np.array([[0.1, 0.0], [0.1, 0.0], [0.1, 0.0]])
-    states = states_of(weight, drift, np.zeros((3, K)), sd=1e-6)
-    assert harm(branch_points(states, 0), drift[0], np.zeros(K))[0] == pytest.approx(2e-8)
+@pytest.mark.parametrize("deviations", [1.0, 3.0, 3.7])
+@pytest.mark.parametrize("estimate", [0.05, -0.05])
+def test_harm_in_the_tails_of_an_offset_is_exact(estimate: float, deviations: float) -> None:
+    """|o - estimate| > |o| if o lies on the other side of half the estimate."""
+    sd = abs(estimate) / 2.0 / deviations
+    states = states_of(np.array([1.0]), np.zeros((1, K)), np.array([[estimate, 0.0]]), sd=sd)
+    result = harm(states, np.zeros(K), np.array([estimate, 0.0]))
+    assert result[0] == pytest.approx(norm.sf(deviations), rel=1e-6)
+
+
+def test_weight_of_states_that_were_dropped_counts_as_harmful() -> None:
+    states = states_of(np.array([0.99, 0.008]), np.full((2, K), 0.1), np.zeros((2, K)), sd=1e-6)
+    np.testing.assert_allclose(harm(states, np.full(K, 0.1), np.zeros(K)), 0.002, rtol=1e-6)
 
 
 def test_harm_of_a_wrong_explanation_is_the_weight_of_the_others() -> None:
     states = states_of(*TWO_EXPLANATIONS, sd=1e-6)
-    result = harm(spread_points(states, 0), states.drift[0, 0], np.zeros(K))
+    result = harm(states, states.drift[0, 0], np.zeros(K))
     np.testing.assert_allclose(result, [0.3, 0.0], atol=1e-9)
 
 
@@ -139,8 +175,8 @@ def test_harm_is_counted_by_the_errors_of_the_currents_themselves() -> None:
     measured = (1.0 + truth[0]) * i + truth[1]
     corrected = (measured - estimate[1]) / (1.0 + estimate[0])
     worse = np.mean((corrected - i) ** 2, axis=0) > np.mean((measured - i) ** 2, axis=0)
-    points = Points(np.ones(1), truth[0][None], truth[1][None])
-    result = harm_probability(points, *estimate, mean=i.mean(axis=0)[None], mean_square=np.mean(i**2, axis=0)[None])
+    states = states_of(np.ones(1), truth[0][None], truth[1][None], sd=0.0)
+    result = harm(states, *estimate, mean=i.mean(axis=0)[None], square=np.mean(i**2, axis=0)[None])
     np.testing.assert_array_equal(result > 0.5, worse)
     rms = correction_error_rms(
         true_drift=truth[0],
@@ -155,15 +191,15 @@ def test_harm_is_counted_by_the_errors_of_the_currents_themselves() -> None:
 
 def test_nothing_changed_does_no_harm() -> None:
     states = states_of(*TWO_EXPLANATIONS, sd=0.05)
-    np.testing.assert_array_equal(harm(spread_points(states, 0), np.zeros(K), np.zeros(K)), 0.0)
+    np.testing.assert_array_equal(harm(states, np.zeros(K), np.zeros(K)), 0.0)
 
 
 def test_harm_is_that_of_the_worst_drive() -> None:
-    points = Points(np.ones(1), np.array([[0.1, 0.0]]), np.array([[-0.02, 0.0]]))
+    states = states_of(np.ones(1), np.array([[0.1, 0.0]]), np.array([[-0.02, 0.0]]), sd=0.0)
     estimate = np.array([0.1, 0.0]), np.array([0.01, 0.0])
     large, small = np.array([[0.9, 0.9]]), np.array([[1e-6, 1e-6]])
     none = np.zeros((1, K))
-    alone = [harm_probability(points, *estimate, mean=none, mean_square=square)[0] for square in (large, small)]
-    both = harm_probability(points, *estimate, mean=np.zeros((2, K)), mean_square=np.concatenate([large, small]))[0]
-    assert alone == [0.0, 1.0]
-    assert both == 1.0
+    alone = [harm(states, *estimate, mean=none, square=square)[0] for square in (large, small)]
+    both = harm(states, *estimate, mean=np.zeros((2, K)), square=np.concatenate([large, small]))[0]
+    assert alone == pytest.approx([0.0, 1.0], abs=1e-12)
+    assert both == pytest.approx(1.0)

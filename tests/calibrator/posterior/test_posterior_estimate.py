@@ -122,11 +122,21 @@ def test_trusted_vehicles_tell_the_reference_as_well_as_their_number_does(truth:
         True
     )
     best = estimate_hyperparameters(rows, [trusted_spread(rows, trusted)], free=np.zeros(5 * K, bool))
-    few, many = (
-        np.std([each.spread.mean[0] for each in draw_hyperparameters(rows, best, carriers=carriers)])
-        for carriers in (3, None)
-    )
-    assert few > 2.0 * many > 0.0
+    drawn = draw_hyperparameters(rows, best, carriers=rows.take(trusted))
+    deviation = np.std([each.spread.mean[0] for each in drawn])
+    one = np.sqrt(np.median(rows.covariance[:, 0, 0]) + best.spread.covariance[0, 0])
+    assert deviation == pytest.approx(one * np.sqrt(np.pi / 2.0 / 3.0), rel=0.5)
+
+
+def test_a_large_fleet_with_few_trusted_vehicles_keeps_the_doubt_about_its_centre(truth: Faults) -> None:
+    rows = rows_of(truth, seed=1)
+    many = rows.take(np.tile(np.arange(VEHICLES), 3))
+    best = estimate_hyperparameters(rows, [trusted_spread(rows, np.arange(VEHICLES) < 2)], free=np.zeros(5 * K, bool))
+    (only,) = draw_hyperparameters(many, best, carriers=rows.take(slice(0, 2)))
+    added = only.spread.covariance - best.spread.covariance
+    one = np.median(rows.covariance[:, 0, 0]) + best.spread.covariance[0, 0]
+    assert added[0, 0] == pytest.approx(one * np.pi / 2.0 / 2.0, rel=0.2)
+    assert added[K, K] == 0.0
 
 
 def test_a_given_prior_is_kept(truth: Faults) -> None:

@@ -182,7 +182,8 @@ def test_errors_of_the_right_state_are_as_large_as_stated() -> None:
 def test_weights_sum_to_one_and_fall(branches: int) -> None:
     rows = rows_of(random_faults(8, vehicles=20, branches=branches, sparsity=60.0))
     states = enumerate_states(rows, prior_of(branches), no_spread(branches))
-    np.testing.assert_allclose(states.weight.sum(axis=1), 1.0)
+    np.testing.assert_allclose(states.weight.sum(axis=1), 1.0, atol=1e-4)
+    assert (states.weight.sum(axis=1) < 1.0 + 1e-9).all()
     assert (np.diff(states.weight, axis=1) <= 0.0).all()
     assert states.weight.shape == (20, MOST_STATES)
 
@@ -315,7 +316,8 @@ def test_impossible_rows_still_give_probabilities() -> None:
     rows = rows_of(random_faults(15, vehicles=2, branches=2, sparsity=80.0), errors=SHARP)
     rows.relative[0, :2], rows.constant[1, :2] = 3.0, -40.0
     states = enumerate_states(rows, paper_prior(2, 1), no_spread(2))
-    np.testing.assert_allclose(states.weight.sum(axis=1), 1.0)
+    np.testing.assert_allclose(states.weight.sum(axis=1), 1.0, atol=1e-4)
+    assert (states.weight.sum(axis=1) < 1.0 + 1e-9).all()
     assert np.isfinite(states.log_evidence).all()
 
 
