@@ -88,7 +88,7 @@ def estimate_delays(
     drives : sequence of Drive
         Drives of one vehicle; a drive with too few good samples of a branch adds nothing.
     branches : sequence of str
-        Names of the K branches that meet at the junction; the first, the reference, should carry the largest current.
+        Names of the K branches that meet at the junction; the first, the reference, should be the one that moves most.
     max_delay_s : float
         Longest difference to look for. [s]
     max_sd_s : float

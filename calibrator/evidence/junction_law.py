@@ -34,7 +34,7 @@ def junction_law(summary: DriveSummary) -> BlockRegression:
     Parameters
     ----------
     summary : DriveSummary
-        Of one vehicle; its first branch should be the one with the largest currents.
+        Of one vehicle; its first branch should be the one that moves most.
 
     Returns
     -------

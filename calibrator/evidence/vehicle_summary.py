@@ -33,7 +33,7 @@ class VehicleSummary:
     summary : DriveSummary
         Of all of them, delays taken out.
     delays : BranchDelays
-        Of its branches; the reference is the branch with the largest currents.
+        Of its branches; the reference is the branch that moves most.
     zero_current : ZeroCurrent
         What the sensors showed while the contactors were open.
     recorded : frozenset of str
