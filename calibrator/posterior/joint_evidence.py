@@ -67,13 +67,17 @@ class _Candidates:
 
 @dataclass(frozen=True)
 class JointEvidence:
-    """Rows and prior of N vehicles, with their relative states; ``constant_covariance`` (N, 2K + 1, 2K + 1) is S."""
+    """Rows and prior of N vehicles, with their relative states.
+
+    ``constant_covariance`` (N, 2K + 1, 2K + 1) is S; ``turning`` says whether constants turn with the ratios.
+    """
 
     log_prior: Array
     prior: FaultPrior
     constant_covariance: Array
     candidates: _Candidates
     design: Array
+    turning: bool
     _noises: dict[tuple[int, ...], tuple[Array, Noise]] = field(default_factory=dict)
 
     @classmethod
@@ -89,7 +93,7 @@ class JointEvidence:
         of_spread = np.diag(spread.covariance)[r : r + K + 1]
         share = np.minimum(of_spread / np.diagonal(second, axis1=1, axis2=2)[:, : K + 1], 1.0)
         candidates = _candidates(rows, spread.mean[r:], carry, states, share)
-        return cls(log_prior, prior, second, candidates, constant_design(K))
+        return cls(log_prior, prior, second, candidates, constant_design(K), turning=rows.means is not None)
 
     def __len__(self) -> int:
         return len(self.candidates.log_evidence)
@@ -151,7 +155,7 @@ class JointEvidence:
             turn = found.turn.copy()
             for k in scaled:
                 turn[:, :, k, 1 + k] -= found.constant_rows[:, :, k]
-                turn[:, :, K, 1 + k] -= found.constant_rows[:, :, k]
+                turn[:, :, K, 1 + k] -= self.turning * found.constant_rows[:, :, k]
             added = turn @ found.covariance @ np.swapaxes(turn, 2, 3)
             self._noises[scaled] = turn, Noise.of(self.constant_covariance[:, None] + added)
         return self._noises[scaled]

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal, norm
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.evidence.readings import no_readings, with_readings
-from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, constant_design, relative_design
+from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, LineMeans, constant_design, relative_design
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.slab import Slab
 from calibrator.posterior.states import MOST_STATES, States, enumerate_states, mean_states
@@ -347,3 +347,56 @@ def test_counts_of_hardware_and_sensor_faults_are_read_from_the_parameters() -> 
         assert states.hardware_count[j, s] == hardware
         every = np.sum(states.relative[j, s] != 0.0) + np.sum(states.constant[j, s] != 0.0)
         assert states.sensor_count[j, s] == every - hardware
+
+
+@pytest.mark.parametrize("sd", [0.001, 0.01, 0.03, 0.05])
+def test_a_drift_told_by_the_mean_current_alone_makes_no_false_offset(sd: float) -> None:
+    """The second branch hardly moves, so its slope and gain ratio are vague, but it carries a tenth of full scale."""
+    K, N, own = 2, 20, 3e-4
+    rng = np.random.default_rng(int(1000 * sd))
+    d, true = np.array([0.0, 0.15]), np.array([-0.1, 0.1])
+    measured = (1.0 + d) * true
+    relative = np.zeros((N, 3 * K - 1))
+    error = rng.normal(size=(N, 2 * K - 1)) * [0.001, sd, sd]
+    relative[:, : 2 * K - 1] = relative_design(K)[: 2 * K - 1] @ np.log1p(np.append(0.0, d)) + error
+    noise = own * rng.normal(size=(N, K + 1))
+    b = (1.0 + d) * (true + noise[:, :K]) - np.exp(relative[:, :K]) * true
+    c = measured[0] + np.exp(relative[:, K]) * measured[1] + noise[:, K]
+    means = LineMeans(model=np.tile(true, (N, 1)), measured=np.tile(measured, (N, 1)))
+    turn = np.repeat(np.eye(5 * K)[None], N, axis=0)
+    turn[:, 3 * K - 1 : 4 * K, : 2 * K - 1] = means.lever(relative)
+    unknown = np.full(K, UNKNOWN_VARIANCE)
+    at_means = np.diag(np.concatenate([[1e-6, sd**2, sd**2], unknown, np.full(K + 1, own**2), unknown]))
+    rows = FleetRows(
+        relative=relative,
+        constant=np.concatenate([b, c[:, None], np.zeros((N, K))], axis=1),
+        covariance=turn @ at_means @ np.swapaxes(turn, 1, 2),
+        means=means,
+    )
+    states = enumerate_states(rows, prior_of(K), no_spread(K))
+    false_offset = (states.constant != 0.0).any(axis=2)
+    assert np.sum(states.weight * false_offset, axis=1).mean() < 0.03
+    drift = np.sum(states.weight * states.drift[:, :, 1], axis=1)
+    np.testing.assert_allclose(drift, 0.15, atol=0.02)
+    assert np.median(np.abs(drift - 0.15)) < min(sd, 2.0 * own / 0.1)
+
+
+def test_a_drift_that_no_row_tells_shows_in_the_hardware_offset_that_it_scales() -> None:
+    """The third branch hardly moves. Both hardware offsets sum to zero once its drift is taken out."""
+    K, drift, hardware = 3, 0.2, 0.239
+    measured = np.array([hardware, 0.0, -(1.0 + drift) * hardware])
+    relative, constant = np.zeros((1, 3 * K - 1)), np.zeros((1, 2 * K + 1))
+    constant[0, :K], constant[0, K] = measured, measured.sum()
+    means = LineMeans(model=np.zeros((1, K)), measured=measured[None])
+    at_means = Errors().covariance(K)
+    for row in (K - 1, 2 * K - 2):
+        at_means[row, row] = UNKNOWN_VARIANCE
+    turn = np.eye(5 * K)
+    turn[3 * K - 1 : 4 * K, : 2 * K - 1] = means.lever(relative)[0]
+    rows = FleetRows(relative=relative, constant=constant, covariance=(turn @ at_means @ turn.T)[None], means=means)
+    states = enumerate_states(rows, prior_of(K), no_spread(K))
+    few = (states.sensor_count[0] == 1) & (states.hardware_count[0] == 1)
+    right = few & (np.abs(states.drift[0, :, 2] - drift) < 0.02) & (np.abs(states.constant[0, :, 0] - hardware) < 0.01)
+    other = few & (np.abs(states.offset[0, :, 2] + drift * hardware) < 0.01)
+    assert states.weight[0, right].sum() > 0.1
+    assert states.weight[0, right | other].sum() > 0.8
