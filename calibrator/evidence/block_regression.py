@@ -20,8 +20,9 @@ ROUNDS = 3
 """rho depends on the estimate and the estimate, weakly, on rho. [1]"""
 LEAST_RHO = 1e-9
 """Of the mean square of y: a regression that fits exactly. [1]"""
-STUDENT = 2.0
-"""Blocks that the tails of an error over its own estimate cost: the variance of Student's distribution."""
+TOO_FEW = 4.0
+"""Blocks that tell no variance: two for slope and intercept, two as its own error makes the tails heavier than normal.
+"""
 LEAST_VARIANCE = 1e-12
 """Of y where it is zero throughout, so that the prior stays: below a microampere, in any unit that is used."""
 
@@ -83,7 +84,6 @@ def regress_blocks(
         scores = right - gram @ estimate
         rho = max(float(np.mean(np.einsum("bp,pq,bq->b", scores, inverse, scores))) * count / p, least)
     scores = scores - scores.mean(axis=0)
-    few = p + STUDENT
-    influence = scores @ inverse * np.sqrt(max(count, few + 1.0) / max(count - few, 1.0))
+    influence = scores @ inverse * np.sqrt(max(count, TOO_FEW + 1.0) / max(count - TOO_FEW, 1.0))
     prior_part = rho**2 * inverse @ np.diag(prior_precision) @ inverse
     return BlockRegression(estimate=estimate, influence=influence, prior_covariance=prior_part)
