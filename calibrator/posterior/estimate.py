@@ -119,12 +119,13 @@ def estimate_fleet(
         In the order of the rows.
     """
     _require_fit(rows, moments, full_scale_a)
-    starts, free = initial_spreads(rows if learning is None else rows.take(learning)), None
-    if trusted is not None and trusted.any():
-        starts, free = [trusted_spread(rows, trusted)], np.zeros(5 * rows.branches, bool)
     learnt = rows if learning is None else rows.take(learning)
+    carriers = None if trusted is None or not trusted.any() else rows.take(trusted)
+    if trusted is None or carriers is None:
+        starts, free = initial_spreads(learnt), None
+    else:
+        starts, free = [trusted_spread(rows, trusted)], np.zeros(5 * rows.branches, bool)
     hyperparameters = estimate_hyperparameters(learnt, starts, given=given, free=free)
-    carriers = rows.take(trusted) if trusted is not None and trusted.any() else None
     drawn = draw_hyperparameters(learnt, hyperparameters, given=given, carriers=carriers)
     states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in drawn])
     usual = moments if learning is None else moments.take(learning)
