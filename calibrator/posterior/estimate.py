@@ -162,18 +162,13 @@ def _of_vehicle(
         spread_points(states, j), states, j, least=(prior.relative.low, prior.constant.low)
     )
     drift, offset = states.drift[j, state], states.offset[j, state]
-    variance = np.concatenate([_mean_square(states, j, "drift", drift), _mean_square(states, j, "offset", offset)])
+    distance = np.concatenate([states.drift[j] - drift, states.offset[j] - offset], axis=1)
+    sd = np.concatenate([states.relative_sd[j, :, 1:], states.constant_sd[j, :, states.branches - 1 :]], axis=1)
+    variance = np.asarray(states.weight[j] @ (distance**2 + sd**2))
     mean, mean_square = _true_moments(*moments, j, drift=drift, offset_a=offset * full_scale_a)
     mean, mean_square = mean / full_scale_a, mean_square / full_scale_a**2
     harm = harm_probability(states, j, drift, offset, mean=mean, mean_square=mean_square)
     return _Vehicle(state, confidence, variance, harm)
-
-
-def _mean_square(states: States, j: int, name: str, estimate: Array) -> Array:
-    """Mean square of the posterior's distance from the estimate, shape (K,)."""
-    sd = states.relative_sd[j, :, 1:] if name == "drift" else states.constant_sd[j, :, states.branches - 1 :]
-    distance = getattr(states, name)[j] - estimate
-    return np.asarray(states.weight[j] @ (distance**2 + sd**2))
 
 
 def _true_moments(moments: Moments, fleet: Moments, j: int, *, drift: Array, offset_a: Array) -> tuple[Array, Array]:
