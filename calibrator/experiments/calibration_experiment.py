@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 from calibrator.errors import FleetError
 from calibrator.experiments.methods import POSTERIOR
-from calibrator.experiments.outcome import BINS, calibration_error
+from calibrator.experiments.outcome import BINS, calibration_figures
 from calibrator.experiments.result import Bin, ExperimentResult, Figure, Row
 
 __all__ = ["ALL", "calibration_experiment", "pooled_bins"]
@@ -77,7 +77,7 @@ def _row(name: str, rows: Sequence[Row]) -> Row:
         "recovery_rate": sum(b.count * b.recovered for b in bins) / vehicles,
         "confidence": sum(b.count * b.confidence for b in bins) / vehicles,
         **_sure(rows, vehicles),
-        "ece": calibration_error(bins),
+        **calibration_figures(bins),
     }
     return Row(
         x=vehicles,

@@ -6,6 +6,7 @@ sure                                 share of vehicles above a confidence of 0.9
 sure_confidence, sure_recovered      their mean confidence, and the share of them that is recovered
 ece                                  expected calibration error: mean over vehicles of |confidence - share recovered| of
                                      the tenth of the scale that their confidence lies in [1]_
+ece_by_chance                        what it is expected to be, with so many vehicles, if the confidence is exact
 f2, complexity                       of the hardware classification; share of vehicles held to have hardware faults
 deployed                             share of the vehicles with faulty sensors of which some branch is corrected
 harmed                               share of the vehicles with a corrected branch of which some branch gets worse on an
@@ -27,7 +28,7 @@ from calibrator.experiments.result import Bin
 from calibrator.experiments.trial import Trial
 from calibrator.score import f2_score, harmed, recovered
 
-__all__ = ["Outcome", "calibration_error", "confidence_bins", "figures_of", "judge", "pooled"]
+__all__ = ["Outcome", "calibration_figures", "confidence_bins", "figures_of", "judge", "pooled"]
 
 SURE = 0.95
 BINS = 10
@@ -154,12 +155,14 @@ def confidence_bins(outcome: Outcome) -> tuple[Bin, ...]:
     return tuple(bins)
 
 
-def calibration_error(bins: Sequence[Bin]) -> float:
-    """Expected calibration error of binned confidences; NaN without vehicles."""
+def calibration_figures(bins: Sequence[Bin]) -> dict[str, float]:
+    """Expected calibration error of binned confidences, and what chance alone makes of it; NaN without vehicles."""
     count = sum(b.count for b in bins)
     if not count:
-        return float("nan")
-    return sum(b.count * abs(b.confidence - b.recovered) for b in bins) / count
+        return dict.fromkeys(("ece", "ece_by_chance"), float("nan"))
+    error = sum(b.count * abs(b.confidence - b.recovered) for b in bins)
+    chance = sum(np.sqrt(2.0 / np.pi * b.count * b.confidence * (1.0 - b.confidence)) for b in bins)
+    return {"ece": float(error / count), "ece_by_chance": float(chance / count)}
 
 
 def _honesty(outcome: Outcome) -> dict[str, float]:
@@ -172,7 +175,7 @@ def _honesty(outcome: Outcome) -> dict[str, float]:
         "sure": _share(sure),
         "sure_confidence": _share(outcome.confidence[sure]),
         "sure_recovered": _share(outcome.recovered[sure]),
-        "ece": calibration_error(confidence_bins(outcome)),
+        **calibration_figures(confidence_bins(outcome)),
     }
 
 

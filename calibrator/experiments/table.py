@@ -8,7 +8,7 @@ from rich.table import Table
 
 from calibrator.experiments.calibration_experiment import ALL, pooled_bins
 from calibrator.experiments.methods import CEILING, POSTERIOR
-from calibrator.experiments.outcome import calibration_error
+from calibrator.experiments.outcome import calibration_figures
 from calibrator.experiments.result import ExperimentResult, Figure, Row
 
 __all__ = ["headline", "markdown_table", "result_markdown", "result_table"]
@@ -19,6 +19,7 @@ HONESTY = {
     "sure_confidence": "their confidence",
     "sure_recovered": "of them recovered",
     "ece": "ECE",
+    "ece_by_chance": "by chance",
     "deployed": "deployed",
     "harmed": "harmed",
     "delay_rmse_ms": "delay error [ms]",
@@ -30,9 +31,9 @@ LEGEND = (
     "Share of vehicles recovered within 10 %: the paper's best printed figure, the published method (/ its "
     "classifier), the default (posterior), and the default where it is told how the faults were drawn (law known: the "
     "most that this evidence gives). Of the default: mean confidence, share of vehicles above 0.95, their mean "
-    "confidence and the share of them that is recovered, expected calibration error (tenths), share of the vehicles "
-    "with faulty sensors that is corrected in some branch, share of the corrected ones of which some branch gets "
-    "worse on an unseen drive."
+    "confidence and the share of them that is recovered, expected calibration error (tenths) and what it is by chance "
+    "if the confidence is exact, share of the vehicles with faulty sensors that is corrected in some branch, share of "
+    "the corrected ones of which some branch gets worse on an unseen drive."
 )
 SHORT_LEGEND = (
     "Share of vehicles recovered within 10 %: the paper's best printed figure, the published method (/ its "
@@ -158,8 +159,10 @@ def _reliability(result: ExperimentResult) -> list[str]:
     if not bins:
         return []
     rows = [[f"{b.low:.1f}", f"{b.count}", f"{b.confidence:.3f}", f"{b.recovered:.3f}"] for b in bins]
+    figures = calibration_figures(bins)
     return [
-        f"All settings together, by tenths of the default's confidence (ECE {calibration_error(bins):.3f}):",
+        f"All settings together, by tenths of the default's confidence (ECE {figures['ece']:.3f}, by chance "
+        f"{figures['ece_by_chance']:.3f}):",
         "",
         *markdown_table(["from", "vehicles", "mean confidence", "recovered"], rows),
         "",

@@ -7,7 +7,7 @@ import pytest
 
 from calibrator.drive import Array, Mask
 from calibrator.experiments.methods import Estimate
-from calibrator.experiments.outcome import Outcome, calibration_error, confidence_bins, figures_of, judge, pooled
+from calibrator.experiments.outcome import Outcome, calibration_figures, confidence_bins, figures_of, judge, pooled
 from calibrator.experiments.result import Bin
 from calibrator.experiments.trial import Trial, unseen_drive
 from calibrator.faults import Faults, true_currents
@@ -59,6 +59,13 @@ def test_honest_confidence_has_a_small_calibration_error() -> None:
     assert figures["sure"] == pytest.approx(0.05, abs=0.005)
 
 
+def test_calibration_error_by_chance_is_the_usual_one_of_an_exact_confidence() -> None:
+    rng = np.random.default_rng(1)
+    confidence = rng.beta(4.0, 1.0, 300)
+    drawn = [figures_of(outcome(confidence, rng.random(300) < confidence)) for _ in range(400)]
+    assert drawn[0]["ece_by_chance"] == pytest.approx(np.mean([figures["ece"] for figures in drawn]), rel=0.1)
+
+
 def test_calibration_error_of_boasting_is_the_excess() -> None:
     figures = figures_of(outcome(np.full(N, 0.9), np.arange(N) < 0.6 * N))
     assert figures["ece"] == pytest.approx(0.3)
@@ -79,8 +86,8 @@ def test_bins_hold_every_vehicle_once_and_pooling_adds_them() -> None:
 
 
 def test_calibration_error_of_no_vehicle_is_not_a_number() -> None:
-    assert np.isnan(calibration_error([]))
-    assert calibration_error([Bin(low=0.9, count=3, confidence=0.95, recovered=0.95)]) == 0.0
+    assert all(np.isnan(value) for value in calibration_figures([]).values())
+    assert calibration_figures([Bin(low=0.9, count=3, confidence=0.95, recovered=0.95)])["ece"] == 0.0
 
 
 def test_true_faults_are_recovered_deployed_and_harm_nobody() -> None:
