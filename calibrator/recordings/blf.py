@@ -1,50 +1,47 @@
-"""Check of a BLF file's structure, so that reading it ends and a cut is noticed.
+"""BLF files (Vector's binary logging format) into frame arrays, without a Python object per frame.
 
 A BLF file is a header ``LOGG`` and objects ``LOBJ``, each with its own size; most are containers, whose content, often
-compressed, is again objects. A size of zero makes a reader go round for ever, and a file cut inside a container reads
-as a shorter one without any error: both are found here before the file is read.
+compressed, is again objects, which may go over from one container into the next. There is no public specification; the
+layout of the objects is that of python-can's reader, which is the oracle of the tests.
+
+A size of zero makes a naive reader go round for ever, and a file cut inside a container reads as a shorter one without
+any error: the structure is checked throughout, and damage is refused with its place.
 """
 
 import struct
 import zlib
+from collections.abc import Iterator
+from datetime import UTC, datetime
 from typing import BinaryIO
 
 from calibrator.errors import LogError
+from calibrator.recordings.blf_objects import LARGEST_OBJECT, OBJECT_HEADER, BlfDamageError, ObjectStream
+from calibrator.recordings.frame_arrays import Frames, concatenate_frames
 
-__all__ = ["check_blf"]
+__all__ = ["read_blf"]
 
-_FILE_HEADER = struct.Struct("<4sL8xQ")
-"""Signature, size of the header, size of the file."""
+_FILE_HEADER = struct.Struct("<4sL8xQ16x8H")
+"""Signature, size of the header, size of the file, date and time of the start (year, month, day of the week, ..)."""
 _FILE_HEADER_BYTES = 144
-_OBJECT_HEADER = struct.Struct("<4sHHLL")
-"""Signature, size and version of the header, size of the object, type."""
-_SMALLEST_OBJECT = 32
-"""An object of header version 1 or 2 without content."""
-_LARGEST_OBJECT = 1 << 28
-"""Containers have some 128 KiB; a larger size is damage."""
 _CONTAINER = 10
 _CONTAINER_HEADER_BYTES = 16
-_DEFLATE = 2
-_CAN_TYPES = frozenset({1, 73, 86, 100, 101})
-_LONGEST_PADDING = 8
+_STORED, _DEFLATE = 0, 2
 
 
-class _DamageError(Exception):
-    """What is wrong, and at which byte of the file."""
-
-    def __init__(self, byte: int, text: str) -> None:
-        super().__init__(f"at byte {byte} {text}")
-
-
-def check_blf(file: BinaryIO, name: str) -> None:
-    """Check that a BLF file is whole.
+def read_blf(file: BinaryIO, name: str) -> Frames:
+    """Read all frames of a BLF file.
 
     Parameters
     ----------
     file : binary file
         The (uncompressed) content, at its start.
     name : str
-        The file's name, for the message.
+        The file's name, for messages.
+
+    Returns
+    -------
+    Frames
+        In the order of the file.
 
     Raises
     ------
@@ -52,87 +49,77 @@ def check_blf(file: BinaryIO, name: str) -> None:
         If the file is no BLF file, is cut, or has an object of impossible size; the message gives the byte, what was
         expected there, and how many frames come before.
     """
-    counter = _FrameCounter()
+    parts: list[Frames] = []
     try:
-        _check(file, counter)
-    except _DamageError as damage:
+        parts.extend(_parts(file))
+    except BlfDamageError as damage:
+        frames = sum(map(len, parts))
         raise LogError(
-            f"{name}: truncated or damaged BLF: {damage}; {counter.frames} frames before it are readable; "
+            f"{name}: truncated or damaged BLF: {damage}; {frames} frames before it are readable; "
             f"copy the file again, or save the readable part with the tool that recorded it"
         ) from None
+    return concatenate_frames(parts)
 
 
-def _check(file: BinaryIO, counter: "_FrameCounter") -> None:
-    size = _check_file_header(file)
+def _parts(file: BinaryIO) -> Iterator[Frames]:
+    """Frames container by container."""
+    size, start_ns = _file_header(file)
+    stream = ObjectStream(start_ns)
     position = file.tell()
-    while head := file.read(_OBJECT_HEADER.size):
-        if len(head) < _OBJECT_HEADER.size:
-            raise _DamageError(position, "the file ends inside an object's header")
-        signature, _, _, length, kind = _OBJECT_HEADER.unpack(head)
-        if signature != b"LOBJ" or not _OBJECT_HEADER.size <= length <= _LARGEST_OBJECT:
-            raise _DamageError(position, f"'LOBJ' and a size are expected, found {signature!r} and {length}")
-        content = file.read(length - _OBJECT_HEADER.size)
-        if len(content) < length - _OBJECT_HEADER.size:
-            raise _DamageError(position, f"an object of {length} bytes starts, but the file ends before")
+    while head := file.read(OBJECT_HEADER.size):
+        if len(head) < OBJECT_HEADER.size:
+            raise BlfDamageError(position, "the file ends inside an object's header")
+        signature, _, _, length, kind = OBJECT_HEADER.unpack(head)
+        if signature != b"LOBJ" or not OBJECT_HEADER.size <= length <= LARGEST_OBJECT:
+            raise BlfDamageError(position, f"'LOBJ' and a size are expected, found {signature!r} and {length}")
+        content = file.read(length - OBJECT_HEADER.size)
+        if len(content) < length - OBJECT_HEADER.size:
+            raise BlfDamageError(position, f"an object of {length} bytes starts, but the file ends before")
         file.read(length % 4)
         if kind == _CONTAINER:
-            counter.count(_container_content(content, position), position)
+            yield stream.frames(_container_content(content, position), position)
         position += length + length % 4
-    if counter.tail.strip(b"\0"):
-        raise _DamageError(position, "the last object is cut")
+    if stream.is_cut:
+        raise BlfDamageError(position, "the last object is cut")
     if size > position:
-        raise _DamageError(position, f"the file ends, but its header says {size} bytes")
+        raise BlfDamageError(position, f"the file ends, but its header says {size} bytes")
 
 
-def _check_file_header(file: BinaryIO) -> int:
-    """Go behind the header and return the size of the file that it states, 0 if unknown."""
+def _file_header(file: BinaryIO) -> tuple[int, int]:
+    """Go behind the header; the size of the file that it states, 0 if unknown, and the start in ns since 1970."""
     head = file.read(_FILE_HEADER_BYTES)
     if len(head) < _FILE_HEADER_BYTES or head[:4] != b"LOGG":
-        raise _DamageError(0, f"the header 'LOGG' of {_FILE_HEADER_BYTES} bytes is expected, found {head[:4]!r}")
-    _, length, size = _FILE_HEADER.unpack_from(head)
-    if not _FILE_HEADER_BYTES <= length <= _LARGEST_OBJECT:
-        raise _DamageError(4, f"the size of the header is {length}")
+        raise BlfDamageError(0, f"the header 'LOGG' of {_FILE_HEADER_BYTES} bytes is expected, found {head[:4]!r}")
+    _, length, size, *start = _FILE_HEADER.unpack_from(head)
+    if not _FILE_HEADER_BYTES <= length <= LARGEST_OBJECT:
+        raise BlfDamageError(4, f"the size of the header is {length}")
     file.read(length - _FILE_HEADER_BYTES)
-    return int(size)
+    return int(size), _start_ns(*start)
+
+
+def _start_ns(year: int, month: int, _weekday: int, day: int, *of_day: int) -> int:
+    """Windows' SYSTEMTIME since 1970; 0 where there is no date. [ns]"""
+    hour, minute, second, milliseconds = of_day
+    try:
+        start = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
+    except ValueError:
+        return 0
+    return max(int(start.timestamp()), 0) * 10**9 + milliseconds * 10**6
 
 
 def _container_content(content: bytes, position: int) -> bytes:
     if len(content) < _CONTAINER_HEADER_BYTES:
-        raise _DamageError(position, "a container has no header")
-    body = content[_CONTAINER_HEADER_BYTES:]
-    if int.from_bytes(content[:2], "little") != _DEFLATE:
+        raise BlfDamageError(position, "a container has no header")
+    body, method = content[_CONTAINER_HEADER_BYTES:], int.from_bytes(content[:2], "little")
+    if method == _STORED:
         return body
+    if method != _DEFLATE:
+        raise BlfDamageError(position, f"a container is compressed by a method {method} that is not known")
     stream = zlib.decompressobj()
     try:
-        text = stream.decompress(body, _LARGEST_OBJECT)
+        text = stream.decompress(body, LARGEST_OBJECT)
     except zlib.error as error:
-        raise _DamageError(position, f"a container cannot be decompressed ({error})") from None
+        raise BlfDamageError(position, f"a container cannot be decompressed ({error})") from None
     if not stream.eof:
-        raise _DamageError(position, "a compressed container is not complete")
+        raise BlfDamageError(position, "a compressed container is not complete")
     return text
-
-
-class _FrameCounter:
-    """Walks the objects of the containers, which may go over from one container into the next."""
-
-    def __init__(self) -> None:
-        self.frames = 0
-        self.tail = b""
-
-    def count(self, content: bytes, position: int) -> None:
-        data = self.tail + content
-        here = 0
-        while (start := data.find(b"LOBJ", here, here + _LONGEST_PADDING)) >= 0:
-            if start + _OBJECT_HEADER.size > len(data):
-                break
-            _, _, version, length, kind = _OBJECT_HEADER.unpack_from(data, start)
-            if not (_SMALLEST_OBJECT if version in {1, 2} else _OBJECT_HEADER.size) <= length <= _LARGEST_OBJECT:
-                raise _DamageError(position, f"a container holds an object of {length} bytes")
-            if start + length > len(data):
-                break
-            self.frames += kind in _CAN_TYPES
-            here = start + length
-        else:
-            if here + _LONGEST_PADDING <= len(data):
-                raise _DamageError(position, "a container holds something that is no object")
-        self.tail = data[here:]

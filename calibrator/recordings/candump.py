@@ -11,6 +11,7 @@ dozen shapes at most. A line of no known shape is damaged and counted.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from calibrator.recordings.frame_arrays import CLASSIC_BYTES, EXTENDED_BIT, FD_BYTES, Frames, concatenate_frames
@@ -150,8 +151,9 @@ def _shapes(fields: _Fields, known: _Index) -> list[_Index]:
 
 def _matrix(buffer: _Bytes, field: tuple[_Index, _Index], lines: _Index) -> _Bytes:
     """Characters of one field of lines of one shape, shape (n, width)."""
-    start, end = field[0][lines], field[1][lines]
-    return buffer[start[:, None] + np.arange(end[0] - start[0])]
+    start = field[0][lines]
+    width = int(field[1][lines[0]] - start[0])
+    return sliding_window_view(buffer, width)[start] if width else np.zeros((len(lines), 0), np.uint8)
 
 
 def _parse_shape(buffer: _Bytes, fields: _Fields, lines: _Index, damaged: NDArray[np.bool_]) -> tuple[Frames, _Index]:
@@ -184,8 +186,14 @@ def _parse_shape(buffer: _Bytes, fields: _Fields, lines: _Index, damaged: NDArra
 
 
 def _decimal(digits: _Bytes) -> tuple[_Index, NDArray[np.bool_]]:
-    values = digits.astype(np.int64) - ord("0")
-    return values @ 10 ** np.arange(digits.shape[1])[::-1], np.all((values >= 0) & (values <= 9), axis=1)
+    values = digits - np.uint8(ord("0"))
+    return _positional(values, 10), np.all(values <= 9, axis=1)  # what lies below "0" wraps
+
+
+def _positional(digits: _Bytes, base: int) -> _Index:
+    """Value of up to 10 digits; in float64, where that is exact, as it multiplies matrices faster."""
+    powers = float(base) ** np.arange(digits.shape[1])[::-1]
+    return np.asarray(digits.astype(np.float64) @ powers).astype(np.int64)
 
 
 def _times(text: _Bytes) -> tuple[_Index, NDArray[np.bool_]]:
@@ -204,7 +212,7 @@ def _identifiers(text: _Bytes) -> tuple[_Index, NDArray[np.bool_]]:
     if text.shape[1] not in {_STANDARD_DIGITS, _EXTENDED_DIGITS}:
         return np.zeros(len(text), np.int64), np.full(len(text), fill_value=False)
     digits = _HEX[text]
-    value = digits.astype(np.int64) @ 16 ** np.arange(text.shape[1])[::-1]
+    value = _positional(digits, 16)
     largest = 0x7FF if text.shape[1] == _STANDARD_DIGITS else _ERROR_BIT | _IDENTIFIER_MASK
     return value, np.all(digits != _NOT_HEX, axis=1) & (value <= largest)
 

@@ -20,8 +20,8 @@ EXTENDED_BIT = 1 << 31
 """Set in a frame's key where the identifier has 29 bits, as in Linux' ``can_id``."""
 CLASSIC_BYTES = 8
 FD_BYTES = 64
-LATEST_TIME_STAMP_S = 9e9
-"""Larger time stamps do not fit into 64 bits of nanoseconds, and no log has them."""
+LATEST_TIME_STAMP_NS = 9 * 10**18
+"""Larger time stamps do not fit into 64 bits, and no log has them. [ns]"""
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
@@ -131,7 +131,7 @@ class FrameCollector:
             self.error_frames += 1
         elif message.is_remote_frame:
             self.remote_frames += 1
-        elif not 0.0 <= message.timestamp <= LATEST_TIME_STAMP_S or _is_cut(message):
+        elif not 0.0 <= message.timestamp <= 1e-9 * LATEST_TIME_STAMP_NS or _is_cut(message):
             self.damaged += 1
         else:
             self._time_ns.append(round(message.timestamp * 1e9))
@@ -173,4 +173,5 @@ def _renumbered(part: Frames, number: dict[str, int]) -> NDArray[np.uint32]:
 
 
 def _widened(data: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    return np.pad(data, ((0, 0), (0, width - data.shape[1])))
+    missing = width - data.shape[1]
+    return np.pad(data, ((0, 0), (0, missing))) if missing else data

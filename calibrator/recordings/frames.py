@@ -21,7 +21,7 @@ from typing import BinaryIO, TextIO, cast
 import can
 
 from calibrator.errors import LogError
-from calibrator.recordings.blf import check_blf
+from calibrator.recordings.blf import read_blf
 from calibrator.recordings.candump import parse_candump
 from calibrator.recordings.frame_arrays import FrameCollector, Frames, concatenate_frames, frame_key
 from calibrator.recordings.mf4 import read_mf4
@@ -152,9 +152,7 @@ def _blocks(file: BinaryIO) -> Iterator[bytes]:
 
 def _read_blf(path: Path) -> Frames:
     with _open(path) as file:
-        check_blf(file, str(path))
-    with _open(path) as file:
-        return _collect(can.BLFReader(file), path, lambda: "")
+        return read_blf(file, str(path))
 
 
 def _read_asc(path: Path) -> Frames:

@@ -1,0 +1,183 @@
+"""The reader of BLF files against python-can's, object by object."""
+
+import io
+import struct
+from collections.abc import Sequence
+
+import can
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibrator.errors import LogError
+from calibrator.recordings.blf import read_blf
+from calibrator.recordings.frame_arrays import FrameCollector, Frames
+
+START = 1_700_000_000.0
+CLASSIC, ERROR, FD, FD_64 = 1, 73, 100, 101
+
+
+def written(messages: Sequence[can.Message], *, container_bytes: int = 1 << 17, compression: int = 6) -> bytes:
+    buffer = io.BytesIO()
+    buffer.close = lambda: None  # type: ignore[method-assign]
+    writer = can.BLFWriter(buffer, compression_level=compression)
+    writer.max_container_size = container_bytes
+    with writer:
+        for message in messages:
+            writer.on_message_received(message)
+    return buffer.getvalue()
+
+
+def of_objects(*objects: bytes) -> bytes:
+    """A file with one stored container of these objects, without a date."""
+    inner = b"".join(each + bytes(len(each) % 4) for each in objects)
+    container = struct.pack("<H6xL4x", 0, len(inner)) + inner
+    header = struct.pack("<4sL", b"LOGG", 144).ljust(144, b"\0")
+    return header + struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(container), 10) + container
+
+
+def an_object(kind: int, body: bytes, *, version: int = 1, flags: int = 2, time: int = 1000) -> bytes:
+    head = struct.pack("<LHHQ" if version == 1 else "<LHHQ8x", flags, 0, 0, time)
+    size = 16 + len(head) + len(body)
+    return struct.pack("<4sHHLL", b"LOBJ", 16 + len(head), version, size, kind) + head + body
+
+
+def classic(identifier: int, data: bytes, *, channel: int = 1, flags: int = 0) -> bytes:
+    return struct.pack("<HBBL8s", channel, flags, len(data), identifier, data)
+
+
+def fd_64(data: bytes, *, code: int, valid: int, extension_at: int = 0) -> bytes:
+    head = struct.pack("<BBBBLLLLLLLHBBL", 1, code, valid, 0, 0x123, 0, 0x1000, 0, 0, 0, 0, 0, 0, extension_at, 0)
+    return head + data
+
+
+def by_python_can(content: bytes) -> Frames:
+    collector = FrameCollector()
+    for message in can.BLFReader(io.BytesIO(content)):
+        collector.add(message)
+    return collector.frames()
+
+
+def assert_the_same(content: bytes) -> Frames:
+    ours, theirs = read_blf(io.BytesIO(content), "x.blf"), by_python_can(content)
+    width = theirs.data.shape[1]
+    np.testing.assert_array_equal(ours.key, theirs.key)
+    np.testing.assert_array_equal(ours.length, theirs.length)
+    np.testing.assert_array_equal(ours.data[:, :width], theirs.data)
+    np.testing.assert_allclose(ours.time_ns, theirs.time_ns, rtol=0, atol=500)
+    assert [ours.channels[c] for c in ours.channel] == [theirs.channels[c] for c in theirs.channel]
+    counts = ("error_frames", "remote_frames", "damaged")
+    assert [getattr(ours, name) for name in counts] == [getattr(theirs, name) for name in counts]
+    return ours
+
+
+def _message(time: float, extended: bool, identifier: int, channel: int, kind: str, data: bytes) -> can.Message:
+    fd = kind == "fd"
+    payload = data[: min(can.util.dlc2len(can.util.len2dlc(len(data))), len(data))] if fd else data[:8]
+    if fd and len(payload) > 8:
+        payload = payload.ljust(can.util.dlc2len(can.util.len2dlc(len(payload))), b"\0")
+    return can.Message(
+        timestamp=START + time,
+        arbitration_id=identifier if extended else identifier & 0x7FF,
+        is_extended_id=extended,
+        is_fd=fd,
+        is_error_frame=kind == "error",
+        is_remote_frame=kind == "remote",
+        channel=channel,
+        data=b"" if kind == "remote" else payload,
+    )
+
+
+messages = st.builds(
+    _message,
+    st.floats(0.0, 1e4),
+    st.booleans(),
+    st.integers(0, 0x1FFFFFFF),
+    st.integers(0, 3),
+    st.sampled_from(["classic", "classic", "fd", "remote", "error"]),
+    st.one_of(st.binary(max_size=64), st.just(b"LOBJ"), st.just(b"LOBJ" + bytes(60))),
+)
+
+
+@given(st.lists(messages, max_size=60), st.sampled_from([200, 1000, 1 << 17]), st.sampled_from([0, 6]))
+def test_any_log_gives_the_frames_that_python_can_reads(
+    log: list[can.Message], container_bytes: int, compression: int
+) -> None:
+    assert_the_same(written(log, container_bytes=container_bytes, compression=compression))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("flags", [1, 2])
+def test_both_headers_and_both_units_of_time_are_read(version: int, flags: int) -> None:
+    body = classic(0x123, b"12345678")
+    frames = assert_the_same(of_objects(an_object(CLASSIC, body, version=version, flags=flags, time=7)))
+    assert frames.time_ns.tolist() == [70_000 if flags == 1 else 7]
+
+
+@pytest.mark.parametrize(("length", "code", "valid"), [(3, 3, 3), (64, 15, 64), (4, 9, 12), (12, 9, 0)])
+def test_the_newer_fd_object_is_read_with_what_it_leaves_out_as_zeros(length: int, code: int, valid: int) -> None:
+    body = fd_64(bytes(range(1, length + 1)), code=code, valid=valid)
+    frames = assert_the_same(of_objects(an_object(FD_64, body), an_object(CLASSIC, classic(0x7, b"ab"))))
+    expected = bytes(range(1, min(length, valid) + 1)).ljust(valid, b"\0")
+    assert frames.data[0, : frames.length[0]].tobytes() == expected
+
+
+def test_what_follows_the_payload_of_the_newer_fd_object_is_no_payload() -> None:
+    body = fd_64(b"\x01\x02\x03\x04" + b"extension", code=9, valid=12, extension_at=32 + 40 + 4)
+    frames = assert_the_same(of_objects(an_object(FD_64, body)))
+    assert frames.data[0, :12].tobytes() == b"\x01\x02\x03\x04".ljust(12, b"\0")
+
+
+def test_objects_that_are_no_frames_are_passed_over() -> None:
+    other = an_object(96, b"a global marker of some length, 9..")
+    frames = assert_the_same(of_objects(other, an_object(CLASSIC, classic(0x10, b"x")), other))
+    assert frames.key.tolist() == [0x10]
+
+
+def test_the_letters_of_an_object_in_a_payload_are_payload() -> None:
+    hidden = an_object(CLASSIC, classic(0x666, b"payload!"))[:48]
+    body = struct.pack("<HBBLLBBB5x64s", 1, 0, 15, 0x123, 0, 0, 1, 64, hidden)
+    frames = assert_the_same(of_objects(an_object(FD, body), an_object(CLASSIC, classic(0x10, b"x"))))
+    assert frames.key.tolist() == [0x123, 0x10]
+
+
+def test_a_header_of_unknown_version_is_counted_as_damaged() -> None:
+    good = an_object(CLASSIC, classic(0x10, b"x"))
+    strange = good[:6] + struct.pack("<H", 7) + good[8:]
+    frames = read_blf(io.BytesIO(of_objects(good, strange)), "x.blf")
+    assert (len(frames), frames.damaged) == (1, 1)
+
+
+def test_an_impossible_time_stamp_is_counted_as_damaged() -> None:
+    good = an_object(CLASSIC, classic(0x10, b"x"))
+    late = an_object(CLASSIC, classic(0x11, b"x"), time=2**64 - 1)
+    frames = read_blf(io.BytesIO(of_objects(late, good)), "x.blf")
+    assert (frames.key.tolist(), frames.damaged) == ([0x10], 1)
+
+
+def test_error_objects_that_python_can_passes_over_are_counted() -> None:
+    content = of_objects(an_object(2, bytes(8)), an_object(104, bytes(60)), an_object(ERROR, bytes(32)))
+    assert read_blf(io.BytesIO(content), "x.blf").error_frames == 3
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (of_objects(an_object(CLASSIC, b"1234")), "an object too short for its frame"),
+        (of_objects(an_object(CLASSIC, classic(1, b"x")), b"no object at all"), "something that is no object"),
+        (of_objects(an_object(CLASSIC, classic(1, b"x")))[:-2], "the file ends before"),
+        (of_objects(an_object(CLASSIC, classic(1, b"x"))[:-4]), "the last object is cut"),
+        (b"LOGG", "the header 'LOGG' of 144 bytes is expected"),
+    ],
+)
+def test_damage_is_refused_with_its_place(content: bytes, message: str) -> None:
+    with pytest.raises(LogError, match=rf"x\.blf: truncated or damaged BLF: at byte \d+ .*{message}.* before it"):
+        read_blf(io.BytesIO(content), "x.blf")
+
+
+def test_a_container_of_an_unknown_method_is_refused() -> None:
+    content = bytearray(of_objects(an_object(CLASSIC, classic(1, b"x"))))
+    content[144 + 16] = 9
+    with pytest.raises(LogError, match="compressed by a method 9 that is not known"):
+        read_blf(io.BytesIO(content), "x.blf")
