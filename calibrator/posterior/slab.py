@@ -64,12 +64,20 @@ class Slab:
 
     def nodes(self, dimensions: int) -> Array:
         """Equally weighted points of the prior, shape (Q, dimensions); one point without coordinates for 0."""
+        return self.at(self.unit_nodes(dimensions))
+
+    @staticmethod
+    def unit_nodes(dimensions: int) -> Array:
+        """Equally weighted points of the unit cube, shape (Q, dimensions)."""
         if dimensions == 0:
             return np.zeros((1, 0))
         if dimensions == 1:
-            unit = (np.arange(2 * POINTS_PER_SIGN)[:, None] + 0.5) / (2 * POINTS_PER_SIGN)
-        else:
-            unit = qmc.Sobol(dimensions, scramble=False).random(POINTS_IN_SPACE) + 0.5 / POINTS_IN_SPACE
+            return (np.arange(2 * POINTS_PER_SIGN)[:, None] + 0.5) / (2 * POINTS_PER_SIGN)
+        points = qmc.Sobol(dimensions, scramble=False).random(POINTS_IN_SPACE)
+        return np.asarray(points + 0.5 / POINTS_IN_SPACE)
+
+    def at(self, unit: Array) -> Array:
+        """Points of the slab at shares of the prior between 0 and 1."""
         centred = 2.0 * unit - 1.0
         magnitude = self.low + (self.high - self.low) * np.abs(centred)
         return np.asarray(np.where(centred < 0.0, -magnitude, magnitude))

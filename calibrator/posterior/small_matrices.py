@@ -1,0 +1,107 @@
+"""Gaussian algebra on matrices of a few rows, and the mass of a normal distribution under the slab; compiled."""
+
+import math
+
+import numpy as np
+
+from calibrator.compiled import compiled
+from calibrator.drive import Array
+from calibrator.posterior.slab import LEAST_DEVIATION, NEVER
+
+__all__ = ["LOG_2PI", "cholesky", "inverse", "log_mass", "quadratic", "solution", "variances"]
+
+LOG_2PI = float(np.log(2.0 * np.pi))
+TINY_PIVOT = 1e-300
+"""Instead of a pivot that rounding made negative."""
+_ROOT_HALF = math.sqrt(0.5)
+_LEAST_MASS = float(np.finfo(float).tiny)
+
+
+@compiled
+def cholesky(A: Array, active: Array, count: int, L: Array) -> float:
+    """Factor the rows and columns ``active[:count]`` of A into L L^T, in place; the logarithm of their determinant."""
+    log_determinant = 0.0
+    for i in range(count):
+        row = active[i]
+        for j in range(i + 1):
+            total = A[row, active[j]]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                total = max(total, TINY_PIVOT)
+                L[i, i] = math.sqrt(total)
+                log_determinant += math.log(total)
+            else:
+                L[i, j] = total / L[j, j]
+    return log_determinant
+
+
+@compiled
+def quadratic(L: Array, b: Array, count: int, z: Array) -> float:
+    """b^T (L L^T)^-1 b; z becomes L^-1 b."""
+    squared = 0.0
+    for i in range(count):
+        total = b[i]
+        for k in range(i):
+            total -= L[i, k] * z[k]
+        z[i] = total / L[i, i]
+        squared += z[i] * z[i]
+    return squared
+
+
+@compiled
+def solution(L: Array, z: Array, count: int, x: Array) -> None:
+    """x becomes L^-T z, the solution of L L^T x = b if z is L^-1 b."""
+    for i in range(count - 1, -1, -1):
+        total = z[i]
+        for k in range(i + 1, count):
+            total -= L[k, i] * x[k]
+        x[i] = total / L[i, i]
+
+
+@compiled
+def inverse(L: Array, count: int, work: Array, C: Array) -> None:
+    """C becomes (L L^T)^-1; ``work`` is of the same shape."""
+    for j in range(count):
+        for i in range(j, count):
+            total = 1.0 if i == j else 0.0
+            for k in range(j, i):
+                total -= L[i, k] * work[k, j]
+            work[i, j] = total / L[i, i]
+    for i in range(count):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, count):
+                total += work[k, i] * work[k, j]
+            C[i, j] = C[j, i] = total
+
+
+@compiled
+def variances(L: Array, count: int, work: Array, out: Array) -> None:
+    """``out`` becomes the diagonal of (L L^T)^-1."""
+    for j in range(count):
+        out[j] = 0.0
+        for i in range(j, count):
+            total = 1.0 if i == j else 0.0
+            for k in range(j, i):
+                total -= L[i, k] * work[k, j]
+            work[i, j] = total / L[i, i]
+            out[j] += work[i, j] * work[i, j]
+
+
+@compiled
+def _normal_mass(low: float, high: float) -> float:
+    """Of a standard normal variable between two values, the first of which is the smaller one."""
+    if low > 0.0:
+        low, high = -high, -low
+    return 0.5 * (math.erfc(-high * _ROOT_HALF) - math.erfc(-low * _ROOT_HALF))
+
+
+@compiled
+def log_mass(mean: float, sd: float, low: float, high: float) -> float:
+    """As :meth:`calibrator.posterior.slab.Slab.log_mass`, of one value."""
+    spread, magnitude = max(sd, LEAST_DEVIATION), abs(mean)
+    mass = _normal_mass((low - magnitude) / spread, (high - magnitude) / spread)
+    if spread * NEVER > low + magnitude:
+        mass += _normal_mass((low + magnitude) / spread, (high + magnitude) / spread)
+    return math.log(max(mass, _LEAST_MASS) * 0.5 / (high - low))
