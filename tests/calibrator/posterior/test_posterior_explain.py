@@ -1,5 +1,7 @@
 """Competing explanations, and what would decide between them."""
 
+from collections import defaultdict
+
 import numpy as np
 import pytest
 
@@ -62,4 +64,11 @@ def test_probabilities_are_those_of_the_states(vehicles: int) -> None:
     relative = np.tile([0.1, 0.15, 0.0], (vehicles, 1))
     states = enumerate_states(rows_of(faults_of(relative, np.zeros((vehicles, 3)))), prior_of(2), no_spread(2))
     for j in range(vehicles):
-        assert sum(each.probability for each in explanations(states, j)) <= 1.0 + 1e-12
+        expected: dict[tuple[float, ...], float] = defaultdict(float)
+        for s, weight in enumerate(states.weight[j]):
+            expected[tuple(np.sign([*states.relative[j, s], *states.constant[j, s]]))] += float(weight)
+        found = explanations(states, j)
+        assert found[0].probability == pytest.approx(max(expected.values()))
+        for each in found:
+            signs = np.sign([each.hardware_drift, *each.drift, each.hardware_offset[0], *each.offset])
+            assert each.probability == pytest.approx(expected[tuple(signs)])
