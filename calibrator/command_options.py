@@ -157,7 +157,7 @@ HarmLimitOption = Annotated[
 ]
 TrustedOption = Annotated[
     list[str] | None,
-    typer.Option("--trusted", help="Vehicle with bench-checked sensors: it carries the reference (posterior)."),
+    typer.Option("--trusted", help="Vehicle with bench-checked sensors; three carry the reference (posterior)."),
 ]
 SensorModelsOption = Annotated[
     bool, typer.Option("--sensor-models", help="Look for sensors that are not linear as well (posterior).")

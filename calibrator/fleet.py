@@ -104,6 +104,11 @@ def calibrate_fleet(
         unknown = names - fleet.vehicles.keys()
         if unknown:
             raise FleetError(f"{path}: no vehicle {', '.join(sorted(unknown))} to {what}")
+    both = settings.hold_out & settings.trusted
+    if both:
+        raise FleetError(
+            f"vehicle {', '.join(sorted(both))} is both held out and trusted: the reference would be learnt from it"
+        )
     equipment = probe_equipment(fleet, database, settings.branches)
     identity = RunIdentity(
         database=database,

@@ -11,7 +11,7 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
 
-__all__ = ["Readings", "no_readings", "trusted_readings", "with_readings"]
+__all__ = ["TRUSTED_OFFSET_SD", "Readings", "no_readings", "trusted_readings", "with_readings"]
 
 TRUSTED_DRIFT_SD = 0.002
 """Accuracy of a bench check of the gain, as of a laboratory shunt. [1]"""

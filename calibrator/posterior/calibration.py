@@ -76,7 +76,12 @@ def calibrate_posterior(
         mean_square_a2=np.stack([np.diag(summary.mean_product_a2) for summary in ordered]),
     )
     posterior = estimate_fleet(rows, moments, full_scale_a=full_scale_a, given=given, trusted=trusted, learning=learnt)
-    health = examine_reference(rows.take(learnt), [names[k] for k in order], full_scale_a=full_scale_a)
+    health = examine_reference(
+        rows.take(learnt),
+        [names[k] for k in order],
+        full_scale_a=full_scale_a,
+        trusted=None if trusted is None else trusted[learnt],
+    )
     return _in_own_order(posterior, health, order)
 
 

@@ -13,12 +13,13 @@ from calibrator.calibration_settings import CalibrationSettings, FleetOutcome, r
 from calibrator.drive import Mask
 from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
-from calibrator.evidence.readings import Readings, no_readings
+from calibrator.evidence.readings import TRUSTED_OFFSET_SD, Readings, no_readings
 from calibrator.evidence.vehicle_summary import VehicleSummary, read_vehicle_summary
 from calibrator.parameter_files import RunIdentity, by_branch, junction_rms_a
 from calibrator.posterior.calibration import calibrate_posterior
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.explain import deciding_evidence, explanations
+from calibrator.posterior.health import FEWEST_TRUSTED
 from calibrator.posterior.second_pass import finding_notices, tell_sensors, without_sensor_models
 from calibrator.posterior.verdict import Deployment, decide
 from calibrator.sensor_models.fleet import SensorFindings, all_linear, find_sensor_models
@@ -33,8 +34,8 @@ from ecu_node.parameters import (
 
 __all__ = ["calibrate_fleet_posterior"]
 
-FEWEST_TRUSTED = 3
-"""Trusted vehicles that carry the reference of a fleet that is in doubt."""
+CONTRADICTION = 4.0
+"""Standard deviations from which on a reading contradicts the trust in a sensor. [1]"""
 UNTOLD = 0.05
 """Probability of other explanations up to which they are not told. [1]"""
 
@@ -94,8 +95,7 @@ def calibrate_fleet_posterior(
         posterior = estimate(findings.summaries)
     health = posterior.health
     assert health is not None
-    doubtful = () if trusted.sum() >= FEWEST_TRUSTED else health.doubtful
-    decision = decide(posterior, identity.database.layout, harm_limit=settings.harm_limit, doubtful=doubtful)
+    decision = decide(posterior, identity.database.layout, harm_limit=settings.harm_limit, doubtful=health.doubtful)
     left_out |= _impossible(vehicles, posterior, equipment.branches)
     parameters = _parameter_files(vehicles, posterior, decision, findings, equipment=equipment, identity=identity)
     if not parameters:
@@ -103,7 +103,11 @@ def calibrate_fleet_posterior(
     return FleetOutcome(
         parameters=parameters,
         left_out=left_out,
-        notices=(*health.warnings, *finding_notices(names, findings, equipment.branches)),
+        notices=(
+            *health.warnings,
+            *_contradictions(vehicles, trusted, equipment.branches, identity.database.layout.full_scale_a),
+            *finding_notices(names, findings, equipment.branches),
+        ),
         details=_details(posterior, equipment.branches),
     )
 
@@ -114,6 +118,22 @@ def _trusted(names: Sequence[str], wanted: frozenset[str], fleet: FleetSource) -
     if missing:
         raise FleetError(f"{fleet.path}: no usable vehicle {', '.join(sorted(missing))} to trust")
     return np.array([name in wanted for name in names])
+
+
+def _contradictions(
+    vehicles: Sequence[VehicleSummary], trusted: Mask, branches: Sequence[str], full_scale_a: float
+) -> list[str]:
+    """Trusted sensors that showed an offset while the contactors were open."""
+    texts = []
+    for vehicle in (vehicle for vehicle, is_trusted in zip(vehicles, trusted, strict=True) if is_trusted):
+        shown, sd_a = vehicle.zero_current.offset_a, vehicle.zero_current.sd_a
+        surprising = np.abs(shown) > CONTRADICTION * np.hypot(sd_a, TRUSTED_OFFSET_SD * full_scale_a)
+        texts += [
+            f"trusted vehicle {vehicle.vehicle}: its {branches[k]} sensor showed {shown[k]:+.1f} A with open "
+            f"contactors; it was taken for faultless: check it again, or do not trust it"
+            for k in np.flatnonzero(surprising).tolist()
+        ]
+    return texts
 
 
 def _parameter_files(
@@ -247,7 +267,26 @@ def _explanations(
         )
         for each in found
     ]
-    return told, deciding_evidence(found, names, full_scale_a) or _most_doubtful(posterior, j, branches, full_scale_a)
+    decisive = deciding_evidence(found, names, full_scale_a) or _held_back(posterior, j, branches, identity)
+    return told, decisive or _most_doubtful(posterior, j, branches, full_scale_a)
+
+
+def _held_back(posterior: FleetPosterior, j: int, branches: Sequence[str], identity: RunIdentity) -> str:
+    """Why what is known of a vehicle is not deployed, if it is not the vehicle's evidence; empty if it is."""
+    layout, faults, health = identity.database.layout, posterior.faults, posterior.health
+    beyond = (np.abs(faults.drift[j]) > layout.limits.drift) | (np.abs(faults.offset_a[j]) > layout.offset_limit_a)
+    if beyond.any():
+        k = int(np.argmax(beyond))
+        return (
+            f"the {branches[k]} sensor is off by {faults.drift[j, k]:+.1%} and {faults.offset_a[j, k]:+.1f} A, beyond "
+            f"the limits of {layout.path.name}: replace the sensor"
+        )
+    if health is not None and health.doubtful:
+        return (
+            f"bench-checked vehicles would decide: the fleet's reference is in doubt for branch "
+            f"{', '.join(branches[k] for k in health.doubtful)}; name at least {FEWEST_TRUSTED} with --trusted"
+        )
+    return ""
 
 
 def _most_doubtful(posterior: FleetPosterior, j: int, branches: Sequence[str], full_scale_a: float) -> str:

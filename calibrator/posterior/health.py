@@ -12,12 +12,16 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.drive import Array
+from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
 from calibrator.posterior.cluster import Cluster, densest_clusters
 from calibrator.posterior.model_spread import MOST_UNMEASURED, unmeasured_load
+from calibrator.posterior.slab import WIDEST
 
-__all__ = ["ReferenceHealth", "examine_reference"]
+__all__ = ["FEWEST_TRUSTED", "ReferenceHealth", "examine_reference"]
+
+FEWEST_TRUSTED = 3
+"""Trusted vehicles that tell a branch and carry its reference, so that it is in no doubt."""
 
 LEAST_AGREEING = 5
 """Vehicles that must agree for their centre to be trusted."""
@@ -31,6 +35,9 @@ ALIKE = 0.25
 """Relative difference up to which distances of second clusters count as one. [1]"""
 SECOND_SHARE, SECOND_GAIN, SECOND_DISTANCE = 0.15, 5.0, 4.0
 """Share, gain, and distance over its spread, of a second cluster that is taken for another variant. [1]"""
+
+FAULTS_RANGE = 2.0 * WIDEST.high
+"""From the lowest to the highest drift or offset that a sensor can have. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +77,9 @@ class ReferenceHealth:
         )
 
 
-def examine_reference(rows: FleetRows, branches: Sequence[str], *, full_scale_a: float) -> ReferenceHealth:
+def examine_reference(
+    rows: FleetRows, branches: Sequence[str], *, full_scale_a: float, trusted: Mask | None = None
+) -> ReferenceHealth:
     """Look for what would fool the reference.
 
     Parameters
@@ -81,6 +90,8 @@ def examine_reference(rows: FleetRows, branches: Sequence[str], *, full_scale_a:
         Names of the K branches in the order of the rows.
     full_scale_a : float
         Full scale of the junction. [A]
+    trusted : ndarray of bool of shape (N,) or None
+        Vehicles that carry the reference of the branches that :data:`FEWEST_TRUSTED` of them tell.
 
     Returns
     -------
@@ -88,21 +99,24 @@ def examine_reference(rows: FleetRows, branches: Sequence[str], *, full_scale_a:
         With warnings in words.
     """
     K = rows.branches
+    carried = _carried(rows, trusted)
+    advice = _advice(carried, K)
     slopes = [_cluster(rows, k) for k in range(K)]
     share = [found[0].share if found else 0.0 for found in slopes]
     distance = [
         float(np.mean(rows.relative[:, k])) - (found[0].centre if found else 0.0) for k, found in enumerate(slopes)
     ]
-    warnings, doubtful = _common_gains(rows, branches)
-    warnings += _no_cluster(slopes, branches, doubtful, len(rows)) + _second_clusters(slopes, branches, len(rows))
+    warnings, doubtful = _common_gains(rows, branches, advice)
+    warnings += _no_cluster(slopes, branches, doubtful, len(rows), advice)
+    warnings += _second_clusters(slopes, branches, len(rows))
     least = ceil(LEAST_AGREEING / max(min(share), 1.0 / 1000.0))
     if len(rows) < least:
         doubtful = set(range(K))
         warnings.append(
             f"{len(rows)} vehicles are few for a fleet in which {min(share):.0%} agree: at least {least} are needed "
-            f"to trust its reference; until then no branch is corrected"
+            f"to trust its reference; {advice}"
         )
-    warnings += _common_offset(rows, doubtful, full_scale_a)
+    warnings += _common_offset(rows, doubtful, full_scale_a, advice)
     load = unmeasured_load(rows.constant[:, K], _sd(rows, 4 * K - 1))
     unmeasured_a = load.centre * full_scale_a
     if abs(load.centre) > max(LEAST_COMMON_OFFSET, SURE * _uncertainty(load, _sd(rows, 4 * K - 1))):
@@ -115,24 +129,37 @@ def examine_reference(rows: FleetRows, branches: Sequence[str], *, full_scale_a:
         mean_distance=tuple(distance),
         least_vehicles=least,
         unmeasured_a=unmeasured_a,
-        doubtful=tuple(sorted(doubtful)),
+        doubtful=tuple(sorted(doubtful - carried)),
         warnings=tuple(warnings),
     )
 
 
-def _common_offset(rows: FleetRows, doubtful: set[int], full_scale_a: float) -> list[str]:
+def _carried(rows: FleetRows, trusted: Mask | None) -> set[int]:
+    """Branches whose slope is told by enough trusted vehicles."""
+    if trusted is None:
+        return set()
+    return {k for k in range(rows.branches) if np.count_nonzero(_told(rows, k)[trusted]) >= FEWEST_TRUSTED}
+
+
+def _advice(carried: set[int], branches: int) -> str:
+    if len(carried) == branches:
+        return "the trusted vehicles carry the reference instead"
+    more = "more " if carried else ""
+    return f"name {more}bench-checked vehicles with --trusted, at least {FEWEST_TRUSTED} that use each branch"
+
+
+def _common_offset(rows: FleetRows, doubtful: set[int], full_scale_a: float, advice: str) -> list[str]:
     """A constant of the junction law that most vehicles share and no load without a sensor makes."""
     K = rows.branches
     sd = _sd(rows, 4 * K - 1)
-    found = densest_clusters(rows.constant[:, K], sd)[0]
+    found = densest_clusters(rows.constant[:, K], sd, widest=FAULTS_RANGE)[0]
     doubt = max(LEAST_COMMON_OFFSET, SURE * _uncertainty(found, sd))
     if -doubt <= found.centre <= MOST_UNMEASURED + doubt or not _agree(found):
         return []
     doubtful.update(range(K))
     return [
         f"the currents of most vehicles sum to {found.centre * full_scale_a:+.1f} A, which no load without a sensor "
-        f"explains: an offset that most vehicles share (a batch of sensors), in any branch; until it is found none is "
-        f"corrected"
+        f"explains: an offset that most vehicles share (a batch of sensors), in any branch; {advice}"
     ]
 
 
@@ -147,7 +174,9 @@ def _told(rows: FleetRows, row: int) -> Array:
 def _cluster(rows: FleetRows, row: int) -> list[Cluster]:
     """The two densest clusters of a relative row among the vehicles that tell it."""
     told = _told(rows, row)
-    return densest_clusters(rows.relative[told, row], _sd(rows, row)[told], most=2) if told.any() else []
+    if not told.any():
+        return []
+    return densest_clusters(rows.relative[told, row], _sd(rows, row)[told], most=2, widest=FAULTS_RANGE)
 
 
 def _uncertainty(cluster: Cluster, sd: Array) -> float:
@@ -156,7 +185,7 @@ def _uncertainty(cluster: Cluster, sd: Array) -> float:
     return float(np.sqrt((cluster.spread**2 + np.median(sd) ** 2) / members))
 
 
-def _common_gains(rows: FleetRows, branches: Sequence[str]) -> tuple[list[str], set[int]]:
+def _common_gains(rows: FleetRows, branches: Sequence[str], advice: str) -> tuple[list[str], set[int]]:
     """Gain ratios of the junction law whose cluster is not at 1: a gain fault that most vehicles share."""
     K = rows.branches
     off: dict[int, float] = {}
@@ -175,13 +204,13 @@ def _common_gains(rows: FleetRows, branches: Sequence[str]) -> tuple[list[str], 
     size = max(off.values(), key=abs)
     text = (
         f"the reference breaks the junction law by {size:+.1%}: a gain fault that most vehicles share (a batch of "
-        f"sensors), in branch {names}; name bench-checked vehicles with --trusted"
+        f"sensors), in branch {names}; {advice}"
     )
     return [text], suspects
 
 
 def _no_cluster(
-    slopes: Sequence[Sequence[Cluster]], branches: Sequence[str], doubtful: set[int], vehicles: int
+    slopes: Sequence[Sequence[Cluster]], branches: Sequence[str], doubtful: set[int], vehicles: int, advice: str
 ) -> list[str]:
     """Branches in which no two vehicles agree."""
     texts = []
@@ -189,8 +218,7 @@ def _no_cluster(
         if vehicles > LEAST_AGREEING and not (found and _agree(found[0])):
             doubtful.add(k)
             texts.append(
-                f"no cluster of vehicles agrees in branch {branches[k]}: every sensor of it may be faulty; name "
-                f"bench-checked vehicles with --trusted"
+                f"no cluster of vehicles agrees in branch {branches[k]}: every sensor of it may be faulty; {advice}"
             )
     return texts
 

@@ -77,11 +77,12 @@ def test_every_file_fits_its_vehicle_and_applies_only_what_hardly_harms(paramete
 
 
 def test_a_vehicle_of_which_nothing_can_be_told_names_its_explanations(parameters: list[VehicleParameters]) -> None:
-    for item in parameters:
-        if item.verdict == "cannot tell":
-            assert item.explanations
-            assert item.deciding_evidence
-            assert not any(branch.apply for branch in item.branches.values())
+    untold = [item for item in parameters if item.verdict == "cannot tell"]
+    assert untold
+    for item in untold:
+        assert item.explanations
+        assert item.deciding_evidence
+        assert not any(branch.apply for branch in item.branches.values())
 
 
 def test_unmeasured_load_is_estimated_from_the_fleet_and_named(fleet: Path, result: Path) -> None:
@@ -103,17 +104,21 @@ def test_a_stricter_harm_limit_corrects_no_more_branches(fleet: Path, result: Pa
 
 def test_trusted_vehicles_are_taken_for_faultless(fleet: Path, tmp_path: Path) -> None:
     truth = read_truth(fleet / "truth.json").vehicles
-    sound = [
-        name
-        for name, vehicle in truth.items()
-        if not any([*vehicle.drift.values(), *vehicle.offset_a.values(), vehicle.hardware_drift])
-        and not any(vehicle.hardware_offset_a.values())
-    ]
+    sound = [name for name, vehicle in truth.items() if not any([*vehicle.drift.values(), *vehicle.offset_a.values()])]
+    assert len(sound) >= 3
     trusted = [part for name in sound for part in ("--trusted", name)]
     run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "result", *trusted)
     assert run.returncode == 0, run.stderr
     rows = [row for row in read_results(tmp_path / "result") if row["vehicle"] in sound]
+    assert len(rows) == 2 * len(sound)
     assert all(row["drift"] == 0.0 and row["offset_a"] == 0.0 for row in rows)
+
+
+def test_a_vehicle_cannot_be_trusted_and_held_out(fleet: Path, tmp_path: Path) -> None:
+    both = ("--trusted", "V001", "--hold-out", "V001")
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "result", *both)
+    assert run.returncode == 1
+    assert "vehicle V001 is both held out and trusted" in run.stderr
 
 
 def test_a_vehicle_that_is_not_there_cannot_be_trusted(fleet: Path, tmp_path: Path) -> None:
