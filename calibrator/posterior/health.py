@@ -16,7 +16,7 @@ from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
 from calibrator.posterior.cluster import Cluster, densest_clusters
 from calibrator.posterior.model_spread import MOST_UNMEASURED, unmeasured_load
-from calibrator.posterior.slab import WIDEST
+from calibrator.posterior.slab import FAULTS_RANGE
 
 __all__ = ["FEWEST_TRUSTED", "ReferenceHealth", "examine_reference"]
 
@@ -35,9 +35,6 @@ ALIKE = 0.25
 """Relative difference up to which distances of second clusters count as one. [1]"""
 SECOND_SHARE, SECOND_GAIN, SECOND_DISTANCE = 0.15, 5.0, 4.0
 """Share, gain, and distance over its spread, of a second cluster that is taken for another variant. [1]"""
-
-FAULTS_RANGE = 2.0 * WIDEST.high
-"""From the lowest to the highest drift or offset that a sensor can have. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, constant_design, relative_design
 from calibrator.posterior.cluster import Cluster, densest_clusters
 from calibrator.posterior.fault_prior import OUTLIER_VARIANCE, FaultPrior, ModelSpread
+from calibrator.posterior.slab import FAULTS_RANGE
 from calibrator.posterior.states import States
 
 __all__ = [
@@ -119,7 +120,7 @@ def unmeasured_load(constant: Array, sd: Array) -> Cluster:
         At zero if too few vehicles agree for such a load to be taken for granted.
     """
     possible = constant > -LAWFUL_CONSTANT - LAWFUL * sd
-    for found in densest_clusters(constant[possible], sd[possible], farthest=MOST_UNMEASURED):
+    for found in densest_clusters(constant[possible], sd[possible], farthest=MOST_UNMEASURED, widest=FAULTS_RANGE):
         share = found.share * float(possible.mean())
         if share >= LEAST_AGREEING_LOAD and found.centre > -LAWFUL_CONSTANT:
             return replace(found, share=share)

@@ -11,7 +11,7 @@ from scipy.stats import qmc
 
 from calibrator.drive import Array
 
-__all__ = ["WIDEST", "Slab"]
+__all__ = ["FAULTS_RANGE", "WIDEST", "Slab"]
 
 POINTS_PER_SIGN = 8
 """Nodes of the midpoint rule along one direction that the evidence leaves open. [1]"""
@@ -77,3 +77,5 @@ class Slab:
 
 WIDEST = Slab(0.002, 0.45)
 """Any fault that a sensor of a running vehicle can have. [1]"""
+FAULTS_RANGE = 2.0 * WIDEST.high
+"""From the lowest to the highest drift or offset that a sensor can have. [1]"""

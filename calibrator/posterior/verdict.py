@@ -68,7 +68,8 @@ def decide(posterior: FleetPosterior, layout: Layout, *, harm_limit: float, doub
         _verdict(corrected[j], faulty[j], float(posterior.confidence[j]), certain=not doubtful)
         for j in range(len(posterior))
     )
-    return Deployment(corrected, verdicts, np.asarray(posterior.hardware_fault > SUSPECTED))
+    hardware = np.asarray(posterior.hardware_fault > SUSPECTED) & (not doubtful)
+    return Deployment(corrected, verdicts, hardware)
 
 
 def _verdict(corrected: Array, faulty: Array, confidence: float, *, certain: bool) -> Verdict:

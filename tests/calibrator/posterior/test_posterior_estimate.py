@@ -144,6 +144,14 @@ def test_a_load_is_found_beside_a_larger_batch_of_offsets() -> None:
     assert load.share == pytest.approx(0.35, abs=0.05)
 
 
+def test_a_load_that_is_the_same_in_every_vehicle_is_found() -> None:
+    rng = np.random.default_rng(1)
+    sd = np.full(16, 3e-5)
+    load = unmeasured_load(0.0075 + 1.5 * sd * rng.normal(size=16), sd)
+    assert load.centre == pytest.approx(0.0075, abs=1e-4)
+    assert load.share > 0.9
+
+
 def test_a_large_fleet_with_few_trusted_vehicles_keeps_the_doubt_about_its_centre(truth: Faults) -> None:
     rows = rows_of(truth, seed=1)
     many = rows.take(np.tile(np.arange(VEHICLES), 3))

@@ -47,6 +47,14 @@ def test_a_doubtful_branch_is_corrected_nowhere_and_nobody_is_cleared(
     assert "no sensor fault" not in decision.verdicts
 
 
+def test_a_hardware_fault_is_suspected_only_against_a_reference_that_is_in_no_doubt(
+    posterior: FleetPosterior, database: VehicleDatabase
+) -> None:
+    sure = replace(posterior, hardware_fault=np.full(len(posterior), 0.9))
+    assert decide(sure, database.layout, harm_limit=LIMIT, doubtful=()).hardware.all()
+    assert not decide(sure, database.layout, harm_limit=LIMIT, doubtful=(1,)).hardware.any()
+
+
 def test_nothing_is_corrected_where_no_harm_is_allowed(posterior: FleetPosterior, database: VehicleDatabase) -> None:
     assert not decide(posterior, database.layout, harm_limit=0.0, doubtful=()).corrected.any()
 
