@@ -65,6 +65,22 @@ class CalibrationSettings:
     unity: str | None = None
     seed: int = 0
 
+    def record(self) -> dict[str, Any]:
+        """What the method in use heeds, for the record of a run."""
+        common = {"branches": self.branches, "hold_out": sorted(self.hold_out)}
+        if self.method is Method.POSTERIOR:
+            trusted = sorted(self.trusted)
+            return {**common, "harm_limit": self.harm_limit, "trusted": trusted, "sensor_models": self.sensor_models}
+        return {
+            **common,
+            "classifier": self.classifier.value,
+            "sparsity": self.sparsity,
+            "magnitude": self.magnitude,
+            "symmetric": self.symmetric,
+            "unity": self.unity,
+            "seed": self.seed,
+        }
+
 
 @dataclass(frozen=True, kw_only=True)
 class FleetOutcome:

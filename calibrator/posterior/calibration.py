@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -15,8 +16,12 @@ from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.health import ReferenceHealth, examine_reference
+from calibrator.posterior.trust import broken_trust
 
 __all__ = ["calibrate_posterior"]
+
+SUSPECTED = 0.5
+"""Probability of a hardware fault from which on a trusted vehicle does not carry the reference. [1]"""
 
 
 def calibrate_posterior(
@@ -44,7 +49,8 @@ def calibrate_posterior(
     readings : Readings or None
         Direct readings of single sensors.
     trusted : ndarray of bool of shape (N,) or None
-        Vehicles whose sensors were found faultless on a bench; they carry the reference.
+        Vehicles whose sensors were found faultless on a bench; they carry the reference, except those that break the
+        junction law or have a hardware fault: they stand in ``health.distrusted``.
     learning : ndarray of bool of shape (N,) or None
         Vehicles from which the fleet's reference and hyper-parameters are learnt; None: all.
 
@@ -68,20 +74,26 @@ def calibrate_posterior(
     model = fit_fleet_model([summary for summary, use in zip(ordered, learnt, strict=True) if use])
     rows = collect_rows(ordered, model, full_scale_a=full_scale_a, learning=learnt)
     known = no_readings(N, K) if readings is None else readings
-    if trusted is not None:
-        known = known.merged(trusted_readings(trusted, K, full_scale_a))
+    carriers = np.zeros(N, bool) if trusted is None else trusted.copy()
+    distrusted = broken_trust(rows, carriers, [names[k] for k in order], full_scale_a=full_scale_a)
+    carriers[list(distrusted)] = False
+    known = known.merged(trusted_readings(carriers, K, full_scale_a))
     rows = with_readings(rows, known.take_branches(order), full_scale_a=full_scale_a)
     moments = Moments(
         mean_a=np.stack([summary.mean_a for summary in ordered]),
         mean_square_a2=np.stack([np.diag(summary.mean_product_a2) for summary in ordered]),
     )
-    posterior = estimate_fleet(rows, moments, full_scale_a=full_scale_a, given=given, trusted=trusted, learning=learnt)
+    estimate = partial(estimate_fleet, rows, moments, full_scale_a=full_scale_a, given=given, learning=learnt)
+    posterior = estimate(trusted=carriers)
+    differing = carriers & (posterior.hardware_fault > SUSPECTED)
+    if differing.any():
+        distrusted |= dict.fromkeys(np.flatnonzero(differing).tolist(), "the vehicle itself differs from the others")
+        carriers &= ~differing
+        posterior = estimate(trusted=carriers)
     health = examine_reference(
-        rows.take(learnt),
-        [names[k] for k in order],
-        full_scale_a=full_scale_a,
-        trusted=None if trusted is None else trusted[learnt],
+        rows.take(learnt), [names[k] for k in order], full_scale_a=full_scale_a, trusted=carriers[learnt]
     )
+    health = replace(health, distrusted=distrusted)
     return _in_own_order(posterior, health, order)
 
 

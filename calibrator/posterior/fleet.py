@@ -6,6 +6,7 @@ computed anew from the linear parts of all sensors.
 
 from collections.abc import Sequence
 from functools import partial
+from typing import cast
 
 import numpy as np
 
@@ -16,10 +17,10 @@ from calibrator.errors import FleetError
 from calibrator.evidence.readings import TRUSTED_OFFSET_SD, Readings, no_readings
 from calibrator.evidence.vehicle_summary import VehicleSummary, read_vehicle_summary
 from calibrator.parameter_files import RunIdentity, by_branch, junction_rms_a
+from calibrator.posterior.advice import advise
 from calibrator.posterior.calibration import calibrate_posterior
 from calibrator.posterior.estimate import FleetPosterior
-from calibrator.posterior.explain import deciding_evidence, explanations
-from calibrator.posterior.health import FEWEST_TRUSTED
+from calibrator.posterior.explain import explanations
 from calibrator.posterior.second_pass import finding_notices, tell_sensors, without_sensor_models
 from calibrator.posterior.verdict import Deployment, decide
 from calibrator.sensor_models.fleet import SensorFindings, all_linear, find_sensor_models
@@ -28,6 +29,7 @@ from ecu_node.parameters import (
     BranchParameters,
     Explanation,
     HardwareFault,
+    HeldBack,
     JunctionResidual,
     VehicleParameters,
 )
@@ -38,6 +40,8 @@ CONTRADICTION = 4.0
 """Standard deviations from which on a reading contradicts the trust in a sensor. [1]"""
 UNTOLD = 0.05
 """Probability of other explanations up to which they are not told. [1]"""
+MOST_TOLD, LEAST_TOLD = 3, 0.02
+"""Explanations that are told, and the least probability of one after the first. [1]"""
 
 
 def calibrate_fleet_posterior(
@@ -105,6 +109,10 @@ def calibrate_fleet_posterior(
         left_out=left_out,
         notices=(
             *health.warnings,
+            *(
+                f"trusted vehicle {names[j]} does not carry the reference: {why}; check it again, or do not trust it"
+                for j, why in health.distrusted.items()
+            ),
             *_contradictions(vehicles, trusted, equipment.branches, identity.database.layout.full_scale_a),
             *finding_notices(names, findings, equipment.branches),
         ),
@@ -199,18 +207,18 @@ def _parameters(
     faults, corrected, zeros = posterior.faults.take(j), deployment.corrected[j], np.zeros(len(branches))
     moments = (vehicle.summary.mean_a, vehicle.summary.mean_product_a2)
     deployed = {"drift": np.where(corrected, faults.drift, 0.0), "offset_a": np.where(corrected, faults.offset_a, 0.0)}
-    undecided = deployment.verdicts[j] == "cannot tell" or posterior.confidence[j] < 1.0 - UNTOLD
-    told, decisive = _explanations(posterior, j, branches, identity) if undecided else ([], "")
+    open_question = deployment.verdicts[j] == "cannot tell" or posterior.confidence[j] < 1.0 - UNTOLD
+    told: list[Explanation] = []
+    decisive = ""
+    if open_question or (deployment.held_back[j] != "").any():
+        told, decisive = _explanations(posterior, deployment, j, branches, identity)
     return VehicleParameters(
         vehicle=vehicle.vehicle,
         layout=identity.layout,
         dbc=identity.dbc,
         verdict=deployment.verdicts[j],
         confidence=_share(posterior.confidence[j]),
-        branches={
-            name: _branch(vehicle, posterior, (j, k), name=name, apply=bool(corrected[k]))
-            for k, name in enumerate(branches)
-        },
+        branches={name: _branch(vehicle, posterior, deployment, (j, k), name=name) for k, name in enumerate(branches)},
         hardware_fault=HardwareFault(
             suspected=bool(deployment.hardware[j]),
             drift=float(faults.hardware_drift),
@@ -230,7 +238,7 @@ def _parameters(
 
 
 def _branch(
-    vehicle: VehicleSummary, posterior: FleetPosterior, place: tuple[int, int], *, name: str, apply: bool
+    vehicle: VehicleSummary, posterior: FleetPosterior, deployment: Deployment, place: tuple[int, int], *, name: str
 ) -> BranchParameters:
     k = vehicle.delays.branches.index(name)
     known = bool(vehicle.delays.known[k])
@@ -239,7 +247,8 @@ def _branch(
         offset_a=float(posterior.faults.offset_a[place]),
         drift_sd=float(posterior.drift_sd[place]),
         offset_sd_a=float(posterior.offset_sd_a[place]),
-        apply=apply,
+        apply=bool(deployment.corrected[place]),
+        held_back=cast("HeldBack", str(deployment.held_back[place])) if deployment.held_back[place] else None,
         delay_s=float(vehicle.delays.delay_s[k]) if known else None,
         delay_sd_s=float(vehicle.delays.sd_s[k]) if known else None,
         fault_probability=_share(posterior.sensor_fault[place]),
@@ -249,53 +258,26 @@ def _branch(
 
 
 def _explanations(
-    posterior: FleetPosterior, j: int, branches: Sequence[str], identity: RunIdentity
+    posterior: FleetPosterior, deployment: Deployment, j: int, branches: Sequence[str], identity: RunIdentity
 ) -> tuple[list[Explanation], str]:
     """The competing explanations of one vehicle, and what would decide between them."""
-    full_scale_a = identity.database.layout.full_scale_a
+    layout = identity.database.layout
     names = [branches[k] for k in posterior.order]
     found = explanations(posterior.states, j)
     told = [
         Explanation(
             probability=_share(each.probability),
             drift={name: float(d) for name, d in zip(names, each.drift, strict=True) if d},
-            offset_a={name: float(o * full_scale_a) for name, o in zip(names, each.offset, strict=True) if o},
+            offset_a={name: float(o * layout.full_scale_a) for name, o in zip(names, each.offset, strict=True) if o},
             hardware_drift=each.hardware_drift,
             hardware_offset_a={
-                name: float(o * full_scale_a) for name, o in zip(names, each.hardware_offset, strict=True) if o
+                name: float(o * layout.full_scale_a) for name, o in zip(names, each.hardware_offset, strict=True) if o
             },
         )
-        for each in found
+        for n, each in enumerate(found[:MOST_TOLD])
+        if not n or each.probability >= LEAST_TOLD
     ]
-    decisive = deciding_evidence(found, names, full_scale_a) or _held_back(posterior, j, branches, identity)
-    return told, decisive or _most_doubtful(posterior, j, branches, full_scale_a)
-
-
-def _held_back(posterior: FleetPosterior, j: int, branches: Sequence[str], identity: RunIdentity) -> str:
-    """Why what is known of a vehicle is not deployed, if it is not the vehicle's evidence; empty if it is."""
-    layout, faults, health = identity.database.layout, posterior.faults, posterior.health
-    beyond = (np.abs(faults.drift[j]) > layout.limits.drift) | (np.abs(faults.offset_a[j]) > layout.offset_limit_a)
-    if beyond.any():
-        k = int(np.argmax(beyond))
-        return (
-            f"the {branches[k]} sensor is off by {faults.drift[j, k]:+.1%} and {faults.offset_a[j, k]:+.1f} A, beyond "
-            f"the limits of {layout.path.name}: replace the sensor"
-        )
-    if health is not None and health.doubtful:
-        return (
-            f"bench-checked vehicles would decide: the fleet's reference is in doubt for branch "
-            f"{', '.join(branches[k] for k in health.doubtful)}; name at least {FEWEST_TRUSTED} with --trusted"
-        )
-    return ""
-
-
-def _most_doubtful(posterior: FleetPosterior, j: int, branches: Sequence[str], full_scale_a: float) -> str:
-    """Which sensor is known least where only one explanation is left."""
-    k = int(np.argmax(np.hypot(posterior.drift_sd[j], posterior.offset_sd_a[j] / full_scale_a)))
-    return (
-        f"more drives would decide: the {branches[k]} sensor's drift is known to +-{posterior.drift_sd[j, k]:.1%} and "
-        f"its offset to +-{posterior.offset_sd_a[j, k]:.1f} A only; record drives in which that current varies"
-    )
+    return told, advise(posterior, deployment, j, found, branches=branches, layout=layout)
 
 
 def _details(posterior: FleetPosterior, branches: Sequence[str]) -> dict[str, object]:

@@ -5,8 +5,8 @@ moves the clusters of the junction law, which needs no reference; two variants o
 whose sensors are all faulty forms none.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from math import ceil
 
 import numpy as np
@@ -55,6 +55,8 @@ class ReferenceHealth:
         Branches whose scale or zero the fleet may have wrong as a whole.
     warnings : tuple of str
         What would fool the reference, one text each.
+    distrusted : mapping of int to str
+        Vehicles that were called trusted and do not carry the reference, by position, and why.
     """
 
     agreeing_share: tuple[float, ...]
@@ -63,6 +65,7 @@ class ReferenceHealth:
     unmeasured_a: float
     doubtful: tuple[int, ...]
     warnings: tuple[str, ...]
+    distrusted: Mapping[int, str] = field(default_factory=dict)
 
     def in_order(self, place: NDArray[np.int64]) -> "ReferenceHealth":
         """Return the same for branches in another order: branch k is at position ``place[k]`` here."""

@@ -97,6 +97,20 @@ def test_a_stricter_harm_limit_corrects_no_more_branches(result: Path, strict: P
     assert any(row["applied"] for row in read_results(result))
 
 
+def test_what_was_chosen_and_why_faults_are_held_back_is_told_of_each_branch(result: Path, strict: Path) -> None:
+    chosen = read_run(strict).settings
+    assert (chosen["harm_limit"], chosen["trusted"], chosen["hold_out"]) == (0.0, [], [])
+    rows = read_results(strict)
+    found = [row for row in rows if row["drift"] or row["offset_a"]]
+    assert {row["held_back"] for row in found} == {"harm limit"}
+    assert all(row["held_back"] is None for row in rows if row not in found)
+    assert not any(row["held_back"] for row in read_results(result) if row["applied"])
+    for row in rows:
+        assert 0.0 <= row["fault_probability"] <= 1.0
+        assert row["drift_sd"] >= 0.0
+        assert row["offset_sd_a"] >= 0.0
+
+
 def test_a_vehicle_of_which_nothing_can_be_told_names_its_explanations(strict: Path) -> None:
     parameters = [read_parameters(path) for path in sorted((strict / "params").iterdir())]
     untold = [item for item in parameters if item.verdict == "cannot tell"]
