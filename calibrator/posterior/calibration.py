@@ -11,12 +11,14 @@ from calibrator.errors import FleetError
 from calibrator.evidence.collect import collect_rows
 from calibrator.evidence.fleet_model import fit_fleet_model
 from calibrator.evidence.readings import Readings, no_readings, trusted_readings, with_readings
+from calibrator.evidence.rows import with_load_spread
 from calibrator.evidence.summary import DriveSummary
 from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.health import ReferenceHealth, examine_reference
 from calibrator.posterior.trust import broken_trust
+from ecu_node.layout import UnmeasuredLoad
 
 __all__ = ["calibrate_posterior"]
 
@@ -33,6 +35,7 @@ def calibrate_posterior(
     readings: Readings | None = None,
     trusted: Mask | None = None,
     learning: Mask | None = None,
+    load: UnmeasuredLoad | None = None,
 ) -> FleetPosterior:
     """Estimate the faults of a fleet from its drives.
 
@@ -53,6 +56,8 @@ def calibrate_posterior(
         junction law or have a hardware fault: they stand in ``health.distrusted``.
     learning : ndarray of bool of shape (N,) or None
         Vehicles from which the fleet's reference and hyper-parameters are learnt; None: all.
+    load : UnmeasuredLoad or None
+        Load that no branch measures, if it is known; None: estimated from the fleet.
 
     Returns
     -------
@@ -78,12 +83,22 @@ def calibrate_posterior(
     distrusted = broken_trust(rows, carriers, [names[k] for k in order], full_scale_a=full_scale_a)
     carriers[list(distrusted)] = False
     known = known.merged(trusted_readings(carriers, K, full_scale_a))
+    if load is not None:
+        rows = with_load_spread(rows, load.sd_a / full_scale_a)
     rows = with_readings(rows, known.take_branches(order), full_scale_a=full_scale_a)
     moments = Moments(
         mean_a=np.stack([summary.mean_a for summary in ordered]),
         mean_square_a2=np.stack([np.diag(summary.mean_product_a2) for summary in ordered]),
     )
-    estimate = partial(estimate_fleet, rows, moments, full_scale_a=full_scale_a, given=given, learning=learnt)
+    estimate = partial(
+        estimate_fleet,
+        rows,
+        moments,
+        full_scale_a=full_scale_a,
+        given=given,
+        learning=learnt,
+        load=None if load is None else load.mean_a / full_scale_a,
+    )
     posterior = estimate(trusted=carriers)
     differing = carriers & (posterior.hardware_fault > SUSPECTED)
     if differing.any():
@@ -91,7 +106,7 @@ def calibrate_posterior(
         carriers &= ~differing
         posterior = estimate(trusted=carriers)
     health = examine_reference(
-        rows.take(learnt), [names[k] for k in order], full_scale_a=full_scale_a, trusted=carriers[learnt]
+        rows.take(learnt), [names[k] for k in order], full_scale_a=full_scale_a, trusted=carriers[learnt], load=load
     )
     health = replace(health, distrusted=distrusted)
     return _in_own_order(posterior, health, order)

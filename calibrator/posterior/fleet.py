@@ -15,6 +15,7 @@ from calibrator.drive import Mask
 from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
 from calibrator.evidence.readings import TRUSTED_OFFSET_SD, Readings, no_readings
+from calibrator.evidence.readings_file import BenchReadings, read_bench_readings, readings_of
 from calibrator.evidence.vehicle_summary import VehicleSummary, read_vehicle_summary
 from calibrator.parameter_files import RunIdentity, by_branch, junction_rms_a
 from calibrator.posterior.advice import advise
@@ -70,6 +71,9 @@ def calibrate_fleet_posterior(
     FleetError
         If too few vehicles can be used, or a trusted one is not there.
     """
+    bench = None
+    if settings.readings is not None:
+        bench = read_bench_readings(settings.readings, fleet.vehicles.keys(), equipment.branches)
     vehicles, left_out = read_vehicles(read_vehicle_summary, fleet, equipment, identity.database, workers=workers)
     names = [vehicle.vehicle for vehicle in vehicles]
     learning = require_learning(names, settings, left_out)
@@ -78,9 +82,10 @@ def calibrate_fleet_posterior(
         calibrate_posterior,
         full_scale_a=identity.database.layout.full_scale_a,
         branches=equipment.branches,
-        readings=_readings(vehicles),
+        readings=_readings(vehicles, bench or {}, equipment.branches),
         trusted=trusted if trusted.any() else None,
         learning=np.array(learning),
+        load=identity.database.layout.unmeasured_load,
     )
     posterior = estimate([vehicle.summary for vehicle in vehicles])
     findings = all_linear(vehicles)
@@ -185,12 +190,13 @@ def _impossible(
     }
 
 
-def _readings(vehicles: Sequence[VehicleSummary]) -> Readings:
-    """Offsets that the sensors showed in zero-current windows."""
+def _readings(vehicles: Sequence[VehicleSummary], bench: BenchReadings, branches: Sequence[str]) -> Readings:
+    """What the sensors showed on a bench, and the offsets that they showed in zero-current windows."""
     offset = np.stack([vehicle.zero_current.offset_a for vehicle in vehicles])
     sd = np.stack([vehicle.zero_current.sd_a for vehicle in vehicles])
     nothing = no_readings(*offset.shape)
-    return Readings(drift=nothing.drift, drift_sd=nothing.drift_sd, offset_a=offset, offset_sd_a=sd)
+    windows = Readings(drift=nothing.drift, drift_sd=nothing.drift_sd, offset_a=offset, offset_sd_a=sd)
+    return windows.merged(readings_of(bench, [vehicle.vehicle for vehicle in vehicles], branches))
 
 
 def _parameters(

@@ -17,6 +17,7 @@ from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
 from calibrator.posterior.cluster import Cluster, densest_clusters
 from calibrator.posterior.model_spread import MOST_UNMEASURED, unmeasured_load
 from calibrator.posterior.slab import FAULTS_RANGE
+from ecu_node.layout import UnmeasuredLoad
 
 __all__ = ["FEWEST_TRUSTED", "ReferenceHealth", "examine_reference"]
 
@@ -78,7 +79,12 @@ class ReferenceHealth:
 
 
 def examine_reference(
-    rows: FleetRows, branches: Sequence[str], *, full_scale_a: float, trusted: Mask | None = None
+    rows: FleetRows,
+    branches: Sequence[str],
+    *,
+    full_scale_a: float,
+    trusted: Mask | None = None,
+    load: UnmeasuredLoad | None = None,
 ) -> ReferenceHealth:
     """Look for what would fool the reference.
 
@@ -92,6 +98,8 @@ def examine_reference(
         Full scale of the junction. [A]
     trusted : ndarray of bool of shape (N,) or None
         Vehicles that carry the reference of the branches that :data:`FEWEST_TRUSTED` of them tell.
+    load : UnmeasuredLoad or None
+        Load that no branch measures, if it is known.
 
     Returns
     -------
@@ -116,14 +124,17 @@ def examine_reference(
             f"{len(rows)} vehicles are few for a fleet in which {min(share):.0%} agree: at least {least} are needed "
             f"to trust its reference; {advice}"
         )
-    warnings += _common_offset(rows, doubtful, full_scale_a, advice)
-    load = unmeasured_load(rows.constant[:, K], _sd(rows, 4 * K - 1))
-    unmeasured_a = load.centre * full_scale_a
-    if abs(load.centre) > max(LEAST_COMMON_OFFSET, SURE * _uncertainty(load, _sd(rows, 4 * K - 1))):
-        warnings.append(
-            f"the currents of most vehicles sum to {unmeasured_a:+.1f} A: a load without a sensor, as is taken here, "
-            f"or an offset that most vehicles share"
-        )
+    warnings += _common_offset(rows, doubtful, full_scale_a, load, advice)
+    unmeasured_a = 0.0 if load is None else load.mean_a
+    if load is None:
+        found = unmeasured_load(rows.constant[:, K], _sd(rows, 4 * K - 1))
+        unmeasured_a = found.centre * full_scale_a
+        if abs(found.centre) > max(LEAST_COMMON_OFFSET, SURE * _uncertainty(found, _sd(rows, 4 * K - 1))):
+            warnings.append(
+                f"the currents of most vehicles sum to {unmeasured_a:+.1f} A: a load without a sensor, as is taken "
+                f"here, or an offset that most vehicles share; if the load is known, declare it as [unmeasured_load] "
+                f"in the layout"
+            )
     return ReferenceHealth(
         agreeing_share=tuple(share),
         mean_distance=tuple(distance),
@@ -148,18 +159,26 @@ def _advice(carried: set[int], branches: int) -> str:
     return f"name {more}bench-checked vehicles with --trusted, at least {FEWEST_TRUSTED} that use each branch"
 
 
-def _common_offset(rows: FleetRows, doubtful: set[int], full_scale_a: float, advice: str) -> list[str]:
+def _common_offset(
+    rows: FleetRows, doubtful: set[int], full_scale_a: float, load: UnmeasuredLoad | None, advice: str
+) -> list[str]:
     """A constant of the junction law that most vehicles share and no load without a sensor makes."""
     K = rows.branches
     sd = _sd(rows, 4 * K - 1)
     found = densest_clusters(rows.constant[:, K], sd, widest=FAULTS_RANGE)[0]
     doubt = max(LEAST_COMMON_OFFSET, SURE * _uncertainty(found, sd))
-    if -doubt <= found.centre <= MOST_UNMEASURED + doubt or not _agree(found):
+    lowest, highest = (0.0, MOST_UNMEASURED) if load is None else (load.mean_a / full_scale_a,) * 2
+    if lowest - doubt <= found.centre <= highest + doubt or not _agree(found):
         return []
+    expected = (
+        "no load without a sensor explains"
+        if load is None
+        else f"the declared load of {load.mean_a:g} A does not explain"
+    )
     doubtful.update(range(K))
     return [
-        f"the currents of most vehicles sum to {found.centre * full_scale_a:+.1f} A, which no load without a sensor "
-        f"explains: an offset that most vehicles share (a batch of sensors), in any branch; {advice}"
+        f"the currents of most vehicles sum to {found.centre * full_scale_a:+.1f} A, which {expected}: an offset that "
+        f"most vehicles share (a batch of sensors), in any branch; {advice}"
     ]
 
 

@@ -133,6 +133,37 @@ def test_trusted_vehicles_are_taken_for_faultless(fleet: Path, tmp_path: Path) -
     assert all(row["drift"] == 0.0 and row["offset_a"] == 0.0 for row in rows)
 
 
+def test_a_bench_reading_of_a_sensor_is_heeded_and_recorded(fleet: Path, result: Path, tmp_path: Path) -> None:
+    vehicle, truth = next(
+        (name, vehicle)
+        for name, vehicle in read_truth(fleet / "truth.json").vehicles.items()
+        if any(vehicle.offset_a.values())
+    )
+    table = tmp_path / "bench.csv"
+    cells = "".join(f"{vehicle},{name},{truth.offset_a[name]},0.02\n" for name in ("battery", "motor"))
+    table.write_text(f"vehicle,branch,offset_a,offset_sd_a\n{cells}")
+    out = tmp_path / "result"
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out, "--readings", table)
+    assert run.returncode == 0, run.stderr
+    assert read_run(out).settings["readings"] == "bench.csv"
+    before, after = (
+        {row["branch"]: row for row in read_results(folder) if row["vehicle"] == vehicle} for folder in (result, out)
+    )
+    for name in ("battery", "motor"):
+        assert after[name]["offset_a"] == pytest.approx(truth.offset_a[name], abs=0.1)
+        assert after[name]["offset_sd_a"] < min(0.03, before[name]["offset_sd_a"])
+
+
+def test_a_slip_in_the_bench_readings_ends_the_run_before_any_drive_is_read(fleet: Path, tmp_path: Path) -> None:
+    table = tmp_path / "bench.csv"
+    table.write_text("vehicle,branch,offset_a,offset_sd_a\nV001,battery,1 A,0.02\n")
+    out = tmp_path / "result"
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out, "--readings", table)
+    assert run.returncode == 1
+    assert "bench.csv: line 2: offset_a is '1 A'; expected a number" in run.stderr
+    assert not out.exists()
+
+
 def test_a_vehicle_cannot_be_trusted_and_held_out(fleet: Path, tmp_path: Path) -> None:
     both = ("--trusted", "V001", "--hold-out", "V001")
     run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "result", *both)

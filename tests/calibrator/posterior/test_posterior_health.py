@@ -8,6 +8,7 @@ import pytest
 from calibrator.faults import Faults
 from calibrator.posterior.estimate import Moments, estimate_fleet
 from calibrator.posterior.health import ReferenceHealth, examine_reference
+from ecu_node.layout import UnmeasuredLoad
 from tests.calibrator.posterior.simulated_rows import FULL_SCALE_A, random_faults, rows_of
 
 NAMES = ("battery", "motor", "auxiliary")
@@ -106,6 +107,19 @@ def test_a_load_of_possible_size_is_taken_for_one() -> None:
     health = examine_reference(replace(rows, constant=constant), NAMES[:2], full_scale_a=FULL_SCALE_A)
     assert health.doubtful == ()
     assert health.unmeasured_a == pytest.approx(3.0, abs=0.7)
+
+
+@pytest.mark.parametrize(("sum_a", "told"), [(3.0, False), (9.0, True), (-3.0, True)])
+def test_a_declared_load_is_expected_and_anything_else_is_an_offset(sum_a: float, told: bool) -> None:
+    rows = rows_of(random_faults(8, vehicles=60, branches=2, sparsity=80.0))
+    constant = rows.constant.copy()
+    constant[:, 2] += sum_a / FULL_SCALE_A
+    load = UnmeasuredLoad(mean_a=3.0, sd_a=0.5)
+    health = examine_reference(replace(rows, constant=constant), NAMES[:2], full_scale_a=FULL_SCALE_A, load=load)
+    assert any("which the declared load of 3 A does not explain" in text for text in health.warnings) == told
+    assert len(health.warnings) == int(told)
+    assert health.doubtful == ((0, 1) if told else ())
+    assert health.unmeasured_a == 3.0
 
 
 def test_two_variants_are_noticed_with_their_number() -> None:
