@@ -50,6 +50,6 @@ def broken_trust(rows: FleetRows, trusted: Mask, branches: Sequence[str], *, ful
             k = int(np.argmax(np.where(gain_off[j], np.abs(ratio[j]), 0.0)))
             found[j] = f"the gains of its sensors {branches[k + 1]} and {branches[0]} differ by {ratio[j, k]:+.1%}"
         else:
-            sum_a, usual_a = rows.constant[j, K] * full_scale_a, load.centre * full_scale_a
+            sum_a, usual_a = np.round(full_scale_a * np.array([rows.constant[j, K], load.centre]), 1) + 0.0
             found[j] = f"its currents sum to {sum_a:+.1f} A on average, {usual_a:+.1f} A being usual"
     return found
