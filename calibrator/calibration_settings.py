@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from calibrator.artificial.truth import FleetTruth
@@ -31,6 +32,8 @@ class CalibrationSettings:
         Vehicles that are calibrated, but from which nothing is learnt for the others.
     trusted : frozenset of str
         Vehicles whose sensors were found faultless on a bench; they carry the reference of the posterior.
+    readings : Path or None
+        Table of bench readings, see :mod:`calibrator.evidence.readings_file`.
     harm_limit : float
         Largest posterior probability of making a branch worse with which it is corrected. [1]
     sensor_models : bool
@@ -55,6 +58,7 @@ class CalibrationSettings:
     branches: tuple[str, ...] | None = None
     hold_out: frozenset[str] = field(default_factory=frozenset)
     trusted: frozenset[str] = field(default_factory=frozenset)
+    readings: Path | None = None
     harm_limit: float = HARM_LIMIT
     sensor_models: bool = False
     classifier: Classifier = Classifier.TREE
@@ -64,6 +68,27 @@ class CalibrationSettings:
     symmetric: bool = False
     unity: str | None = None
     seed: int = 0
+
+    def record(self) -> dict[str, Any]:
+        """What the method in use heeds, for the record of a run."""
+        common = {"branches": self.branches, "hold_out": sorted(self.hold_out)}
+        if self.method is Method.POSTERIOR:
+            return {
+                **common,
+                "harm_limit": self.harm_limit,
+                "trusted": sorted(self.trusted),
+                "readings": None if self.readings is None else self.readings.name,
+                "sensor_models": self.sensor_models,
+            }
+        return {
+            **common,
+            "classifier": self.classifier.value,
+            "sparsity": self.sparsity,
+            "magnitude": self.magnitude,
+            "symmetric": self.symmetric,
+            "unity": self.unity,
+            "seed": self.seed,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,6 +26,7 @@ __all__ = [
     "MagnitudeOption",
     "MinutesOption",
     "NoiseOption",
+    "ReadingsOption",
     "SeedOption",
     "SensorModelsOption",
     "SparsityOption",
@@ -41,7 +42,7 @@ __all__ = [
 ]
 
 OWN_OPTIONS = {
-    Method.POSTERIOR: ("harm_limit", "trusted", "sensor_models"),
+    Method.POSTERIOR: ("harm_limit", "trusted", "readings", "sensor_models"),
     Method.PUBLISHED: ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity"),
 }
 """What only one method heeds."""
@@ -157,7 +158,14 @@ HarmLimitOption = Annotated[
 ]
 TrustedOption = Annotated[
     list[str] | None,
-    typer.Option("--trusted", help="Vehicle with bench-checked sensors: it carries the reference (posterior)."),
+    typer.Option("--trusted", help="Vehicle with bench-checked sensors; three carry the reference (posterior)."),
+]
+ReadingsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--readings",
+        help="Bench readings: CSV with columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a (posterior).",
+    ),
 ]
 SensorModelsOption = Annotated[
     bool, typer.Option("--sensor-models", help="Look for sensors that are not linear as well (posterior).")

@@ -38,6 +38,8 @@ class CalibrationReport:
     undecided: Mapping[str, str]
     """Vehicles of which it cannot be told what is faulty, and what would decide."""
     hardware_suspected: int
+    held_back: Mapping[str, int]
+    """Branches in which a fault was found that is not applied, by reason."""
     junction_rms_measured_a: float
     """Median over vehicles. [A]"""
     junction_rms_deployed_a: float
@@ -56,6 +58,7 @@ class CalibrationReport:
             *((f"  {verdict}", f"{count}") for verdict, count in self.verdicts.items()),
             ("  hardware fault suspected", f"{self.hardware_suspected}"),
             ("vehicles left out", f"{len(run.left_out)}"),
+            *((f"faults held back, {reason}", f"{count}") for reason, count in self.held_back.items()),
             ("junction sum RMS, median, measured [A]", f"{self.junction_rms_measured_a:.2f}"),
             ("junction sum RMS, median, deployed [A]", f"{self.junction_rms_deployed_a:.2f}"),
             *_detail_rows(run),
@@ -104,6 +107,11 @@ def calibrate_fleet(
         unknown = names - fleet.vehicles.keys()
         if unknown:
             raise FleetError(f"{path}: no vehicle {', '.join(sorted(unknown))} to {what}")
+    both = settings.hold_out & settings.trusted
+    if both:
+        raise FleetError(
+            f"vehicle {', '.join(sorted(both))} is both held out and trusted: the reference would be learnt from it"
+        )
     equipment = probe_equipment(fleet, database, settings.branches)
     identity = RunIdentity(
         database=database,
@@ -112,13 +120,19 @@ def calibrate_fleet(
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
     outcome = METHODS[settings.method](fleet, equipment, identity, settings, workers=workers)
-    run = _record(fleet, equipment, identity, outcome)
+    run = _record(fleet, equipment, identity, settings, outcome)
     left_out = [LeftOut(vehicle=vehicle, reason=reason) for vehicle, reason in outcome.left_out.items()]
     write_results(out, outcome.parameters, left_out, run)
     return _report(out, outcome, run)
 
 
-def _record(fleet: FleetSource, equipment: Equipment, identity: RunIdentity, outcome: FleetOutcome) -> RunRecord:
+def _record(
+    fleet: FleetSource,
+    equipment: Equipment,
+    identity: RunIdentity,
+    settings: CalibrationSettings,
+    outcome: FleetOutcome,
+) -> RunRecord:
     return RunRecord(
         tool=identity.tool,
         method=identity.method.value,
@@ -127,6 +141,7 @@ def _record(fleet: FleetSource, equipment: Equipment, identity: RunIdentity, out
         layout=identity.database.layout.name,
         branches=list(equipment.branches),
         model_inputs=list(equipment.inputs),
+        settings=settings.record(),
         created=identity.created,
         details=dict(outcome.details),
         vehicles=len(outcome.parameters),
@@ -149,6 +164,11 @@ def _report(out: Path, outcome: FleetOutcome, run: RunRecord) -> CalibrationRepo
         run=run,
         verdicts=dict(Counter[str](item.verdict for item in parameters)),
         undecided={item.vehicle: item.deciding_evidence for item in parameters if item.verdict == "cannot tell"},
+        held_back=dict(
+            Counter[str](
+                branch.held_back for item in parameters for branch in item.branches.values() if branch.held_back
+            )
+        ),
         hardware_suspected=sum(item.hardware_fault.suspected for item in parameters),
         junction_rms_measured_a=float(np.median(measured)),
         junction_rms_deployed_a=float(np.median(deployed)),

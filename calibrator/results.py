@@ -29,8 +29,16 @@ SCHEMA = pa.schema(
         pa.field("verdict", pa.string(), nullable=False),
         pa.field("drift", pa.float64(), metadata={"unit": "1"}),
         pa.field("offset_a", pa.float64(), metadata={"unit": "A"}),
+        pa.field("drift_sd", pa.float64(), metadata={"unit": "1"}),
+        pa.field("offset_sd_a", pa.float64(), metadata={"unit": "A"}),
+        pa.field("delay_s", pa.float64(), metadata={"unit": "s"}),
         pa.field("applied", pa.bool_()),
+        pa.field("held_back", pa.string()),
+        pa.field("confidence", pa.float64(), metadata={"unit": "1"}),
+        pa.field("fault_probability", pa.float64(), metadata={"unit": "1"}),
+        pa.field("harm_probability", pa.float64(), metadata={"unit": "1"}),
         pa.field("hardware_fault", pa.bool_()),
+        pa.field("hardware_probability", pa.float64(), metadata={"unit": "1"}),
         pa.field("hardware_drift", pa.float64(), metadata={"unit": "1"}),
         pa.field("hardware_offset_a", pa.float64(), metadata={"unit": "A"}),
         pa.field("junction_rms_measured_a", pa.float64(), metadata={"unit": "A"}),
@@ -60,6 +68,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     layout: str
     branches: list[str]
     model_inputs: list[str]
+    settings: dict[str, Any]
+    """What the user chose: hold-out and trusted vehicles, harm limit, or the published method's classifier."""
     created: str
     details: dict[str, Any]
     """What the method tells of its run: unity drive and simulation SNR, or reference, delays and hyper-parameters."""
@@ -133,8 +143,16 @@ def _rows(item: VehicleParameters) -> list[dict[str, Any]]:
             "verdict": item.verdict,
             "drift": branch.drift,
             "offset_a": branch.offset_a,
+            "drift_sd": branch.drift_sd,
+            "offset_sd_a": branch.offset_sd_a,
+            "delay_s": branch.delay_s,
             "applied": branch.apply,
+            "held_back": branch.held_back,
+            "confidence": item.confidence,
+            "fault_probability": branch.fault_probability,
+            "harm_probability": branch.harm_probability,
             "hardware_fault": item.hardware_fault.suspected,
+            "hardware_probability": item.hardware_fault.probability,
             "hardware_drift": item.hardware_fault.drift,
             "hardware_offset_a": item.hardware_fault.offset_a.get(name, 0.0),
             "junction_rms_measured_a": item.junction_residual.measured_a,

@@ -47,6 +47,14 @@ class VehicleDatabase:
             f"names; it has {known}"
         )
 
+    def current_step_a(self, branch: str) -> float:
+        """Step of the signal of a branch [A]; 0 where its current is a quotient of two signals."""
+        name = self.layout.find_branch(branch).signal
+        if name is None:
+            return 0.0
+        _, signal = self.signal(name)
+        return float(signal.scale) * unit_factor(signal, AMPERE, f"branch {branch}")
+
 
 def read_database(layout: Layout) -> VehicleDatabase:
     """Load the DBC of a layout and look every signal up that the layout names.

@@ -27,6 +27,7 @@ __all__ = [
     "Name",
     "SignalName",
     "StatusMessage",
+    "UnmeasuredLoad",
     "file_digest",
     "read_layout",
     "split_signal",
@@ -95,6 +96,15 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Largest magnitude of an offset [A]; 40 % of full scale where not given."""
 
 
+class UnmeasuredLoad(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What flows out of the junction where no branch measures it, as control units take it."""
+
+    mean_a: Annotated[float, msgspec.Meta(ge=0.0, le=1e6)]
+    """Mean over vehicles. [A]"""
+    sd_a: Annotated[float, msgspec.Meta(ge=0.0, le=1e6)]
+    """Standard deviation over vehicles. [A]"""
+
+
 class StatusMessage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The message in which the node reports itself, and its signals."""
 
@@ -137,6 +147,8 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """What the model of one vehicle is driven by."""
     fleet_inputs: list[str] = []
     """What the model of the whole fleet is driven by; the model inputs where not given."""
+    unmeasured_load: UnmeasuredLoad | None = None
+    """If it is known; where not given, it is estimated from the fleet."""
     limits: Limits = Limits()
     status: StatusMessage | None = None
     e2e: EndToEnd | None = None

@@ -22,6 +22,7 @@ __all__ = [
     "Explanation",
     "FileReference",
     "HardwareFault",
+    "HeldBack",
     "JunctionResidual",
     "Provenance",
     "UnfitError",
@@ -41,6 +42,9 @@ Verdict = Literal["no sensor fault", "corrected", "cannot tell", "not enough dat
 _UNDECIDED: tuple[Verdict, ...] = ("cannot tell", "not enough data")
 """Verdicts with which nothing was found that could be applied."""
 
+HeldBack = Literal["beyond the limits", "not linear", "reference in doubt", "moved too little", "harm limit"]
+"""Why a branch in which a fault was found is passed through."""
+
 _Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$", description="SHA-256, line ends counted as LF")]
 _Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 _NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
@@ -54,6 +58,9 @@ class BranchParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     drift_sd: Annotated[_NotNegative | None, msgspec.Meta(description="standard deviation of the drift [1]")] = None
     offset_sd_a: Annotated[_NotNegative | None, msgspec.Meta(description="standard deviation of the offset [A]")] = None
     apply: Annotated[bool, msgspec.Meta(description="false: the node passes this branch through")]
+    held_back: Annotated[
+        HeldBack | None, msgspec.Meta(description="why a fault that was found is not applied; null: none, or it is")
+    ] = None
     sensor_model: Annotated[
         SensorModel | None, msgspec.Meta(description="null: linear; the node passes any other branch through")
     ] = None

@@ -15,7 +15,7 @@ __all__ = ["collect_rows"]
 
 LEAST_GAIN = 0.3
 """Slopes and gain ratios below are no sensor's, but those of a branch that hardly moved. [1]"""
-FEWEST_BLOCKS = 3
+FEWEST_BLOCKS = 4
 """Of a vehicle; fewer tell no variance."""
 FLEET_BLOCKS = 20.0
 """Weight of the fleet's usual correlation of rows against that of one vehicle, in blocks."""
@@ -74,7 +74,7 @@ def _of_vehicle(summary: DriveSummary, model: FleetModel, full_scale_a: float) -
     slopes, law = regress_on_fleet(summary, model.read_out), junction_law(summary)
     estimate = np.concatenate([*(fit.estimate for fit in slopes), law.estimate])
     influence = np.concatenate([*(fit.influence for fit in slopes), law.influence], axis=1)
-    covariance = influence.T @ influence if len(influence) >= FEWEST_BLOCKS else UNKNOWN_VARIANCE * np.eye(3 * K)
+    covariance = influence.T @ influence
     for k, fit in enumerate([*slopes, law]):
         part = slice(2 * k, 2 * k + len(fit.estimate))
         covariance[part, part] += fit.prior_covariance
@@ -85,6 +85,8 @@ def _of_vehicle(summary: DriveSummary, model: FleetModel, full_scale_a: float) -
     lever = np.zeros((K + 1, 2 * K - 1))
     lever[:K, :K], lever[K, K:] = np.diag(means[0]), -means[1, 1:]
     covariance = _turned(covariance[order][:, order] * np.outer(unit, unit), lever)
+    if len(influence) < FEWEST_BLOCKS:
+        covariance = UNKNOWN_VARIANCE * np.eye(3 * K)
     return _Raw(estimate[order] * unit, means, covariance, len(influence))
 
 

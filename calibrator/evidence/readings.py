@@ -11,7 +11,7 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
 
-__all__ = ["Readings", "no_readings", "trusted_readings", "with_readings"]
+__all__ = ["TRUSTED_DRIFT_SD", "TRUSTED_OFFSET_SD", "Readings", "no_readings", "trusted_readings", "with_readings"]
 
 TRUSTED_DRIFT_SD = 0.002
 """Accuracy of a bench check of the gain, as of a laboratory shunt. [1]"""
@@ -26,9 +26,9 @@ class Readings:
     Attributes
     ----------
     drift, drift_sd : ndarray of shape (N, K)
-        Read drift and its standard deviation. [1]
+        Read drift, above -1, and its standard deviation, positive. [1]
     offset_a, offset_sd_a : ndarray of shape (N, K)
-        Read offset and its standard deviation. [A]
+        Read offset and its standard deviation, positive. [A]
     """
 
     drift: Array
@@ -37,13 +37,25 @@ class Readings:
     offset_sd_a: Array
 
     def merged(self, other: "Readings") -> "Readings":
-        """Take the other's readings where there are any, and these elsewhere."""
-        pairs = {name: (mine, getattr(other, name)) for name, mine in vars(self).items()}
-        return Readings(**{name: np.where(np.isfinite(new), new, old) for name, (old, new) in pairs.items()})
+        """Both together: of a sensor that was read twice the mean, weighted by precision."""
+        drift, drift_sd = _weighted((self.drift, self.drift_sd), (other.drift, other.drift_sd))
+        offset_a, offset_sd_a = _weighted((self.offset_a, self.offset_sd_a), (other.offset_a, other.offset_sd_a))
+        return Readings(drift=drift, drift_sd=drift_sd, offset_a=offset_a, offset_sd_a=offset_sd_a)
 
     def take_branches(self, order: list[int]) -> "Readings":
         """Return the same readings with the branches in another order."""
         return Readings(**{name: values[:, order] for name, values in vars(self).items()})
+
+
+def _weighted(*readings: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Mean by precision of values with standard deviations, NaN where neither tells, and its standard deviation."""
+    told = [np.isfinite(value) & np.isfinite(sd) for value, sd in readings]
+    precision = [np.where(there, 1.0 / np.square(sd), 0.0) for there, (_, sd) in zip(told, readings, strict=True)]
+    total = np.sum(precision, axis=0)
+    parts = zip(told, precision, readings, strict=True)
+    moment = np.sum([np.where(there, weight * value, 0.0) for there, weight, (value, _) in parts], axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(total > 0.0, moment / total, np.nan), np.where(total > 0.0, 1.0 / np.sqrt(total), np.nan)
 
 
 def no_readings(vehicles: int, branches: int) -> Readings:
@@ -105,7 +117,8 @@ def with_readings(rows: FleetRows, readings: Readings, *, full_scale_a: float) -
     relative[:, 2 * K - 1 :] = np.where(drift_read, np.log1p(np.where(drift_read, readings.drift, 0.0)), 0.0)
     constant[:, K + 1 :] = np.where(offset_read, readings.offset_a, 0.0) / full_scale_a
     drift_row, offset_row = np.arange(2 * K - 1, 3 * K - 1), np.arange(4 * K, 5 * K)
-    covariance[:, drift_row, drift_row] = np.where(drift_read, readings.drift_sd**2, UNKNOWN_VARIANCE)
+    log_sd = readings.drift_sd / (1.0 + readings.drift)
+    covariance[:, drift_row, drift_row] = np.where(drift_read, log_sd**2, UNKNOWN_VARIANCE)
     covariance[:, offset_row, offset_row] = np.where(
         offset_read, (readings.offset_sd_a / full_scale_a) ** 2, UNKNOWN_VARIANCE
     )

@@ -18,7 +18,7 @@ b and c are where lines meet zero. They turn with the ratios about the means of 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.faults import Index
 
-__all__ = ["UNKNOWN_VARIANCE", "FleetRows", "LineMeans", "constant_design", "relative_design"]
+__all__ = ["UNKNOWN_VARIANCE", "FleetRows", "LineMeans", "constant_design", "relative_design", "with_load_spread"]
 
 UNKNOWN_VARIANCE = 100.0
 """Of a row that says nothing: ten times full scale, or a factor of 20 000. [1]"""
@@ -213,6 +213,26 @@ class FleetRows:
         if self.means is not None:
             seen[:, :, : self.branches + 1] += self.means.beyond_linear(self.relative, parameters, residual)
         return np.asarray(seen)
+
+
+def with_load_spread(rows: FleetRows, sd: float) -> FleetRows:
+    """Evidence in which loads that no branch measures differ between vehicles.
+
+    Parameters
+    ----------
+    rows : FleetRows
+        Of N vehicles.
+    sd : float
+        Standard deviation of these loads over vehicles, in fractions of full scale. [1]
+
+    Returns
+    -------
+    FleetRows
+        The same with a wider constant of the junction law.
+    """
+    covariance, junction = rows.covariance.copy(), 4 * rows.branches - 1
+    covariance[:, junction, junction] += sd**2
+    return replace(rows, covariance=covariance)
 
 
 def relative_design(branches: int) -> Array:

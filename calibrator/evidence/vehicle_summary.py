@@ -89,7 +89,7 @@ def read_vehicle_summary(
         drives=tuple(entry.name for entry in entries),
         summary=summarise(samples, period_s=layout.period_s),
         delays=delays,
-        zero_current=zero_current_offsets(drives, equipment.branches, layout.contactor),
+        zero_current=zero_current_offsets(drives, equipment.branches, database),
         recorded=frozenset.intersection(*(_recorded(drive) for drive in drives)),
     )
 

@@ -1,12 +1,14 @@
 """Zero-current windows: while the contactors are open no current flows, so every sensor shows its offset."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from calibrator.drive import Array, Channel, Drive
-from ecu_node.layout import Contactor
+from ecu_node.database import VehicleDatabase
+from ecu_node.layout import Contactor, Layout
 
 __all__ = ["ZeroCurrent", "zero_current_offsets"]
 
@@ -16,6 +18,8 @@ FEWEST_SAMPLES = 10
 """Of a branch, for its reading to count."""
 RESOLUTION_A = 0.02
 """Least standard deviation of a reading: sensors drift within a window by about so much. [A]"""
+PIECE_S = 5.0
+"""Of a window: what wanders within it moves the medians of its pieces. [s]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,14 +29,14 @@ class ZeroCurrent:
     Attributes
     ----------
     offset_a, sd_a : ndarray of shape (K,)
-        Mean and its standard deviation. [A]
+        Mean of the windows' medians and its standard deviation. [A]
     """
 
     offset_a: Array
     sd_a: Array
 
 
-def zero_current_offsets(drives: Sequence[Drive], branches: Sequence[str], contactor: Contactor | None) -> ZeroCurrent:
+def zero_current_offsets(drives: Sequence[Drive], branches: Sequence[str], database: VehicleDatabase) -> ZeroCurrent:
     """Read the offsets in all windows of a vehicle's drives.
 
     Parameters
@@ -41,36 +45,48 @@ def zero_current_offsets(drives: Sequence[Drive], branches: Sequence[str], conta
         Of one vehicle.
     branches : sequence of str
         Names of the K branches.
-    contactor : Contactor or None
-        Which input tells that the contactors are open; None: no window is known.
+    database : VehicleDatabase
+        Its layout says which input tells that the contactors are open; if none does, no window is known.
 
     Returns
     -------
     ZeroCurrent
-        Of the branches.
+        Of the branches. How far pieces of windows differ counts once per window: pieces of one wander together.
     """
     offset, sd = np.full(len(branches), np.nan), np.full(len(branches), np.nan)
     for k, name in enumerate(branches):
-        shown = [_shown(drive, name, contactor) for drive in drives] if contactor is not None else []
-        values = np.concatenate([np.zeros(0), *shown])
-        if len(values) >= FEWEST_SAMPLES:
-            offset[k] = np.median(values)
-            sd[k] = np.hypot(RESOLUTION_A, np.sqrt(np.pi / 2.0) * values.std() / np.sqrt(len(values)))
+        windows = [window for drive in drives for window in _shown(drive, name, database.layout)]
+        if sum(len(current.value) for current in windows) >= FEWEST_SAMPLES:
+            medians = [np.median(current.value) for current in windows]
+            pieces = np.concatenate([_medians_of_pieces(current) for current in windows])
+            noise = np.concatenate([current.value - middle for current, middle in zip(windows, medians, strict=True)])
+            white = np.sqrt(np.pi / 2.0) * noise.std() / np.sqrt(len(noise))
+            wander = pieces.std(ddof=1) / np.sqrt(len(windows)) if len(pieces) > 1 else 0.0
+            step_a = database.current_step_a(name) / np.sqrt(12.0)
+            offset[k], sd[k] = np.mean(medians), np.sqrt(RESOLUTION_A**2 + step_a**2 + max(white, wander) ** 2)
     return ZeroCurrent(offset_a=offset, sd_a=sd)
 
 
-def _shown(drive: Drive, branch: str, contactor: Contactor) -> Array:
-    """Good samples of a branch well inside the windows of one drive. [A]"""
-    state, current = drive.inputs.get(contactor.input), drive.branches.get(branch)
+def _medians_of_pieces(current: Channel) -> Array:
+    number = ((current.time_s - current.time_s[0]) / PIECE_S).astype(np.int64)
+    return np.array([np.median(current.value[number == piece]) for piece in np.unique(number)])
+
+
+def _shown(drive: Drive, branch: str, layout: Layout) -> Iterator[Channel]:
+    """Good samples of a branch well inside each window of one drive; a gap in the state ends a window."""
+    if layout.contactor is None:
+        return
+    state, current = drive.inputs.get(layout.contactor.input), drive.branches.get(branch)
     if state is None or current is None:
-        return np.zeros(0)
-    open_, time_s = _is_open(state, contactor), current.time_s
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], open_, [False]]).astype(np.int8)))
-    inside = np.zeros(len(time_s), bool)
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        return
+    number = np.cumsum(np.diff(state.time_s, prepend=state.time_s[:1]) > layout.max_age_s)
+    number = np.where(_is_open(state, layout.contactor), 2 * number + 1, 0)
+    edges = np.append(np.flatnonzero(np.diff(number, prepend=0)), len(number))
+    for start, stop in pairwise(edges.tolist()):
         first, last = state.time_s[start] + SETTLING_S, state.time_s[stop - 1] - SETTLING_S
-        inside |= (time_s >= first) & (time_s <= last)
-    return np.asarray(current.value[inside & current.good])
+        inside = (current.time_s >= first) & (current.time_s <= last) & current.good
+        if number[start] and inside.any():
+            yield Channel(time_s=current.time_s[inside], value=current.value[inside], good=current.good[inside])
 
 
 def _is_open(state: Channel, contactor: Contactor) -> Array:

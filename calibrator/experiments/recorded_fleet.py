@@ -14,7 +14,7 @@ from calibrator.drives.align import base_inputs, choose_inputs
 from calibrator.drives.derived import evaluate_formula
 from calibrator.errors import FleetError
 from calibrator.random_streams import Purpose, random_stream
-from ecu_node.database import AMPERE, VehicleDatabase, unit_factor
+from ecu_node.database import VehicleDatabase
 from ecu_node.formula import parse_formula
 from ecu_node.layout import Layout
 
@@ -95,15 +95,7 @@ class RecordedFleet:
 
     def resolution_a(self, branches: tuple[str, ...]) -> Array:
         """Steps of the signals of some branches, shape (K,); 0 where a branch has none. [A]"""
-        steps = []
-        for name in branches:
-            branch = self.database.layout.find_branch(name)
-            if branch.signal is None:
-                steps.append(0.0)
-                continue
-            _, signal = self.database.signal(branch.signal)
-            steps.append(float(signal.scale) * unit_factor(signal, AMPERE, f"branch {name}"))
-        return np.array(steps)
+        return np.array([self.database.current_step_a(name) for name in branches])
 
     def inputs(self, trip: GroundTruth) -> Mapping[str, Array]:
         """Inputs of the vehicles' and of the fleet's model that a trip has, by name, each of shape (T,)."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -10,13 +11,19 @@ from calibrator.errors import FleetError
 from calibrator.evidence.collect import collect_rows
 from calibrator.evidence.fleet_model import fit_fleet_model
 from calibrator.evidence.readings import Readings, no_readings, trusted_readings, with_readings
+from calibrator.evidence.rows import with_load_spread
 from calibrator.evidence.summary import DriveSummary
 from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.health import ReferenceHealth, examine_reference
+from calibrator.posterior.trust import broken_trust
+from ecu_node.layout import UnmeasuredLoad
 
 __all__ = ["calibrate_posterior"]
+
+SUSPECTED = 0.5
+"""Probability of a hardware fault from which on a trusted vehicle does not carry the reference. [1]"""
 
 
 def calibrate_posterior(
@@ -28,6 +35,7 @@ def calibrate_posterior(
     readings: Readings | None = None,
     trusted: Mask | None = None,
     learning: Mask | None = None,
+    load: UnmeasuredLoad | None = None,
 ) -> FleetPosterior:
     """Estimate the faults of a fleet from its drives.
 
@@ -44,9 +52,12 @@ def calibrate_posterior(
     readings : Readings or None
         Direct readings of single sensors.
     trusted : ndarray of bool of shape (N,) or None
-        Vehicles whose sensors were found faultless on a bench; they carry the reference.
+        Vehicles whose sensors were found faultless on a bench; they carry the reference, except those that break the
+        junction law or have a hardware fault: they stand in ``health.distrusted``.
     learning : ndarray of bool of shape (N,) or None
         Vehicles from which the fleet's reference and hyper-parameters are learnt; None: all.
+    load : UnmeasuredLoad or None
+        Load that no branch measures, if it is known; None: estimated from the fleet.
 
     Returns
     -------
@@ -68,15 +79,36 @@ def calibrate_posterior(
     model = fit_fleet_model([summary for summary, use in zip(ordered, learnt, strict=True) if use])
     rows = collect_rows(ordered, model, full_scale_a=full_scale_a, learning=learnt)
     known = no_readings(N, K) if readings is None else readings
-    if trusted is not None:
-        known = known.merged(trusted_readings(trusted, K, full_scale_a))
+    carriers = np.zeros(N, bool) if trusted is None else trusted.copy()
+    distrusted = broken_trust(rows, carriers, [names[k] for k in order], full_scale_a=full_scale_a)
+    carriers[list(distrusted)] = False
+    known = known.merged(trusted_readings(carriers, K, full_scale_a))
+    if load is not None:
+        rows = with_load_spread(rows, load.sd_a / full_scale_a)
     rows = with_readings(rows, known.take_branches(order), full_scale_a=full_scale_a)
     moments = Moments(
         mean_a=np.stack([summary.mean_a for summary in ordered]),
         mean_square_a2=np.stack([np.diag(summary.mean_product_a2) for summary in ordered]),
     )
-    posterior = estimate_fleet(rows, moments, full_scale_a=full_scale_a, given=given, trusted=trusted, learning=learnt)
-    health = examine_reference(rows.take(learnt), [names[k] for k in order], full_scale_a=full_scale_a)
+    estimate = partial(
+        estimate_fleet,
+        rows,
+        moments,
+        full_scale_a=full_scale_a,
+        given=given,
+        learning=learnt,
+        load=None if load is None else load.mean_a / full_scale_a,
+    )
+    posterior = estimate(trusted=carriers)
+    differing = carriers & (posterior.hardware_fault > SUSPECTED)
+    if differing.any():
+        distrusted |= dict.fromkeys(np.flatnonzero(differing).tolist(), "the vehicle itself differs from the others")
+        carriers &= ~differing
+        posterior = estimate(trusted=carriers)
+    health = examine_reference(
+        rows.take(learnt), [names[k] for k in order], full_scale_a=full_scale_a, trusted=carriers[learnt], load=load
+    )
+    health = replace(health, distrusted=distrusted)
     return _in_own_order(posterior, health, order)
 
 

@@ -21,6 +21,10 @@ MARGIN = 0.1
 """The background reaches beyond the values by this share of their range. [1]"""
 
 
+SD_OF_RANGE = 9.0
+"""Range of the background over the deviation of its Gaussian half, where faults say how wide it is. [1]"""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Cluster:
     """One cluster.
@@ -41,7 +45,9 @@ class Cluster:
     gain: float
 
 
-def densest_clusters(values: Array, sd: Array, *, most: int = 1, farthest: float = np.inf) -> list[Cluster]:
+def densest_clusters(
+    values: Array, sd: Array, *, most: int = 1, farthest: float = np.inf, widest: float = 0.0
+) -> list[Cluster]:
     """Find the most likely clusters, the best first; later ones lie apart from those before.
 
     Parameters
@@ -52,6 +58,9 @@ def densest_clusters(values: Array, sd: Array, *, most: int = 1, farthest: float
         Number of clusters wanted.
     farthest : float
         Largest magnitude of a centre.
+    widest : float
+        Range of what faults can make of the values: the background is at least as wide, so that values that all agree
+        are a cluster too.
 
     Returns
     -------
@@ -67,7 +76,8 @@ def densest_clusters(values: Array, sd: Array, *, most: int = 1, farthest: float
     if extent <= narrowest:
         return [Cluster(centre=float(np.median(near)), spread=0.0, share=1.0, gain=0.0)]
     spreads = np.geomspace(narrowest / 4.0, max(extent / 4.0, narrowest), SPREADS)
-    background = 0.5 * norm.pdf(values, values.mean(), values.std()) + 0.5 / (extent * (1.0 + 2.0 * MARGIN))
+    wide, sd_wide = max(extent * (1.0 + 2.0 * MARGIN), widest), max(values.std(), widest / SD_OF_RANGE)
+    background = 0.5 * norm.pdf(values, values.mean(), sd_wide) + 0.5 / wide
     found = [_at_spread(values, sd, centres, float(spread), background) for spread in spreads]
     gain = np.array([gain for gain, _ in found])
     share = np.array([share for _, share in found])

@@ -17,7 +17,7 @@ from calibrator.posterior.hyperparameters import (
     draw_hyperparameters,
     estimate_hyperparameters,
 )
-from calibrator.posterior.model_spread import initial_spreads, trusted_spread
+from calibrator.posterior.model_spread import free_centres, initial_spreads, trusted_spread
 from calibrator.posterior.states import States, enumerate_states, mean_states
 
 __all__ = ["FleetPosterior", "Moments", "estimate_fleet"]
@@ -95,6 +95,7 @@ def estimate_fleet(
     given: FaultPrior | None = None,
     trusted: Mask | None = None,
     learning: Mask | None = None,
+    load: float | None = None,
 ) -> FleetPosterior:
     """Estimate the faults of every vehicle of a fleet.
 
@@ -112,6 +113,9 @@ def estimate_fleet(
         Vehicles that were found faultless, whose rows hold that reading; they alone carry the reference then.
     learning : ndarray of bool of shape (N,) or None
         Vehicles from which hyper-parameters are learnt; None: all.
+    load : float or None
+        Mean load that no branch measures, in fractions of full scale, if it is known; its spread is then in the
+        covariance of the rows. None: estimated from the fleet. [1]
 
     Returns
     -------
@@ -122,9 +126,11 @@ def estimate_fleet(
     learnt = rows if learning is None else rows.take(learning)
     carriers = None if trusted is None or not trusted.any() else rows.take(trusted)
     if trusted is None or carriers is None:
-        starts, free = initial_spreads(learnt), None
+        starts, free = initial_spreads(learnt), free_centres(rows.branches)
     else:
         starts, free = [trusted_spread(rows, trusted)], np.zeros(5 * rows.branches, bool)
+    if load is not None:
+        starts, free[4 * rows.branches - 1] = [start.with_load(load) for start in starts], False
     hyperparameters = estimate_hyperparameters(learnt, starts, given=given, free=free)
     drawn = draw_hyperparameters(learnt, hyperparameters, given=given, carriers=carriers)
     states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in drawn])

@@ -1,6 +1,5 @@
-"""Competing explanations of a vehicle's recordings, and what further evidence would decide between them."""
+"""Competing explanations of a vehicle's recordings."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,14 +7,7 @@ import numpy as np
 from calibrator.drive import Array
 from calibrator.posterior.states import States
 
-__all__ = ["FaultExplanation", "deciding_evidence", "explanations"]
-
-MOST = 3
-"""Explanations that are told."""
-LEAST_PROBABILITY = 0.02
-"""Of an explanation that is told. [1]"""
-TOLD_APART = 0.002
-"""Smallest difference that a zero-current window or a bench check shows: drifts, offsets over full scale. [1]"""
+__all__ = ["FaultExplanation", "explanations"]
 
 
 @dataclass(frozen=True)
@@ -40,7 +32,7 @@ class FaultExplanation:
 
 
 def explanations(states: States, vehicle: int) -> list[FaultExplanation]:
-    """Most probable supports of one vehicle, signs told apart, each with its mean parameters.
+    """Supports of one vehicle, signs told apart, each with its mean parameters.
 
     Parameters
     ----------
@@ -60,8 +52,8 @@ def explanations(states: States, vehicle: int) -> list[FaultExplanation]:
     supports, group = np.unique(np.sign(parameters), axis=0, return_inverse=True)
     probability = np.bincount(group.ravel(), weight, len(supports))
     found: list[FaultExplanation] = []
-    for g in np.argsort(-probability, kind="stable")[:MOST]:
-        if found and probability[g] < LEAST_PROBABILITY:
+    for g in np.argsort(-probability, kind="stable"):
+        if found and not probability[g]:
             break
         share = np.where(group.ravel() == g, weight, 0.0)
         mean = share @ parameters / share.sum()
@@ -72,35 +64,3 @@ def explanations(states: States, vehicle: int) -> list[FaultExplanation]:
             )
         )
     return found
-
-
-def deciding_evidence(found: Sequence[FaultExplanation], branches: Sequence[str], full_scale_a: float) -> str:
-    """Say what would tell the two most probable explanations apart.
-
-    Parameters
-    ----------
-    found : sequence of FaultExplanation
-        From :func:`explanations`.
-    branches : sequence of str
-        Names of the K branches.
-    full_scale_a : float
-        Full scale of the junction. [A]
-
-    Returns
-    -------
-    str
-        One sentence; empty if there is one explanation.
-    """
-    if len(found) < 2:
-        return ""
-    first, second = found[0], found[1]
-    offset, drift = np.abs(first.offset - second.offset), np.abs(first.drift - second.drift)
-    k = int(np.argmax(offset))
-    if offset[k] > TOLD_APART:
-        readings = f"{first.offset[k] * full_scale_a:+.1f} A or {second.offset[k] * full_scale_a:+.1f} A"
-        return f"a zero-current window (contactors open) would decide: the {branches[k]} sensor then shows {readings}"
-    k = int(np.argmax(drift))
-    if drift[k] > TOLD_APART:
-        readings = f"{first.drift[k]:+.1%} or {second.drift[k]:+.1%}"
-        return f"a check of the {branches[k]} sensor against a reference would decide: its gain is off by {readings}"
-    return "the explanations differ in the vehicle, not in its sensors: inspect the hardware"

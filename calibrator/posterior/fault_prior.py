@@ -1,6 +1,6 @@
 """Prior of the faults, and of what vehicles without faults differ by: the hyper-parameters of the posterior."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -68,3 +68,9 @@ class ModelSpread:
     covariance: Array
     outlier_share: float = 0.0
     dispersion: Array | float = 1.0
+
+    def with_load(self, load: float) -> "ModelSpread":
+        """Return the same with a known mean of the load that no branch measures, in fractions of full scale."""
+        mean = self.mean.copy()
+        mean[4 * len(mean) // 5 - 1] = load
+        return replace(self, mean=mean)

@@ -6,6 +6,7 @@ computed anew from the linear parts of all sensors.
 
 from collections.abc import Sequence
 from functools import partial
+from typing import cast
 
 import numpy as np
 
@@ -13,12 +14,14 @@ from calibrator.calibration_settings import CalibrationSettings, FleetOutcome, r
 from calibrator.drive import Mask
 from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
-from calibrator.evidence.readings import Readings, no_readings
+from calibrator.evidence.readings import TRUSTED_OFFSET_SD, Readings, no_readings
+from calibrator.evidence.readings_file import BenchReadings, read_bench_readings, readings_of
 from calibrator.evidence.vehicle_summary import VehicleSummary, read_vehicle_summary
 from calibrator.parameter_files import RunIdentity, by_branch, junction_rms_a
+from calibrator.posterior.advice import advise
 from calibrator.posterior.calibration import calibrate_posterior
 from calibrator.posterior.estimate import FleetPosterior
-from calibrator.posterior.explain import deciding_evidence, explanations
+from calibrator.posterior.explain import explanations
 from calibrator.posterior.second_pass import finding_notices, tell_sensors, without_sensor_models
 from calibrator.posterior.verdict import Deployment, decide
 from calibrator.sensor_models.fleet import SensorFindings, all_linear, find_sensor_models
@@ -27,16 +30,19 @@ from ecu_node.parameters import (
     BranchParameters,
     Explanation,
     HardwareFault,
+    HeldBack,
     JunctionResidual,
     VehicleParameters,
 )
 
 __all__ = ["calibrate_fleet_posterior"]
 
-FEWEST_TRUSTED = 3
-"""Trusted vehicles that carry the reference of a fleet that is in doubt."""
+CONTRADICTION = 4.0
+"""Standard deviations from which on a reading contradicts the trust in a sensor. [1]"""
 UNTOLD = 0.05
 """Probability of other explanations up to which they are not told. [1]"""
+MOST_TOLD, LEAST_TOLD = 3, 0.02
+"""Explanations that are told, and the least probability of one after the first. [1]"""
 
 
 def calibrate_fleet_posterior(
@@ -65,6 +71,9 @@ def calibrate_fleet_posterior(
     FleetError
         If too few vehicles can be used, or a trusted one is not there.
     """
+    bench = None
+    if settings.readings is not None:
+        bench = read_bench_readings(settings.readings, fleet.vehicles.keys(), equipment.branches)
     vehicles, left_out = read_vehicles(read_vehicle_summary, fleet, equipment, identity.database, workers=workers)
     names = [vehicle.vehicle for vehicle in vehicles]
     learning = require_learning(names, settings, left_out)
@@ -73,9 +82,10 @@ def calibrate_fleet_posterior(
         calibrate_posterior,
         full_scale_a=identity.database.layout.full_scale_a,
         branches=equipment.branches,
-        readings=_readings(vehicles),
+        readings=_readings(vehicles, bench or {}, equipment.branches),
         trusted=trusted if trusted.any() else None,
         learning=np.array(learning),
+        load=identity.database.layout.unmeasured_load,
     )
     posterior = estimate([vehicle.summary for vehicle in vehicles])
     findings = all_linear(vehicles)
@@ -94,8 +104,7 @@ def calibrate_fleet_posterior(
         posterior = estimate(findings.summaries)
     health = posterior.health
     assert health is not None
-    doubtful = () if trusted.sum() >= FEWEST_TRUSTED else health.doubtful
-    decision = decide(posterior, identity.database.layout, harm_limit=settings.harm_limit, doubtful=doubtful)
+    decision = decide(posterior, identity.database.layout, harm_limit=settings.harm_limit, doubtful=health.doubtful)
     left_out |= _impossible(vehicles, posterior, equipment.branches)
     parameters = _parameter_files(vehicles, posterior, decision, findings, equipment=equipment, identity=identity)
     if not parameters:
@@ -103,7 +112,15 @@ def calibrate_fleet_posterior(
     return FleetOutcome(
         parameters=parameters,
         left_out=left_out,
-        notices=(*health.warnings, *finding_notices(names, findings, equipment.branches)),
+        notices=(
+            *health.warnings,
+            *(
+                f"trusted vehicle {names[j]} does not carry the reference: {why}; check it again, or do not trust it"
+                for j, why in health.distrusted.items()
+            ),
+            *_contradictions(vehicles, trusted, equipment.branches, identity.database.layout.full_scale_a),
+            *finding_notices(names, findings, equipment.branches),
+        ),
         details=_details(posterior, equipment.branches),
     )
 
@@ -114,6 +131,22 @@ def _trusted(names: Sequence[str], wanted: frozenset[str], fleet: FleetSource) -
     if missing:
         raise FleetError(f"{fleet.path}: no usable vehicle {', '.join(sorted(missing))} to trust")
     return np.array([name in wanted for name in names])
+
+
+def _contradictions(
+    vehicles: Sequence[VehicleSummary], trusted: Mask, branches: Sequence[str], full_scale_a: float
+) -> list[str]:
+    """Trusted sensors that showed an offset while the contactors were open."""
+    texts = []
+    for vehicle in (vehicle for vehicle, is_trusted in zip(vehicles, trusted, strict=True) if is_trusted):
+        shown, sd_a = vehicle.zero_current.offset_a, vehicle.zero_current.sd_a
+        surprising = np.abs(shown) > CONTRADICTION * np.hypot(sd_a, TRUSTED_OFFSET_SD * full_scale_a)
+        texts += [
+            f"trusted vehicle {vehicle.vehicle}: its {branches[k]} sensor showed {shown[k]:+.1f} A with open "
+            f"contactors; it was taken for faultless: check it again, or do not trust it"
+            for k in np.flatnonzero(surprising).tolist()
+        ]
+    return texts
 
 
 def _parameter_files(
@@ -157,12 +190,13 @@ def _impossible(
     }
 
 
-def _readings(vehicles: Sequence[VehicleSummary]) -> Readings:
-    """Offsets that the sensors showed in zero-current windows."""
+def _readings(vehicles: Sequence[VehicleSummary], bench: BenchReadings, branches: Sequence[str]) -> Readings:
+    """What the sensors showed on a bench, and the offsets that they showed in zero-current windows."""
     offset = np.stack([vehicle.zero_current.offset_a for vehicle in vehicles])
     sd = np.stack([vehicle.zero_current.sd_a for vehicle in vehicles])
     nothing = no_readings(*offset.shape)
-    return Readings(drift=nothing.drift, drift_sd=nothing.drift_sd, offset_a=offset, offset_sd_a=sd)
+    windows = Readings(drift=nothing.drift, drift_sd=nothing.drift_sd, offset_a=offset, offset_sd_a=sd)
+    return windows.merged(readings_of(bench, [vehicle.vehicle for vehicle in vehicles], branches))
 
 
 def _parameters(
@@ -179,18 +213,18 @@ def _parameters(
     faults, corrected, zeros = posterior.faults.take(j), deployment.corrected[j], np.zeros(len(branches))
     moments = (vehicle.summary.mean_a, vehicle.summary.mean_product_a2)
     deployed = {"drift": np.where(corrected, faults.drift, 0.0), "offset_a": np.where(corrected, faults.offset_a, 0.0)}
-    undecided = deployment.verdicts[j] == "cannot tell" or posterior.confidence[j] < 1.0 - UNTOLD
-    told, decisive = _explanations(posterior, j, branches, identity) if undecided else ([], "")
+    open_question = deployment.verdicts[j] == "cannot tell" or posterior.confidence[j] < 1.0 - UNTOLD
+    told: list[Explanation] = []
+    decisive = ""
+    if open_question or (deployment.held_back[j] != "").any():
+        told, decisive = _explanations(posterior, deployment, j, branches, identity)
     return VehicleParameters(
         vehicle=vehicle.vehicle,
         layout=identity.layout,
         dbc=identity.dbc,
         verdict=deployment.verdicts[j],
         confidence=_share(posterior.confidence[j]),
-        branches={
-            name: _branch(vehicle, posterior, (j, k), name=name, apply=bool(corrected[k]))
-            for k, name in enumerate(branches)
-        },
+        branches={name: _branch(vehicle, posterior, deployment, (j, k), name=name) for k, name in enumerate(branches)},
         hardware_fault=HardwareFault(
             suspected=bool(deployment.hardware[j]),
             drift=float(faults.hardware_drift),
@@ -210,7 +244,7 @@ def _parameters(
 
 
 def _branch(
-    vehicle: VehicleSummary, posterior: FleetPosterior, place: tuple[int, int], *, name: str, apply: bool
+    vehicle: VehicleSummary, posterior: FleetPosterior, deployment: Deployment, place: tuple[int, int], *, name: str
 ) -> BranchParameters:
     k = vehicle.delays.branches.index(name)
     known = bool(vehicle.delays.known[k])
@@ -219,7 +253,8 @@ def _branch(
         offset_a=float(posterior.faults.offset_a[place]),
         drift_sd=float(posterior.drift_sd[place]),
         offset_sd_a=float(posterior.offset_sd_a[place]),
-        apply=apply,
+        apply=bool(deployment.corrected[place]),
+        held_back=cast("HeldBack", str(deployment.held_back[place])) if deployment.held_back[place] else None,
         delay_s=float(vehicle.delays.delay_s[k]) if known else None,
         delay_sd_s=float(vehicle.delays.sd_s[k]) if known else None,
         fault_probability=_share(posterior.sensor_fault[place]),
@@ -229,34 +264,26 @@ def _branch(
 
 
 def _explanations(
-    posterior: FleetPosterior, j: int, branches: Sequence[str], identity: RunIdentity
+    posterior: FleetPosterior, deployment: Deployment, j: int, branches: Sequence[str], identity: RunIdentity
 ) -> tuple[list[Explanation], str]:
     """The competing explanations of one vehicle, and what would decide between them."""
-    full_scale_a = identity.database.layout.full_scale_a
+    layout = identity.database.layout
     names = [branches[k] for k in posterior.order]
     found = explanations(posterior.states, j)
     told = [
         Explanation(
             probability=_share(each.probability),
             drift={name: float(d) for name, d in zip(names, each.drift, strict=True) if d},
-            offset_a={name: float(o * full_scale_a) for name, o in zip(names, each.offset, strict=True) if o},
+            offset_a={name: float(o * layout.full_scale_a) for name, o in zip(names, each.offset, strict=True) if o},
             hardware_drift=each.hardware_drift,
             hardware_offset_a={
-                name: float(o * full_scale_a) for name, o in zip(names, each.hardware_offset, strict=True) if o
+                name: float(o * layout.full_scale_a) for name, o in zip(names, each.hardware_offset, strict=True) if o
             },
         )
-        for each in found
+        for n, each in enumerate(found[:MOST_TOLD])
+        if not n or each.probability >= LEAST_TOLD
     ]
-    return told, deciding_evidence(found, names, full_scale_a) or _most_doubtful(posterior, j, branches, full_scale_a)
-
-
-def _most_doubtful(posterior: FleetPosterior, j: int, branches: Sequence[str], full_scale_a: float) -> str:
-    """Which sensor is known least where only one explanation is left."""
-    k = int(np.argmax(np.hypot(posterior.drift_sd[j], posterior.offset_sd_a[j] / full_scale_a)))
-    return (
-        f"more drives would decide: the {branches[k]} sensor's drift is known to +-{posterior.drift_sd[j, k]:.1%} and "
-        f"its offset to +-{posterior.offset_sd_a[j, k]:.1f} A only; record drives in which that current varies"
-    )
+    return told, advise(posterior, deployment, j, found, branches=branches, layout=layout)
 
 
 def _details(posterior: FleetPosterior, branches: Sequence[str]) -> dict[str, object]:

@@ -9,8 +9,8 @@ slab; at its edges the correlation between parameters is left out.
 
 Rows can leave directions open: if all relative parameters are there, a common factor can move from d_h to the drifts
 unseen, and if o_h,k and o_k are there, an offset from one to the other, unless some reading tells one of them. Which
-directions are open depends on the rows of the vehicle. One parameter of each, the pivot, is set to the nodes of the
-slab in turn, and the others follow.
+directions are open depends on the rows of the vehicle, where their noise is least. One parameter of each, the pivot, is
+set to the nodes of the slab in turn, and the others follow.
 """
 
 from collections.abc import Callable, Sequence
@@ -165,7 +165,8 @@ def _each(
     """Integrate all vehicles, those with the same pivots together."""
     active = np.array(support.active, np.int64)
     X = design[:, active]
-    pivots = _pivots(X.T @ noise.precision[:, 0] @ X, slab)
+    sharpest = noise.log_determinant.argmin(axis=1)
+    pivots = _pivots(X.T @ noise.precision[np.arange(len(sharpest)), sharpest] @ X, slab)
     patterns, which = np.unique(pivots, axis=0, return_inverse=True)
     places = [np.flatnonzero(which.ravel() == i) for i in range(len(patterns))]
     fits = [integrate(j, list(active[p]), list(active[~p])) for j, p in zip(places, patterns, strict=True)]

@@ -5,19 +5,24 @@ moves the clusters of the junction law, which needs no reference; two variants o
 whose sensors are all faulty forms none.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.drive import Array
+from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
 from calibrator.posterior.cluster import Cluster, densest_clusters
 from calibrator.posterior.model_spread import MOST_UNMEASURED, unmeasured_load
+from calibrator.posterior.slab import FAULTS_RANGE
+from ecu_node.layout import UnmeasuredLoad
 
-__all__ = ["ReferenceHealth", "examine_reference"]
+__all__ = ["FEWEST_TRUSTED", "ReferenceHealth", "examine_reference"]
+
+FEWEST_TRUSTED = 3
+"""Trusted vehicles that tell a branch and carry its reference, so that it is in no doubt."""
 
 LEAST_AGREEING = 5
 """Vehicles that must agree for their centre to be trusted."""
@@ -51,6 +56,8 @@ class ReferenceHealth:
         Branches whose scale or zero the fleet may have wrong as a whole.
     warnings : tuple of str
         What would fool the reference, one text each.
+    distrusted : mapping of int to str
+        Vehicles that were called trusted and do not carry the reference, by position, and why.
     """
 
     agreeing_share: tuple[float, ...]
@@ -59,6 +66,7 @@ class ReferenceHealth:
     unmeasured_a: float
     doubtful: tuple[int, ...]
     warnings: tuple[str, ...]
+    distrusted: Mapping[int, str] = field(default_factory=dict)
 
     def in_order(self, place: NDArray[np.int64]) -> "ReferenceHealth":
         """Return the same for branches in another order: branch k is at position ``place[k]`` here."""
@@ -70,7 +78,14 @@ class ReferenceHealth:
         )
 
 
-def examine_reference(rows: FleetRows, branches: Sequence[str], *, full_scale_a: float) -> ReferenceHealth:
+def examine_reference(
+    rows: FleetRows,
+    branches: Sequence[str],
+    *,
+    full_scale_a: float,
+    trusted: Mask | None = None,
+    load: UnmeasuredLoad | None = None,
+) -> ReferenceHealth:
     """Look for what would fool the reference.
 
     Parameters
@@ -81,6 +96,10 @@ def examine_reference(rows: FleetRows, branches: Sequence[str], *, full_scale_a:
         Names of the K branches in the order of the rows.
     full_scale_a : float
         Full scale of the junction. [A]
+    trusted : ndarray of bool of shape (N,) or None
+        Vehicles that carry the reference of the branches that :data:`FEWEST_TRUSTED` of them tell.
+    load : UnmeasuredLoad or None
+        Load that no branch measures, if it is known.
 
     Returns
     -------
@@ -88,51 +107,78 @@ def examine_reference(rows: FleetRows, branches: Sequence[str], *, full_scale_a:
         With warnings in words.
     """
     K = rows.branches
+    carried = _carried(rows, trusted)
+    advice = _advice(carried, K)
     slopes = [_cluster(rows, k) for k in range(K)]
     share = [found[0].share if found else 0.0 for found in slopes]
     distance = [
         float(np.mean(rows.relative[:, k])) - (found[0].centre if found else 0.0) for k, found in enumerate(slopes)
     ]
-    warnings, doubtful = _common_gains(rows, branches)
-    warnings += _no_cluster(slopes, branches, doubtful, len(rows)) + _second_clusters(slopes, branches, len(rows))
+    warnings, doubtful = _common_gains(rows, branches, advice)
+    warnings += _no_cluster(slopes, branches, doubtful, len(rows), advice)
+    warnings += _second_clusters(slopes, branches, len(rows))
     least = ceil(LEAST_AGREEING / max(min(share), 1.0 / 1000.0))
     if len(rows) < least:
         doubtful = set(range(K))
         warnings.append(
             f"{len(rows)} vehicles are few for a fleet in which {min(share):.0%} agree: at least {least} are needed "
-            f"to trust its reference; until then no branch is corrected"
+            f"to trust its reference; {advice}"
         )
-    warnings += _common_offset(rows, doubtful, full_scale_a)
-    load = unmeasured_load(rows.constant[:, K], _sd(rows, 4 * K - 1))
-    unmeasured_a = load.centre * full_scale_a
-    if abs(load.centre) > max(LEAST_COMMON_OFFSET, SURE * _uncertainty(load, _sd(rows, 4 * K - 1))):
-        warnings.append(
-            f"the currents of most vehicles sum to {unmeasured_a:+.1f} A: a load without a sensor, as is taken here, "
-            f"or an offset that most vehicles share"
-        )
+    warnings += _common_offset(rows, doubtful, full_scale_a, load, advice)
+    unmeasured_a = 0.0 if load is None else load.mean_a
+    if load is None:
+        found = unmeasured_load(rows.constant[:, K], _sd(rows, 4 * K - 1))
+        unmeasured_a = found.centre * full_scale_a
+        if abs(found.centre) > max(LEAST_COMMON_OFFSET, SURE * _uncertainty(found, _sd(rows, 4 * K - 1))):
+            warnings.append(
+                f"the currents of most vehicles sum to {unmeasured_a:+.1f} A: a load without a sensor, as is taken "
+                f"here, or an offset that most vehicles share; if the load is known, declare it as [unmeasured_load] "
+                f"in the layout"
+            )
     return ReferenceHealth(
         agreeing_share=tuple(share),
         mean_distance=tuple(distance),
         least_vehicles=least,
         unmeasured_a=unmeasured_a,
-        doubtful=tuple(sorted(doubtful)),
+        doubtful=tuple(sorted(doubtful - carried)),
         warnings=tuple(warnings),
     )
 
 
-def _common_offset(rows: FleetRows, doubtful: set[int], full_scale_a: float) -> list[str]:
+def _carried(rows: FleetRows, trusted: Mask | None) -> set[int]:
+    """Branches whose slope is told by enough trusted vehicles."""
+    if trusted is None:
+        return set()
+    return {k for k in range(rows.branches) if np.count_nonzero(_told(rows, k)[trusted]) >= FEWEST_TRUSTED}
+
+
+def _advice(carried: set[int], branches: int) -> str:
+    if len(carried) == branches:
+        return "the trusted vehicles carry the reference instead"
+    more = "more " if carried else ""
+    return f"name {more}bench-checked vehicles with --trusted, at least {FEWEST_TRUSTED} that use each branch"
+
+
+def _common_offset(
+    rows: FleetRows, doubtful: set[int], full_scale_a: float, load: UnmeasuredLoad | None, advice: str
+) -> list[str]:
     """A constant of the junction law that most vehicles share and no load without a sensor makes."""
     K = rows.branches
     sd = _sd(rows, 4 * K - 1)
-    found = densest_clusters(rows.constant[:, K], sd)[0]
+    found = densest_clusters(rows.constant[:, K], sd, widest=FAULTS_RANGE)[0]
     doubt = max(LEAST_COMMON_OFFSET, SURE * _uncertainty(found, sd))
-    if -doubt <= found.centre <= MOST_UNMEASURED + doubt or not _agree(found):
+    lowest, highest = (0.0, MOST_UNMEASURED) if load is None else (load.mean_a / full_scale_a,) * 2
+    if lowest - doubt <= found.centre <= highest + doubt or not _agree(found):
         return []
+    expected = (
+        "no load without a sensor explains"
+        if load is None
+        else f"the declared load of {load.mean_a:g} A does not explain"
+    )
     doubtful.update(range(K))
     return [
-        f"the currents of most vehicles sum to {found.centre * full_scale_a:+.1f} A, which no load without a sensor "
-        f"explains: an offset that most vehicles share (a batch of sensors), in any branch; until it is found none is "
-        f"corrected"
+        f"the currents of most vehicles sum to {found.centre * full_scale_a:+.1f} A, which {expected}: an offset that "
+        f"most vehicles share (a batch of sensors), in any branch; {advice}"
     ]
 
 
@@ -147,7 +193,9 @@ def _told(rows: FleetRows, row: int) -> Array:
 def _cluster(rows: FleetRows, row: int) -> list[Cluster]:
     """The two densest clusters of a relative row among the vehicles that tell it."""
     told = _told(rows, row)
-    return densest_clusters(rows.relative[told, row], _sd(rows, row)[told], most=2) if told.any() else []
+    if not told.any():
+        return []
+    return densest_clusters(rows.relative[told, row], _sd(rows, row)[told], most=2, widest=FAULTS_RANGE)
 
 
 def _uncertainty(cluster: Cluster, sd: Array) -> float:
@@ -156,7 +204,7 @@ def _uncertainty(cluster: Cluster, sd: Array) -> float:
     return float(np.sqrt((cluster.spread**2 + np.median(sd) ** 2) / members))
 
 
-def _common_gains(rows: FleetRows, branches: Sequence[str]) -> tuple[list[str], set[int]]:
+def _common_gains(rows: FleetRows, branches: Sequence[str], advice: str) -> tuple[list[str], set[int]]:
     """Gain ratios of the junction law whose cluster is not at 1: a gain fault that most vehicles share."""
     K = rows.branches
     off: dict[int, float] = {}
@@ -175,13 +223,13 @@ def _common_gains(rows: FleetRows, branches: Sequence[str]) -> tuple[list[str], 
     size = max(off.values(), key=abs)
     text = (
         f"the reference breaks the junction law by {size:+.1%}: a gain fault that most vehicles share (a batch of "
-        f"sensors), in branch {names}; name bench-checked vehicles with --trusted"
+        f"sensors), in branch {names}; {advice}"
     )
     return [text], suspects
 
 
 def _no_cluster(
-    slopes: Sequence[Sequence[Cluster]], branches: Sequence[str], doubtful: set[int], vehicles: int
+    slopes: Sequence[Sequence[Cluster]], branches: Sequence[str], doubtful: set[int], vehicles: int, advice: str
 ) -> list[str]:
     """Branches in which no two vehicles agree."""
     texts = []
@@ -189,8 +237,7 @@ def _no_cluster(
         if vehicles > LEAST_AGREEING and not (found and _agree(found[0])):
             doubtful.add(k)
             texts.append(
-                f"no cluster of vehicles agrees in branch {branches[k]}: every sensor of it may be faulty; name "
-                f"bench-checked vehicles with --trusted"
+                f"no cluster of vehicles agrees in branch {branches[k]}: every sensor of it may be faulty; {advice}"
             )
     return texts
 

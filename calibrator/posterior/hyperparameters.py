@@ -26,7 +26,7 @@ from calibrator.posterior.model_spread import (
     free_centres,
     next_spread,
 )
-from calibrator.posterior.slab import Slab
+from calibrator.posterior.slab import WIDEST, Slab
 from calibrator.posterior.states import States, enumerate_states
 from calibrator.random_streams import Purpose, random_stream
 
@@ -36,8 +36,6 @@ __all__ = [
     "estimate_hyperparameters",
 ]
 
-WIDEST = Slab(0.002, 0.45)
-"""Any fault that a sensor of a running vehicle can have. [1]"""
 TRIAL_STEPS, STEPS = 4, 12
 """Steps of each start, and of the best one after that."""
 CONVERGED = 0.005

@@ -136,9 +136,9 @@ class JointEvidence:
         N, M, Q = fit.log_evidence.shape
         moved, relative_sd = _moved(found.covariance, turn, noise, fit)
         factor = (1.0 + found.parameters[:, :, None]) * np.exp(moved)
-        stretch = np.concatenate([np.ones((N, M, Q, self.prior.branches - 1)), np.exp(moved[..., 1:])], axis=3)
+        # The rows were divided by the 1 + d of the state, whatever moves it: the offsets stay.
         offset_sd = np.sqrt(np.diagonal(fit.covariance, axis1=3, axis2=4)) * found.scale[:, :, None]
-        arrays = (factor - 1.0, relative_sd * factor, fit.parameters * stretch, offset_sd * stretch)
+        arrays = (factor - 1.0, relative_sd * factor, fit.parameters, offset_sd)
         relative, relative_sd, constant, constant_sd = (values.reshape(N, M * Q, -1) for values in arrays)
         total = (log_weight[:, :, None] + fit.log_evidence).reshape(N, M * Q)
         return total, (relative, relative_sd, constant, constant_sd)

@@ -12,6 +12,7 @@ from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, constant_design, relative_design
 from calibrator.posterior.cluster import Cluster, densest_clusters
 from calibrator.posterior.fault_prior import OUTLIER_VARIANCE, FaultPrior, ModelSpread
+from calibrator.posterior.slab import FAULTS_RANGE
 from calibrator.posterior.states import States
 
 __all__ = [
@@ -118,9 +119,11 @@ def unmeasured_load(constant: Array, sd: Array) -> Cluster:
     Cluster
         At zero if too few vehicles agree for such a load to be taken for granted.
     """
-    for found in densest_clusters(constant, sd, farthest=MOST_UNMEASURED):
-        if found.share >= LEAST_AGREEING_LOAD and found.centre > -LAWFUL_CONSTANT:
-            return found
+    possible = constant > -LAWFUL_CONSTANT - LAWFUL * sd
+    for found in densest_clusters(constant[possible], sd[possible], farthest=MOST_UNMEASURED, widest=FAULTS_RANGE):
+        share = found.share * float(possible.mean())
+        if share >= LEAST_AGREEING_LOAD and found.centre > -LAWFUL_CONSTANT:
+            return replace(found, share=share)
     return Cluster(centre=0.0, spread=0.0, share=0.0, gain=0.0)
 
 
@@ -148,8 +151,11 @@ def trusted_spread(rows: FleetRows, trusted: Mask) -> ModelSpread:
     ModelSpread
         Centres of slopes, intercepts and junction constant are the trusted vehicles'.
     """
-    values = np.concatenate([rows.relative, rows.constant], axis=1)
-    mean = np.where(free_centres(rows.branches), np.median(values[trusted], axis=0), 0.0)
+    values = np.concatenate([rows.relative, rows.constant], axis=1)[trusted]
+    told = np.diagonal(rows.covariance, axis1=1, axis2=2)[trusted] < UNKNOWN_VARIANCE / 2.0
+    mean = np.zeros(values.shape[1])
+    for row in np.flatnonzero(np.asarray(free_centres(rows.branches), bool) & told.any(axis=0)):
+        mean[row] = np.median(values[told[:, row], row])
     covariance = _guessed_spread(rows) + np.diag(_least_spread(rows.branches) ** 2)
     return ModelSpread(
         mean=mean, covariance=covariance, outlier_share=GUESSED_OUTLIER_SHARE, dispersion=FIRST_DISPERSION

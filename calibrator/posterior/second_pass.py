@@ -39,14 +39,16 @@ def without_sensor_models(deployment: Deployment, findings: SensorFindings) -> D
         verdict "corrected" if another of its branches is, else "cannot tell".
     """
     not_linear, undecided = findings.not_linear, findings.undecided
-    held_back = not_linear | undecided.any(axis=1, keepdims=True)
-    corrected = deployment.corrected & ~held_back
-    concerned: Mask = np.any(held_back, axis=1)
+    not_corrected: Mask = not_linear | undecided.any(axis=1, keepdims=True)
+    held_back = deployment.held_back.copy()
+    held_back[not_linear | (deployment.corrected & not_corrected)] = "not linear"
+    corrected = deployment.corrected & ~not_corrected
+    concerned: Mask = np.any(not_corrected, axis=1)
     verdicts = tuple(
         _verdict(any_corrected=bool(corrected[j].any())) if concerned[j] else verdict
         for j, verdict in enumerate(deployment.verdicts)
     )
-    return replace(deployment, corrected=corrected, verdicts=verdicts)
+    return replace(deployment, corrected=corrected, held_back=held_back, verdicts=verdicts)
 
 
 def _verdict(*, any_corrected: bool) -> Verdict:

@@ -11,7 +11,7 @@ from scipy.stats import qmc
 
 from calibrator.drive import Array
 
-__all__ = ["Slab"]
+__all__ = ["FAULTS_RANGE", "WIDEST", "Slab"]
 
 POINTS_PER_SIGN = 8
 """Nodes of the midpoint rule along one direction that the evidence leaves open. [1]"""
@@ -81,3 +81,9 @@ class Slab:
         centred = 2.0 * unit - 1.0
         magnitude = self.low + (self.high - self.low) * np.abs(centred)
         return np.asarray(np.where(centred < 0.0, -magnitude, magnitude))
+
+
+WIDEST = Slab(0.002, 0.45)
+"""Any fault that a sensor of a running vehicle can have. [1]"""
+FAULTS_RANGE = 2.0 * WIDEST.high
+"""From the lowest to the highest drift or offset that a sensor can have. [1]"""

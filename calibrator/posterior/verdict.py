@@ -1,13 +1,15 @@
 """Verdict on each vehicle: which branches the node may correct, and what is said of the vehicle as a whole."""
 
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 from calibrator.posterior.estimate import FleetPosterior
 from ecu_node.layout import Layout
-from ecu_node.parameters import Verdict
+from ecu_node.parameters import HeldBack, Verdict
 
 __all__ = ["Deployment", "decide"]
 
@@ -15,6 +17,7 @@ CONFIDENT = 0.95
 """Posterior probability from which on the calibrator says what it found. [1]"""
 SUSPECTED = 0.5
 """Probability of a hardware fault from which on it is reported. [1]"""
+LONGEST_REASON = max(map(len, get_args(HeldBack)))
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,9 @@ class Deployment:
     ----------
     corrected : ndarray of bool of shape (N, K)
         Branches that the node is to correct.
+    held_back : ndarray of str of shape (N, K)
+        Why a branch in which a fault was found is not corrected, one of :data:`ecu_node.parameters.HeldBack`; empty
+        where it is, or where none was found.
     verdicts : tuple of str
         Of each vehicle.
     hardware : ndarray of bool of shape (N,)
@@ -32,6 +38,7 @@ class Deployment:
     """
 
     corrected: Mask
+    held_back: NDArray[np.str_]
     verdicts: tuple[Verdict, ...]
     hardware: Mask
 
@@ -61,14 +68,25 @@ def decide(posterior: FleetPosterior, layout: Layout, *, harm_limit: float, doub
     """
     drift, offset_a = posterior.faults.drift, posterior.faults.offset_a
     faulty = (drift != 0.0) | (offset_a != 0.0)
-    allowed = (np.abs(drift) <= layout.limits.drift) & (np.abs(offset_a) <= layout.offset_limit_a)
-    corrected = faulty & allowed & posterior.identifiable & (posterior.harm < harm_limit)
-    corrected[:, list(doubtful)] = False
+    in_doubt = np.zeros_like(faulty)
+    in_doubt[:, list(doubtful)] = True
+    held_back = np.full(faulty.shape, "", f"<U{LONGEST_REASON}")
+    within = (np.abs(drift) <= layout.limits.drift) & (np.abs(offset_a) <= layout.offset_limit_a)
+    by_rising_weight: dict[HeldBack, Mask] = {
+        "harm limit": ~(posterior.harm < harm_limit),
+        "moved too little": ~posterior.identifiable,
+        "reference in doubt": in_doubt,
+        "beyond the limits": ~within,
+    }
+    for reason, applies in by_rising_weight.items():
+        held_back[faulty & applies] = reason
+    corrected = faulty & (held_back == "")
     verdicts = tuple(
         _verdict(corrected[j], faulty[j], float(posterior.confidence[j]), certain=not doubtful)
         for j in range(len(posterior))
     )
-    return Deployment(corrected, verdicts, np.asarray(posterior.hardware_fault > SUSPECTED))
+    hardware = np.asarray(posterior.hardware_fault > SUSPECTED) & (not doubtful)
+    return Deployment(corrected, held_back, verdicts, hardware)
 
 
 def _verdict(corrected: Array, faulty: Array, confidence: float, *, certain: bool) -> Verdict:

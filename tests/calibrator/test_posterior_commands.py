@@ -76,14 +76,6 @@ def test_every_file_fits_its_vehicle_and_applies_only_what_hardly_harms(paramete
             assert not branch.apply or branch.harm_probability < 0.001
 
 
-def test_a_vehicle_of_which_nothing_can_be_told_names_its_explanations(parameters: list[VehicleParameters]) -> None:
-    for item in parameters:
-        if item.verdict == "cannot tell":
-            assert item.explanations
-            assert item.deciding_evidence
-            assert not any(branch.apply for branch in item.branches.values())
-
-
 def test_unmeasured_load_is_estimated_from_the_fleet_and_named(fleet: Path, result: Path) -> None:
     run = read_run(result)
     truth = [vehicle.unmeasured_a for vehicle in read_truth(fleet / "truth.json").vehicles.values()]
@@ -91,29 +83,92 @@ def test_unmeasured_load_is_estimated_from_the_fleet_and_named(fleet: Path, resu
     assert any("load without a sensor" in notice for notice in run.notices)
 
 
-def test_a_stricter_harm_limit_corrects_no_more_branches(fleet: Path, result: Path, tmp_path: Path) -> None:
-    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "strict", "--harm-limit", 0)
+@pytest.fixture(scope="module")
+def strict(fleet: Path) -> Path:
+    """Nothing may do harm, so nothing is corrected and faulty vehicles stay undecided."""
+    out = fleet.parent / "strict"
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out, "--harm-limit", 0)
     assert run.returncode == 0, run.stderr
-    usual, strict = (
-        {(r["vehicle"], r["branch"]): r for r in read_results(out)} for out in (result, tmp_path / "strict")
-    )
-    assert not any(row["applied"] for row in strict.values())
-    assert any(row["applied"] for row in usual.values())
+    return out
+
+
+def test_a_stricter_harm_limit_corrects_no_more_branches(result: Path, strict: Path) -> None:
+    assert not any(row["applied"] for row in read_results(strict))
+    assert any(row["applied"] for row in read_results(result))
+
+
+def test_what_was_chosen_and_why_faults_are_held_back_is_told_of_each_branch(result: Path, strict: Path) -> None:
+    chosen = read_run(strict).settings
+    assert (chosen["harm_limit"], chosen["trusted"], chosen["hold_out"]) == (0.0, [], [])
+    rows = read_results(strict)
+    found = [row for row in rows if row["drift"] or row["offset_a"]]
+    assert {row["held_back"] for row in found} == {"harm limit"}
+    assert all(row["held_back"] is None for row in rows if row not in found)
+    assert not any(row["held_back"] for row in read_results(result) if row["applied"])
+    for row in rows:
+        assert 0.0 <= row["fault_probability"] <= 1.0
+        assert row["drift_sd"] >= 0.0
+        assert row["offset_sd_a"] >= 0.0
+
+
+def test_a_vehicle_of_which_nothing_can_be_told_names_its_explanations(strict: Path) -> None:
+    parameters = [read_parameters(path) for path in sorted((strict / "params").iterdir())]
+    untold = [item for item in parameters if item.verdict == "cannot tell"]
+    assert untold
+    for item in untold:
+        assert item.explanations
+        assert item.deciding_evidence
+        assert not any(branch.apply for branch in item.branches.values())
 
 
 def test_trusted_vehicles_are_taken_for_faultless(fleet: Path, tmp_path: Path) -> None:
     truth = read_truth(fleet / "truth.json").vehicles
-    sound = [
-        name
-        for name, vehicle in truth.items()
-        if not any([*vehicle.drift.values(), *vehicle.offset_a.values(), vehicle.hardware_drift])
-        and not any(vehicle.hardware_offset_a.values())
-    ]
+    sound = [name for name, vehicle in truth.items() if not any([*vehicle.drift.values(), *vehicle.offset_a.values()])]
+    assert len(sound) >= 3
     trusted = [part for name in sound for part in ("--trusted", name)]
     run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "result", *trusted)
     assert run.returncode == 0, run.stderr
     rows = [row for row in read_results(tmp_path / "result") if row["vehicle"] in sound]
+    assert len(rows) == 2 * len(sound)
     assert all(row["drift"] == 0.0 and row["offset_a"] == 0.0 for row in rows)
+
+
+def test_a_bench_reading_of_a_sensor_is_heeded_and_recorded(fleet: Path, result: Path, tmp_path: Path) -> None:
+    vehicle, truth = next(
+        (name, vehicle)
+        for name, vehicle in read_truth(fleet / "truth.json").vehicles.items()
+        if any(vehicle.offset_a.values())
+    )
+    table = tmp_path / "bench.csv"
+    cells = "".join(f"{vehicle},{name},{truth.offset_a[name]},0.02\n" for name in ("battery", "motor"))
+    table.write_text(f"vehicle,branch,offset_a,offset_sd_a\n{cells}")
+    out = tmp_path / "result"
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out, "--readings", table)
+    assert run.returncode == 0, run.stderr
+    assert read_run(out).settings["readings"] == "bench.csv"
+    before, after = (
+        {row["branch"]: row for row in read_results(folder) if row["vehicle"] == vehicle} for folder in (result, out)
+    )
+    for name in ("battery", "motor"):
+        assert after[name]["offset_a"] == pytest.approx(truth.offset_a[name], abs=0.1)
+        assert after[name]["offset_sd_a"] < min(0.03, before[name]["offset_sd_a"])
+
+
+def test_a_slip_in_the_bench_readings_ends_the_run_before_any_drive_is_read(fleet: Path, tmp_path: Path) -> None:
+    table = tmp_path / "bench.csv"
+    table.write_text("vehicle,branch,offset_a,offset_sd_a\nV001,battery,1 A,0.02\n")
+    out = tmp_path / "result"
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out, "--readings", table)
+    assert run.returncode == 1
+    assert "bench.csv: line 2: offset_a is '1 A'; expected a number" in run.stderr
+    assert not out.exists()
+
+
+def test_a_vehicle_cannot_be_trusted_and_held_out(fleet: Path, tmp_path: Path) -> None:
+    both = ("--trusted", "V001", "--hold-out", "V001")
+    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "result", *both)
+    assert run.returncode == 1
+    assert "vehicle V001 is both held out and trusted" in run.stderr
 
 
 def test_a_vehicle_that_is_not_there_cannot_be_trusted(fleet: Path, tmp_path: Path) -> None:

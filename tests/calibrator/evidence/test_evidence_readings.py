@@ -1,6 +1,9 @@
 """Direct readings of single sensors as rows of the evidence."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from calibrator.evidence.readings import Readings, no_readings, trusted_readings, with_readings
 from calibrator.evidence.rows import UNKNOWN_VARIANCE
@@ -46,9 +49,22 @@ def test_trusted_vehicles_read_zero_and_the_others_nothing() -> None:
     assert np.isnan(readings.offset_sd_a[1]).all()
 
 
-def test_later_readings_take_the_place_of_earlier_ones_only_where_there_are_any() -> None:
-    merged = offset_reading((1.0, 2.0)).merged(offset_reading((5.0, np.nan)))
-    assert merged.offset_a.tolist() == [[5.0, 2.0]]
+def test_a_sensor_that_is_read_twice_counts_with_the_precision_of_each_reading() -> None:
+    first, second = offset_reading((1.0, 2.0)), offset_reading((5.0, np.nan))
+    sharp = replace(second, offset_sd_a=np.array([[0.05, 0.05]]))
+    merged = first.merged(sharp)
+    assert merged.offset_a[0] == pytest.approx([(1.0 + 4.0 * 5.0) / 5.0, 2.0])
+    assert merged.offset_sd_a[0] == pytest.approx([0.1 / np.sqrt(5.0), 0.1])
+    assert np.isnan(merged.drift).all()
+    assert np.isnan(merged.drift_sd).all()
+
+
+def test_the_deviation_of_a_gain_reading_is_that_of_the_logarithm() -> None:
+    nothing = no_readings(1, 2)
+    read = replace(nothing, drift=np.array([[0.25, np.nan]]), drift_sd=np.array([[0.01, np.nan]]))
+    rows = with_readings(rows_of(AMBIGUOUS), read, full_scale_a=FULL_SCALE_A)
+    assert rows.relative[0, 3] == pytest.approx(np.log(1.25))
+    assert rows.covariance[0, 3, 3] == pytest.approx((0.01 / 1.25) ** 2)
 
 
 def test_readings_follow_their_branches() -> None:

@@ -5,11 +5,11 @@ import pytest
 
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.errors import FleetError
-from calibrator.evidence.rows import FleetRows
+from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, with_load_spread
 from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
 from calibrator.posterior.hyperparameters import draw_hyperparameters, estimate_hyperparameters
-from calibrator.posterior.model_spread import trusted_spread
+from calibrator.posterior.model_spread import trusted_spread, unmeasured_load
 from calibrator.score import recovered
 from tests.calibrator.posterior.simulated_rows import (
     FULL_SCALE_A,
@@ -126,6 +126,50 @@ def test_trusted_vehicles_tell_the_reference_as_well_as_their_number_does(truth:
     deviation = np.std([each.spread.mean[0] for each in drawn])
     one = np.sqrt(np.median(rows.covariance[:, 0, 0]) + best.spread.covariance[0, 0])
     assert deviation == pytest.approx(one * np.sqrt(np.pi / 2.0 / 3.0), rel=0.5)
+
+
+def test_a_trusted_vehicle_that_never_used_a_branch_says_nothing_of_its_centre(truth: Faults) -> None:
+    rows = rows_of(truth, seed=1)
+    relative, covariance = rows.relative.copy(), rows.covariance.copy()
+    relative[0, 1], relative[1:3, 1], covariance[1:3, 1, 1] = 0.03, 0.0, UNKNOWN_VARIANCE
+    trusted = np.arange(VEHICLES) < 3
+    assert trusted_spread(replace(rows, relative=relative, covariance=covariance), trusted).mean[1] == 0.03
+
+
+def test_a_load_is_found_beside_a_larger_batch_of_offsets() -> None:
+    rng = np.random.default_rng(1)
+    constant = np.repeat([-0.01, 0.0075, 0.05], [45, 35, 20]) + 1e-4 * rng.normal(size=100)
+    load = unmeasured_load(constant, np.full(100, 1e-4))
+    assert load.centre == pytest.approx(0.0075, abs=2e-4)
+    assert load.share == pytest.approx(0.35, abs=0.05)
+
+
+def test_a_load_that_is_the_same_in_every_vehicle_is_found() -> None:
+    rng = np.random.default_rng(1)
+    sd = np.full(16, 3e-5)
+    load = unmeasured_load(0.0075 + 1.5 * sd * rng.normal(size=16), sd)
+    assert load.centre == pytest.approx(0.0075, abs=1e-4)
+    assert load.share > 0.9
+
+
+def test_a_declared_load_takes_the_place_of_the_one_that_few_vehicles_tell() -> None:
+    truth = random_faults(4, vehicles=8, branches=K, sparsity=66.0)
+    load = 0.0075 + 0.0025 * np.random.default_rng(2).normal(size=8)
+    rows = rows_of(truth, seed=3)
+    rows.constant[:, K] += load * (1.0 + truth.drift[:, 0])
+    told = with_load_spread(rows, 0.0025)
+    given = estimate_fleet(told, moments_of(8), full_scale_a=FULL_SCALE_A, load=0.0075, given=prior_of(K))
+    assert given.hyperparameters.spread.mean[4 * K - 1] == 0.0075
+    wrong = estimate_fleet(told, moments_of(8), full_scale_a=FULL_SCALE_A, load=0.03, given=prior_of(K))
+    assert given.hyperparameters.log_evidence > wrong.hyperparameters.log_evidence + 5.0
+
+
+def test_the_spread_of_loads_widens_the_constant_alone(truth: Faults) -> None:
+    rows = rows_of(truth)
+    added = with_load_spread(rows, 0.0025).covariance - rows.covariance
+    expected = np.zeros((5 * K, 5 * K))
+    expected[4 * K - 1, 4 * K - 1] = 0.0025**2
+    np.testing.assert_allclose(added, np.broadcast_to(expected, added.shape), atol=1e-12)
 
 
 def test_a_large_fleet_with_few_trusted_vehicles_keeps_the_doubt_about_its_centre(truth: Faults) -> None:

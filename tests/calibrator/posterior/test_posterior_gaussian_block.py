@@ -209,3 +209,24 @@ def log_evidence_of_drifts(y: Array, design: Array, R: Array, slab: Slab) -> flo
     support = Support(tuple(range(len(y))), hardware=False)
     fit = integrate_relative(y[None, None], design, support, Noise.of(R[None]), slab)
     return float(logsumexp(fit.log_evidence))
+
+
+@pytest.mark.parametrize("active", [(0, 2), (1, 2)])
+def test_a_vague_state_beside_it_does_not_change_the_evidence_of_a_sharp_one(active: tuple[int, ...]) -> None:
+    sharp = np.diag([1e-6, 1e-6, 1e-6, UNKNOWN_VARIANCE, UNKNOWN_VARIANCE])
+    vague = sharp + 0.01 * np.outer([0.0, 1.0, 1.0, 0.0, 0.0], [0.0, 1.0, 1.0, 0.0, 0.0])
+    support = constant_support(K, active)
+    y = constant_design(K)[:, list(active)] @ np.array([0.1237, -0.1])
+    y[3:] = 0.0
+    found = []
+    for place, noises in enumerate([(sharp, vague), (vague, sharp)]):
+        fit = integrate_constant(
+            np.stack([y, y])[None],
+            constant_design(K),
+            support,
+            Noise.of(np.stack(noises)[None]),
+            SLAB,
+            scale=np.ones((1, 2, 2 * K - 1)),
+        )
+        found.append(float(logsumexp(fit.log_evidence[0, place])))
+    assert found[0] == pytest.approx(found[1])

@@ -8,6 +8,7 @@ import pytest
 from calibrator.faults import Faults
 from calibrator.posterior.estimate import Moments, estimate_fleet
 from calibrator.posterior.health import ReferenceHealth, examine_reference
+from ecu_node.layout import UnmeasuredLoad
 from tests.calibrator.posterior.simulated_rows import FULL_SCALE_A, random_faults, rows_of
 
 NAMES = ("battery", "motor", "auxiliary")
@@ -32,6 +33,45 @@ def test_ordinary_fleets_raise_no_alarm(branches: int, sparsity: float, seed: in
     health = examined(random_faults(seed, vehicles=60, branches=branches, sparsity=sparsity), seed=seed)
     assert health.warnings == ()
     assert health.doubtful == ()
+
+
+def with_drifts(vehicles: int, faulty: int, *, branch: int = 0, offset_a: float = 0.0, drift: float = 0.1) -> Faults:
+    """A fleet without faults but for some vehicles' one sensor."""
+    zero = np.zeros((vehicles, 2))
+    d, o = zero.copy(), zero.copy()
+    d[:faulty, branch], o[:faulty, branch] = drift * (-1.0) ** np.arange(faulty), offset_a
+    return Faults(hardware_drift=np.zeros(vehicles), hardware_offset_a=zero, drift=d, offset_a=o)
+
+
+@pytest.mark.parametrize("vehicles", [10, 20, 40, 80])
+@pytest.mark.parametrize("faulty", [0, 1, 4])
+def test_fleets_that_nearly_all_agree_raise_no_alarm(vehicles: int, faulty: int) -> None:
+    for seed in range(5):
+        health = examined(with_drifts(vehicles, faulty), seed=seed)
+        assert (health.warnings, health.doubtful) == ((), ())
+        assert health.least_vehicles <= 10
+
+
+@pytest.mark.parametrize("vehicles", [10, 20, 40])
+def test_a_fault_that_every_vehicle_has_is_noticed(vehicles: int) -> None:
+    shared = with_drifts(vehicles, 0)
+    gain = replace(shared, drift=shared.drift + np.array([0.06, 0.0]))
+    offset = replace(shared, offset_a=shared.offset_a + np.array([0.0, 12.0]))
+    for seed in range(5):
+        assert any("breaks the junction law" in text for text in examined(gain, seed=seed).warnings)
+        assert any("an offset that most vehicles share" in text for text in examined(offset, seed=seed).warnings)
+
+
+def test_enough_trusted_vehicles_take_the_doubt_and_the_notice_says_so() -> None:
+    fleet = with_batch(random_faults(1, vehicles=60, branches=2, sparsity=80.0), branch=0, drift=0.06, share=0.8)
+    trusted = np.arange(60) >= 57
+    rows = rows_of(fleet)
+    carried = examine_reference(rows, NAMES[:2], full_scale_a=FULL_SCALE_A, trusted=trusted)
+    assert carried.doubtful == ()
+    assert any("the trusted vehicles carry the reference instead" in text for text in carried.warnings)
+    few = examine_reference(rows, NAMES[:2], full_scale_a=FULL_SCALE_A, trusted=np.arange(60) >= 58)
+    assert few.doubtful == (0, 1)
+    assert any("with --trusted, at least 3 that use each branch" in text for text in few.warnings)
 
 
 def test_gain_fault_of_most_vehicles_breaks_the_junction_law_and_names_both_branches_of_two() -> None:
@@ -67,6 +107,19 @@ def test_a_load_of_possible_size_is_taken_for_one() -> None:
     health = examine_reference(replace(rows, constant=constant), NAMES[:2], full_scale_a=FULL_SCALE_A)
     assert health.doubtful == ()
     assert health.unmeasured_a == pytest.approx(3.0, abs=0.7)
+
+
+@pytest.mark.parametrize(("sum_a", "told"), [(3.0, False), (9.0, True), (-3.0, True)])
+def test_a_declared_load_is_expected_and_anything_else_is_an_offset(sum_a: float, told: bool) -> None:
+    rows = rows_of(random_faults(8, vehicles=60, branches=2, sparsity=80.0))
+    constant = rows.constant.copy()
+    constant[:, 2] += sum_a / FULL_SCALE_A
+    load = UnmeasuredLoad(mean_a=3.0, sd_a=0.5)
+    health = examine_reference(replace(rows, constant=constant), NAMES[:2], full_scale_a=FULL_SCALE_A, load=load)
+    assert any("which the declared load of 3 A does not explain" in text for text in health.warnings) == told
+    assert len(health.warnings) == int(told)
+    assert health.doubtful == ((0, 1) if told else ())
+    assert health.unmeasured_a == 3.0
 
 
 def test_two_variants_are_noticed_with_their_number() -> None:

@@ -34,7 +34,9 @@ def findings(*choices: Sequence[SensorModelChoice]) -> SensorFindings:
 
 
 def deployment(corrected: Sequence[Sequence[bool]], *verdicts: Verdict) -> Deployment:
-    return Deployment(np.array(corrected), verdicts, np.zeros(len(verdicts), bool))
+    return Deployment(
+        np.array(corrected), np.full((len(verdicts), 2), "", "<U20"), verdicts, np.zeros(len(verdicts), bool)
+    )
 
 
 def parameters(verdict: Verdict, drift: float = 0.05) -> VehicleParameters:
@@ -78,6 +80,7 @@ def test_a_branch_with_a_sensor_model_is_not_corrected_but_others_are(
     before = deployment([corrected], "corrected" if any(corrected) else "no sensor fault")
     decision = without_sensor_models(before, findings([BY_SIGN, LINEAR]))
     assert decision.corrected.tolist() == [after]
+    assert decision.held_back.tolist() == [["not linear", ""]]
     assert decision.verdicts == (verdict,)
 
 
@@ -85,6 +88,7 @@ def test_no_branch_of_a_vehicle_with_an_undecided_sensor_is_corrected_and_other_
     before = deployment([[True, True], [True, True]], "corrected", "corrected")
     decision = without_sensor_models(before, findings([UNDECIDED, LINEAR], [LINEAR, LINEAR]))
     assert decision.corrected.tolist() == [[False, False], [True, True]]
+    assert decision.held_back.tolist() == [["not linear", "not linear"], ["", ""]]
     assert decision.verdicts == ("cannot tell", "corrected")
 
 

@@ -416,3 +416,29 @@ def test_a_drift_that_no_row_tells_shows_in_the_hardware_offset_that_it_scales()
     other = few & (np.abs(states.offset[0, :, 2] + drift * hardware) < 0.01)
     assert states.weight[0, right].sum() > 0.1
     assert states.weight[0, right | other].sum() > 0.8
+
+
+@pytest.mark.parametrize("slope_sd", [0.03, 0.1])
+def test_an_offset_that_a_window_shows_does_not_move_with_the_drift(slope_sd: float) -> None:
+    """Slope and gain ratio are off by 5 %; the mean current and the reading put the drift right."""
+    true, d, o = np.array([-0.1, 0.1]), np.array([0.0, 0.15]), np.array([0.0, 0.1])
+    measured, own = (1.0 + d) * true + o, 3e-4
+    relative = np.zeros((1, 3 * 2 - 1))
+    relative[0, :3] = relative_design(2)[:3] @ np.log1p(np.append(0.0, d)) + np.array([0.0, -0.05, 0.05])
+    at_zero = measured - np.exp(relative[0, :2]) * true
+    junction = measured[0] + np.exp(relative[0, 2]) * measured[1]
+    means = LineMeans(model=true[None], measured=measured[None])
+    turn = np.eye(10)
+    turn[5:8, :3] = means.lever(relative)[0]
+    variance = [1e-6, slope_sd**2, slope_sd**2, *[UNKNOWN_VARIANCE] * 2, *[own**2] * 3, UNKNOWN_VARIANCE, 2.5e-4**2]
+    rows = FleetRows(
+        relative=relative,
+        constant=np.array([[*at_zero, junction, 0.0, o[1]]]),
+        covariance=(turn @ np.diag(variance) @ turn.T)[None],
+        means=means,
+    )
+    states = enumerate_states(rows, prior_of(2, hardware=0.02), no_spread(2))
+    likely = states.weight[0] > 0.05
+    assert likely.any()
+    assert np.all(np.abs(states.offset[0, likely, 1] - o[1]) < 4.0 * states.constant_sd[0, likely, 2])
+    assert np.all(states.constant_sd[0, likely, 2] < 5e-4)
