@@ -155,7 +155,8 @@ def _details(result: ExperimentResult) -> tuple[list[str], list[list[str]]]:
 
 def _reliability(result: ExperimentResult) -> list[str]:
     """Lines that compare the default's confidence with what became of it; none without a confidence."""
-    bins = pooled_bins(row for row in result.rows if row.method == DEFAULT and row.series != ALL)
+    rows_of_default = [row for row in result.rows if row.method == DEFAULT]
+    bins = pooled_bins([row for row in rows_of_default if row.series == ALL] or rows_of_default)
     if not bins:
         return []
     rows = [[f"{b.low:.1f}", f"{b.count}", f"{b.confidence:.3f}", f"{b.recovered:.3f}"] for b in bins]

@@ -96,7 +96,7 @@ def test_folder_gets_record_page_picture_and_an_index_of_all_results(snr: Experi
 
 
 def test_calibration_pools_the_confidences_of_the_default_alone(snr: ExperimentResult) -> None:
-    result = calibration_experiment([snr, replace(snr, name="sparsity")])
+    result = calibration_experiment([snr, _with_seed(replace(snr, name="sparsity"), 100)])
     assert [row.series for row in result.rows] == ["snr", "sparsity", ALL]
     one, _, both = result.rows
     assert (one.x, both.x) == (64.0, 128.0)
@@ -104,6 +104,34 @@ def test_calibration_pools_the_confidences_of_the_default_alone(snr: ExperimentR
     rates = [row.figures["recovery_rate"].mean for row in snr.rows if row.method == POSTERIOR.name]
     assert one.figures["recovery_rate"].mean == pytest.approx(sum(rates) / 2.0)
     assert one.figures["sure_recovered"].mean <= 1.0
+
+
+def test_trials_that_experiments_share_count_once_all_together(snr: ExperimentResult) -> None:
+    shared = replace(snr, name="classifier", rows=tuple(row for row in snr.rows if row.x == 20.0))
+    result = calibration_experiment([shared, snr])
+    classifier, whole, together = result.rows
+    assert (classifier.x, whole.x, together.x) == (32.0, 64.0, 64.0)
+    assert together.bins == whole.bins
+    assert together.figures == whole.figures
+    assert sum(int(line.split("|")[2]) for line in _tenths(result_markdown(result))) == 64
+
+
+def test_trials_of_other_seeds_or_figures_are_not_taken_for_the_same(snr: ExperimentResult) -> None:
+    other = replace(snr, name="sparsity")
+    assert calibration_experiment([snr, _with_seed(other, 100)]).rows[-1].x == 128.0
+    first = next(row for row in snr.rows if row.bins)
+    figures = {**first.figures, "deployed": replace(first.figures["deployed"], mean=0.123)}
+    changed = replace(other, rows=(replace(first, figures=figures),))
+    assert calibration_experiment([snr, changed]).rows[-1].x == 96.0
+
+
+def _with_seed(result: ExperimentResult, seed: int) -> ExperimentResult:
+    return replace(result, settings={**result.settings, "seed": seed})
+
+
+def _tenths(page: str) -> list[str]:
+    """Rows of the last table of a page."""
+    return page.rpartition("| --- |\n")[2].partition("\n\n")[0].splitlines()
 
 
 def test_calibration_of_nothing_is_refused() -> None:
