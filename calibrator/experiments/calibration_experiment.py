@@ -44,7 +44,7 @@ def calibration_experiment(results: Sequence[ExperimentResult]) -> ExperimentRes
     }
     used = {name: rows for name, rows in rows_by_name.items() if rows}
     if not used:
-        raise FleetError("no experiment has a confidence to check; run 'calibrator experiment all' first")
+        raise FleetError("no experiment has a confidence to check; run 'calibrator experiment all --out FOLDER' first")
     together = {_trials(result, row): row for result in results for row in used.get(result.name, ())}
     seeds = {str(result.settings.get("repetitions", "?")) for result in results if result.name in used}
     return ExperimentResult(

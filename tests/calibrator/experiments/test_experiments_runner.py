@@ -146,6 +146,24 @@ def test_calibration_takes_the_records_of_the_folder(snr: ExperimentResult, tmp_
     assert (tmp_path / "results" / "calibration.png").is_file()
 
 
+def test_calibration_without_records_says_what_to_run_first_and_runs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("calibrator.experiments.runner.EXPERIMENTS", dict.fromkeys(EXPERIMENTS, _must_not_run))
+    folder = tmp_path / "results"
+    with pytest.raises(
+        FleetError, match=f"{folder}: no experiment is recorded .* 'calibrator experiment all --out {folder}'"
+    ):
+        run_experiments(["calibration"], RunOptions(), out=folder)
+    assert not folder.exists()
+    with pytest.raises(FleetError, match="'calibrator experiment all --out FOLDER'"):
+        run_experiments(["calibration"], RunOptions())
+
+
+def _must_not_run(options: RunOptions) -> ExperimentResult:
+    raise AssertionError("an experiment was run")
+
+
 def test_experiments_on_recorded_trips_write_their_pictures(fleet: RecordedFleet, tmp_path: Path) -> None:
     results = (
         real_experiment(fleet=fleet, cases=(RecordedCase(),), effort=ONCE),
@@ -175,6 +193,14 @@ def test_runner_runs_quick_experiments_of_both_kinds(tmp_path: Path) -> None:
     assert snr.settings["drive"] == "smooth"
     assert real.settings["drive"] == "8 built-in trips, no recordings"
     assert (tmp_path / "results.md").is_file()
+
+
+def test_only_experiments_on_recorded_trips_need_a_layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = RunOptions(quick=True, repetitions=1, drive=smooth_drive(samples=2000))
+    assert run_experiments(["snr"], options)[0].name == "snr"
+    with pytest.raises(FleetError, match=r"hv_powertrain\.toml: not in this folder.*name it with --layout$"):
+        run_experiments(["snr", "real"], options)
 
 
 def test_every_experiment_has_a_name_on_the_command_line() -> None:
