@@ -15,9 +15,9 @@ from calibrator.experiments.recorded_experiments import data_experiment, phase_e
 from calibrator.experiments.recorded_fleet import RecordedFleet
 from calibrator.experiments.recorded_trial import RecordedCase
 from calibrator.experiments.records import read_results, write_result
-from calibrator.experiments.result import ExperimentResult, decode_result
+from calibrator.experiments.result import ExperimentResult, Figure, decode_result
 from calibrator.experiments.runner import EXPERIMENTS, RunOptions, run_experiments
-from calibrator.experiments.table import headline, result_markdown, result_table
+from calibrator.experiments.table import DETAILS, caption, headline, result_markdown, result_table
 from calibrator.experiments.trial import FleetLaw
 from calibrator.options import ExperimentName
 from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, smooth_drive
@@ -79,6 +79,52 @@ def test_page_holds_all_figures_of_all_methods(snr: ExperimentResult) -> None:
     assert page.count("\n| ") == 2 + 2 + 2 + len(snr.rows) + 2 + len(tenths)
     assert "(0.91)" in page
     assert "harmed" in page
+
+
+def test_captions_explain_the_columns_that_are_there_and_no_others(snr: ExperimentResult) -> None:
+    only_published = replace(snr, rows=tuple(row for row in snr.rows if row.method == PERFECT.name))
+    page, printed = result_markdown(only_published), _printed(only_published)
+    for text in (page, printed):
+        assert "the paper's best printed figure and the published method (/ its classifier)." in text
+        for absent in ("the default", "confidence", "calibration error", "delays", "law known"):
+            assert absent not in text
+    assert "in some branch (deployed)" in page
+    assert "the figures above" not in page
+    pooled = result_markdown(calibration_experiment([snr]))
+    assert "within 10 %: the default (posterior). Of the default: mean confidence, share of vehicles above" in pooled
+    assert "count once in 'all together'" in pooled
+    for absent in ("paper", "published", "f2", "hardware", "(deployed)", "(harmed)", "25 %"):
+        assert absent not in pooled.partition("Settings:")[0]
+
+
+def test_captions_name_every_column(snr: ExperimentResult) -> None:
+    methods = (CEILING.name, LEFT_IN.name)
+    more = tuple(replace(row, method=name) for name in methods for row in snr.rows if row.method == POSTERIOR.name)
+    figures = {name: Figure(mean=0.5, sd=0.0) for name in DETAILS}
+    result = replace(snr, rows=tuple(replace(row, figures=figures) for row in (*snr.rows, *more)))
+    text = caption([result])
+    columns = ("law known", "delays left in")
+    sure = ("mean confidence", "above 0.95", "their mean confidence", "of them that is recovered")
+    for words in (*columns, *sure, "ECE", "by chance", "(deployed)", "(harmed)", "error of the estimated delays"):
+        assert words in text
+    details = result_markdown(result).partition("Of each method: ")[2].partition("\n")[0]
+    for words in ("within 10 %", "within 25 %", "f2", "(hardware)", "the figures above"):
+        assert words in details
+
+
+def test_index_explains_what_some_of_its_tables_show(snr: ExperimentResult, tmp_path: Path) -> None:
+    only_published = replace(snr, rows=tuple(row for row in snr.rows if row.method == PERFECT.name))
+    write_result(tmp_path / "results", only_published, tuple(EXPERIMENTS))
+    assert "confidence" not in (tmp_path / "results.md").read_text()
+    write_result(tmp_path / "results", replace(snr, name="classifier"), tuple(EXPERIMENTS))
+    assert "mean confidence" in (tmp_path / "results.md").read_text()
+
+
+def _printed(result: ExperimentResult) -> str:
+    console = Console(width=200)
+    with console.capture() as capture:
+        console.print(result_table(result))
+    return " ".join(capture.get().split())
 
 
 def test_folder_gets_record_page_picture_and_an_index_of_all_results(snr: ExperimentResult, tmp_path: Path) -> None:
