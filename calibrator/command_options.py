@@ -4,12 +4,13 @@ Upper bounds are far beyond what a vehicle has; they catch slips of units before
 """
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from calibrator.options import Classifier, Method
+from calibrator.options import Classifier, ExperimentName, Method
 
 __all__ = [
     "BalancedOption",
@@ -19,6 +20,8 @@ __all__ = [
     "CurrentsOption",
     "DelayOption",
     "DrivesOption",
+    "ExperimentDrivesOption",
+    "ExperimentLayoutOption",
     "HarmLimitOption",
     "HoldOutOption",
     "JsonOption",
@@ -26,7 +29,10 @@ __all__ = [
     "MagnitudeOption",
     "MinutesOption",
     "NoiseOption",
+    "QuickOption",
     "ReadingsOption",
+    "RepetitionsOption",
+    "ResultsFolderOption",
     "SeedOption",
     "SensorModelsOption",
     "SparsityOption",
@@ -38,6 +44,7 @@ __all__ = [
     "UnseenMinutesOption",
     "VehiclesOption",
     "WorkersOption",
+    "require_heeded_options",
     "require_own_options",
 ]
 
@@ -46,6 +53,13 @@ OWN_OPTIONS = {
     Method.PUBLISHED: ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity"),
 }
 """What only one method heeds."""
+RECORDED_EXPERIMENTS = (ExperimentName.REAL, ExperimentName.DELAY, ExperimentName.DATA, ExperimentName.PHASE)
+"""Those on recorded trips; the others take the built-in vehicle."""
+RECORDED_OPTIONS = ("drives", "layout")
+"""What only experiments on recorded trips heed."""
+RUN_OPTIONS = (*RECORDED_OPTIONS, "quick", "repetitions", "seed", "workers")
+"""What only experiments that run something heed."""
+MAX_REPETITIONS = 1000
 MAX_VEHICLES = 100_000
 MAX_CURRENTS = 16
 MAX_SEED = 2**32 - 1
@@ -179,6 +193,27 @@ HoldOutOption = Annotated[
 UnityOption = Annotated[
     str | None, typer.Option("--unity", help="Vehicle whose held-out data is the unity drive (published).")
 ]
+QuickOption = Annotated[bool, typer.Option("--quick", help="Small and fast: shows that it runs, not the figures.")]
+RepetitionsOption = Annotated[
+    int | None,
+    typer.Option(
+        "--repetitions", min=1, max=MAX_REPETITIONS, help="Trials per setting; without it 10, with --quick 2."
+    ),
+]
+ExperimentDrivesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--drives", help=f"Drive store for {', '.join(RECORDED_EXPERIMENTS)}; without it the built-in vehicle."
+    ),
+]
+ExperimentLayoutOption = Annotated[
+    Path | None,
+    typer.Option("--layout", help="Layout of these drives; without it dbc/hv_powertrain.toml of a checkout."),
+]
+ResultsFolderOption = Annotated[
+    Path | None,
+    typer.Option("--out", help="Folder for NAME.md, NAME.json and NAME.png; FOLDER.md beside it lists all."),
+]
 
 
 def require_own_options(context: typer.Context, method: Method) -> None:
@@ -197,8 +232,46 @@ def require_own_options(context: typer.Context, method: Method) -> None:
         Naming the first such option.
     """
     for other, names in OWN_OPTIONS.items():
-        sources = {name: context.get_parameter_source(name) for name in names}
-        given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+        given = _given_options(context, names)
         if other is not method and given:
-            option = f"--{given[0].replace('_', '-')}"
-            raise typer.BadParameter(f"belongs to --method {other.value}, not {method.value}", param_hint=option)
+            raise typer.BadParameter(f"belongs to --method {other.value}, not {method.value}", param_hint=given[0])
+
+
+def require_heeded_options(context: typer.Context, name: ExperimentName) -> None:
+    """Refuse options that an experiment does not heed, and ``calibration`` without the folder that it pools.
+
+    Parameters
+    ----------
+    context : typer.Context
+        Of the command.
+    name : ExperimentName
+        The experiment; all together heed every option.
+
+    Raises
+    ------
+    typer.BadParameter
+        Naming the first such option.
+    """
+    unheeded: tuple[str, ...] = ()
+    reason = ""
+    if name is ExperimentName.CALIBRATION:
+        unheeded, reason = RUN_OPTIONS, "calibration runs nothing, it pools what is recorded in --out"
+    elif name not in (*RECORDED_EXPERIMENTS, ExperimentName.ALL):
+        unheeded = RECORDED_OPTIONS
+        reason = f"{name.value} takes the built-in vehicle; this is only for {', '.join(RECORDED_EXPERIMENTS)}"
+    given = _given_options(context, unheeded)
+    if given:
+        raise typer.BadParameter(reason, param_hint=given[0])
+    if name is ExperimentName.CALIBRATION and context.params["out"] is None:
+        raise typer.BadParameter(
+            "calibration pools what is recorded there; first run 'calibrator experiment all --out FOLDER', or some "
+            "experiments by their names",
+            param_hint="--out",
+        )
+
+
+def _given_options(context: typer.Context, names: Sequence[str]) -> list[str]:
+    """Those of some parameters that stand on the command line, as they are written there."""
+    sources = {name: context.get_parameter_source(name) for name in names}
+    given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+    return [f"--{name.replace('_', '-')}" for name in given]

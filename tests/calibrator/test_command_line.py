@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from calibrator.cli import app
+from calibrator.cli import app, main
+from calibrator.command_options import RECORDED_EXPERIMENTS
+from calibrator.experiments.runner import EXPERIMENTS, Recorded
 from calibrator.interrupts import INTERRUPTED, MESSAGE
 
 ROOT = Path(__file__).parents[2]
@@ -91,6 +93,61 @@ def test_output_that_cannot_be_made_is_refused_before_the_work(command: list[str
     assert run.stderr == (
         f"calibrator: {tmp_path / 'file' / 'x'}: cannot be made: {tmp_path / 'file'} is a file; choose another folder\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["sparsity", "--drives", "store"], "--drives: sparsity takes the built-in vehicle; this is only for real,"),
+        (["snr", "--layout", "none.toml"], "--layout: snr takes the built-in vehicle; this is only for real, delay"),
+        (["calibration", "--quick"], "--quick: calibration runs nothing, it pools what is recorded in --out"),
+        (["calibration", "--repetitions", "3"], "--repetitions: calibration runs nothing"),
+        (["calibration", "--seed", "0"], "--seed: calibration runs nothing"),
+        (["calibration", "--drives", "store"], "--drives: calibration runs nothing"),
+        (["calibration", "--layout", "none.toml"], "--layout: calibration runs nothing"),
+        (["calibration", "--workers", "1"], "--workers: calibration runs nothing"),
+        (["calibration", "--json"], "--out: calibration pools what is recorded there; first run 'calibrator "),
+    ],
+)
+def test_experiment_refuses_what_it_does_not_heed(arguments: list[str], message: str, tmp_path: Path) -> None:
+    out = [] if "--json" in arguments else ["--out", str(tmp_path / "x")]
+    run = CliRunner().invoke(app, ["experiment", *arguments, *out])
+    assert run.exit_code == 2
+    (error,) = [line for line in run.stderr.splitlines() if line.startswith("Error")]
+    assert message in error
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        *((name, ["--drives", "store", "--layout", "none.toml"]) for name in (*RECORDED_EXPERIMENTS, "all")),
+        ("sparsity", ["--quick", "--repetitions", "1", "--seed", "3", "--workers", "1"]),
+    ],
+)
+def test_experiment_heeds_its_own_options(name: str, options: list[str], tmp_path: Path) -> None:
+    # The folder is what is complained of: the options before it were not.
+    (tmp_path / "file").write_text("mine")
+    run = CliRunner().invoke(app, ["experiment", name, *options, "--out", str(tmp_path / "file" / "x")])
+    assert run.exit_code == 1
+    assert "cannot be made" in str(run.exception)
+
+
+def test_experiments_said_to_heed_drives_are_those_on_recorded_trips() -> None:
+    assert list(RECORDED_EXPERIMENTS) == [name for name, run in EXPERIMENTS.items() if isinstance(run, Recorded)]
+
+
+@pytest.mark.parametrize("name", ["real", "all"])
+def test_experiment_on_recorded_trips_outside_a_checkout_asks_for_a_layout_before_it_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["calibrator", "experiment", name, "--quick"])
+    assert main() == 1
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("calibrator: dbc/hv_powertrain.toml: not in this folder")
+    assert printed.err.endswith("name it with --layout\n")
 
 
 def test_layout_without_the_builtin_vehicles_names_is_told_them(tmp_path: Path) -> None:
