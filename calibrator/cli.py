@@ -273,6 +273,7 @@ def experiment(
 
     if out is not None:
         require_possible_folder(out)
+        require_possible_folder(out.absolute().parent)
     names = (*EXPERIMENTS, CALIBRATION) if name is ExperimentName.ALL else (name.value,)
     options = RunOptions(quick=quick, seed=seed, repetitions=repetitions, jobs=workers, layout=layout, drives=drives)
     results = run_experiments(names, options, out=out, console=None if json else Console())

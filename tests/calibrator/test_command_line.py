@@ -93,6 +93,24 @@ def test_output_that_cannot_be_made_is_refused_before_the_work(command: list[str
     )
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["simulate", "--vehicles", "2"],
+        ["calibrate", "nowhere"],
+        ["import", "nowhere.log"],
+        ["experiment", "snr"],
+    ],
+)
+def test_output_where_the_system_makes_nothing_is_refused_before_the_work(command: list[str]) -> None:
+    layout = [] if command[0] == "experiment" else ["--layout", str(LAYOUT)]
+    run = calibrator(*command, *layout, "--out", "/proc/x")
+    assert run.returncode == 1
+    (line,) = run.stderr.splitlines()
+    assert line.startswith("calibrator: /proc/x: nothing can be made in /proc: ")
+    assert line.endswith("; choose another folder")
+
+
 def test_layout_without_the_builtin_vehicles_names_is_told_them(tmp_path: Path) -> None:
     text = LAYOUT.read_text().replace('"hv_powertrain.dbc"', f'"{LAYOUT.parent / "hv_powertrain.dbc"}"')
     for name in ("battery", "motor", "auxiliary", "dcdc", "motor_rear"):
