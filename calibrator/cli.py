@@ -35,6 +35,7 @@ from calibrator.command_options import (
     VehiclesOption,
     WorkersOption,
     require_own_options,
+    require_truth_where_used,
 )
 from calibrator.errors import LogError
 from calibrator.folders import require_new_folder, require_possible_folder
@@ -204,8 +205,7 @@ def calibrate(
     with importing():
         from calibrator.fleet import CalibrationSettings, calibrate_fleet
 
-    if (classifier is Classifier.PERFECT) != (truth is not None):
-        raise typer.BadParameter("--classifier perfect and --truth FILE belong together", param_hint="--classifier")
+    require_truth_where_used(classifier, truth, method)
     require_own_options(context, method)
     settings = CalibrationSettings(
         method=method,

@@ -201,7 +201,7 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
         (("calibrate", "nowhere", "--layout", LAYOUT, "--out", "x"), 1, "nowhere: no such folder"),
         (("calibrate", ".", "--layout", "none.toml", "--out", "x"), 1, "none.toml: cannot read the layout"),
         (("score", "nowhere", "--truth", "none.json"), 1, "none.json: cannot read the truth"),
-        (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--classifier", "perfect"), 2, "belong together"),
+        (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--classifier", "perfect"), 2, "is told the truth"),
         (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--symmetric"), 2, "belongs to --method published, not"),
         (
             ("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--method", "published", "--trusted", "V001"),
