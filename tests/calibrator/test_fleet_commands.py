@@ -197,6 +197,19 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
     assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)
 
 
+@pytest.mark.parametrize("method", ["posterior", "published"])
+def test_one_car_alone_is_refused_with_what_can_be_done(fleet: Path, method: str, tmp_path: Path) -> None:
+    shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "V001")
+    shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "twin")
+    files = ["--layout", LAYOUT, "--out", tmp_path / "x", "--workers", 1]
+    run = calibrator("calibrate", tmp_path / "logs", "--method", method, *files)
+    assert run.returncode == 1
+    (line,) = [line for line in run.stderr.splitlines() if line.startswith("calibrator:")]
+    assert "1 usable vehicle to learn from, at least 2 are needed, as every vehicle is compared with its fleet" in line
+    assert "(tools/compare_kirchhoff.py shows the sum of one); twin: same recording as V001" in line
+    assert not (tmp_path / "x").exists()
+
+
 def test_copy_of_a_vehicle_cannot_be_trusted(broken_fleet: Path, tmp_path: Path) -> None:
     run = calibrator("calibrate", broken_fleet, "--layout", LAYOUT, "--out", tmp_path / "x", "--trusted", "other")
     assert run.returncode == 1
