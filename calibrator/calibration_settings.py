@@ -120,6 +120,6 @@ def require_learning(names: Sequence[str], settings: CalibrationSettings, left_o
         reasons = "".join(f"; {name}: {reason}" for name, reason in left_out.items())
         raise FleetError(
             f"{sum(learning)} usable vehicle to learn from, at least {LEAST_VEHICLES} are needed, "
-            f"as every vehicle is compared with its fleet{reasons}"
+            f"as every vehicle is compared with its fleet (tools/compare_kirchhoff.py shows the sum of one){reasons}"
         )
     return learning

@@ -42,6 +42,7 @@ from calibrator.command_options import (
     WorkersOption,
     require_heeded_options,
     require_own_options,
+    require_truth_where_used,
 )
 from calibrator.errors import LogError
 from calibrator.folders import require_new_folder, require_possible_folder
@@ -209,8 +210,7 @@ def calibrate(
     with importing():
         from calibrator.fleet import CalibrationSettings, calibrate_fleet
 
-    if (classifier is Classifier.PERFECT) != (truth is not None):
-        raise typer.BadParameter("--classifier perfect and --truth FILE belong together", param_hint="--classifier")
+    require_truth_where_used(classifier, truth, method)
     require_own_options(context, method)
     settings = CalibrationSettings(
         method=method,
@@ -270,6 +270,7 @@ def experiment(
 
     if out is not None:
         require_possible_folder(out)
+        require_possible_folder(out.absolute().parent)
     names = (*EXPERIMENTS, CALIBRATION) if name is ExperimentName.ALL else (name.value,)
     options = RunOptions(quick=quick, seed=seed, repetitions=repetitions, jobs=workers, layout=layout, drives=drives)
     results = run_experiments(names, options, out=out, console=None if json else Console())

@@ -27,15 +27,17 @@ def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--noise", "inf"], ""),
-        (["--noise", "nan"], ""),
-        (["--noise", "-0.1"], ""),
-        (["--delay", "inf"], ""),
-        (["--delay", "1e9"], ""),
-        (["--minutes", "1e9"], ""),
-        (["--minutes", "nan"], ""),
-        (["--unseen-minutes", "inf"], ""),
-        (["--sparsity", "nan"], ""),
+        (["--noise", "inf"], "inf: expected a number from 0 to 1"),
+        (["--noise", "nan"], "nan: expected a number from 0 to 1"),
+        (["--noise", "-0.1"], "-0.1: expected a number from 0 to 1"),
+        (["--delay", "inf"], "inf: expected a number from 0 to 1000"),
+        (["--delay", "1e9"], "1e9: expected a number from 0 to 1000"),
+        (["--minutes", "1e9"], "1e9: expected a number from 0.1 to 240"),
+        (["--minutes", "nan"], "nan: expected a number from 0.1 to 240"),
+        (["--unseen-minutes", "inf"], "inf: expected a number from 0.1 to 240"),
+        (["--sparsity", "nan"], "nan: expected a number from 0 to 100"),
+        (["--sparsity", "-inf"], "-inf: expected a number from 0 to 100"),
+        (["--sparsity", "few"], "few: expected a number from 0 to 100"),
         (["--unmeasured", "nan", "1"], "expected mean and standard deviation from 0 to 1000 A"),
         (["--unmeasured", "1", "-1"], "expected mean and standard deviation from 0 to 1000 A"),
         (["--unmeasured", "1e6", "1"], "expected mean and standard deviation from 0 to 1000 A"),
@@ -66,7 +68,10 @@ def test_simulate_refuses_what_no_fleet_has_before_it_does_anything(
     [
         (["--branches", "battery,battery"], "battery is named twice"),
         (["--branches", "battery,"], "expected names of branches with commas between them"),
-        (["--magnitude", "nan", "nan"], "expected 0 <= LO <= HI < 1"),
+        (["--magnitude", "nan", "nan"], "nan nan: expected 0 <= LO <= HI < 1"),
+        (["--harm-limit", "nan"], "nan: expected a number from 0 to 1"),
+        (["--sparsity", "inf"], "inf: expected a number from 0 to 100"),
+        (["--symmetric"], "belongs to --method published, not posterior; leave it out or change the method"),
     ],
 )
 def test_calibrate_refuses_wrong_options(options: list[str], message: str, tmp_path: Path) -> None:
@@ -74,6 +79,38 @@ def test_calibrate_refuses_wrong_options(options: list[str], message: str, tmp_p
     run = CliRunner().invoke(app, ["calibrate", str(tmp_path), *options, *files])
     assert run.exit_code == 2
     assert message in run.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ["--truth", "t.json", "--method", "published"],
+            "--truth: used by the perfect classifier alone, not by tree; add --classifier perfect, or leave it out",
+        ),
+        (
+            ["--truth", "t.json", "--classifier", "threshold"],
+            "--truth: used by the perfect classifier alone, not by threshold; "
+            "add --method published --classifier perfect, or leave it out",
+        ),
+        (
+            ["--classifier", "perfect", "--method", "published"],
+            "--classifier: perfect is told the truth; add --truth FILE, the truth.json of this artificial fleet",
+        ),
+        (
+            ["--classifier", "perfect"],
+            "--classifier: perfect is told the truth; "
+            "add --method published --truth FILE, the truth.json of this artificial fleet",
+        ),
+    ],
+)
+def test_truth_and_perfect_classifier_each_say_what_is_missing(
+    options: list[str], message: str, tmp_path: Path
+) -> None:
+    files = ["--layout", str(LAYOUT), "--out", str(tmp_path / "x")]
+    run = CliRunner().invoke(app, ["calibrate", str(tmp_path), *options, *files])
+    assert run.exit_code == 2
+    assert run.stderr.splitlines()[-1] == f"Error: Invalid value for {message}"
 
 
 @pytest.mark.parametrize(
@@ -148,6 +185,24 @@ def test_experiment_on_recorded_trips_outside_a_checkout_asks_for_a_layout_befor
     assert printed.out == ""
     assert printed.err.startswith("calibrator: dbc/hv_powertrain.toml: not in this folder")
     assert printed.err.endswith("name it with --layout\n")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["simulate", "--vehicles", "2"],
+        ["calibrate", "nowhere"],
+        ["import", "nowhere.log"],
+        ["experiment", "snr"],
+    ],
+)
+def test_output_where_the_system_makes_nothing_is_refused_before_the_work(command: list[str]) -> None:
+    layout = [] if command[0] == "experiment" else ["--layout", str(LAYOUT)]
+    run = calibrator(*command, *layout, "--out", "/proc/x")
+    assert run.returncode == 1
+    (line,) = run.stderr.splitlines()
+    assert line.startswith("calibrator: /proc/x: nothing can be made in /proc: ")
+    assert line.endswith("; choose another folder")
 
 
 def test_layout_without_the_builtin_vehicles_names_is_told_them(tmp_path: Path) -> None:

@@ -1,11 +1,12 @@
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from calibrator.errors import FleetError
-from calibrator.folders import whole_folder
+from calibrator.folders import require_new_folder, require_possible_folder, whole_folder
 
 
 def test_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
@@ -53,3 +54,38 @@ def test_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
         whole_folder(tmp_path / "file" / "out"),
     ):
         pass
+
+
+@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
+@pytest.mark.parametrize("name", ["x", "x/y/z"])
+def test_folder_in_which_the_system_makes_nothing_is_refused(require: Callable[[Path], None], name: str) -> None:
+    # No right forbids it to root; only trying tells.
+    with pytest.raises(FleetError, match=rf"^/proc/{name}: nothing can be made in /proc: .*; choose another folder$"):
+        require(Path("/proc") / name)
+
+
+@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
+def test_trial_leaves_nothing_behind(require: Callable[[Path], None], tmp_path: Path) -> None:
+    for out in (tmp_path, tmp_path / "a", tmp_path / "a" / "b" / "c"):
+        require(out)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
+def test_name_that_is_too_long_is_refused_at_the_start(require: Callable[[Path], None], tmp_path: Path) -> None:
+    with pytest.raises(FleetError, match=r"nothing can be made in .*: File name too long"):
+        require(tmp_path / "good" / ("x" * 300))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
+def test_link_to_nowhere_is_refused(require: Callable[[Path], None], tmp_path: Path) -> None:
+    (tmp_path / "out").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(FleetError, match="choose another"):
+        require(tmp_path / "out")
+
+
+def test_new_folder_is_not_made_over_a_mounted_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "is_mount", lambda _: True)
+    with pytest.raises(FleetError, match="a disk is mounted there"):
+        require_new_folder(tmp_path)
