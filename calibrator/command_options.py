@@ -52,7 +52,7 @@ __all__ = [
 
 OWN_OPTIONS = {
     Method.POSTERIOR: ("harm_limit", "trusted", "readings", "sensor_models"),
-    Method.PUBLISHED: ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity"),
+    Method.PUBLISHED: ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity", "seed"),
 }
 """What only one method heeds."""
 RECORDED_EXPERIMENTS = (ExperimentName.REAL, ExperimentName.DELAY, ExperimentName.DATA, ExperimentName.PHASE)

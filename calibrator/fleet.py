@@ -104,6 +104,9 @@ def calibrate_fleet(
     """
     require_new_folder(out)
     fleet = without_copies(find_fleet(path))
+    if not fleet.vehicles:
+        why = "; ".join(f"{name}: {reason}" for name, reason in fleet.left_out.items())
+        raise FleetError(f"{path}: no drive that is one vehicle's alone; {why}")
     for names, what in ((settings.hold_out, "hold out"), (settings.trusted, "trust")):
         unknown = sorted(names - fleet.vehicles.keys())
         if unknown:
@@ -148,7 +151,7 @@ def _record(
         details=dict(outcome.details),
         vehicles=len(outcome.parameters),
         left_out=dict(outcome.left_out),
-        notices=[*equipment.notices, *outcome.notices],
+        notices=[*fleet.notices, *equipment.notices, *outcome.notices],
     )
 
 

@@ -22,7 +22,9 @@ def require_possible_folder(out: Path) -> None:
 
 def require_new_folder(out: Path) -> None:
     """Raise FleetError if a folder to be written exists and holds something, or cannot be made or replaced."""
-    if os.path.lexists(out) and (not out.is_dir() or any(out.iterdir())):
+    if out.is_symlink():
+        raise FleetError(f"{out}: is a link, so it cannot be replaced; name the folder itself or choose another --out")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FleetError(f"{out}: exists and is not empty; choose another --out or remove it")
     if out.is_mount():
         raise FleetError(f"{out}: a disk is mounted there, so it cannot be replaced; choose a folder in it")
@@ -59,7 +61,8 @@ def whole_folder(out: Path) -> Iterator[Path]:
     Yields
     ------
     Path
-        Folder to fill. It is removed if the block fails; one that a killed process left is removed by the next run.
+        Folder to fill. It is removed if the block fails; one that a killed process left is removed by the next run. If
+        it cannot be renamed, it stays and is named.
 
     Raises
     ------
@@ -76,11 +79,15 @@ def whole_folder(out: Path) -> Iterator[Path]:
         raise FleetError(f"{out}: cannot be made: {error.strerror}; choose another folder") from None
     try:
         yield partial
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    try:
         if out.exists():
             out.rmdir()
         partial.rename(out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    except OSError as error:
+        raise FleetError(f"{out}: cannot be replaced: {error.strerror}; what was made stands in {partial}") from None
 
 
 def _remove_abandoned(out: Path) -> None:

@@ -1,14 +1,15 @@
 """Recordings that a fleet holds twice: a copy tells nothing new, yet would count as another vehicle or drive.
 
-Two drives are the same recording if their files hold the same bytes but for compression and names. No two recordings of
-a car are: noise and time stamps differ.
+Two drives are the same recording if they hold the same, whatever they are called and however logs are packed. No two
+recordings of a car are: noise and time stamps differ. Of one that two vehicles have it cannot be told whose it is, so
+neither is calibrated with it. Copies of a drive that different versions of this program stored are not recognised.
 """
 
 import gzip
 import hashlib
 import io
 import zlib
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,12 +22,13 @@ __all__ = ["without_copies"]
 
 _HEAD_BYTES = 1 << 16
 """Looked at before a whole log is: where the noise differs, it does so here."""
+WHOSE = "it cannot be told whose it is: remove it where it does not belong"
 _UNREADABLE = (UserError, OSError, EOFError, zlib.error)
 """What a damaged file may raise; whoever reads the drive tells of it."""
 
 
 def without_copies(fleet: FleetSource) -> FleetSource:
-    """Leave out every drive that is a copy of an earlier one, and vehicles that have no others.
+    """Count a recording that a vehicle has twice once, and leave out those that several vehicles have.
 
     Parameters
     ----------
@@ -36,36 +38,37 @@ def without_copies(fleet: FleetSource) -> FleetSource:
     Returns
     -------
     FleetSource
-        The same without copies; why they are left out stands by VEHICLE or VEHICLE/DRIVE.
+        The same without copies; vehicles that have no other drives are left out, other copies stand in the notices.
     """
-    originals = _originals([entry for entries in fleet.vehicles.values() for entry in entries])
-    left_out = dict(fleet.left_out)
-    vehicles: dict[str, tuple[DriveFile, ...]] = {}
-    for name, entries in fleet.vehicles.items():
-        kept = tuple(entry for entry in entries if entry not in originals)
-        copies = [entry for entry in entries if entry in originals]
+    dropped: dict[DriveFile, DriveFile] = {}
+    notices: list[str] = []
+    entries = [entry for entries in fleet.vehicles.values() for entry in entries]
+    for same in (group for suspects in _groups(entries, _outline) for group in _groups(suspects, _digest)):
+        if len({entry.vehicle for entry in same}) > 1:
+            dropped |= {entry: next(e for e in same if e.vehicle != entry.vehicle) for entry in same}
+        else:
+            dropped |= dict.fromkeys(same[1:], same[0])
+    left_out, vehicles = dict(fleet.left_out), {}
+    for name, drives in fleet.vehicles.items():
+        kept = tuple(entry for entry in drives if entry not in dropped)
+        originals = [dropped[entry] for entry in drives if entry in dropped]
         if kept:
             vehicles[name] = kept
-            left_out |= {f"{name}/{e.name}": _reason([f"{originals[e].vehicle}/{originals[e].name}"]) for e in copies}
+            notices += [_notice(entry, dropped[entry]) for entry in drives if entry in dropped]
         else:
-            left_out[name] = _reason([originals[entry].vehicle for entry in copies])
-    return replace(fleet, vehicles=vehicles, left_out=left_out)
+            others = ", ".join(dict.fromkeys(entry.vehicle for entry in originals))
+            left_out[name] = f"same recording as {others}; {WHOSE}"
+    return replace(fleet, vehicles=vehicles, left_out=left_out, notices=(*fleet.notices, *notices))
 
 
-def _reason(originals: Sequence[str]) -> str:
-    return (
-        f"same recording as {', '.join(dict.fromkeys(originals))}; a copy tells nothing new: remove the one that "
-        f"is in the wrong place"
-    )
+def _notice(copy: DriveFile, original: DriveFile) -> str:
+    if copy.vehicle == original.vehicle:
+        return f"vehicle {copy.vehicle}: drive {copy.name} is the same recording as {original.name}, and counts once"
+    return f"vehicle {copy.vehicle}: drive {copy.name} is left out: same recording as {_label(original)}; {WHOSE}"
 
 
-def _originals(entries: Sequence[DriveFile]) -> dict[DriveFile, DriveFile]:
-    """The first drive of the same recording, by copy."""
-    found: dict[DriveFile, DriveFile] = {}
-    for suspects in _groups(entries, _outline):
-        for same in _groups(suspects, _digest):
-            found |= dict.fromkeys(same[1:], same[0])
-    return found
+def _label(entry: DriveFile) -> str:
+    return f"{entry.vehicle}/{entry.name}"
 
 
 def _groups(entries: Iterable[DriveFile], key: Callable[[Path], Hashable]) -> list[list[DriveFile]]:

@@ -46,7 +46,7 @@ def calibration_experiment(results: Sequence[ExperimentResult]) -> ExperimentRes
     if not used:
         raise FleetError("no experiment has a confidence to check; run 'calibrator experiment all --out FOLDER' first")
     together = {_trials(result, row): row for result in results for row in used.get(result.name, ())}
-    seeds = {str(result.settings.get("repetitions", "?")) for result in results if result.name in used}
+    repetitions = {str(result.settings.get("repetitions", "?")) for result in results if result.name in used}
     return ExperimentResult(
         name=NAME,
         title="Reliability of the confidence",
@@ -54,7 +54,7 @@ def calibration_experiment(results: Sequence[ExperimentResult]) -> ExperimentRes
         series_label="experiment",
         settings={
             "experiments": ", ".join(used),
-            "repetitions": " or ".join(sorted(seeds)),
+            "repetitions": " or ".join(sorted(repetitions)),
             "seed": " or ".join(sorted({str(r.settings.get("seed", "?")) for r in results if r.name in used})),
             "drive": "those of the experiments",
         },

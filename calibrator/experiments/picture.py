@@ -184,7 +184,8 @@ def _draw_curve(axes: Axes, curve: _Curve, name: str, *, aside_pt: float) -> Non
 
 def _within_shares(figures: Sequence[Merit]) -> Array:
     """Lengths of the error bars down and up, shape (2, n): a share cannot be below 0 or above 1."""
-    return np.array([[min(f.sd, f.mean) for f in figures], [min(f.sd, 1.0 - f.mean) for f in figures]])
+    room = np.clip([[f.mean, 1.0 - f.mean] for f in figures], 0.0, None).T
+    return np.asarray(np.minimum(room, [f.sd for f in figures]))
 
 
 def _set_x_axis(axes: Axes, values: Sequence[float]) -> None:

@@ -8,6 +8,7 @@ in candump logs such lines are counted and left out, up to :data:`MAX_DAMAGED_SH
 import gzip
 import io
 import logging
+import shlex
 import shutil
 import tempfile
 import warnings
@@ -143,7 +144,7 @@ def _remedy(path: Path, frames: int) -> str:
     """What to do with a text log of which only the first frames can be read."""
     if not frames or not path.name.lower().endswith(".gz"):
         return "copy the file again"
-    part = f"'gzip -dc {path.name} > {path.stem}'"
+    part = f"'gzip -dc {shlex.quote(path.name)} > {shlex.quote(path.stem)}'"
     return f"copy the file again, or keep the readable part, {part}, and remove {path.name}"
 
 

@@ -189,25 +189,33 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
     assert "0x110" in left_out["no_branch"] or "branch" in left_out["no_branch"]
     assert "motor" in left_out["no_motor"]
     assert "drive.blf" in left_out["blf"]
-    assert left_out["other"].startswith("same recording as V002; a copy tells nothing new")
+    assert left_out["other"].startswith("same recording as V002; it cannot be told whose it is")
+    assert left_out["V002"].startswith("same recording as other; it cannot be told whose it is")
     twins = [reason for reason in left_out.values() if "V001" in reason and "elsewhere" in reason]
     assert twins, left_out
     assert any("my,drive" in reason for reason in left_out.values()), left_out
-    assert sorted(path.stem for path in (out / "params").iterdir()) == ["V002", "V003", "V004", "V005", "V006"]
+    assert sorted(path.stem for path in (out / "params").iterdir()) == ["V003", "V004", "V005", "V006"]
     assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)
 
 
 @pytest.mark.parametrize("method", ["posterior", "published"])
 def test_one_car_alone_is_refused_with_what_can_be_done(fleet: Path, method: str, tmp_path: Path) -> None:
     shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "V001")
-    shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "twin")
     files = ["--layout", LAYOUT, "--out", tmp_path / "x", "--workers", 1]
     run = calibrator("calibrate", tmp_path / "logs", "--method", method, *files)
     assert run.returncode == 1
     (line,) = [line for line in run.stderr.splitlines() if line.startswith("calibrator:")]
     assert "1 usable vehicle to learn from, at least 2 are needed, as every vehicle is compared with its fleet" in line
-    assert "(tools/compare_kirchhoff.py shows the sum of one); twin: same recording as V001" in line
+    assert "(tools/compare_kirchhoff.py shows the sum of one)" in line
     assert not (tmp_path / "x").exists()
+
+
+def test_a_fleet_of_copies_is_refused_with_the_reason(fleet: Path, tmp_path: Path) -> None:
+    for name in ("one", "other"):
+        shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / name)
+    run = calibrator("calibrate", tmp_path / "logs", "--layout", LAYOUT, "--out", tmp_path / "x")
+    assert run.returncode == 1
+    assert "no drive that is one vehicle's alone; one: same recording as other" in run.stderr
 
 
 def test_copy_of_a_vehicle_cannot_be_trusted(broken_fleet: Path, tmp_path: Path) -> None:

@@ -78,11 +78,30 @@ def test_name_that_is_too_long_is_refused_at_the_start(require: Callable[[Path],
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
-def test_link_to_nowhere_is_refused(require: Callable[[Path], None], tmp_path: Path) -> None:
-    (tmp_path / "out").symlink_to(tmp_path / "nowhere")
+def test_link_is_not_replaced_wherever_it_leads(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "out").symlink_to(tmp_path / "there")
+    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
+    for name in ("out", "dangling"):
+        with pytest.raises(FleetError, match=f"{name}: is a link"):
+            require_new_folder(tmp_path / name)
+    require_possible_folder(tmp_path / "out")
     with pytest.raises(FleetError, match="choose another"):
-        require(tmp_path / "out")
+        require_possible_folder(tmp_path / "dangling")
+
+
+def fill_while_the_place_is_taken(out: Path) -> None:
+    with whole_folder(out) as folder:
+        (folder / "result").write_text("hours of work")
+        out.mkdir()
+        (out / "in the way").write_text("")
+
+
+def test_what_was_made_stays_if_it_cannot_be_put_in_its_place(tmp_path: Path) -> None:
+    with pytest.raises(FleetError, match=r"out: cannot be replaced: .*; what was made stands in") as caught:
+        fill_while_the_place_is_taken(tmp_path / "out")
+    kept = Path(str(caught.value).rpartition("stands in ")[2])
+    assert (kept / "result").read_text() == "hours of work"
 
 
 def test_new_folder_is_not_made_over_a_mounted_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

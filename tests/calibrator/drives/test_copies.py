@@ -30,30 +30,43 @@ def names(fleet: FleetSource) -> DriveNames:
     return {vehicle: [entry.name for entry in entries] for vehicle, entries in fleet.vehicles.items()}
 
 
-def test_vehicle_that_is_a_copy_is_left_out_with_the_reason(tmp_path: Path) -> None:
+def test_vehicles_with_the_same_recordings_are_both_left_out_as_it_cannot_be_told_whose_they_are(
+    tmp_path: Path,
+) -> None:
     for vehicle, seed in (("V001", 1), ("V002", 2), ("V003", 1)):
         put(tmp_path / vehicle / "monday.log", log(seed))
         put(tmp_path / vehicle / "tuesday.log", log(10 + seed))
     fleet = without_copies(find_fleet(tmp_path))
-    assert names(fleet) == {"V001": ["monday", "tuesday"], "V002": ["monday", "tuesday"]}
-    assert list(fleet.left_out) == ["V003"]
-    assert fleet.left_out["V003"].startswith("same recording as V001; a copy tells nothing new: ")
+    assert names(fleet) == {"V002": ["monday", "tuesday"]}
+    assert fleet.left_out["V001"].startswith("same recording as V003; it cannot be told whose it is")
+    assert fleet.left_out["V003"].startswith("same recording as V001; it cannot be told whose it is")
 
 
-def test_drive_that_is_a_copy_is_left_out_and_the_vehicle_stays(tmp_path: Path) -> None:
+def test_a_recording_of_two_vehicles_is_left_out_of_both_and_they_keep_their_others(tmp_path: Path) -> None:
+    put(tmp_path / "A" / "monday.log", log(1))
+    put(tmp_path / "A" / "tuesday.log", log(2))
+    put(tmp_path / "B" / "monday.log", log(2))
+    put(tmp_path / "B" / "wednesday.log", log(3))
+    fleet = without_copies(find_fleet(tmp_path))
+    assert names(fleet) == {"A": ["monday"], "B": ["wednesday"]}
+    assert [notice.split(";")[0] for notice in fleet.notices] == [
+        "vehicle A: drive tuesday is left out: same recording as B/monday",
+        "vehicle B: drive monday is left out: same recording as A/tuesday",
+    ]
+    assert not fleet.left_out
+
+
+def test_a_recording_that_a_vehicle_has_twice_counts_once(tmp_path: Path) -> None:
     put(tmp_path / "V001" / "monday.log", log(1))
     put(tmp_path / "V001" / "tuesday.log", log(1))
-    put(tmp_path / "V002" / "monday.log", log(2))
-    put(tmp_path / "V002" / "tuesday.log", log(1))
     fleet = without_copies(find_fleet(tmp_path))
-    assert names(fleet) == {"V001": ["monday"], "V002": ["monday"]}
-    assert list(fleet.left_out) == ["V001/tuesday", "V002/tuesday"]
-    assert all(reason.startswith("same recording as V001/monday; ") for reason in fleet.left_out.values())
+    assert names(fleet) == {"V001": ["monday"]}
+    assert fleet.notices == ("vehicle V001: drive tuesday is the same recording as monday, and counts once",)
 
 
 def test_compression_does_not_make_another_recording(tmp_path: Path) -> None:
     put(tmp_path / "V001" / "drive.log", log(1))
-    put(tmp_path / "V002" / "drive.log.gz", log(1))
+    put(tmp_path / "V001" / "other.log.gz", log(1))
     assert names(without_copies(find_fleet(tmp_path))) == {"V001": ["drive"]}
 
 
@@ -89,8 +102,8 @@ def test_copies_in_a_store_are_found_whatever_their_names(tmp_path: Path, databa
         write_drive(tmp_path, drive(seed, vehicle, name), database.layout)
     shutil.copytree(tmp_path / "drives" / "V1", tmp_path / "drives" / "V3")
     fleet = without_copies(find_fleet(tmp_path))
-    assert names(fleet) == {"V1": ["a"], "V2": ["a"]}
-    assert set(fleet.left_out) == {"V1/b", "V3", "another one"}
+    assert names(fleet) == {}
+    assert set(fleet.left_out) == {"V1", "V2", "V3", "another one"}
 
 
 def test_drives_of_a_store_that_differ_in_one_label_are_two(tmp_path: Path, database: VehicleDatabase) -> None:

@@ -44,6 +44,11 @@ def equal() -> ExperimentResult:
     )
 
 
+def test_a_mean_that_rounding_lifts_over_one_is_drawn() -> None:
+    over = float(np.nextafter(1.0, 2.0))
+    drawn(result_of(row_of(20, POSTERIOR.name, over, sd=0.1), row_of(100, POSTERIOR.name, 1.0, sd=0.1)))
+
+
 def curves_of(axes: Axes) -> list[Line2D]:
     containers = [c for c in axes.containers if isinstance(c, ErrorbarContainer)]
     return [line for container in containers if isinstance(line := container.lines[0], Line2D)]
