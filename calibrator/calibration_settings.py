@@ -8,6 +8,7 @@ from typing import Any
 from calibrator.artificial.truth import FleetTruth
 from calibrator.errors import FleetError
 from calibrator.options import Classifier, Method
+from ecu_node.layout import file_digest
 from ecu_node.parameters import VehicleParameters
 
 __all__ = ["HARM_LIMIT", "LEAST_VEHICLES", "CalibrationSettings", "FleetOutcome", "require_learning"]
@@ -33,7 +34,7 @@ class CalibrationSettings:
     trusted : frozenset of str
         Vehicles whose sensors were found faultless on a bench; they carry the reference of the posterior.
     readings : Path or None
-        Table of bench readings, see :mod:`calibrator.evidence.readings_file`.
+        Table of bench readings, see :mod:`calibrator.posterior.bench_table`.
     harm_limit : float
         Largest posterior probability of making a branch worse with which it is corrected. [1]
     sensor_models : bool
@@ -77,7 +78,7 @@ class CalibrationSettings:
                 **common,
                 "harm_limit": self.harm_limit,
                 "trusted": sorted(self.trusted),
-                "readings": None if self.readings is None else self.readings.name,
+                "readings": None if self.readings is None else [self.readings.name, file_digest(self.readings)],
                 "sensor_models": self.sensor_models,
             }
         return {
@@ -120,6 +121,6 @@ def require_learning(names: Sequence[str], settings: CalibrationSettings, left_o
         reasons = "".join(f"; {name}: {reason}" for name, reason in left_out.items())
         raise FleetError(
             f"{sum(learning)} usable vehicle to learn from, at least {LEAST_VEHICLES} are needed, "
-            f"as every vehicle is compared with its fleet{reasons}"
+            f"as every vehicle is compared with its fleet (tools/compare_kirchhoff.py shows the sum of one){reasons}"
         )
     return learning

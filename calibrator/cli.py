@@ -16,6 +16,8 @@ from calibrator.command_options import (
     CurrentsOption,
     DelayOption,
     DrivesOption,
+    ExperimentDrivesOption,
+    ExperimentLayoutOption,
     HarmLimitOption,
     HoldOutOption,
     JsonOption,
@@ -23,7 +25,10 @@ from calibrator.command_options import (
     MagnitudeOption,
     MinutesOption,
     NoiseOption,
+    QuickOption,
     ReadingsOption,
+    RepetitionsOption,
+    ResultsFolderOption,
     SeedOption,
     SensorModelsOption,
     SparsityOption,
@@ -35,7 +40,9 @@ from calibrator.command_options import (
     UnseenMinutesOption,
     VehiclesOption,
     WorkersOption,
+    require_heeded_options,
     require_own_options,
+    require_truth_where_used,
 )
 from calibrator.errors import LogError
 from calibrator.folders import require_new_folder, require_possible_folder
@@ -52,9 +59,6 @@ if TYPE_CHECKING:
     from calibrator.artificial.truth import FleetTruth
 
 __all__ = ["app", "main"]
-
-DEFAULT_LAYOUT = Path("dbc/hv_powertrain.toml")
-"""Of the examples that come with the source."""
 
 app = typer.Typer(
     help="Learn from recorded drives what each vehicle's high-voltage current sensors do wrong.",
@@ -206,8 +210,7 @@ def calibrate(
     with importing():
         from calibrator.fleet import CalibrationSettings, calibrate_fleet
 
-    if (classifier is Classifier.PERFECT) != (truth is not None):
-        raise typer.BadParameter("--classifier perfect and --truth FILE belong together", param_hint="--classifier")
+    require_truth_where_used(classifier, truth, method)
     require_own_options(context, method)
     settings = CalibrationSettings(
         method=method,
@@ -245,37 +248,29 @@ def score(
 
 @app.command()
 def experiment(
+    context: typer.Context,
     name: Annotated[ExperimentName, typer.Argument(help="Which experiment, or all.")],
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Small and fast: shows that it runs, not the figures.")
-    ] = False,
-    repetitions: Annotated[
-        int | None, typer.Option("--repetitions", min=1, max=1000, help="Trials per setting.")
-    ] = None,
+    quick: QuickOption = False,
+    repetitions: RepetitionsOption = None,
     seed: SeedOption = 0,
-    drives: Annotated[
-        Path | None,
-        typer.Option("--drives", help="Drive store for real, delay, data and phase; without it the built-in vehicle."),
-    ] = None,
-    layout: Annotated[
-        Path, typer.Option("--layout", help="Layout that the drive store was made with.")
-    ] = DEFAULT_LAYOUT,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder for NAME.md, NAME.json and NAME.png; FOLDER.md beside it lists all."),
-    ] = None,
+    drives: ExperimentDrivesOption = None,
+    layout: ExperimentLayoutOption = None,
+    out: ResultsFolderOption = None,
     workers: WorkersOption = 2,
     json: JsonOption = False,
 ) -> None:
     """Run an experiment and print the paper's figures, the published method and the default side by side.
 
-    'calibration' pools the confidences of the experiments recorded in --out.
+    'calibration' runs nothing: it pools the confidences of the experiments that were recorded in --out before. Options
+    that an experiment does not heed are refused.
     """
+    require_heeded_options(context, name)
     with importing():
         from calibrator.experiments.runner import CALIBRATION, EXPERIMENTS, RunOptions, run_experiments
 
     if out is not None:
         require_possible_folder(out)
+        require_possible_folder(out.absolute().parent)
     names = (*EXPERIMENTS, CALIBRATION) if name is ExperimentName.ALL else (name.value,)
     options = RunOptions(quick=quick, seed=seed, repetitions=repetitions, jobs=workers, layout=layout, drives=drives)
     results = run_experiments(names, options, out=out, console=None if json else Console())

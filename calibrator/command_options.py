@@ -4,12 +4,13 @@ Upper bounds are far beyond what a vehicle has; they catch slips of units before
 """
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from calibrator.options import Classifier, Method
+from calibrator.options import Classifier, ExperimentName, Method
 
 __all__ = [
     "BalancedOption",
@@ -19,6 +20,8 @@ __all__ = [
     "CurrentsOption",
     "DelayOption",
     "DrivesOption",
+    "ExperimentDrivesOption",
+    "ExperimentLayoutOption",
     "HarmLimitOption",
     "HoldOutOption",
     "JsonOption",
@@ -26,7 +29,10 @@ __all__ = [
     "MagnitudeOption",
     "MinutesOption",
     "NoiseOption",
+    "QuickOption",
     "ReadingsOption",
+    "RepetitionsOption",
+    "ResultsFolderOption",
     "SeedOption",
     "SensorModelsOption",
     "SparsityOption",
@@ -38,14 +44,24 @@ __all__ = [
     "UnseenMinutesOption",
     "VehiclesOption",
     "WorkersOption",
+    "number_option",
+    "require_heeded_options",
     "require_own_options",
+    "require_truth_where_used",
 ]
 
 OWN_OPTIONS = {
     Method.POSTERIOR: ("harm_limit", "trusted", "readings", "sensor_models"),
-    Method.PUBLISHED: ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity"),
+    Method.PUBLISHED: ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity", "seed"),
 }
 """What only one method heeds."""
+RECORDED_EXPERIMENTS = (ExperimentName.REAL, ExperimentName.DELAY, ExperimentName.DATA, ExperimentName.PHASE)
+"""Those on recorded trips; the others take the built-in vehicle."""
+RECORDED_OPTIONS = ("drives", "layout")
+"""What only experiments on recorded trips heed."""
+RUN_OPTIONS = (*RECORDED_OPTIONS, "quick", "repetitions", "seed", "workers")
+"""What only experiments that run something heed."""
+MAX_REPETITIONS = 1000
 MAX_VEHICLES = 100_000
 MAX_CURRENTS = 16
 MAX_SEED = 2**32 - 1
@@ -58,11 +74,34 @@ MAX_UNMEASURED_A = 1000.0
 """More than the full scale of any car's junction. [A]"""
 
 
-def _finite(value: float) -> float:
-    """Refuse not-a-number, which is neither above nor below any bound."""
-    if not math.isfinite(value):
-        raise typer.BadParameter(f"{value:g}: expected a finite number")
-    return value
+def number_option(name: str, low: float, high: float, meaning: str) -> Any:
+    """Make an option that is a finite number between bounds; whatever else is given is named with what is expected.
+
+    Parameters
+    ----------
+    name : str
+        Of the option, with its dashes.
+    low, high : float
+        Smallest and largest number.
+    meaning : str
+        What it is, with its unit, for the help; the bounds are added.
+
+    Returns
+    -------
+    typer's option
+        For ``Annotated[float, ...]``.
+    """
+
+    def parse(given: str | float) -> float:
+        try:
+            value = float(given)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:  # nor is not-a-number
+            raise typer.BadParameter(f"{given}: expected a number from {low:g} to {high:g}")
+        return value
+
+    return typer.Option(name, parser=parse, metavar="NUMBER", help=f"{meaning}, {low:g} to {high:g}.")
 
 
 def _magnitude(value: tuple[float, float]) -> tuple[float, float]:
@@ -101,14 +140,7 @@ BranchesOption = Annotated[
 DrivesOption = Annotated[str, typer.Option("--drives", help="Drive store with the trips to drive, or 'builtin'.")]
 SymmetricOption = Annotated[bool, typer.Option("--symmetric", help="The fleet's mean is the ideal vehicle (22).")]
 SparsityOption = Annotated[
-    float,
-    typer.Option(
-        "--sparsity",
-        min=0,
-        max=100,
-        callback=_finite,
-        help="Share of zero fault parameters of an artificial fleet [%].",
-    ),
+    float, number_option("--sparsity", 0, 100, "Share of zero fault parameters of an artificial fleet [%]")
 ]
 MagnitudeOption = Annotated[
     tuple[float, float],
@@ -119,14 +151,8 @@ MagnitudeOption = Annotated[
         help="Range of its fault magnitudes, 0 <= LO <= HI < 1: drifts, and offsets as fractions of full scale.",
     ),
 ]
-NoiseOption = Annotated[
-    float,
-    typer.Option("--noise", min=0, max=1, callback=_finite, help="Sensor noise (sd), fraction of full scale."),
-]
-DelayOption = Annotated[
-    float,
-    typer.Option("--delay", min=0, max=MAX_DELAY_MS, callback=_finite, help="Largest delay of a branch [ms]."),
-]
+NoiseOption = Annotated[float, number_option("--noise", 0, 1, "Sensor noise (sd), fraction of full scale")]
+DelayOption = Annotated[float, number_option("--delay", 0, MAX_DELAY_MS, "Largest delay of a branch [ms]")]
 UnmeasuredOption = Annotated[
     tuple[float, float],
     typer.Option(
@@ -136,25 +162,14 @@ UnmeasuredOption = Annotated[
         help=f"Load without a sensor: mean and sd over vehicles, each 0 to {MAX_UNMEASURED_A:g} [A].",
     ),
 ]
-MinutesOption = Annotated[
-    float,
-    typer.Option("--minutes", min=0.1, max=MAX_MINUTES, callback=_finite, help="Length of each built-in trip."),
-]
+MinutesOption = Annotated[float, number_option("--minutes", 0.1, MAX_MINUTES, "Length of each built-in trip [min]")]
 UnseenMinutesOption = Annotated[
-    float,
-    typer.Option("--unseen-minutes", min=0.1, max=MAX_MINUTES, callback=_finite, help="Length of each unseen trip."),
+    float, number_option("--unseen-minutes", 0.1, MAX_MINUTES, "Length of each unseen trip [min]")
 ]
 CommonDriveOption = Annotated[bool, typer.Option("--common-drive", help="One trip for all vehicles.")]
 BalancedOption = Annotated[bool, typer.Option("--balanced", help="No hardware faults in half of the vehicles.")]
 HarmLimitOption = Annotated[
-    float,
-    typer.Option(
-        "--harm-limit",
-        min=0,
-        max=1,
-        callback=_finite,
-        help="Correct a branch if harm is less probable (posterior).",
-    ),
+    float, number_option("--harm-limit", 0, 1, "Correct a branch if harm is less probable (posterior)")
 ]
 TrustedOption = Annotated[
     list[str] | None,
@@ -179,6 +194,27 @@ HoldOutOption = Annotated[
 UnityOption = Annotated[
     str | None, typer.Option("--unity", help="Vehicle whose held-out data is the unity drive (published).")
 ]
+QuickOption = Annotated[bool, typer.Option("--quick", help="Small and fast: shows that it runs, not the figures.")]
+RepetitionsOption = Annotated[
+    int | None,
+    typer.Option(
+        "--repetitions", min=1, max=MAX_REPETITIONS, help="Trials per setting; without it 10, with --quick 2."
+    ),
+]
+ExperimentDrivesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--drives", help=f"Drive store for {', '.join(RECORDED_EXPERIMENTS)}; without it the built-in vehicle."
+    ),
+]
+ExperimentLayoutOption = Annotated[
+    Path | None,
+    typer.Option("--layout", help="Layout of these drives; without it dbc/hv_powertrain.toml of a checkout."),
+]
+ResultsFolderOption = Annotated[
+    Path | None,
+    typer.Option("--out", help="Folder for NAME.md, NAME.json and NAME.png; FOLDER.md beside it lists all."),
+]
 
 
 def require_own_options(context: typer.Context, method: Method) -> None:
@@ -197,8 +233,81 @@ def require_own_options(context: typer.Context, method: Method) -> None:
         Naming the first such option.
     """
     for other, names in OWN_OPTIONS.items():
-        sources = {name: context.get_parameter_source(name) for name in names}
-        given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+        given = _given_options(context, names)
         if other is not method and given:
-            option = f"--{given[0].replace('_', '-')}"
-            raise typer.BadParameter(f"belongs to --method {other.value}, not {method.value}", param_hint=option)
+            raise typer.BadParameter(
+                f"belongs to --method {other.value}, not {method.value}; leave it out or change the method",
+                param_hint=given[0],
+            )
+
+
+def require_truth_where_used(classifier: Classifier, truth: Path | None, method: Method) -> None:
+    """Refuse a truth that nothing uses, and the perfect classifier without one.
+
+    Parameters
+    ----------
+    classifier : Classifier
+        That is used.
+    truth : Path or None
+        The truth, if it was given.
+    method : Method
+        That is used; the other one has no classifier.
+
+    Raises
+    ------
+    typer.BadParameter
+        Naming the option that was given, and what to add.
+    """
+    if (classifier is Classifier.PERFECT) == (truth is not None):
+        return
+    with_method = "" if method is Method.PUBLISHED else "--method published "
+    if truth is not None:
+        raise typer.BadParameter(
+            f"used by the perfect classifier alone, not by {classifier.value}; "
+            f"add {with_method}--classifier perfect, or leave it out",
+            param_hint="--truth",
+        )
+    raise typer.BadParameter(
+        f"perfect is told the truth; add {with_method}--truth FILE, the truth.json of this artificial fleet",
+        param_hint="--classifier",
+    )
+
+
+def require_heeded_options(context: typer.Context, name: ExperimentName) -> None:
+    """Refuse options that an experiment does not heed, and ``calibration`` without the folder that it pools.
+
+    Parameters
+    ----------
+    context : typer.Context
+        Of the command.
+    name : ExperimentName
+        The experiment; all together heed every option.
+
+    Raises
+    ------
+    typer.BadParameter
+        Naming the first such option.
+    """
+    unheeded: tuple[str, ...] = ()
+    reason = ""
+    if name is ExperimentName.CALIBRATION:
+        unheeded, reason = RUN_OPTIONS, "calibration runs nothing, it pools what is recorded in --out"
+    elif name not in (*RECORDED_EXPERIMENTS, ExperimentName.ALL):
+        unheeded = RECORDED_OPTIONS
+        reason = f"{name.value} takes the built-in vehicle; this is only for {', '.join(RECORDED_EXPERIMENTS)}"
+    given = _given_options(context, unheeded)
+    if given:
+        raise typer.BadParameter(reason, param_hint=given[0])
+    if name is ExperimentName.CALIBRATION and context.params["out"] is None:
+        raise typer.BadParameter(
+            "calibration pools what is recorded there; first run 'calibrator experiment all --out FOLDER', or some "
+            "experiments by their names",
+            param_hint="--out",
+        )
+
+
+def _given_options(context: typer.Context, names: Sequence[str]) -> list[str]:
+    """Those of some parameters that stand on the command line, as they are written there."""
+    sources = {name: context.get_parameter_source(name) for name in names}
+    given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+    return [f"--{name.replace('_', '-')}" for name in given]

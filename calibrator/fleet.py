@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from calibrator.calibration_settings import CalibrationSettings, FleetOutcome
+from calibrator.drives.copies import without_copies
 from calibrator.drives.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment
 from calibrator.errors import FleetError
 from calibrator.folders import require_new_folder
@@ -102,11 +103,15 @@ def calibrate_fleet(
         If the fleet as a whole cannot be calibrated.
     """
     require_new_folder(out)
-    fleet = find_fleet(path)
+    fleet = without_copies(find_fleet(path))
+    if not fleet.vehicles:
+        why = "; ".join(f"{name}: {reason}" for name, reason in fleet.left_out.items())
+        raise FleetError(f"{path}: no drive that is one vehicle's alone; {why}")
     for names, what in ((settings.hold_out, "hold out"), (settings.trusted, "trust")):
-        unknown = names - fleet.vehicles.keys()
+        unknown = sorted(names - fleet.vehicles.keys())
         if unknown:
-            raise FleetError(f"{path}: no vehicle {', '.join(sorted(unknown))} to {what}")
+            reasons = [f"; {name}: {fleet.left_out[name]}" for name in unknown if name in fleet.left_out]
+            raise FleetError(f"{path}: no vehicle {', '.join(unknown)} to {what}{''.join(reasons)}")
     both = settings.hold_out & settings.trusted
     if both:
         raise FleetError(
@@ -146,7 +151,7 @@ def _record(
         details=dict(outcome.details),
         vehicles=len(outcome.parameters),
         left_out=dict(outcome.left_out),
-        notices=[*equipment.notices, *outcome.notices],
+        notices=[*fleet.notices, *equipment.notices, *outcome.notices],
     )
 
 

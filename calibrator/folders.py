@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from calibrator.errors import FleetError
 
@@ -12,19 +13,40 @@ __all__ = ["require_new_folder", "require_possible_folder", "whole_folder"]
 
 
 def require_possible_folder(out: Path) -> None:
-    """Raise FleetError, before any work is done, if a folder neither exists nor can be made."""
-    nearest = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
-    if not nearest.is_dir():
-        raise FleetError(f"{out}: cannot be made: {nearest} is a file; choose another folder")
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise FleetError(f"{out}: cannot be written: no right to write into {nearest}; choose another folder")
+    """Raise FleetError, before any work is done, if a folder neither exists nor can be made, or nothing can be in it.
+
+    Rights alone do not tell (a read-only disk, /proc), so a folder is made for a moment.
+    """
+    _require_possible(out.absolute(), out)
 
 
 def require_new_folder(out: Path) -> None:
-    """Raise FleetError if a folder to be written exists and holds something, or cannot be made."""
+    """Raise FleetError if a folder to be written exists and holds something, or cannot be made or replaced."""
+    if out.is_symlink():
+        raise FleetError(f"{out}: is a link, so it cannot be replaced; name the folder itself or choose another --out")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FleetError(f"{out}: exists and is not empty; choose another --out or remove it")
-    require_possible_folder(out)
+    if out.is_mount():
+        raise FleetError(f"{out}: a disk is mounted there, so it cannot be replaced; choose a folder in it")
+    _require_possible(_partial(out), out)
+
+
+def _partial(out: Path) -> Path:
+    """Where a folder is filled: beside it, hidden."""
+    out = out.absolute()
+    return out.with_name(f".{out.name}.partial-{os.getpid()}")
+
+
+def _require_possible(folder: Path, out: Path) -> None:
+    """Make a folder in a hidden one, and remove both; `out` is what the user calls it."""
+    nearest = next(path for path in (folder, *folder.parents) if os.path.lexists(path))
+    if not nearest.is_dir():
+        raise FleetError(f"{out}: cannot be made: {nearest} is a file; choose another folder")
+    try:
+        with TemporaryDirectory(prefix=".trial-", dir=nearest) as trial:
+            (Path(trial) / folder.relative_to(nearest)).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FleetError(f"{out}: nothing can be made in {nearest}: {error.strerror}; choose another folder") from None
 
 
 @contextmanager
@@ -39,7 +61,8 @@ def whole_folder(out: Path) -> Iterator[Path]:
     Yields
     ------
     Path
-        Folder to fill. It is removed if the block fails; one that a killed process left is removed by the next run.
+        Folder to fill. It is removed if the block fails; one that a killed process left is removed by the next run. If
+        it cannot be renamed, it stays and is named.
 
     Raises
     ------
@@ -47,8 +70,7 @@ def whole_folder(out: Path) -> Iterator[Path]:
         If the folder is not empty or cannot be made.
     """
     require_new_folder(out)
-    out = out.absolute()
-    partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
+    out, partial = out.absolute(), _partial(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         _remove_abandoned(out)
@@ -57,11 +79,15 @@ def whole_folder(out: Path) -> Iterator[Path]:
         raise FleetError(f"{out}: cannot be made: {error.strerror}; choose another folder") from None
     try:
         yield partial
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    try:
         if out.exists():
             out.rmdir()
         partial.rename(out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    except OSError as error:
+        raise FleetError(f"{out}: cannot be replaced: {error.strerror}; what was made stands in {partial}") from None
 
 
 def _remove_abandoned(out: Path) -> None:

@@ -207,7 +207,8 @@ def _why_not(error: Exception, content: bytes) -> str:
 def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:
     """Check that parameters were made for this vehicle, layout and DBC, decided on, and within the layout's limits.
 
-    A file whose verdict is "cannot tell" or "not enough data" fits only if it applies no branch.
+    A file whose verdict is "cannot tell" or "not enough data" fits only if it applies no branch. Limits are those of
+    what is applied.
 
     Parameters
     ----------
@@ -250,6 +251,8 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
     for name, branch in parameters.branches.items():
         if name not in layout.branch_names:
             raise UnfitError(Reason.WRONG_LAYOUT, f"parameters for branch {name!r}, which {layout.path} does not have")
+        if not branch.apply:
+            continue
         if not abs(branch.drift) <= layout.limits.drift:
             raise UnfitError(
                 Reason.IMPLAUSIBLE_PARAMETERS,

@@ -12,6 +12,7 @@ import msgspec
 import typer
 from rich.console import Console
 
+from calibrator.command_options import number_option
 from calibrator.recordings.frames import FrameCollector, Frames, read_frames
 from calibrator.recordings.readers import drive_from_frames
 from calibrator.report.kirchhoff import compare_kirchhoff
@@ -39,7 +40,7 @@ def main(
     dbc: Annotated[Path | None, typer.Option(help="DBC to use instead of the one the layout names.")] = None,
     interface: Annotated[str | None, typer.Option(help="Listen to a bus of this python-can interface.")] = None,
     channel: Annotated[str | None, typer.Option(help="Channel of the bus, such as vcan0.")] = None,
-    duration: Annotated[float, typer.Option(min=0.1, max=86400.0, help="How long to listen [s].")] = 30.0,
+    duration: Annotated[float, number_option("--duration", 0.1, 86400.0, "How long to listen [s]")] = 30.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
     plot: Annotated[Path | None, typer.Option(help="Draw the currents into this picture (.png, .pdf, .svg).")] = None,
 ) -> None:

@@ -17,6 +17,7 @@ from calibrator.recordings.bmw_i3 import BRANCHES, INPUTS, ImportedTrip, trip_fr
 from calibrator.recordings.csv_table import read_csv_table
 from calibrator.recordings.drive_log import write_drive_log
 from calibrator.recordings.signal_range import signal_ranges
+from calibrator.report.text import told_once
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.layout import read_layout
@@ -140,9 +141,8 @@ def _print_account(account: Account, *, as_json: bool) -> None:
         }
         typer.echo(json.dumps(values, indent=2))
     else:
-        for name, trip in done.items():
-            for notice in trip.notices:
-                typer.echo(f"{name}: {notice}")
+        for line in told_once((name, notice) for name, trip in done.items() for notice in trip.notices):
+            typer.echo(line)
         typer.echo(
             f"{len(done)} trips imported, {duration_h:.1f} h; {len(account.already_there)} already there; "
             f"{len(failed)} left out"

@@ -150,7 +150,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _speed(text: str) -> float:
-    speed = float(text)
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = math.nan
     if not (math.isfinite(speed) and speed >= 0.0):
         raise argparse.ArgumentTypeError(f"{text}: a number of at least 0 is expected")
     return speed

@@ -36,6 +36,8 @@ class FleetSource:
         Drives by vehicle, sorted.
     left_out : mapping of str to str
         Why a vehicle, or a file where its vehicle is unclear, was left out.
+    notices : tuple of str
+        What else the user should know.
     fleet_ids : frozenset of str
         Artificial fleets that the drives come from, see :mod:`calibrator.drives.fleet_id`; empty if unknown.
     """
@@ -43,6 +45,7 @@ class FleetSource:
     path: Path
     vehicles: Mapping[str, tuple[DriveFile, ...]]
     left_out: Mapping[str, str]
+    notices: tuple[str, ...] = ()
     fleet_ids: frozenset[str] = frozenset()
 
 

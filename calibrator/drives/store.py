@@ -5,6 +5,7 @@ file's metadata carries schema version, vehicle, drive, and name and digest of t
 signs mean something only together with it.
 """
 
+import hashlib
 import io
 import json
 import re
@@ -23,7 +24,16 @@ from ecu_node.errors import UserError
 from ecu_node.layout import Layout, file_digest
 from ecu_node.parameters import write_atomically
 
-__all__ = ["has_drive", "iterate_drives", "list_drives", "read_drive_file", "require_plain_name", "write_drive"]
+__all__ = [
+    "drive_digest",
+    "drive_outline",
+    "has_drive",
+    "iterate_drives",
+    "list_drives",
+    "read_drive_file",
+    "require_plain_name",
+    "write_drive",
+]
 
 SCHEMA_VERSION = 1
 _FOLDER = "drives"
@@ -219,6 +229,59 @@ def read_drive_file(path: Path, layout: Layout) -> Drive:
         branches={key: channel for (kind, key), channel in rows.items() if kind == "branch"},
         inputs={key: channel for (kind, key), channel in rows.items() if kind == "input"},
     )
+
+
+def drive_outline(path: Path) -> tuple[int, ...]:
+    """Rows and sizes of a drive's columns, without reading them: different for different recordings, as a rule.
+
+    Parameters
+    ----------
+    path : Path
+        A file of a store.
+
+    Returns
+    -------
+    tuple of int
+        Numbers of the file's directory.
+
+    Raises
+    ------
+    DriveError
+        If the file is no drive.
+    """
+    with _reading(path):
+        about = pq.read_metadata(path)
+        groups = [about.row_group(k) for k in range(about.num_row_groups)]
+        columns = [group.column(k) for group in groups for k in range(group.num_columns)]
+    sizes = [size for column in columns for size in (column.total_compressed_size, column.total_uncompressed_size)]
+    return (about.num_rows, *sizes)
+
+
+def drive_digest(path: Path) -> bytes:
+    """Digest of the channels of a drive, whatever its name and vehicle.
+
+    Parameters
+    ----------
+    path : Path
+        A file of a store.
+
+    Returns
+    -------
+    bytes
+        The same for the same recording.
+
+    Raises
+    ------
+    DriveError
+        If the file is cut or no drive.
+    """
+    digest = hashlib.blake2b()
+    with _reading(path):
+        for kind, name, channel in _channels(pq.read_table(path)):
+            digest.update(f"{kind} {name} {len(channel.time_s)}".encode())
+            for values in (channel.time_s, channel.value, channel.good):
+                digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.digest()
 
 
 def _path(store: Path, vehicle: str, name: str) -> Path:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from calibrator.experiments.picture import write_picture
 from calibrator.experiments.result import ExperimentResult, decode_result
-from calibrator.experiments.table import LEGEND, headline, markdown_table, result_markdown
+from calibrator.experiments.table import caption, headline, markdown_table, result_markdown
 from ecu_node.parameters import write_atomically
 
 __all__ = ["index_path", "read_results", "write_result"]
@@ -47,7 +47,7 @@ def index_path(folder: Path) -> Path:
 
 
 def _index(folder: Path, results: Sequence[ExperimentResult]) -> str:
-    lines = ["# Results of the experiments", "", f"Written by `calibrator experiment`. {LEGEND}", ""]
+    lines = ["# Results of the experiments", "", f"Written by `calibrator experiment`. {caption(results)}", ""]
     for result in results:
         settings = result.settings
         lines += [

@@ -1,7 +1,7 @@
 """Run experiments by name: tables on the console; pages, JSON and pictures in a folder."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +29,15 @@ from calibrator.experiments.trial import FleetLaw
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 
-__all__ = ["CALIBRATION", "EXPERIMENTS", "RunOptions", "run_experiments"]
+__all__ = ["CALIBRATION", "EXPERIMENTS", "Recorded", "RunOptions", "run_experiments"]
 
 REPETITIONS, QUICK_REPETITIONS = 10, 2
 QUICK_DURATION_S = 300.0
 QUICK_TRIPS = 8
 QUICK_LAW = FleetLaw(vehicles=20, training_vehicles=400)
 CALIBRATION = "calibration"
+DEFAULT_LAYOUT = Path("dbc/hv_powertrain.toml")
+"""Of the examples that come with the source."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,21 +54,25 @@ class RunOptions:
         Trials per setting; None: 10, or 2 if quick.
     jobs : int
         Processes.
-    layout : Path
-        Layout of the recorded drives.
+    layout : Path or None
+        Layout of the recorded drives; None: that of the built-in vehicle, if the current folder is a checkout. Only
+        experiments on recorded trips need one.
     drives : Path or None
         Drive store with the recorded drives; None: trips of the built-in vehicle take their place.
     drive : CommonDrive or None
         The drive that all vehicles of an experiment of the paper make; None: of the built-in vehicle.
+    fleet : RecordedFleet or None
+        The recorded trips; None: of ``layout`` and ``drives``.
     """
 
     quick: bool = False
     seed: int = 0
     repetitions: int | None = None
     jobs: int = 1
-    layout: Path = Path("dbc/hv_powertrain.toml")
+    layout: Path | None = None
     drives: Path | None = None
     drive: CommonDrive | None = None
+    fleet: RecordedFleet | None = None
 
     @property
     def effort(self) -> Effort:
@@ -96,14 +102,23 @@ class _Common:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Recorded:
-    """An experiment on recorded trips."""
+class Recorded:
+    """An experiment on recorded trips.
+
+    Attributes
+    ----------
+    run : callable
+        The experiment.
+    quick : mapping
+        Its arguments that make it small.
+    """
 
     run: Callable[..., ExperimentResult]
     quick: Mapping[str, Any]
 
     def __call__(self, options: RunOptions) -> ExperimentResult:
-        fleet = _recorded_fleet(options)
+        """Run it on the fleet of the options."""
+        fleet = options.fleet or _recorded_fleet(options)
         return self.run(fleet=fleet, effort=options.effort, **(self.quick if options.quick else {}))
 
 
@@ -116,10 +131,10 @@ EXPERIMENTS: Mapping[str, Callable[[RunOptions], ExperimentResult]] = {
         run=statespace_experiment, vehicles=500, duration_s=1200.0, quick={"sparsities": (60.0, 80.0)}
     ),
     "asymmetry": _Common(run=asymmetry_experiment, quick={"fleet_sizes": (20,), "sign_biases": (0.0, 0.4)}),
-    "real": _Recorded(run=real_experiment, quick={"cases": (RecordedCase(unmeasured_a=(3.0, 1.0)),)}),
-    "delay": _Recorded(run=delay_experiment, quick={"delays_ms": (0.0, 300.0)}),
-    "data": _Recorded(run=data_experiment, quick={"minutes": (2.0, 5.0), "fleet_sizes": (10,)}),
-    "phase": _Recorded(run=phase_experiment, quick={"sparsities": (60.0, 80.0), "magnitudes": ((0.05, 0.25),)}),
+    "real": Recorded(run=real_experiment, quick={"cases": (RecordedCase(unmeasured_a=(3.0, 1.0)),)}),
+    "delay": Recorded(run=delay_experiment, quick={"delays_ms": (0.0, 300.0)}),
+    "data": Recorded(run=data_experiment, quick={"minutes": (2.0, 5.0), "fleet_sizes": (10,)}),
+    "phase": Recorded(run=phase_experiment, quick={"sparsities": (60.0, 80.0), "magnitudes": ((0.05, 0.25),)}),
 }
 """All but ``calibration``, which pools the others."""
 
@@ -127,13 +142,13 @@ EXPERIMENTS: Mapping[str, Callable[[RunOptions], ExperimentResult]] = {
 def run_experiments(
     names: Sequence[str], options: RunOptions, *, out: Path | None = None, console: Console | None = None
 ) -> list[ExperimentResult]:
-    """Run experiments one after the other.
+    """Run experiments one after the other; recorded trips are read before any is run.
 
     Parameters
     ----------
     names : sequence of str
         Of :data:`EXPERIMENTS`, or ``calibration``: pools the experiments run before it and those recorded in the
-        folder; if there are none, all others are run first.
+        folder.
     options : RunOptions
         How.
     out : Path or None
@@ -150,17 +165,20 @@ def run_experiments(
     Raises
     ------
     FleetError
-        If there is no such experiment, the number of repetitions is not positive, or there are too few trips.
+        If there is no such experiment, the number of repetitions is not positive, there are too few trips, or nothing
+        is recorded that ``calibration`` could pool.
     UserError
-        If layout or drives cannot be read.
+        If layout or drives cannot be read, or there is no default layout.
     """
     known = (*EXPERIMENTS, CALIBRATION)
     for name in names:
         if name not in known:
             raise FleetError(f"no experiment '{name}'; choose one of {', '.join(known)}")
+    if any(isinstance(EXPERIMENTS.get(name), Recorded) for name in names):
+        options = replace(options, fleet=options.fleet or _recorded_fleet(options))
     done: list[ExperimentResult] = []
     for name in names:
-        result = _calibration(done, options, out) if name == CALIBRATION else EXPERIMENTS[name](options)
+        result = _calibration(done, out) if name == CALIBRATION else EXPERIMENTS[name](options)
         done.append(result)
         if console is not None:
             console.print(result_table(result))
@@ -169,16 +187,29 @@ def run_experiments(
     return done
 
 
-def _calibration(done: Sequence[ExperimentResult], options: RunOptions, out: Path | None) -> ExperimentResult:
+def _calibration(done: Sequence[ExperimentResult], out: Path | None) -> ExperimentResult:
     recorded = read_results(out, tuple(EXPERIMENTS)) if out is not None else []
     by_name = {result.name: result for result in (*recorded, *done)}
     if not by_name:
-        by_name = {name: run(options) for name, run in EXPERIMENTS.items()}
+        raise FleetError(
+            f"{'--out' if out is None else out}: no experiment is recorded that calibration could pool; first run "
+            f"'calibrator experiment all --out {out or 'FOLDER'}', or some experiments by their names"
+        )
     return calibration_experiment(list(by_name.values()))
 
 
+def _default_layout() -> Path:
+    """Layout of the built-in vehicle, which comes with the source but not with an installed package."""
+    if not DEFAULT_LAYOUT.is_file():
+        raise FleetError(
+            f"{DEFAULT_LAYOUT}: not in this folder, which is no checkout of the source; experiments on recorded trips "
+            "need a layout, also for built-in ones: name it with --layout"
+        )
+    return DEFAULT_LAYOUT
+
+
 def _recorded_fleet(options: RunOptions) -> RecordedFleet:
-    database = read_database(read_layout(options.layout))
+    database = read_database(read_layout(options.layout or _default_layout()))
     if options.drives is not None:
         fleet = read_fleet(options.drives, database)
         return fleet.take(QUICK_TRIPS, duration_s=QUICK_DURATION_S) if options.quick else fleet

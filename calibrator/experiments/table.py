@@ -3,15 +3,18 @@
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
+from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from calibrator.experiments.calibration_experiment import ALL, pooled_bins
+from calibrator.experiments.caption import PAPER, details_caption, headline_caption
 from calibrator.experiments.methods import CEILING, POSTERIOR
 from calibrator.experiments.outcome import calibration_figures
 from calibrator.experiments.result import ExperimentResult, Figure, Row
 
-__all__ = ["headline", "markdown_table", "result_markdown", "result_table"]
+__all__ = ["caption", "headline", "markdown_table", "result_markdown", "result_table"]
 
 HONESTY = {
     "confidence": "confidence",
@@ -27,23 +30,7 @@ HONESTY = {
 DETAILS = {"recovery_rate": "10 %", "recovery_rate_25": "25 %", "f2": "f2", "complexity": "hardware", **HONESTY}
 SHORT = ("confidence", "ece", "delay_rmse_ms")
 """What fits on a console of 80 columns."""
-LEGEND = (
-    "Share of vehicles recovered within 10 %: the paper's best printed figure, the published method (/ its "
-    "classifier), the default (posterior), and the default where it is told how the faults were drawn (law known: the "
-    "most that this evidence gives). Of the default: mean confidence, share of vehicles above 0.95, their mean "
-    "confidence and the share of them that is recovered, expected calibration error (tenths) and what it is by chance "
-    "if the confidence is exact, share of the vehicles with faulty sensors that is corrected in some branch, share of "
-    "the corrected ones of which some branch gets worse on an unseen drive."
-)
-SHORT_LEGEND = (
-    "Share of vehicles recovered within 10 %: the paper's best printed figure, the published method (/ its "
-    "classifier), the default (posterior), and of the default mean confidence and expected calibration error; --out "
-    "writes all figures."
-)
-DETAILS_LEGEND = (
-    "Recovered within 10 and 25 %, f2 of the hardware classification, share held to have hardware faults, and the "
-    "figures above, for each method; in brackets the paper."
-)
+SHARED_ONCE = f"Settings that several experiments share are the same trials and count once in '{ALL}'."
 NOTHING = "-"
 DEFAULT = POSTERIOR.name
 
@@ -66,11 +53,8 @@ def headline(result: ExperimentResult, honesty: Collection[str] = tuple(HONESTY)
         One per setting.
     """
     series = [result.series_label] if result.series_label else []
-    has_paper = any(figure.paper is not None for row in result.rows for figure in row.figures.values())
-    shown = [
-        name for name in HONESTY if name in honesty and any(name in row.figures for row in result.rows if row.bins)
-    ]
-    header = [*series, result.x_label, *(["paper"] if has_paper else []), *result.methods]
+    has_paper, shown = _has_paper(result), _shown(result, honesty)
+    header = [*series, result.x_label, *([PAPER] if has_paper else []), *result.methods]
     lines = []
     for key in dict.fromkeys((row.series, row.x) for row in result.rows):
         rows = {row.method: row for row in result.rows if (row.series, row.x) == key}
@@ -83,28 +67,59 @@ def headline(result: ExperimentResult, honesty: Collection[str] = tuple(HONESTY)
     return [*header, *(HONESTY[name] for name in shown)], lines
 
 
-def result_table(result: ExperimentResult) -> Table:
-    """Headline of a result for the console."""
-    settings = result.settings
-    vehicles = f"{settings['vehicles']} vehicles, " if isinstance(settings.get("vehicles"), int) else ""
-    table = Table(
-        box=None,
-        pad_edge=False,
-        collapse_padding=True,
-        title=result.title,
-        caption=f"{SHORT_LEGEND} {vehicles}{settings['repetitions']} repetitions, seed {settings['seed']}, "
-        f"drive {settings['drive']}.{_failures(result)}",
-        caption_justify="left",
-        title_justify="left",
-    )
-    header, rows = headline(_without_ceiling(result), SHORT)
+def caption(results: Sequence[ExperimentResult], honesty: Collection[str] = tuple(HONESTY)) -> str:
+    """Explain the columns of the headlines of results.
+
+    Parameters
+    ----------
+    results : sequence of ExperimentResult
+        Whose headlines are shown below each other.
+    honesty : collection of str
+        As in :func:`headline`.
+
+    Returns
+    -------
+    str
+        Sentences; a column that no headline has is not mentioned.
+    """
+    columns = {name for result in results for name in (*result.methods, *([PAPER] if _has_paper(result) else []))}
+    text = headline_caption(columns, {name for result in results for name in _shown(result, honesty)})
+    pooled = any(row.series == ALL for result in results for row in result.rows)
+    return f"{text} {SHARED_ONCE}" if pooled else text
+
+
+def _has_paper(result: ExperimentResult) -> bool:
+    """Whether the paper states some recovery rate."""
+    return any(figure.paper is not None for row in result.rows for figure in row.figures.values())
+
+
+def _shown(result: ExperimentResult, honesty: Collection[str] = tuple(HONESTY)) -> list[str]:
+    """Figures of the default in the headline."""
+    there = {name for row in result.rows if row.bins for name in row.figures}
+    return [name for name in HONESTY if name in honesty and name in there]
+
+
+def _detailed(result: ExperimentResult) -> list[str]:
+    """Figures in the table of all."""
+    return [name for name in DETAILS if any(name in row.figures for row in result.rows)]
+
+
+def result_table(result: ExperimentResult) -> Group:
+    """Headline of a result for the console: title, table and caption, which is as wide as the console."""
+    shown = _without_ceiling(result)
+    table = Table(box=None, pad_edge=False, collapse_padding=True)
+    header, rows = headline(shown, SHORT)
     for number, heading in enumerate(header):
         first = number == 0 and bool(result.series_label)
         text = escape(heading).replace("/", "/\n").replace(", ", ",\n")
         table.add_column(text, justify="left" if first else "right", no_wrap=first)
     for row in rows:
         table.add_row(*row)
-    return table
+    settings = result.settings
+    vehicles = f"{settings['vehicles']} vehicles, " if isinstance(settings.get("vehicles"), int) else ""
+    effort = f"{settings['repetitions']} repetitions, seed {settings['seed']}, drive {settings['drive']}"
+    text = f"{caption([shown], SHORT)} --out writes all figures. {vehicles}{effort}.{_failures(shown)}"
+    return Group(Text(result.title, style="bold"), table, Text(text, style="dim"), Text())
 
 
 def _without_ceiling(result: ExperimentResult) -> ExperimentResult:
@@ -119,13 +134,13 @@ def result_markdown(result: ExperimentResult) -> str:
         [
             f"# {result.title}",
             "",
-            f"Written by `calibrator experiment {result.name} --out FOLDER`. {LEGEND}{_failures(result)}",
+            f"Written by `calibrator experiment {result.name} --out FOLDER`. {caption([result])}{_failures(result)}",
             "",
             *markdown_table(*headline(result)),
             "",
             f"![{result.title}]({result.name}.png)",
             "",
-            DETAILS_LEGEND,
+            details_caption(_detailed(result), _shown(result), paper=_has_paper(result)),
             "",
             *markdown_table(*_details(result)),
             "",
@@ -143,7 +158,7 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list
 
 def _details(result: ExperimentResult) -> tuple[list[str], list[list[str]]]:
     """All figures of all rows, the paper's in brackets."""
-    names = [name for name in DETAILS if any(name in row.figures for row in result.rows)]
+    names = _detailed(result)
     series = [result.series_label] if result.series_label else []
     lines = []
     for row in result.rows:
@@ -155,7 +170,8 @@ def _details(result: ExperimentResult) -> tuple[list[str], list[list[str]]]:
 
 def _reliability(result: ExperimentResult) -> list[str]:
     """Lines that compare the default's confidence with what became of it; none without a confidence."""
-    bins = pooled_bins(row for row in result.rows if row.method == DEFAULT and row.series != ALL)
+    rows_of_default = [row for row in result.rows if row.method == DEFAULT]
+    bins = pooled_bins([row for row in rows_of_default if row.series == ALL] or rows_of_default)
     if not bins:
         return []
     rows = [[f"{b.low:.1f}", f"{b.count}", f"{b.confidence:.3f}", f"{b.recovered:.3f}"] for b in bins]

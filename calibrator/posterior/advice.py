@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calibrator.drive import Mask
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.explain import FaultExplanation
-from calibrator.posterior.health import FEWEST_TRUSTED
+from calibrator.posterior.model_spread import FEWEST_TRUSTED
 from calibrator.posterior.verdict import Deployment
 from ecu_node.layout import Layout
 
@@ -62,7 +63,7 @@ def advise(
     concerned = {posterior.order.index(int(k)) for k in np.flatnonzero(held_back != "")}
     ordered = [branches[k] for k in posterior.order]
     decisive = deciding_evidence(found, ordered, layout.full_scale_a, concerned=concerned)
-    return decisive or _least_known(posterior, j, branches, layout.full_scale_a)
+    return decisive or _least_known(posterior, j, held_back != "", branches, layout.full_scale_a)
 
 
 def deciding_evidence(
@@ -112,9 +113,12 @@ def deciding_evidence(
     return f"a check of the {branches[k]} sensor against a reference would decide: its gain is off by {readings}"
 
 
-def _least_known(posterior: FleetPosterior, j: int, branches: Sequence[str], full_scale_a: float) -> str:
-    """Which sensor is known least where only one explanation is left."""
-    k = int(np.argmax(np.hypot(posterior.drift_sd[j], posterior.offset_sd_a[j] / full_scale_a)))
+def _least_known(
+    posterior: FleetPosterior, j: int, concerned: Mask, branches: Sequence[str], full_scale_a: float
+) -> str:
+    """Which sensor of those concerned, or of all if none is, is known least where only one explanation is left."""
+    sd = np.hypot(posterior.drift_sd[j], posterior.offset_sd_a[j] / full_scale_a)
+    k = int(np.argmax(np.where(concerned | ~concerned.any(), sd, -np.inf)))
     return (
         f"more drives would decide: the {branches[k]} sensor's drift is known to +-{posterior.drift_sd[j, k]:.2%} and "
         f"its offset to +-{posterior.offset_sd_a[j, k]:.2f} A only; record drives in which that current varies"

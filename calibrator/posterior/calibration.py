@@ -17,13 +17,12 @@ from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.health import ReferenceHealth, examine_reference
+from calibrator.posterior.model_spread import FEWEST_TRUSTED
 from calibrator.posterior.trust import broken_trust
+from calibrator.posterior.verdict import SUSPECTED
 from ecu_node.layout import UnmeasuredLoad
 
 __all__ = ["calibrate_posterior"]
-
-SUSPECTED = 0.5
-"""Probability of a hardware fault from which on a trusted vehicle does not carry the reference. [1]"""
 
 
 def calibrate_posterior(
@@ -52,8 +51,9 @@ def calibrate_posterior(
     readings : Readings or None
         Direct readings of single sensors.
     trusted : ndarray of bool of shape (N,) or None
-        Vehicles whose sensors were found faultless on a bench; they carry the reference, except those that break the
-        junction law or have a hardware fault: they stand in ``health.distrusted``.
+        Vehicles whose sensors were found faultless on a bench. At least :data:`FEWEST_TRUSTED` carry the reference.
+        Those that break the junction law are not trusted, those that differ from the others do not carry: see the
+        health.
     learning : ndarray of bool of shape (N,) or None
         Vehicles from which the fleet's reference and hyper-parameters are learnt; None: all.
     load : UnmeasuredLoad or None
@@ -80,7 +80,7 @@ def calibrate_posterior(
     rows = collect_rows(ordered, model, full_scale_a=full_scale_a, learning=learnt)
     known = no_readings(N, K) if readings is None else readings
     carriers = np.zeros(N, bool) if trusted is None else trusted.copy()
-    distrusted = broken_trust(rows, carriers, [names[k] for k in order], full_scale_a=full_scale_a)
+    distrusted = broken_trust(rows, carriers, [names[k] for k in order], full_scale_a=full_scale_a, load=load)
     carriers[list(distrusted)] = False
     known = known.merged(trusted_readings(carriers, K, full_scale_a))
     if load is not None:
@@ -101,14 +101,20 @@ def calibrate_posterior(
     )
     posterior = estimate(trusted=carriers)
     differing = carriers & (posterior.hardware_fault > SUSPECTED)
+    if np.count_nonzero(carriers) < FEWEST_TRUSTED:
+        differing[:] = False
     if differing.any():
-        distrusted |= dict.fromkeys(np.flatnonzero(differing).tolist(), "the vehicle itself differs from the others")
         carriers &= ~differing
         posterior = estimate(trusted=carriers)
     health = examine_reference(
-        rows.take(learnt), [names[k] for k in order], full_scale_a=full_scale_a, trusted=carriers[learnt], load=load
+        rows.take(learnt),
+        [names[k] for k in order],
+        full_scale_a=full_scale_a,
+        trusted=carriers[learnt],
+        load=load,
+        load_in_use_a=posterior.hyperparameters.spread.mean[4 * K - 1] * full_scale_a,
     )
-    health = replace(health, distrusted=distrusted)
+    health = replace(health, distrusted=distrusted, differing=tuple(np.flatnonzero(differing).tolist()))
     return _in_own_order(posterior, health, order)
 
 

@@ -100,7 +100,7 @@ def best_estimates(points: Points, states: States, vehicle: int, *, least: tuple
     near &= _near(points.offset, states.offset[vehicle, candidates], least[1])
     covered = near @ points.weight
     state = int(np.argmax(covered >= covered.max() - EQUALLY_GOOD))
-    return state, float(covered[state])
+    return state, min(float(covered[state]), 1.0)
 
 
 def harm_probability(

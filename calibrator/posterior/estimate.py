@@ -17,7 +17,13 @@ from calibrator.posterior.hyperparameters import (
     draw_hyperparameters,
     estimate_hyperparameters,
 )
-from calibrator.posterior.model_spread import free_centres, initial_spreads, trusted_spread
+from calibrator.posterior.model_spread import (
+    FEWEST_TRUSTED,
+    free_centres,
+    initial_spreads,
+    trusted_spread,
+    uncarried_centres,
+)
 from calibrator.posterior.states import States, enumerate_states, mean_states
 
 __all__ = ["FleetPosterior", "Moments", "estimate_fleet"]
@@ -110,7 +116,8 @@ def estimate_fleet(
     given : FaultPrior or None
         Prior of the faults, if it is known; None: estimated from the fleet.
     trusted : ndarray of bool of shape (N,) or None
-        Vehicles that were found faultless, whose rows hold that reading; they alone carry the reference then.
+        Vehicles that were found faultless, whose rows hold that reading; where at least :data:`FEWEST_TRUSTED` of them
+        tell a row, they alone carry its centre.
     learning : ndarray of bool of shape (N,) or None
         Vehicles from which hyper-parameters are learnt; None: all.
     load : float or None
@@ -124,11 +131,9 @@ def estimate_fleet(
     """
     _require_fit(rows, moments, full_scale_a)
     learnt = rows if learning is None else rows.take(learning)
-    carriers = None if trusted is None or not trusted.any() else rows.take(trusted)
-    if trusted is None or carriers is None:
-        starts, free = initial_spreads(learnt), free_centres(rows.branches)
-    else:
-        starts, free = [trusted_spread(rows, trusted)], np.zeros(5 * rows.branches, bool)
+    starts, free, carriers = initial_spreads(learnt), np.asarray(free_centres(rows.branches), bool), None
+    if trusted is not None and np.count_nonzero(trusted) >= FEWEST_TRUSTED:
+        starts, free, carriers = [trusted_spread(rows, trusted)], uncarried_centres(rows, trusted), rows.take(trusted)
     if load is not None:
         starts, free[4 * rows.branches - 1] = [start.with_load(load) for start in starts], False
     hyperparameters = estimate_hyperparameters(learnt, starts, given=given, free=free)

@@ -14,11 +14,10 @@ from calibrator.calibration_settings import CalibrationSettings, FleetOutcome, r
 from calibrator.drive import Mask
 from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
-from calibrator.evidence.readings import TRUSTED_OFFSET_SD, Readings, no_readings
-from calibrator.evidence.readings_file import BenchReadings, read_bench_readings, readings_of
 from calibrator.evidence.vehicle_summary import VehicleSummary, read_vehicle_summary
 from calibrator.parameter_files import RunIdentity, by_branch, junction_rms_a
 from calibrator.posterior.advice import advise
+from calibrator.posterior.bench import merge_readings, read_bench, trust_notices, trusted_of, window_notices
 from calibrator.posterior.calibration import calibrate_posterior
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.explain import explanations
@@ -37,8 +36,6 @@ from ecu_node.parameters import (
 
 __all__ = ["calibrate_fleet_posterior"]
 
-CONTRADICTION = 4.0
-"""Standard deviations from which on a reading contradicts the trust in a sensor. [1]"""
 UNTOLD = 0.05
 """Probability of other explanations up to which they are not told. [1]"""
 MOST_TOLD, LEAST_TOLD = 3, 0.02
@@ -71,23 +68,25 @@ def calibrate_fleet_posterior(
     FleetError
         If too few vehicles can be used, or a trusted one is not there.
     """
-    bench = None
-    if settings.readings is not None:
-        bench = read_bench_readings(settings.readings, fleet.vehicles.keys(), equipment.branches)
+    full_scale_a = identity.database.layout.full_scale_a
+    bench = read_bench(settings, fleet, equipment.branches, full_scale_a=full_scale_a)
     vehicles, left_out = read_vehicles(read_vehicle_summary, fleet, equipment, identity.database, workers=workers)
     names = [vehicle.vehicle for vehicle in vehicles]
     learning = require_learning(names, settings, left_out)
-    trusted = _trusted(names, settings.trusted, fleet)
+    trusted = trusted_of(names, settings.trusted, fleet)
+    readings, doubts = merge_readings(vehicles, bench, equipment.branches)
     estimate = partial(
         calibrate_posterior,
-        full_scale_a=identity.database.layout.full_scale_a,
+        full_scale_a=full_scale_a,
         branches=equipment.branches,
-        readings=_readings(vehicles, bench or {}, equipment.branches),
+        readings=readings,
         trusted=trusted if trusted.any() else None,
         learning=np.array(learning),
         load=identity.database.layout.unmeasured_load,
     )
     posterior = estimate([vehicle.summary for vehicle in vehicles])
+    assert posterior.health is not None
+    trusted[list(posterior.health.distrusted)] = False
     findings = all_linear(vehicles)
     if settings.sensor_models:
         findings = find_sensor_models(
@@ -114,39 +113,13 @@ def calibrate_fleet_posterior(
         left_out=left_out,
         notices=(
             *health.warnings,
-            *(
-                f"trusted vehicle {names[j]} does not carry the reference: {why}; check it again, or do not trust it"
-                for j, why in health.distrusted.items()
-            ),
-            *_contradictions(vehicles, trusted, equipment.branches, identity.database.layout.full_scale_a),
+            *trust_notices(names, health),
+            *doubts,
+            *window_notices(vehicles, trusted, equipment.branches, full_scale_a),
             *finding_notices(names, findings, equipment.branches),
         ),
         details=_details(posterior, equipment.branches),
     )
-
-
-def _trusted(names: Sequence[str], wanted: frozenset[str], fleet: FleetSource) -> Mask:
-    """Which vehicles are trusted; FleetError if one that should be cannot be used."""
-    missing = wanted - set(names)
-    if missing:
-        raise FleetError(f"{fleet.path}: no usable vehicle {', '.join(sorted(missing))} to trust")
-    return np.array([name in wanted for name in names])
-
-
-def _contradictions(
-    vehicles: Sequence[VehicleSummary], trusted: Mask, branches: Sequence[str], full_scale_a: float
-) -> list[str]:
-    """Trusted sensors that showed an offset while the contactors were open."""
-    texts = []
-    for vehicle in (vehicle for vehicle, is_trusted in zip(vehicles, trusted, strict=True) if is_trusted):
-        shown, sd_a = vehicle.zero_current.offset_a, vehicle.zero_current.sd_a
-        surprising = np.abs(shown) > CONTRADICTION * np.hypot(sd_a, TRUSTED_OFFSET_SD * full_scale_a)
-        texts += [
-            f"trusted vehicle {vehicle.vehicle}: its {branches[k]} sensor showed {shown[k]:+.1f} A with open "
-            f"contactors; it was taken for faultless: check it again, or do not trust it"
-            for k in np.flatnonzero(surprising).tolist()
-        ]
-    return texts
 
 
 def _parameter_files(
@@ -188,15 +161,6 @@ def _impossible(
         for j, vehicle in enumerate(vehicles)
         if not possible[j].all()
     }
-
-
-def _readings(vehicles: Sequence[VehicleSummary], bench: BenchReadings, branches: Sequence[str]) -> Readings:
-    """What the sensors showed on a bench, and the offsets that they showed in zero-current windows."""
-    offset = np.stack([vehicle.zero_current.offset_a for vehicle in vehicles])
-    sd = np.stack([vehicle.zero_current.sd_a for vehicle in vehicles])
-    nothing = no_readings(*offset.shape)
-    windows = Readings(drift=nothing.drift, drift_sd=nothing.drift_sd, offset_a=offset, offset_sd_a=sd)
-    return windows.merged(readings_of(bench, [vehicle.vehicle for vehicle in vehicles], branches))
 
 
 def _parameters(

@@ -15,14 +15,11 @@ from numpy.typing import NDArray
 from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
 from calibrator.posterior.cluster import Cluster, densest_clusters
-from calibrator.posterior.model_spread import MOST_UNMEASURED, unmeasured_load
+from calibrator.posterior.model_spread import FEWEST_TRUSTED, MOST_UNMEASURED, unmeasured_load
 from calibrator.posterior.slab import FAULTS_RANGE
 from ecu_node.layout import UnmeasuredLoad
 
-__all__ = ["FEWEST_TRUSTED", "ReferenceHealth", "examine_reference"]
-
-FEWEST_TRUSTED = 3
-"""Trusted vehicles that tell a branch and carry its reference, so that it is in no doubt."""
+__all__ = ["ReferenceHealth", "examine_reference"]
 
 LEAST_AGREEING = 5
 """Vehicles that must agree for their centre to be trusted."""
@@ -57,7 +54,9 @@ class ReferenceHealth:
     warnings : tuple of str
         What would fool the reference, one text each.
     distrusted : mapping of int to str
-        Vehicles that were called trusted and do not carry the reference, by position, and why.
+        Vehicles that were called trusted and break the junction law, by position, and how.
+    differing : tuple of int
+        Trusted vehicles that differ from the others as by a hardware fault, and do not carry the reference.
     """
 
     agreeing_share: tuple[float, ...]
@@ -67,6 +66,7 @@ class ReferenceHealth:
     doubtful: tuple[int, ...]
     warnings: tuple[str, ...]
     distrusted: Mapping[int, str] = field(default_factory=dict)
+    differing: tuple[int, ...] = ()
 
     def in_order(self, place: NDArray[np.int64]) -> "ReferenceHealth":
         """Return the same for branches in another order: branch k is at position ``place[k]`` here."""
@@ -85,6 +85,7 @@ def examine_reference(
     full_scale_a: float,
     trusted: Mask | None = None,
     load: UnmeasuredLoad | None = None,
+    load_in_use_a: float | None = None,
 ) -> ReferenceHealth:
     """Look for what would fool the reference.
 
@@ -100,6 +101,8 @@ def examine_reference(
         Vehicles that carry the reference of the branches that :data:`FEWEST_TRUSTED` of them tell.
     load : UnmeasuredLoad or None
         Load that no branch measures, if it is known.
+    load_in_use_a : float or None
+        Mean load that the posterior takes, as trusted vehicles may show another than most; None: that of most. [A]
 
     Returns
     -------
@@ -128,12 +131,18 @@ def examine_reference(
     unmeasured_a = 0.0 if load is None else load.mean_a
     if load is None:
         found = unmeasured_load(rows.constant[:, K], _sd(rows, 4 * K - 1))
-        unmeasured_a = found.centre * full_scale_a
-        if abs(found.centre) > max(LEAST_COMMON_OFFSET, SURE * _uncertainty(found, _sd(rows, 4 * K - 1))):
+        most_a = found.centre * full_scale_a
+        unmeasured_a = most_a if load_in_use_a is None else load_in_use_a
+        doubt_a = max(LEAST_COMMON_OFFSET, SURE * _uncertainty(found, _sd(rows, 4 * K - 1))) * full_scale_a
+        if carried and abs(most_a - unmeasured_a) > doubt_a:
             warnings.append(
-                f"the currents of most vehicles sum to {unmeasured_a:+.1f} A: a load without a sensor, as is taken "
-                f"here, or an offset that most vehicles share; if the load is known, declare it as [unmeasured_load] "
-                f"in the layout"
+                f"the currents of most vehicles sum to {most_a:+.1f} A, those of the trusted ones to "
+                f"{unmeasured_a:+.1f} A: the rest is an offset that most vehicles share"
+            )
+        elif abs(most_a) > doubt_a:
+            warnings.append(
+                f"the currents of most vehicles sum to {most_a:+.1f} A: a load without a sensor, as is taken here, or "
+                f"an offset that most vehicles share; if the load is known, declare it (docs/method.md)"
             )
     return ReferenceHealth(
         agreeing_share=tuple(share),

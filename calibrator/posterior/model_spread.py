@@ -16,6 +16,7 @@ from calibrator.posterior.slab import FAULTS_RANGE
 from calibrator.posterior.states import States
 
 __all__ = [
+    "FEWEST_TRUSTED",
     "MOST_UNMEASURED",
     "USED_STATES",
     "centre_covariance",
@@ -24,6 +25,7 @@ __all__ = [
     "initial_spreads",
     "next_spread",
     "trusted_spread",
+    "uncarried_centres",
     "unmeasured_load",
 ]
 
@@ -41,6 +43,8 @@ LEAST_SPREAD = np.array([1e-5, 1e-6])
 """Least model spread of relative and constant rows: far below any sensor's resolution. [1]"""
 LAWFUL, LAWFUL_GAIN, LAWFUL_CONSTANT = 3.0, 0.001, 0.002
 """Deviations up to which a vehicle obeys the junction law, and the least one of a gain ratio and the constant. [1]"""
+FEWEST_TRUSTED = 3
+"""Trusted vehicles that carry the reference of a branch that they tell."""
 FEWEST_LAWFUL = 3
 """Vehicles that make a cluster."""
 LEAST_AGREEING_LOAD = 0.15
@@ -151,8 +155,7 @@ def trusted_spread(rows: FleetRows, trusted: Mask) -> ModelSpread:
     ModelSpread
         Centres of slopes, intercepts and junction constant are the trusted vehicles'.
     """
-    values = np.concatenate([rows.relative, rows.constant], axis=1)[trusted]
-    told = np.diagonal(rows.covariance, axis1=1, axis2=2)[trusted] < UNKNOWN_VARIANCE / 2.0
+    values, told = np.concatenate([rows.relative, rows.constant], axis=1)[trusted], _told(rows)[trusted]
     mean = np.zeros(values.shape[1])
     for row in np.flatnonzero(np.asarray(free_centres(rows.branches), bool) & told.any(axis=0)):
         mean[row] = np.median(values[told[:, row], row])
@@ -160,6 +163,16 @@ def trusted_spread(rows: FleetRows, trusted: Mask) -> ModelSpread:
     return ModelSpread(
         mean=mean, covariance=covariance, outlier_share=GUESSED_OUTLIER_SHARE, dispersion=FIRST_DISPERSION
     )
+
+
+def uncarried_centres(rows: FleetRows, trusted: Mask) -> Mask:
+    """Rows whose centre the fleet has to tell: too few trusted vehicles do; shape (5K,)."""
+    return np.asarray(free_centres(rows.branches) & (_told(rows)[trusted].sum(axis=0) < FEWEST_TRUSTED))
+
+
+def _told(rows: FleetRows) -> Mask:
+    """Rows that say something, shape (N, 5K)."""
+    return np.asarray(np.diagonal(rows.covariance, axis1=1, axis2=2) < UNKNOWN_VARIANCE / 2.0)
 
 
 def next_spread(rows: FleetRows, states: States, prior: FaultPrior, spread: ModelSpread, free: Array) -> ModelSpread:

@@ -75,6 +75,8 @@ def tell_sensors(parameters: VehicleParameters, choices: Sequence[SensorModelCho
     why_not = _why_not_corrected(choices, list(parameters.branches))
     if not why_not:
         return parameters
+    held_back = any(branch.held_back == "not linear" for branch in parameters.branches.values())
+    concerned = held_back or parameters.verdict == "cannot tell"
     return msgspec.structs.replace(
         parameters,
         branches={
@@ -82,7 +84,7 @@ def tell_sensors(parameters: VehicleParameters, choices: Sequence[SensorModelCho
             for (name, branch), choice in zip(parameters.branches.items(), choices, strict=True)
         },
         confidence=None if any(choice.undecided for choice in choices) else parameters.confidence,
-        deciding_evidence=why_not if parameters.verdict == "cannot tell" else parameters.deciding_evidence,
+        deciding_evidence=why_not if concerned else parameters.deciding_evidence,
     )
 
 

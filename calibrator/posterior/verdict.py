@@ -11,7 +11,7 @@ from calibrator.posterior.estimate import FleetPosterior
 from ecu_node.layout import Layout
 from ecu_node.parameters import HeldBack, Verdict
 
-__all__ = ["Deployment", "decide"]
+__all__ = ["SUSPECTED", "Deployment", "decide"]
 
 CONFIDENT = 0.95
 """Posterior probability from which on the calibrator says what it found. [1]"""
@@ -73,10 +73,10 @@ def decide(posterior: FleetPosterior, layout: Layout, *, harm_limit: float, doub
     held_back = np.full(faulty.shape, "", f"<U{LONGEST_REASON}")
     within = (np.abs(drift) <= layout.limits.drift) & (np.abs(offset_a) <= layout.offset_limit_a)
     by_rising_weight: dict[HeldBack, Mask] = {
+        "beyond the limits": ~within,
         "harm limit": ~(posterior.harm < harm_limit),
         "moved too little": ~posterior.identifiable,
         "reference in doubt": in_doubt,
-        "beyond the limits": ~within,
     }
     for reason, applies in by_rising_weight.items():
         held_back[faulty & applies] = reason

@@ -8,6 +8,7 @@ in candump logs such lines are counted and left out, up to :data:`MAX_DAMAGED_SH
 import gzip
 import io
 import logging
+import shlex
 import shutil
 import tempfile
 import warnings
@@ -101,6 +102,8 @@ def _suffix(path: Path) -> str:
 
 
 def _reason(error: BaseException) -> str:
+    if isinstance(error, EOFError):
+        return "the compressed file is cut off"
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return str(text).splitlines()[0]
 
@@ -123,9 +126,10 @@ def _read_candump(path: Path) -> Frames:
                 lines += block.lines
                 above += text.count(b"\n")
     except _UNREADABLE as error:
+        frames_before = sum(map(len, parts))
         raise LogError(
-            f"{path}: truncated or damaged after line {above}: {_reason(error)}; "
-            f"{sum(map(len, parts))} frames before it are readable; copy the file again"
+            f"{path}: truncated or damaged {f'after line {above}' if above else 'in its first line'}: "
+            f"{_reason(error)}; {frames_before} frames before it are readable; {_remedy(path, frames_before)}"
         ) from None
     frames = concatenate_frames(parts)
     if frames.damaged > MAX_DAMAGED_SHARE * lines:
@@ -136,18 +140,46 @@ def _read_candump(path: Path) -> Frames:
     return frames
 
 
+def _remedy(path: Path, frames: int) -> str:
+    """What to do with a text log of which only the first frames can be read."""
+    if not frames or not path.name.lower().endswith(".gz"):
+        return "copy the file again"
+    part = f"'gzip -dc {shlex.quote(path.name)} > {shlex.quote(path.stem)}'"
+    return f"copy the file again, or keep the readable part, {part}, and remove {path.name}"
+
+
 def _blocks(file: BinaryIO) -> Iterator[bytes]:
-    """Pieces of some size that end at a line end."""
+    """Pieces of some size that end at a line end; those before a damage come before its error."""
     rest = b""
-    while block := file.read(BLOCK_BYTES):
+    damage: Exception | None = None
+    while damage is None:
+        block, damage = _whole_block(file)
+        if not block:
+            break
         cut = block.rfind(b"\n") + 1
         if cut:
             yield rest + block[:cut]
             rest = block[cut:]
         else:
             rest += block
+    if damage is not None:
+        raise damage
     if rest:
         yield rest
+
+
+def _whole_block(file: BinaryIO) -> tuple[bytes, Exception | None]:
+    """As much of a block as can be read, and what kept the rest; a single large read would lose it all."""
+    parts: list[bytes] = []
+    left = BLOCK_BYTES
+    read1 = cast("io.BufferedIOBase", file).read1
+    try:
+        while left > 0 and (part := read1(left)):
+            parts.append(part)
+            left -= len(part)
+    except _UNREADABLE as error:
+        return b"".join(parts), error
+    return b"".join(parts), None
 
 
 def _read_blf(path: Path) -> Frames:
@@ -184,7 +216,7 @@ def _read_mf4(path: Path) -> Frames:
             raise LogError(str(error).replace(unpacked.name, str(path))) from None
 
 
-def _collect(reader: can.io.generic.MessageReader, path: Path, place: Callable[[], str]) -> Frames:
+def _collect(reader: can.io.generic.MessageReader, path: Path, place: Callable[[Exception], str]) -> Frames:
     """Take every message; what python-can raises on damage becomes a LogError with the place."""
     collector = FrameCollector()
     try:
@@ -192,9 +224,11 @@ def _collect(reader: can.io.generic.MessageReader, path: Path, place: Callable[[
             for message in reader:
                 collector.add(message)
     except Exception as error:  # noqa: BLE001 (python-can lets through whatever its parsing meets)
+        unreadable = isinstance(error, _UNREADABLE)
+        remedy = _remedy(path, len(collector)) if unreadable else "copy the file again, or cut it there"
         raise LogError(
-            f"{path}: damaged{place()} ({_reason(error)}); {len(collector)} frames before it are readable; "
-            f"copy the file again, or cut it there"
+            f"{path}: damaged{place(error)} ({_reason(error)}); {len(collector)} frames before it are readable; "
+            f"{remedy}"
         ) from None
     return collector.frames()
 
@@ -219,9 +253,9 @@ class _CountedLines:
         """Close the file."""
         self._text.close()
 
-    def place(self) -> str:
-        """Where reading has come to."""
-        return f" at line {self._count}"
+    def place(self, error: Exception) -> str:
+        """Where an error is: in the line read last, or behind it if no more could be read."""
+        return f" {'after' if isinstance(error, _UNREADABLE) else 'at'} line {self._count}"
 
 
 class _Complaints(logging.Handler):

@@ -1,7 +1,7 @@
 """CAN logs of one or many vehicles into a drive store. One bad log never stops the others."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from joblib import delayed
@@ -12,6 +12,7 @@ from calibrator.drives.store import has_drive, write_drive
 from calibrator.interrupts import in_processes
 from calibrator.recordings.readers import read_recording
 from calibrator.recordings.sources import find_logs
+from calibrator.report.notices import Notice, merged_notices
 from calibrator.report.progress import progress_bar
 from calibrator.report.text import dumps, left_out_text, table
 from ecu_node.database import VehicleDatabase
@@ -28,7 +29,7 @@ class ImportedDrive:
     name: str
     duration_s: float
     branches: tuple[str, ...]
-    notices: tuple[str, ...]
+    notices: tuple[Notice, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,13 +43,14 @@ class ImportReport:
     left_out: dict[str, str]
 
     def as_json(self) -> str:
-        """The report as JSON."""
-        return dumps(asdict(self))
+        """The report as JSON, with the notices of every drive."""
+        drives = [{**vars(drive), "notices": list(map(str, drive.notices))} for drive in self.drives]
+        return dumps({**vars(self), "drives": drives})
 
     def as_text(self) -> str:
-        """The report for people."""
+        """The report for people; a notice that several drives share is told once."""
         rows = [(d.vehicle, d.name, f"{d.duration_s:.1f}", ", ".join(d.branches)) for d in self.drives]
-        notices = _grouped({f"{d.vehicle}/{d.name}": d.notices for d in self.drives})
+        notices = [f"  {line}" for line in merged_notices({(d.vehicle, d.name): d.notices for d in self.drives})]
         parts = [
             table(("vehicle", "drive", "duration [s]", "branches"), rows) if rows else "",
             "\n".join(["notices:", *notices]) if notices else "",
@@ -105,15 +107,6 @@ def _note_fleets(store: Path, logs: Sequence[DriveFile]) -> None:
         write_fleet_ids(store, fleet_ids)
 
 
-def _grouped(notices: Mapping[str, Sequence[str]]) -> list[str]:
-    """One line per notice, with the drive or the number of drives it is about."""
-    drives: dict[str, list[str]] = {}
-    for drive, texts in notices.items():
-        for text in texts:
-            drives.setdefault(text, []).append(drive)
-    return [f"  {where[0] if len(where) == 1 else f'{len(where)} drives'}: {text}" for text, where in drives.items()]
-
-
 def _import_one(log: DriveFile, database: VehicleDatabase, store: Path) -> ImportedDrive | str | None:
     """Import one log; the text of the error if it cannot be used; None if it was imported before."""
     try:
@@ -129,5 +122,5 @@ def _import_one(log: DriveFile, database: VehicleDatabase, store: Path) -> Impor
         name=drive.name,
         duration_s=drive.duration_s,
         branches=tuple(drive.branches),
-        notices=tuple(recording.report.notices()),
+        notices=tuple(recording.report.counted_notices()),
     )

@@ -19,6 +19,7 @@ from calibrator.recordings.e2e_profile import p01_is_sound
 from calibrator.recordings.frame_arrays import EXTENDED_BIT, Frames, frame_key
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.log_time import CLOCK_GAP_S, repaired_time
+from calibrator.report.notices import Notice
 from ecu_node.database import AMPERE, VOLT, WATT, VehicleDatabase, unit_factor
 from ecu_node.layout import Branch
 
@@ -74,22 +75,31 @@ class RecordingReport:
 
     def notices(self) -> list[str]:
         """Return what a user should know, one short text each; empty if the log is whole and sound."""
-        absent = [item.name for item in self.channels if not item.frames]
-        texts = [f"no frames of {', '.join(absent)}"] if absent else []
-        spoilt = [item for item in self.channels if item.not_good]
-        texts += [f"{item.name}: {item.not_good} of {item.frames} frames not usable" for item in spoilt]
-        return texts + self.log_notices()
+        return [str(notice) for notice in self.counted_notices()]
 
     def log_notices(self) -> list[str]:
         """Return those of the notices that concern the log as a whole, not single channels."""
-        gap = f"each step became a gap of {CLOCK_GAP_S:g} s"
+        return [str(notice) for notice in self._counted_log_notices()]
+
+    def counted_notices(self) -> list[Notice]:
+        """Return the notices with their counts apart, so that those of many logs can be told together."""
+        absent = [item.name for item in self.channels if not item.frames]
+        spoilt = [item for item in self.channels if item.not_good]
+        notices = [Notice(text=f"no frames of {', '.join(absent)}")] if absent else []
+        notices += [
+            Notice(text=f"{item.name}: {{}} of {{}} frames not usable", counts=(item.not_good, item.frames))
+            for item in spoilt
+        ]
+        return notices + self._counted_log_notices()
+
+    def _counted_log_notices(self) -> list[Notice]:
         texts = {
-            f"{self.damaged} damaged lines or frames left out": self.damaged,
-            f"{self.error_frames} error frames": self.error_frames,
-            f"{self.disordered} frames out of order, sorted": self.disordered,
-            f"the clock was set {self.clock_steps} times, {gap}": self.clock_steps,
+            "{} damaged lines or frames left out": self.damaged,
+            "{} error frames": self.error_frames,
+            "{} frames out of order, sorted": self.disordered,
+            f"the clock was set {{}} times, each step became a gap of {CLOCK_GAP_S:g} s": self.clock_steps,
         }
-        return [text for text, count in texts.items() if count]
+        return [Notice(text=text, counts=(count,)) for text, count in texts.items() if count]
 
 
 @dataclass(frozen=True, kw_only=True)

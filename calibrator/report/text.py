@@ -1,11 +1,14 @@
 """Reports as text or JSON for standard output."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import msgspec
 
-__all__ = ["dumps", "left_out_text", "table", "undecided_text"]
+__all__ = ["dumps", "left_out_text", "table", "told_once", "undecided_text"]
+
+MOST_NAMES = 6
+"""Names told on one line: half a line of a terminal."""
 
 
 def dumps(value: Any) -> str:
@@ -25,17 +28,40 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     )
 
 
+def told_once(texts: Iterable[tuple[str, str]]) -> list[str]:
+    """One line per text.
+
+    Parameters
+    ----------
+    texts : iterable of (str, str)
+        Name of a vehicle or drive, and what is to be said of it.
+
+    Returns
+    -------
+    list of str
+        Each text once, after the names it is about: the first few of many, and how many more there are.
+    """
+    names: dict[str, list[str]] = {}
+    for name, text in texts:
+        names.setdefault(text, []).append(name)
+    return [f"{_few(found)}: {text}" for text, found in names.items()]
+
+
 def undecided_text(undecided: Mapping[str, str], most: int = 10) -> str:
-    """One line per vehicle of which nothing can be told, and what would decide; empty if there is none."""
+    """One line per reason why nothing can be told of vehicles, and what would decide; empty if there is none."""
     if not undecided:
         return ""
-    lines = [f"  {name}: {reason or 'no explanation stands out'}" for name, reason in list(undecided.items())[:most]]
-    more = [f"  and {len(undecided) - most} more, see their parameter files"] if len(undecided) > most else []
-    return "\n".join(["cannot tell:", *lines, *more])
+    lines = told_once((name, reason or "no explanation stands out") for name, reason in undecided.items())
+    more = [f"  and {len(lines) - most} other reasons, see their parameter files"] if len(lines) > most else []
+    return "\n".join(["cannot tell:", *(f"  {line}" for line in lines[:most]), *more])
 
 
 def left_out_text(left_out: Mapping[str, str]) -> str:
-    """One line per thing that was left out, and why; empty if there is none."""
-    if not left_out:
-        return ""
-    return "\n".join(["left out:", *(f"  {name}: {reason}" for name, reason in left_out.items())])
+    """One line per reason why things were left out; empty if nothing was."""
+    return "\n".join(["left out:", *(f"  {line}" for line in told_once(left_out.items()))]) if left_out else ""
+
+
+def _few(names: Sequence[str]) -> str:
+    if len(names) <= MOST_NAMES:
+        return ", ".join(names)
+    return f"{', '.join(names[:MOST_NAMES])} and {len(names) - MOST_NAMES} more"

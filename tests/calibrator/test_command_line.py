@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from calibrator.cli import app
+from calibrator.cli import app, main
+from calibrator.command_options import RECORDED_EXPERIMENTS
+from calibrator.experiments.runner import EXPERIMENTS, Recorded
 from calibrator.interrupts import INTERRUPTED, MESSAGE
 
 ROOT = Path(__file__).parents[2]
@@ -25,15 +27,17 @@ def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--noise", "inf"], ""),
-        (["--noise", "nan"], ""),
-        (["--noise", "-0.1"], ""),
-        (["--delay", "inf"], ""),
-        (["--delay", "1e9"], ""),
-        (["--minutes", "1e9"], ""),
-        (["--minutes", "nan"], ""),
-        (["--unseen-minutes", "inf"], ""),
-        (["--sparsity", "nan"], ""),
+        (["--noise", "inf"], "inf: expected a number from 0 to 1"),
+        (["--noise", "nan"], "nan: expected a number from 0 to 1"),
+        (["--noise", "-0.1"], "-0.1: expected a number from 0 to 1"),
+        (["--delay", "inf"], "inf: expected a number from 0 to 1000"),
+        (["--delay", "1e9"], "1e9: expected a number from 0 to 1000"),
+        (["--minutes", "1e9"], "1e9: expected a number from 0.1 to 240"),
+        (["--minutes", "nan"], "nan: expected a number from 0.1 to 240"),
+        (["--unseen-minutes", "inf"], "inf: expected a number from 0.1 to 240"),
+        (["--sparsity", "nan"], "nan: expected a number from 0 to 100"),
+        (["--sparsity", "-inf"], "-inf: expected a number from 0 to 100"),
+        (["--sparsity", "few"], "few: expected a number from 0 to 100"),
         (["--unmeasured", "nan", "1"], "expected mean and standard deviation from 0 to 1000 A"),
         (["--unmeasured", "1", "-1"], "expected mean and standard deviation from 0 to 1000 A"),
         (["--unmeasured", "1e6", "1"], "expected mean and standard deviation from 0 to 1000 A"),
@@ -64,7 +68,10 @@ def test_simulate_refuses_what_no_fleet_has_before_it_does_anything(
     [
         (["--branches", "battery,battery"], "battery is named twice"),
         (["--branches", "battery,"], "expected names of branches with commas between them"),
-        (["--magnitude", "nan", "nan"], "expected 0 <= LO <= HI < 1"),
+        (["--magnitude", "nan", "nan"], "nan nan: expected 0 <= LO <= HI < 1"),
+        (["--harm-limit", "nan"], "nan: expected a number from 0 to 1"),
+        (["--sparsity", "inf"], "inf: expected a number from 0 to 100"),
+        (["--symmetric"], "belongs to --method published, not posterior; leave it out or change the method"),
     ],
 )
 def test_calibrate_refuses_wrong_options(options: list[str], message: str, tmp_path: Path) -> None:
@@ -72,6 +79,38 @@ def test_calibrate_refuses_wrong_options(options: list[str], message: str, tmp_p
     run = CliRunner().invoke(app, ["calibrate", str(tmp_path), *options, *files])
     assert run.exit_code == 2
     assert message in run.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ["--truth", "t.json", "--method", "published"],
+            "--truth: used by the perfect classifier alone, not by tree; add --classifier perfect, or leave it out",
+        ),
+        (
+            ["--truth", "t.json", "--classifier", "threshold"],
+            "--truth: used by the perfect classifier alone, not by threshold; "
+            "add --method published --classifier perfect, or leave it out",
+        ),
+        (
+            ["--classifier", "perfect", "--method", "published"],
+            "--classifier: perfect is told the truth; add --truth FILE, the truth.json of this artificial fleet",
+        ),
+        (
+            ["--classifier", "perfect"],
+            "--classifier: perfect is told the truth; "
+            "add --method published --truth FILE, the truth.json of this artificial fleet",
+        ),
+    ],
+)
+def test_truth_and_perfect_classifier_each_say_what_is_missing(
+    options: list[str], message: str, tmp_path: Path
+) -> None:
+    files = ["--layout", str(LAYOUT), "--out", str(tmp_path / "x")]
+    run = CliRunner().invoke(app, ["calibrate", str(tmp_path), *options, *files])
+    assert run.exit_code == 2
+    assert run.stderr.splitlines()[-1] == f"Error: Invalid value for {message}"
 
 
 @pytest.mark.parametrize(
@@ -91,6 +130,79 @@ def test_output_that_cannot_be_made_is_refused_before_the_work(command: list[str
     assert run.stderr == (
         f"calibrator: {tmp_path / 'file' / 'x'}: cannot be made: {tmp_path / 'file'} is a file; choose another folder\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["sparsity", "--drives", "store"], "--drives: sparsity takes the built-in vehicle; this is only for real,"),
+        (["snr", "--layout", "none.toml"], "--layout: snr takes the built-in vehicle; this is only for real, delay"),
+        (["calibration", "--quick"], "--quick: calibration runs nothing, it pools what is recorded in --out"),
+        (["calibration", "--repetitions", "3"], "--repetitions: calibration runs nothing"),
+        (["calibration", "--seed", "0"], "--seed: calibration runs nothing"),
+        (["calibration", "--drives", "store"], "--drives: calibration runs nothing"),
+        (["calibration", "--layout", "none.toml"], "--layout: calibration runs nothing"),
+        (["calibration", "--workers", "1"], "--workers: calibration runs nothing"),
+        (["calibration", "--json"], "--out: calibration pools what is recorded there; first run 'calibrator "),
+    ],
+)
+def test_experiment_refuses_what_it_does_not_heed(arguments: list[str], message: str, tmp_path: Path) -> None:
+    out = [] if "--json" in arguments else ["--out", str(tmp_path / "x")]
+    run = CliRunner().invoke(app, ["experiment", *arguments, *out])
+    assert run.exit_code == 2
+    (error,) = [line for line in run.stderr.splitlines() if line.startswith("Error")]
+    assert message in error
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        *((name, ["--drives", "store", "--layout", "none.toml"]) for name in (*RECORDED_EXPERIMENTS, "all")),
+        ("sparsity", ["--quick", "--repetitions", "1", "--seed", "3", "--workers", "1"]),
+    ],
+)
+def test_experiment_heeds_its_own_options(name: str, options: list[str], tmp_path: Path) -> None:
+    # The folder is what is complained of: the options before it were not.
+    (tmp_path / "file").write_text("mine")
+    run = CliRunner().invoke(app, ["experiment", name, *options, "--out", str(tmp_path / "file" / "x")])
+    assert run.exit_code == 1
+    assert "cannot be made" in str(run.exception)
+
+
+def test_experiments_said_to_heed_drives_are_those_on_recorded_trips() -> None:
+    assert list(RECORDED_EXPERIMENTS) == [name for name, run in EXPERIMENTS.items() if isinstance(run, Recorded)]
+
+
+@pytest.mark.parametrize("name", ["real", "all"])
+def test_experiment_on_recorded_trips_outside_a_checkout_asks_for_a_layout_before_it_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["calibrator", "experiment", name, "--quick"])
+    assert main() == 1
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("calibrator: dbc/hv_powertrain.toml: not in this folder")
+    assert printed.err.endswith("name it with --layout\n")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["simulate", "--vehicles", "2"],
+        ["calibrate", "nowhere"],
+        ["import", "nowhere.log"],
+        ["experiment", "snr"],
+    ],
+)
+def test_output_where_the_system_makes_nothing_is_refused_before_the_work(command: list[str]) -> None:
+    layout = [] if command[0] == "experiment" else ["--layout", str(LAYOUT)]
+    run = calibrator(*command, *layout, "--out", "/proc/x")
+    assert run.returncode == 1
+    (line,) = run.stderr.splitlines()
+    assert line.startswith("calibrator: /proc/x: nothing can be made in /proc: ")
+    assert line.endswith("; choose another folder")
 
 
 def test_layout_without_the_builtin_vehicles_names_is_told_them(tmp_path: Path) -> None:

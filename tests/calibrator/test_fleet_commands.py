@@ -150,7 +150,7 @@ def test_nothing_is_learnt_from_a_vehicle_that_is_held_out(fleet: Path, tmp_path
 
 @pytest.fixture
 def broken_fleet(fleet: Path, tmp_path: Path) -> Path:
-    """Six good vehicles and five with one fault each."""
+    """Six good vehicles, five with one fault each, and a copy of one."""
     copy = tmp_path / "broken"
     for folder in sorted((fleet / "logs").iterdir())[:6]:
         shutil.copytree(folder, copy / folder.name)
@@ -168,6 +168,7 @@ def broken_fleet(fleet: Path, tmp_path: Path) -> Path:
     (copy / "blf").mkdir()
     (copy / "blf" / "drive.blf").write_bytes(b"LOGG" + bytes(300))
     shutil.copytree(copy / "V001", copy / "elsewhere" / "V001")
+    shutil.copytree(copy / "V002", copy / "other")
     (copy / "comma").mkdir()
     shutil.copy(copy / "V002" / "drive.log.gz", copy / "comma" / "my,drive.log.gz")
     return copy
@@ -188,11 +189,39 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
     assert "0x110" in left_out["no_branch"] or "branch" in left_out["no_branch"]
     assert "motor" in left_out["no_motor"]
     assert "drive.blf" in left_out["blf"]
+    assert left_out["other"].startswith("same recording as V002; it cannot be told whose it is")
+    assert left_out["V002"].startswith("same recording as other; it cannot be told whose it is")
     twins = [reason for reason in left_out.values() if "V001" in reason and "elsewhere" in reason]
     assert twins, left_out
     assert any("my,drive" in reason for reason in left_out.values()), left_out
-    assert sorted(path.stem for path in (out / "params").iterdir()) == ["V002", "V003", "V004", "V005", "V006"]
+    assert sorted(path.stem for path in (out / "params").iterdir()) == ["V003", "V004", "V005", "V006"]
     assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)
+
+
+@pytest.mark.parametrize("method", ["posterior", "published"])
+def test_one_car_alone_is_refused_with_what_can_be_done(fleet: Path, method: str, tmp_path: Path) -> None:
+    shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "V001")
+    files = ["--layout", LAYOUT, "--out", tmp_path / "x", "--workers", 1]
+    run = calibrator("calibrate", tmp_path / "logs", "--method", method, *files)
+    assert run.returncode == 1
+    (line,) = [line for line in run.stderr.splitlines() if line.startswith("calibrator:")]
+    assert "1 usable vehicle to learn from, at least 2 are needed, as every vehicle is compared with its fleet" in line
+    assert "(tools/compare_kirchhoff.py shows the sum of one)" in line
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_fleet_of_copies_is_refused_with_the_reason(fleet: Path, tmp_path: Path) -> None:
+    for name in ("one", "other"):
+        shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / name)
+    run = calibrator("calibrate", tmp_path / "logs", "--layout", LAYOUT, "--out", tmp_path / "x")
+    assert run.returncode == 1
+    assert "no drive that is one vehicle's alone; one: same recording as other" in run.stderr
+
+
+def test_copy_of_a_vehicle_cannot_be_trusted(broken_fleet: Path, tmp_path: Path) -> None:
+    run = calibrator("calibrate", broken_fleet, "--layout", LAYOUT, "--out", tmp_path / "x", "--trusted", "other")
+    assert run.returncode == 1
+    assert "no vehicle other to trust; other: same recording as V002" in run.stderr
 
 
 @pytest.mark.parametrize(
@@ -201,7 +230,7 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
         (("calibrate", "nowhere", "--layout", LAYOUT, "--out", "x"), 1, "nowhere: no such folder"),
         (("calibrate", ".", "--layout", "none.toml", "--out", "x"), 1, "none.toml: cannot read the layout"),
         (("score", "nowhere", "--truth", "none.json"), 1, "none.json: cannot read the truth"),
-        (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--classifier", "perfect"), 2, "belong together"),
+        (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--classifier", "perfect"), 2, "is told the truth"),
         (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--symmetric"), 2, "belongs to --method published, not"),
         (
             ("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--method", "published", "--trusted", "V001"),

@@ -10,7 +10,7 @@ import pytest
 from calibrator.artificial.truth import read_truth
 from calibrator.results import read_results, read_run
 from ecu_node.database import read_database
-from ecu_node.layout import read_layout
+from ecu_node.layout import file_digest, read_layout
 from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
@@ -145,7 +145,7 @@ def test_a_bench_reading_of_a_sensor_is_heeded_and_recorded(fleet: Path, result:
     out = tmp_path / "result"
     run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out, "--readings", table)
     assert run.returncode == 0, run.stderr
-    assert read_run(out).settings["readings"] == "bench.csv"
+    assert read_run(out).settings["readings"] == ["bench.csv", file_digest(table)]
     before, after = (
         {row["branch"]: row for row in read_results(folder) if row["vehicle"] == vehicle} for folder in (result, out)
     )

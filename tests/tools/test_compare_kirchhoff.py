@@ -104,6 +104,13 @@ def test_a_missing_dbc_is_the_options_and_not_the_layouts(log: Path) -> None:
     assert (done.returncode, done.stderr) == (1, "compare_kirchhoff: missing.dbc: no such DBC; check --dbc\n")
 
 
+@pytest.mark.parametrize("duration", ["nan", "inf", "0", "long"])
+def test_a_duration_that_is_none_is_named_with_what_is_expected(duration: str) -> None:
+    done = run("--interface", "virtual", "--channel", "x", "--duration", duration, "--layout", LAYOUT)
+    assert done.returncode == 2
+    assert f"'--duration': {duration}: expected a number from 0.1 to 86400" in done.stderr
+
+
 def test_a_silent_bus_and_an_unknown_interface_are_named() -> None:
     silent = run("--interface", "virtual", "--channel", "x", "--duration", 0.2, "--layout", LAYOUT)
     assert (silent.returncode, silent.stdout) == (1, "")

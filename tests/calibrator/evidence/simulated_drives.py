@@ -64,7 +64,7 @@ def drive_of(rng: np.random.Generator, faults: Faults, conditions: Conditions) -
     u = coloured(rng, T, INPUTS, conditions.memory) + np.array([0.5, 0.2, 0.0])
     error = conditions.model_error_a * coloured(rng, T, K, conditions.memory)
     i = true_currents(u @ read_out_of(K), faults) + error - error.mean(axis=1, keepdims=True)
-    i[:, 0] -= conditions.unmeasured_a
+    i[:, 0] += conditions.unmeasured_a
     i_m = measured_currents(i, faults) + conditions.noise_a * rng.normal(size=(T, K))
     return samples_of(u, i_m)
 

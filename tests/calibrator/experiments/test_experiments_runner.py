@@ -15,9 +15,9 @@ from calibrator.experiments.recorded_experiments import data_experiment, phase_e
 from calibrator.experiments.recorded_fleet import RecordedFleet
 from calibrator.experiments.recorded_trial import RecordedCase
 from calibrator.experiments.records import read_results, write_result
-from calibrator.experiments.result import ExperimentResult, decode_result
+from calibrator.experiments.result import ExperimentResult, Figure, decode_result
 from calibrator.experiments.runner import EXPERIMENTS, RunOptions, run_experiments
-from calibrator.experiments.table import headline, result_markdown, result_table
+from calibrator.experiments.table import DETAILS, caption, headline, result_markdown, result_table
 from calibrator.experiments.trial import FleetLaw
 from calibrator.options import ExperimentName
 from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, smooth_drive
@@ -81,6 +81,52 @@ def test_page_holds_all_figures_of_all_methods(snr: ExperimentResult) -> None:
     assert "harmed" in page
 
 
+def test_captions_explain_the_columns_that_are_there_and_no_others(snr: ExperimentResult) -> None:
+    only_published = replace(snr, rows=tuple(row for row in snr.rows if row.method == PERFECT.name))
+    page, printed = result_markdown(only_published), _printed(only_published)
+    for text in (page, printed):
+        assert "the paper's best printed figure and the published method (/ its classifier)." in text
+        for absent in ("the default", "confidence", "calibration error", "delays", "law known"):
+            assert absent not in text
+    assert "in some branch (deployed)" in page
+    assert "the figures above" not in page
+    pooled = result_markdown(calibration_experiment([snr]))
+    assert "within 10 %: the default (posterior). Of the default: mean confidence, share of vehicles above" in pooled
+    assert "count once in 'all together'" in pooled
+    for absent in ("paper", "published", "f2", "hardware", "(deployed)", "(harmed)", "25 %"):
+        assert absent not in pooled.partition("Settings:")[0]
+
+
+def test_captions_name_every_column(snr: ExperimentResult) -> None:
+    methods = (CEILING.name, LEFT_IN.name)
+    more = tuple(replace(row, method=name) for name in methods for row in snr.rows if row.method == POSTERIOR.name)
+    figures = {name: Figure(mean=0.5, sd=0.0) for name in DETAILS}
+    result = replace(snr, rows=tuple(replace(row, figures=figures) for row in (*snr.rows, *more)))
+    text = caption([result])
+    columns = ("law known", "delays left in")
+    sure = ("mean confidence", "above 0.95", "their mean confidence", "of them that is recovered")
+    for words in (*columns, *sure, "ECE", "by chance", "(deployed)", "(harmed)", "error of the estimated delays"):
+        assert words in text
+    details = result_markdown(result).partition("Of each method: ")[2].partition("\n")[0]
+    for words in ("within 10 %", "within 25 %", "f2", "(hardware)", "the figures above"):
+        assert words in details
+
+
+def test_index_explains_what_some_of_its_tables_show(snr: ExperimentResult, tmp_path: Path) -> None:
+    only_published = replace(snr, rows=tuple(row for row in snr.rows if row.method == PERFECT.name))
+    write_result(tmp_path / "results", only_published, tuple(EXPERIMENTS))
+    assert "confidence" not in (tmp_path / "results.md").read_text()
+    write_result(tmp_path / "results", replace(snr, name="classifier"), tuple(EXPERIMENTS))
+    assert "mean confidence" in (tmp_path / "results.md").read_text()
+
+
+def _printed(result: ExperimentResult) -> str:
+    console = Console(width=200)
+    with console.capture() as capture:
+        console.print(result_table(result))
+    return " ".join(capture.get().split())
+
+
 def test_folder_gets_record_page_picture_and_an_index_of_all_results(snr: ExperimentResult, tmp_path: Path) -> None:
     folder = tmp_path / "new" / "results"
     order = tuple(EXPERIMENTS)
@@ -96,7 +142,7 @@ def test_folder_gets_record_page_picture_and_an_index_of_all_results(snr: Experi
 
 
 def test_calibration_pools_the_confidences_of_the_default_alone(snr: ExperimentResult) -> None:
-    result = calibration_experiment([snr, replace(snr, name="sparsity")])
+    result = calibration_experiment([snr, _with_seed(replace(snr, name="sparsity"), 100)])
     assert [row.series for row in result.rows] == ["snr", "sparsity", ALL]
     one, _, both = result.rows
     assert (one.x, both.x) == (64.0, 128.0)
@@ -104,6 +150,34 @@ def test_calibration_pools_the_confidences_of_the_default_alone(snr: ExperimentR
     rates = [row.figures["recovery_rate"].mean for row in snr.rows if row.method == POSTERIOR.name]
     assert one.figures["recovery_rate"].mean == pytest.approx(sum(rates) / 2.0)
     assert one.figures["sure_recovered"].mean <= 1.0
+
+
+def test_trials_that_experiments_share_count_once_all_together(snr: ExperimentResult) -> None:
+    shared = replace(snr, name="classifier", rows=tuple(row for row in snr.rows if row.x == 20.0))
+    result = calibration_experiment([shared, snr])
+    classifier, whole, together = result.rows
+    assert (classifier.x, whole.x, together.x) == (32.0, 64.0, 64.0)
+    assert together.bins == whole.bins
+    assert together.figures == whole.figures
+    assert sum(int(line.split("|")[2]) for line in _tenths(result_markdown(result))) == 64
+
+
+def test_trials_of_other_seeds_or_figures_are_not_taken_for_the_same(snr: ExperimentResult) -> None:
+    other = replace(snr, name="sparsity")
+    assert calibration_experiment([snr, _with_seed(other, 100)]).rows[-1].x == 128.0
+    first = next(row for row in snr.rows if row.bins)
+    figures = {**first.figures, "deployed": replace(first.figures["deployed"], mean=0.123)}
+    changed = replace(other, rows=(replace(first, figures=figures),))
+    assert calibration_experiment([snr, changed]).rows[-1].x == 96.0
+
+
+def _with_seed(result: ExperimentResult, seed: int) -> ExperimentResult:
+    return replace(result, settings={**result.settings, "seed": seed})
+
+
+def _tenths(page: str) -> list[str]:
+    """Rows of the last table of a page."""
+    return page.rpartition("| --- |\n")[2].partition("\n\n")[0].splitlines()
 
 
 def test_calibration_of_nothing_is_refused() -> None:
@@ -116,6 +190,24 @@ def test_calibration_takes_the_records_of_the_folder(snr: ExperimentResult, tmp_
     (result,) = run_experiments(["calibration"], RunOptions(), out=tmp_path / "results")
     assert result.settings["experiments"] == "snr"
     assert (tmp_path / "results" / "calibration.png").is_file()
+
+
+def test_calibration_without_records_says_what_to_run_first_and_runs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("calibrator.experiments.runner.EXPERIMENTS", dict.fromkeys(EXPERIMENTS, _must_not_run))
+    folder = tmp_path / "results"
+    with pytest.raises(
+        FleetError, match=f"{folder}: no experiment is recorded .* 'calibrator experiment all --out {folder}'"
+    ):
+        run_experiments(["calibration"], RunOptions(), out=folder)
+    assert not folder.exists()
+    with pytest.raises(FleetError, match="'calibrator experiment all --out FOLDER'"):
+        run_experiments(["calibration"], RunOptions())
+
+
+def _must_not_run(options: RunOptions) -> ExperimentResult:
+    raise AssertionError("an experiment was run")
 
 
 def test_experiments_on_recorded_trips_write_their_pictures(fleet: RecordedFleet, tmp_path: Path) -> None:
@@ -147,6 +239,14 @@ def test_runner_runs_quick_experiments_of_both_kinds(tmp_path: Path) -> None:
     assert snr.settings["drive"] == "smooth"
     assert real.settings["drive"] == "8 built-in trips, no recordings"
     assert (tmp_path / "results.md").is_file()
+
+
+def test_only_experiments_on_recorded_trips_need_a_layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = RunOptions(quick=True, repetitions=1, drive=smooth_drive(samples=2000))
+    assert run_experiments(["snr"], options)[0].name == "snr"
+    with pytest.raises(FleetError, match=r"hv_powertrain\.toml: not in this folder.*name it with --layout$"):
+        run_experiments(["snr", "real"], options)
 
 
 def test_every_experiment_has_a_name_on_the_command_line() -> None:

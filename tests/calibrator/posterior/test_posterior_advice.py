@@ -75,8 +75,10 @@ def posterior() -> FleetPosterior:
     return estimate_fleet(rows_of(faults), moments, full_scale_a=FULL_SCALE_A)
 
 
-def advice_on_first_faulty(posterior: FleetPosterior, database: VehicleDatabase, *, doubtful: tuple[int, ...]) -> str:
-    decision = decide(posterior, database.layout, harm_limit=0.0, doubtful=doubtful)
+def advice_on_first_faulty(
+    posterior: FleetPosterior, database: VehicleDatabase, *, doubtful: tuple[int, ...] = (), harm_limit: float = 0.0
+) -> str:
+    decision = decide(posterior, database.layout, harm_limit=harm_limit, doubtful=doubtful)
     j = int(np.flatnonzero((decision.held_back != "").any(axis=1))[0])
     found = explanations(posterior.states, j)
     return advise(posterior, decision, j, found, branches=NAMES, layout=database.layout)
@@ -99,10 +101,40 @@ def test_a_reference_in_doubt_is_decided_by_trusted_vehicles(
 
 
 def test_a_sensor_beyond_the_limits_is_to_be_replaced(posterior: FleetPosterior, database: VehicleDatabase) -> None:
-    wild = replace(posterior, faults=replace(posterior.faults, drift=np.full_like(posterior.faults.drift, 0.9)))
-    text = advice_on_first_faulty(wild, database, doubtful=())
+    wild = replace(
+        posterior,
+        faults=replace(posterior.faults, drift=np.full_like(posterior.faults.drift, 0.9)),
+        harm=np.zeros_like(posterior.harm),
+        identifiable=np.ones_like(posterior.identifiable),
+    )
+    text = advice_on_first_faulty(wild, database, harm_limit=0.001)
     assert "the battery sensor is off by +90.0%" in text
     assert "replace the sensor" in text
+    unsure = replace(wild, harm=np.ones_like(posterior.harm))
+    assert "replace the sensor" not in advice_on_first_faulty(unsure, database, harm_limit=0.001)
+
+
+def test_branches_in_another_order_than_the_states_keep_their_names(
+    posterior: FleetPosterior, database: VehicleDatabase
+) -> None:
+    explanations_of_offsets = [
+        explanation(0.99, drift=(0.0, 0.0), offset=(0.02, 0.0)),
+        explanation(0.01, drift=(0.0, 0.0), offset=(0.0, 0.02)),
+    ]
+    turned = replace(posterior, order=(1, 0))
+    decision = decide(turned, database.layout, harm_limit=0.0, doubtful=())
+    j = int(np.flatnonzero((decision.held_back != "").any(axis=1))[0])
+    text = advise(turned, decision, j, explanations_of_offsets, branches=NAMES, layout=database.layout)
+    assert "the motor sensor then shows +8.0 A or +0.0 A" in text
+    for k in (0, 1):
+        held = replace(decision, held_back=np.where(np.arange(2) == k, "harm limit", "")[None].repeat(30, axis=0))
+        same_elsewhere = [
+            explanation(0.99, drift=(0.0, 0.0), offset=(0.02, 0.0)),
+            explanation(0.01, drift=(0.0, 0.0), offset=(0.0, 0.0)),
+        ]
+        text = advise(turned, held, j, same_elsewhere, branches=NAMES, layout=database.layout)
+        assert ("zero-current window" in text) == (k == 1), "the states' first branch is the second one here"
+        assert k == 1 or text.startswith(f"more drives would decide: the {NAMES[k]} sensor")
 
 
 def test_where_nothing_else_is_in_the_way_more_drives_decide(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -128,6 +129,13 @@ def test_a_sensor_that_a_parameter_file_cannot_say_keeps_its_linear_part() -> No
 
 def test_a_corrected_vehicle_keeps_its_deciding_evidence() -> None:
     assert tell_sensors(parameters("corrected"), [BY_SIGN, LINEAR]).deciding_evidence == "as before"
+
+
+def test_a_corrected_vehicle_with_a_branch_held_back_is_told_that_no_drive_makes_it_linear() -> None:
+    before = parameters("corrected")
+    motor = msgspec.structs.replace(before.branches["battery"], held_back="not linear")
+    held = msgspec.structs.replace(before, branches={**before.branches, "battery": motor})
+    assert "battery (gain by sign)" in tell_sensors(held, [BY_SIGN, LINEAR]).deciding_evidence
 
 
 def test_notices_name_each_vehicle_concerned_once() -> None:

@@ -83,6 +83,9 @@ def test_parameters_beyond_the_limits_of_the_layout_are_not_deployed(
     posterior: FleetPosterior, database: VehicleDatabase
 ) -> None:
     wild = replace(posterior, faults=replace(posterior.faults, drift=np.full_like(posterior.faults.drift, 0.9)))
-    decision = decide(wild, database.layout, harm_limit=1.0, doubtful=(0,))
+    sure = replace(wild, harm=np.zeros_like(wild.harm), identifiable=np.ones_like(wild.identifiable))
+    decision = decide(sure, database.layout, harm_limit=LIMIT, doubtful=())
     assert not decision.corrected.any()
     assert (decision.held_back == "beyond the limits").all()
+    unsure = decide(replace(sure, harm=np.ones_like(wild.harm)), database.layout, harm_limit=LIMIT, doubtful=(0,))
+    assert unsure.held_back[0].tolist() == ["reference in doubt", "harm limit"]

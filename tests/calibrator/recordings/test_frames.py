@@ -2,7 +2,9 @@ import gzip
 import importlib.util
 import io
 import logging
+import re
 import struct
+import zlib
 from contextlib import suppress
 from pathlib import Path
 
@@ -189,12 +191,41 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         read_frames(tmp_path / "nowhere.log")
 
 
-def test_a_truncated_gzip_says_how_many_frames_were_readable(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "drive.log", some_messages(5000))
+def cut_log(tmp_path: Path, suffix: str, share: float) -> tuple[Path, list[bytes]]:
+    """A gzipped log that is cut off, and the whole lines that `gzip -dc` gets out of it."""
+    packed = gzip.compress(write_log(tmp_path / f"drive{suffix}", some_messages(20_000)).read_bytes())
+    cut = tmp_path / f"cut{suffix}.gz"
+    cut.write_bytes(packed[: int(share * len(packed))])
+    readable = zlib.decompressobj(wbits=31).decompress(cut.read_bytes())
+    return cut, readable[: readable.rfind(b"\n") + 1].splitlines(keepends=True)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.99])
+def test_a_truncated_gzip_names_the_line_and_the_readable_frames(tmp_path: Path, share: float) -> None:
+    cut, lines = cut_log(tmp_path, ".log", share)
+    assert len(lines) > 100
+    message = (
+        rf"cut\.log\.gz: truncated or damaged after line {len(lines)}: the compressed file is cut off; "
+        rf"{len(lines)} frames before it are readable; copy the file again, or keep the readable part, "
+        r"'gzip -dc cut\.log\.gz > cut\.log', and remove cut\.log\.gz"
+    )
+    with pytest.raises(LogError, match=message):
+        read_frames(cut)
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".trc"])
+def test_a_truncated_gzip_of_other_text_logs_names_the_line_too(tmp_path: Path, suffix: str) -> None:
+    cut, lines = cut_log(tmp_path, suffix, 0.5)
+    with pytest.raises(LogError, match=r"the compressed file is cut off.*'gzip -dc cut") as caught:
+        read_frames(cut)
+    (line,) = [int(word) for word in re.findall(r"damaged after line (\d+)", str(caught.value))]
+    assert len(lines) - 200 < line <= len(lines)  # what is unpacked but not yet split into lines is lost
+
+
+def test_a_gzip_cut_before_any_frame_names_no_line(tmp_path: Path) -> None:
     cut = tmp_path / "cut.log.gz"
-    packed = gzip.compress(path.read_bytes())
-    cut.write_bytes(packed[: len(packed) // 2])
-    with pytest.raises(LogError, match=r"cut\.log\.gz: truncated or damaged after line \d+: .*\d+ frames before it"):
+    cut.write_bytes(gzip.compress(write_log(tmp_path / "drive.log", some_messages()).read_bytes())[:15])
+    with pytest.raises(LogError, match=r"damaged in its first line: .*; 0 frames before it .*; copy the file again$"):
         read_frames(cut)
 
 

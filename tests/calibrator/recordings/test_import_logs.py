@@ -1,3 +1,5 @@
+import json
+import re
 from pathlib import Path
 
 import pytest
@@ -33,6 +35,20 @@ def test_what_is_there_is_named_and_what_is_new_is_added(
     assert (len(first.drives), first.already_there) == (1, ())
     assert ([drive.vehicle for drive in both.drives], both.already_there) == (["V002"], ("V001/drive",))
     assert f"1 drives written to {tmp_path}, 1 already there, 0 left out" in both.as_text()
+
+
+def test_equal_notices_are_told_once_and_json_keeps_those_of_every_drive(
+    fleet: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
+    report = imported([fleet / "logs"], tmp_path, database)
+    told = [line for line in report.as_text().splitlines() if "junction_box_temperature" in line]
+    kept = [notice for drive in json.loads(report.as_json())["drives"] for notice in drive["notices"]]
+    kept = [notice for notice in kept if "junction_box_temperature" in notice]
+    frames = [int(re.findall(r"(\d+) of", notice)[0]) for notice in kept]
+    assert len(frames) == 2
+    assert told == [
+        f"  in 2 vehicles: junction_box_temperature: {sum(frames)} of {sum(frames)} frames not usable",
+    ]
 
 
 def test_a_damaged_drive_in_the_store_is_not_taken_for_imported(

@@ -1,0 +1,81 @@
+"""What the columns of the tables mean: a caption names those that are there, and no others."""
+
+from collections.abc import Collection, Sequence
+
+from calibrator.experiments.delay_experiment import LEFT_IN
+from calibrator.experiments.methods import CEILING, POSTERIOR
+
+__all__ = ["PAPER", "details_caption", "headline_caption"]
+
+PAPER = "paper"
+PUBLISHED = "published"
+COLUMNS = {
+    PAPER: "the paper's best printed figure",
+    PUBLISHED: "the published method (/ its classifier)",
+    POSTERIOR.name: "the default (posterior)",
+    LEFT_IN.name: "the default with the delays left in",
+    CEILING.name: "the default if it is told how the faults were drawn (law known: the most that this evidence gives)",
+}
+FIGURES = {
+    "confidence": "mean confidence",
+    "sure": "share of vehicles above 0.95",
+    "sure_confidence": "their mean confidence",
+    "sure_recovered": "the share of them that is recovered",
+    "ece": "expected calibration error (ECE, by tenths)",
+    "ece_by_chance": "what it is by chance if the confidence is exact",
+    "deployed": "share of the vehicles with faulty sensors that is corrected in some branch (deployed)",
+    "harmed": "share of the corrected ones of which some branch gets worse on an unseen drive (harmed)",
+    "delay_rmse_ms": "root mean square error of the estimated delays",
+    "recovery_rate": "share of vehicles recovered within 10 %",
+    "recovery_rate_25": "within 25 %",
+    "f2": "f2 of the hardware classification",
+    "complexity": "share held to have hardware faults (hardware)",
+}
+
+
+def headline_caption(columns: Collection[str], figures: Collection[str]) -> str:
+    """Caption of a table of recovery rates.
+
+    Parameters
+    ----------
+    columns : collection of str
+        Names of the methods that have a column, and :data:`PAPER` if the paper has one.
+    figures : collection of str
+        Figures of the default that have a column, by the names of :mod:`calibrator.experiments.outcome`.
+
+    Returns
+    -------
+    str
+        Sentences.
+    """
+    there = {PUBLISHED if name.startswith(f"{PUBLISHED}/") else name for name in columns}
+    rates = _enumeration([text for name, text in COLUMNS.items() if name in there])
+    more = _enumeration([text for name, text in FIGURES.items() if name in figures])
+    return f"Share of vehicles recovered within 10 %: {rates}." + (f" Of the default: {more}." if more else "")
+
+
+def details_caption(figures: Collection[str], explained: Collection[str], *, paper: bool) -> str:
+    """Caption of a table of all figures.
+
+    Parameters
+    ----------
+    figures : collection of str
+        Those that have a column.
+    explained : collection of str
+        Those that a caption above explains.
+    paper : bool
+        Whether the paper's figures are beside.
+
+    Returns
+    -------
+    str
+        A sentence.
+    """
+    texts = [FIGURES[name] for name in ("recovery_rate", *FIGURES) if name in figures and name not in explained]
+    texts = list(dict.fromkeys(texts)) + (["the figures above"] if set(figures) & set(explained) else [])
+    return f"Of each method: {_enumeration(texts)}{'; in brackets the paper' if paper else ''}."
+
+
+def _enumeration(texts: Sequence[str]) -> str:
+    """Texts with commas, and 'and' before the last."""
+    return " and ".join(part for part in (", ".join(texts[:-1]), *texts[-1:]) if part)

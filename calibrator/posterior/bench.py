@@ -1,0 +1,119 @@
+"""What the user knows of single sensors, trusted vehicles and bench readings, and where the drives contradict it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calibrator.calibration_settings import CalibrationSettings
+from calibrator.drive import Mask
+from calibrator.drives.fleet_source import FleetSource
+from calibrator.errors import FleetError
+from calibrator.evidence.readings import TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD, Readings, no_readings
+from calibrator.evidence.vehicle_summary import VehicleSummary
+from calibrator.posterior.bench_table import BenchReadings, read_bench_readings, readings_of
+from calibrator.posterior.health import ReferenceHealth
+
+__all__ = ["merge_readings", "read_bench", "trust_notices", "trusted_of", "window_notices"]
+
+CONTRADICTION = 4.0
+"""Standard deviations from which on two readings of one sensor contradict each other. [1]"""
+
+
+def read_bench(
+    settings: CalibrationSettings, fleet: FleetSource, branches: Sequence[str], *, full_scale_a: float
+) -> BenchReadings:
+    """Read the table of bench readings, if there is one; FleetError if it contradicts the trust in a vehicle."""
+    if settings.readings is None:
+        return {}
+    bench = read_bench_readings(settings.readings, fleet, branches, full_scale_a=full_scale_a)
+    for (vehicle, branch), (drift, drift_sd, offset_a, offset_sd_a) in bench.items():
+        if vehicle in settings.trusted and (
+            abs(drift) > CONTRADICTION * np.hypot(drift_sd, TRUSTED_DRIFT_SD)
+            or abs(offset_a) > CONTRADICTION * np.hypot(offset_sd_a, TRUSTED_OFFSET_SD * full_scale_a)
+        ):
+            raise FleetError(
+                f"{settings.readings}: the {branch} sensor of {vehicle} was read as faulty, and {vehicle} is trusted; "
+                f"a trusted vehicle is one whose sensors were all found faultless"
+            )
+    return bench
+
+
+def trusted_of(names: Sequence[str], wanted: frozenset[str], fleet: FleetSource) -> Mask:
+    """Which vehicles are trusted, shape (N,); FleetError if one that should be cannot be used."""
+    missing = wanted - set(names)
+    if missing:
+        raise FleetError(f"{fleet.path}: no usable vehicle {', '.join(sorted(missing))} to trust")
+    return np.array([name in wanted for name in names])
+
+
+def merge_readings(
+    vehicles: Sequence[VehicleSummary], bench: BenchReadings, branches: Sequence[str]
+) -> tuple[Readings, list[str]]:
+    """What the sensors showed on a bench, and in zero-current windows.
+
+    Parameters
+    ----------
+    vehicles : sequence of VehicleSummary
+        N vehicles.
+    bench : mapping
+        Bench readings.
+    branches : sequence of str
+        Names of the K branches.
+
+    Returns
+    -------
+    readings : Readings
+        Both together; neither where they contradict each other.
+    notices : list of str
+        Where they do, and readings that could not be used.
+    """
+    names = [vehicle.vehicle for vehicle in vehicles]
+    nothing = no_readings(len(vehicles), len(branches))
+    offset_a = np.stack([vehicle.zero_current.offset_a for vehicle in vehicles])
+    sd_a = np.stack([vehicle.zero_current.sd_a for vehicle in vehicles])
+    read = readings_of(bench, names, branches)
+    apart = np.abs(offset_a - read.offset_a) > CONTRADICTION * np.hypot(sd_a, read.offset_sd_a)
+    notices = [
+        f"vehicle {names[j]}: its {branches[k]} sensor was read as {read.offset_a[j, k]:+.1f} A on the bench, and "
+        f"showed {offset_a[j, k]:+.1f} A with open contactors: neither is used; check it again"
+        for j, k in np.argwhere(apart).tolist()
+    ]
+    unused = sorted({vehicle for vehicle, _ in bench} - set(names))
+    if unused:
+        notices.append(f"bench readings of vehicles that are left out are not used: {', '.join(unused)}")
+    windows = replace(nothing, offset_a=np.where(apart, np.nan, offset_a), offset_sd_a=np.where(apart, np.nan, sd_a))
+    kept = replace(
+        read,
+        offset_a=np.where(apart, np.nan, read.offset_a),
+        offset_sd_a=np.where(apart, np.nan, read.offset_sd_a),
+    )
+    return windows.merged(kept), notices
+
+
+def trust_notices(names: Sequence[str], health: ReferenceHealth) -> list[str]:
+    """Trusted vehicles that contradict the trust in them."""
+    return [
+        *(f"vehicle {names[j]} is not trusted: {why}; check it again" for j, why in health.distrusted.items()),
+        *(
+            f"trusted vehicle {names[j]} does not carry the reference: it differs from the other trusted ones as by a "
+            f"hardware fault"
+            for j in health.differing
+        ),
+    ]
+
+
+def window_notices(
+    vehicles: Sequence[VehicleSummary], trusted: Mask, branches: Sequence[str], full_scale_a: float
+) -> list[str]:
+    """Trusted sensors that showed an offset while the contactors were open."""
+    texts = []
+    for vehicle in (vehicle for vehicle, is_trusted in zip(vehicles, trusted, strict=True) if is_trusted):
+        shown, sd_a = vehicle.zero_current.offset_a, vehicle.zero_current.sd_a
+        surprising = np.abs(shown) > CONTRADICTION * np.hypot(sd_a, TRUSTED_OFFSET_SD * full_scale_a)
+        texts += [
+            f"trusted vehicle {vehicle.vehicle}: its {branches[k]} sensor showed {shown[k]:+.1f} A with open "
+            f"contactors; it was taken for faultless: check it again, or do not trust it"
+            for k in np.flatnonzero(surprising).tolist()
+        ]
+    return texts
