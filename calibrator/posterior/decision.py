@@ -1,7 +1,7 @@
 """What to say of each vehicle: estimate, confidence, and which branches may be corrected.
 
-The states become weighted points (each state spread by its standard deviations). The estimate is the state near which,
-within the tolerance of "recovered", the most weight lies; that weight is the confidence. A branch is corrected if the
+Each state is spread by its standard deviations, over quasi-random points. The estimate is the state near which, within
+the tolerance of "recovered", the most weight lies; that weight is the confidence. A branch is corrected if the
 probability that correction makes it worse is below the harm limit. With alpha = (1 + d) / (1 + d_hat) - 1 and
 beta = (o - o_hat) / (1 + d_hat), it does where
 
@@ -10,16 +10,19 @@ beta = (o - o_hat) / (1 + d_hat), it does where
 which is quadratic in d and in o: the probability is known in the one that matters more, for each value of the other.
 """
 
-from dataclasses import dataclass
+import math
+from functools import cache
 
 import numpy as np
 from scipy.stats import norm, qmc
 
-from calibrator.drive import Array, Mask
+from calibrator.compiled import compiled, inlined, inner
+from calibrator.drive import Array
+from calibrator.posterior.small_matrices import normal_mass
 from calibrator.posterior.states import States
 from calibrator.score import TOLERANCE
 
-__all__ = ["Points", "best_estimates", "harm_probability", "spread_points"]
+__all__ = ["best_estimate", "harm_probability"]
 
 POINTS_PER_STATE = 64
 """Points by which the spread of one state is told; a power of two for the quasi-random rule."""
@@ -29,58 +32,14 @@ EQUALLY_GOOD = 0.01
 """Difference of confidence below which the more probable state is taken. [1]"""
 CANDIDATES = 48
 """States that are tried as estimates, the most probable ones."""
+_STEP = 2.0 * FARTHEST / STEPS
 
 
-@dataclass(frozen=True)
-class Points:
-    """Weighted points of the posterior of one vehicle.
-
-    Attributes
-    ----------
-    weight : ndarray of shape (P,)
-        Sums to 1 at most.
-    drift, offset : ndarray of shape (P, K)
-        Of the sensors; offsets in fractions of full scale. [1]
-    """
-
-    weight: Array
-    drift: Array
-    offset: Array
-
-
-def spread_points(states: States, vehicle: int) -> Points:
-    """Points of one vehicle's posterior.
-
-    Parameters
-    ----------
-    states : States
-        Of the fleet.
-    vehicle : int
-        Which vehicle.
-
-    Returns
-    -------
-    Points
-        :data:`POINTS_PER_STATE` of each state.
-    """
-    K = states.branches
-    drift, offset = states.drift[vehicle], states.offset[vehicle]
-    drift_sd, offset_sd = states.relative_sd[vehicle, :, 1:], states.constant_sd[vehicle, :, K - 1 :]
-    normal = norm.ppf(qmc.Sobol(2 * K, scramble=True, rng=0).random(POINTS_PER_STATE))
-    return Points(
-        np.repeat(states.weight[vehicle] / POINTS_PER_STATE, POINTS_PER_STATE),
-        (drift[:, None] + drift_sd[:, None] * normal[:, :K]).reshape(-1, K),
-        (offset[:, None] + offset_sd[:, None] * normal[:, K:]).reshape(-1, K),
-    )
-
-
-def best_estimates(points: Points, states: States, vehicle: int, *, least: tuple[float, float]) -> tuple[int, float]:
+def best_estimate(states: States, vehicle: int, *, least: tuple[float, float]) -> tuple[int, float]:
     """Find the state that most of the posterior is within tolerance of.
 
     Parameters
     ----------
-    points : Points
-        Of the vehicle.
     states : States
         Of the fleet.
     vehicle : int
@@ -95,12 +54,71 @@ def best_estimates(points: Points, states: States, vehicle: int, *, least: tuple
     confidence : float
         Posterior probability that the estimate's drifts and offsets are both recovered: within 10 % of the true norm.
     """
-    candidates = slice(0, CANDIDATES)
-    near = _near(points.drift, states.drift[vehicle, candidates], least[0])
-    near &= _near(points.offset, states.offset[vehicle, candidates], least[1])
-    covered = near @ points.weight
+    K, j = states.branches, vehicle
+    covered = _covered(
+        states.weight[j],
+        np.stack([states.drift[j], states.relative_sd[j, :, 1:]]),
+        np.stack([states.offset[j], states.constant_sd[j, :, K - 1 :]]),
+        np.array(least),
+        _normal_points(2 * K),
+    )
     state = int(np.argmax(covered >= covered.max() - EQUALLY_GOOD))
     return state, min(float(covered[state]), 1.0)
+
+
+@cache
+def _normal_points(dimensions: int) -> Array:
+    """Quasi-random points of a standard normal distribution, shape (POINTS_PER_STATE, dimensions)."""
+    return np.asarray(norm.ppf(qmc.Sobol(dimensions, scramble=True, rng=0).random(POINTS_PER_STATE)))
+
+
+@compiled
+def _covered(weight: Array, drift: Array, offset: Array, least: Array, normal: Array) -> Array:
+    """Weight near each of the first states, (C,); ``drift`` and ``offset`` (2, S, K) are means and deviations."""
+    S, K = drift.shape[1:]
+    covered = np.zeros(min(S, CANDIDATES))
+    for s in range(S):
+        if weight[s] == 0.0:
+            continue
+        for c in range(len(covered)):
+            near_drift = _surely_near(drift, s, c, least[0])
+            near_offset = _surely_near(offset, s, c, least[1])
+            if near_drift == 0 or near_offset == 0:
+                continue
+            count = 0
+            for point in normal:
+                is_near = near_drift == 1 or _is_near(drift, s, c, least[0], point[:K])
+                if is_near and (near_offset == 1 or _is_near(offset, s, c, least[1], point[K:])):
+                    count += 1
+            covered[c] += weight[s] * count / len(normal)
+    return covered
+
+
+@inlined
+def _surely_near(values: Array, s: int, c: int, least: float) -> int:
+    """Whether all of state s lies within tolerance of c's mean: 1 if so, 0 if nothing does, -1 if points must tell."""
+    distance, size, widest = 0.0, 0.0, 0.0
+    for k in range(values.shape[2]):
+        distance += (values[0, s, k] - values[0, c, k]) ** 2
+        size += values[0, s, k] ** 2
+        widest += values[1, s, k] ** 2
+    distance, size, widest = math.sqrt(distance), math.sqrt(size), FARTHEST * math.sqrt(widest)
+    if distance + widest <= TOLERANCE * max(size - widest, least):
+        return 1
+    if distance - widest > TOLERANCE * max(size + widest, least):
+        return 0
+    return -1
+
+
+@inlined
+def _is_near(values: Array, s: int, c: int, least: float, normal: Array) -> bool:
+    """Whether one point of state s lies within tolerance of c's mean."""
+    distance, size = 0.0, 0.0
+    for k in range(values.shape[2]):
+        value = values[0, s, k] + values[1, s, k] * normal[k]
+        distance += (value - values[0, c, k]) ** 2
+        size += value**2
+    return distance <= (TOLERANCE * max(math.sqrt(size), least)) ** 2
 
 
 def harm_probability(
@@ -125,62 +143,87 @@ def harm_probability(
         Of the drive on which it is largest, with the weight of the states that were left out; 0 where the estimate is
         zero, as nothing is changed.
     """
-    K, weight = states.branches, states.weight[vehicle]
-    d, d_sd = states.drift[vehicle, :, None], states.relative_sd[vehicle, :, None, 1:]
-    o, o_sd = states.offset[vehicle, :, None], states.constant_sd[vehicle, :, None, K - 1 :]
-    z = np.linspace(-FARTHEST, FARTHEST, STEPS + 1)
-    share, z = norm.pdf(z) / norm.pdf(z).sum(), z[:, None]
-    worst = np.full(K, max(1.0 - float(weight.sum()), 0.0))
-    worse = []
-    for m, s in zip(mean, mean_square, strict=True):
-        in_offset = _positive_quadratic(*_in_offset(d + d_sd * z, drift, offset, (m, s)), o, o_sd)
-        in_drift = _positive_quadratic(*_in_drift(o + o_sd * z, drift, offset, (m, s)), d, d_sd)
-        worse.append(np.where(d_sd * np.sqrt(s) > o_sd, in_drift, in_offset))
-    worst += np.einsum("s,q,msqk->mk", weight, share, np.stack(worse)).max(axis=0)
-    changed = (drift != 0.0) | (offset != 0.0)
-    return np.asarray(np.where(changed, np.minimum(worst, 1.0), 0.0))
+    K, j = states.branches, vehicle
+    return _harm(
+        states.weight[j],
+        np.stack([states.drift[j], states.relative_sd[j, :, 1:]]),
+        np.stack([states.offset[j], states.constant_sd[j, :, K - 1 :]]),
+        np.stack([drift, offset]),
+        np.stack([mean, mean_square]),
+    )
 
 
-Coefficients = tuple[Array, Array, Array]
+@compiled
+def _harm(weight: Array, drift: Array, offset: Array, estimate: Array, moments: Array) -> Array:
+    """As above; ``drift`` and ``offset`` (2, S, K) are means and deviations, ``moments`` (2, M, K)."""
+    S, K = drift.shape[1:]
+    total = 0.0
+    for step in range(STEPS + 1):
+        total += math.exp(-0.5 * (step * _STEP - FARTHEST) ** 2)
+    harm = np.zeros(K)
+    for k in range(K):
+        if estimate[0, k] == 0.0 and estimate[1, k] == 0.0:
+            continue
+        largest = 0.0
+        for m in range(moments.shape[1]):
+            square, sum_ = moments[1, m, k], 0.0
+            for s in range(S):
+                if weight[s] == 0.0:
+                    continue
+                d, d_sd, o, o_sd = drift[0, s, k], drift[1, s, k], offset[0, s, k], offset[1, s, k]
+                in_drift = d_sd * math.sqrt(square) > o_sd
+                less_sd = o_sd if in_drift else d_sd
+                if less_sd == 0.0:
+                    sum_ += weight[s] * _worse(d, o, in_drift, d_sd, o_sd, estimate[:, k], moments[:, m, k])
+                    continue
+                inner_sum = 0.0
+                for step in range(STEPS + 1):
+                    z = step * _STEP - FARTHEST
+                    d_z, o_z = (d, o + o_sd * z) if in_drift else (d + d_sd * z, o)
+                    inner_sum += math.exp(-0.5 * z * z) * _worse(
+                        d_z, o_z, in_drift, d_sd, o_sd, estimate[:, k], moments[:, m, k]
+                    )
+                sum_ += weight[s] * inner_sum / total
+            largest = max(largest, sum_)
+        harm[k] = min(largest + max(1.0 - weight.sum(), 0.0), 1.0)
+    return harm
 
 
-def _in_offset(d: Array, drift: Array, offset: Array, moments: tuple[Array, Array]) -> Coefficients:
-    """Mean square error with correction less that without, as a polynomial in the offset; falling powers."""
-    (m, s), unit = moments, 1.0 + drift
-    away = (d - drift) / unit
-    linear = 2.0 * (away * m / unit - offset / unit**2 - d * m)
-    constant = (away**2 - d**2) * s - 2.0 * away * m * offset / unit + (offset / unit) ** 2
-    return 1.0 / unit**2 - 1.0, linear, constant
+@inner
+def _worse(d: float, o: float, in_drift: bool, d_sd: float, o_sd: float, estimate: Array, moments: Array) -> float:
+    """Probability that correction makes it worse if one of drift and offset is known, and the other has its spread."""
+    m, s = moments[0], moments[1]
+    d_hat, o_hat = estimate[0], estimate[1]
+    unit = 1.0 + d_hat
+    if in_drift:
+        away = (o - o_hat) / unit
+        square = (1.0 / unit**2 - 1.0) * s
+        linear = 2.0 * (away * m / unit - d_hat * s / unit**2 - o * m)
+        constant = (d_hat / unit) ** 2 * s - 2.0 * d_hat / unit * away * m + away**2 - o**2
+        return _positive_quadratic(square, linear, constant, d, d_sd)
+    away = (d - d_hat) / unit
+    square = 1.0 / unit**2 - 1.0
+    linear = 2.0 * (away * m / unit - o_hat / unit**2 - d * m)
+    constant = (away**2 - d**2) * s - 2.0 * away * m * o_hat / unit + (o_hat / unit) ** 2
+    return _positive_quadratic(square, linear, constant, o, o_sd)
 
 
-def _in_drift(o: Array, drift: Array, offset: Array, moments: tuple[Array, Array]) -> Coefficients:
-    """The same as a polynomial in the drift."""
-    (m, s), unit = moments, 1.0 + drift
-    away = (o - offset) / unit
-    linear = 2.0 * (away * m / unit - drift * s / unit**2 - o * m)
-    constant = (drift / unit) ** 2 * s - 2.0 * drift / unit * away * m + away**2 - o**2
-    return (1.0 / unit**2 - 1.0) * s, linear, constant
-
-
-def _positive_quadratic(square: Array, linear: Array, constant: Array, mean: Array, sd: Array) -> Array:
+@inner
+def _positive_quadratic(square: float, linear: float, constant: float, mean: float, sd: float) -> float:
     """Probability that square x^2 + linear x + constant is positive for x ~ N(mean, sd^2), which may be 0."""
     a, b = (square * mean + linear) * mean + constant, 2.0 * square * mean + linear
     # In t = x - mean: square t^2 + b t + a. Roots by the form that does not cancel.
-    discriminant = b**2 - 4.0 * square * a
-    q = -0.5 * (b + np.where(b < 0.0, -1.0, 1.0) * np.sqrt(np.maximum(discriminant, 0.0)))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        first, second = np.where(square == 0.0, np.inf, q / square), np.where(q == 0.0, 0.0, a / q)
-        lower, upper = np.minimum(first, second), np.maximum(first, second)
-        below, above = norm.cdf(lower / sd), norm.sf(upper / sd)
-        on_line = np.where(b > 0.0, norm.sf(second / sd), norm.cdf(second / sd))
-    outside = below + above
-    curved = np.where(discriminant <= 0.0, square > 0.0, np.where(square > 0.0, outside, 1.0 - outside))
-    straight = np.where(b == 0.0, a > 0.0, on_line)
-    return np.where(sd > 0.0, np.where(square == 0.0, straight, curved), a > 0.0)
-
-
-def _near(points: Array, candidates: Array, least: float) -> Mask:
-    """Whether each candidate (C, K) is within tolerance of each point (P, K), shape (C, P)."""
-    squared = np.sum(candidates**2, axis=1)[:, None] + np.sum(points**2, axis=1) - 2.0 * candidates @ points.T
-    norm_of_points = np.maximum(np.linalg.norm(points, axis=1), least)
-    return np.asarray(squared <= (TOLERANCE * norm_of_points) ** 2)
+    if sd == 0.0 or (square == 0.0 and b == 0.0):
+        return 1.0 if a > 0.0 else 0.0
+    if square == 0.0:
+        return normal_mass(-a / b / sd, np.inf) if b > 0.0 else normal_mass(-np.inf, -a / b / sd)
+    discriminant = b * b - 4.0 * square * a
+    if discriminant <= 0.0:
+        return 1.0 if square > 0.0 else 0.0
+    q = -0.5 * (b + math.copysign(math.sqrt(discriminant), b))
+    first = q / square
+    second = a / q if q != 0.0 else 0.0
+    lower, upper = min(first, second) / sd, max(first, second) / sd
+    if square > 0.0:
+        return normal_mass(-np.inf, lower) + normal_mass(upper, np.inf)
+    return normal_mass(lower, upper)

@@ -9,7 +9,7 @@ from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.evidence.rows import FleetRows
 from calibrator.faults import Faults, Index
-from calibrator.posterior.decision import best_estimates, harm_probability, spread_points
+from calibrator.posterior.decision import best_estimate, harm_probability
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.health import ReferenceHealth
 from calibrator.posterior.hyperparameters import (
@@ -139,8 +139,8 @@ def estimate_fleet(
     hyperparameters = estimate_hyperparameters(learnt, starts, given=given, free=free)
     drawn = draw_hyperparameters(learnt, hyperparameters, given=given, carriers=carriers)
     states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in drawn])
-    usual = moments if learning is None else moments.take(learning)
-    vehicles = [_of_vehicle(states, j, hyperparameters.prior, (moments, usual), full_scale_a) for j in range(len(rows))]
+    usual = _usual_moments(moments if learning is None else moments.take(learning))
+    vehicles = [_of_vehicle(states, j, hyperparameters.prior, moments, usual, full_scale_a) for j in range(len(rows))]
     return _joined(vehicles, rows, states, hyperparameters, full_scale_a)
 
 
@@ -167,28 +167,33 @@ class _Vehicle:
 
 
 def _of_vehicle(
-    states: States, j: int, prior: FaultPrior, moments: tuple[Moments, Moments], full_scale_a: float
+    states: States, j: int, prior: FaultPrior, moments: Moments, usual: tuple[Array, Array], full_scale_a: float
 ) -> _Vehicle:
-    state, confidence = best_estimates(
-        spread_points(states, j), states, j, least=(prior.relative.low, prior.constant.low)
-    )
+    state, confidence = best_estimate(states, j, least=(prior.relative.low, prior.constant.low))
     drift, offset = states.drift[j, state], states.offset[j, state]
     distance = np.concatenate([states.drift[j] - drift, states.offset[j] - offset], axis=1)
     sd = np.concatenate([states.relative_sd[j, :, 1:], states.constant_sd[j, :, states.branches - 1 :]], axis=1)
     variance = np.asarray(states.weight[j] @ (distance**2 + sd**2))
-    mean, mean_square = _true_moments(*moments, j, drift=drift, offset_a=offset * full_scale_a)
+    mean, mean_square = _true_moments(moments, usual, j, drift=drift, offset_a=offset * full_scale_a)
     mean, mean_square = mean / full_scale_a, mean_square / full_scale_a**2
     harm = harm_probability(states, j, drift, offset, mean=mean, mean_square=mean_square)
     return _Vehicle(state, confidence, variance, harm)
 
 
-def _true_moments(moments: Moments, fleet: Moments, j: int, *, drift: Array, offset_a: Array) -> tuple[Array, Array]:
+def _true_moments(
+    moments: Moments, usual: tuple[Array, Array], j: int, *, drift: Array, offset_a: Array
+) -> tuple[Array, Array]:
     """Moments of the true currents on the vehicle's own drives and on the fleet's usual one, each of shape (2, K)."""
     mean, square = moments.mean_a[j], moments.mean_square_a2[j]
     own_mean = (mean - offset_a) / (1.0 + drift)
     own_square = np.maximum((square - 2.0 * offset_a * mean + offset_a**2) / (1.0 + drift) ** 2, own_mean**2)
-    usual_mean, usual_square = np.median(fleet.mean_a, axis=0), np.median(fleet.mean_square_a2, axis=0)
-    return np.stack([own_mean, usual_mean]), np.stack([own_square, np.maximum(usual_square, usual_mean**2)])
+    return np.stack([own_mean, usual[0]]), np.stack([own_square, usual[1]])
+
+
+def _usual_moments(moments: Moments) -> tuple[Array, Array]:
+    """Mean (K,) [A] and mean square (K,) [A^2] of the fleet's usual drive."""
+    mean, square = np.median(moments.mean_a, axis=0), np.median(moments.mean_square_a2, axis=0)
+    return mean, np.maximum(square, mean**2)
 
 
 def _joined(

@@ -144,7 +144,7 @@ def sort_falling(values: Array, order: NDArray[np.int64], count: int) -> None:
 
 
 @inner
-def _normal_mass(low: float, high: float) -> float:
+def normal_mass(low: float, high: float) -> float:
     """Of a standard normal variable between two values, the first of which is the smaller one."""
     if low > 0.0:
         low, high = -high, -low
@@ -155,7 +155,7 @@ def _normal_mass(low: float, high: float) -> float:
 def log_mass(mean: float, sd: float, low: float, high: float) -> float:
     """As :meth:`calibrator.posterior.slab.Slab.log_mass`, of one value."""
     spread, magnitude = max(sd, LEAST_DEVIATION), abs(mean)
-    mass = _normal_mass((low - magnitude) / spread, (high - magnitude) / spread)
+    mass = normal_mass((low - magnitude) / spread, (high - magnitude) / spread)
     if spread * NEVER > low + magnitude:
-        mass += _normal_mass((low + magnitude) / spread, (high + magnitude) / spread)
+        mass += normal_mass((low + magnitude) / spread, (high + magnitude) / spread)
     return math.log(max(mass, _LEAST_MASS) * 0.5 / (high - low))

@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from scipy.stats import norm
 
 from calibrator.drive import Array
 from calibrator.faults import Faults
-from calibrator.posterior.decision import Points, best_estimates, harm_probability, spread_points
+from calibrator.posterior.decision import best_estimate, harm_probability
 from calibrator.posterior.states import States, enumerate_states
 from calibrator.score import correction_error_rms
 from tests.calibrator.posterior.simulated_rows import faults_of, no_spread, prior_of, rows_of
@@ -35,6 +35,15 @@ def states_of(weight: Array, drift: Array, offset: Array, *, sd: float) -> State
     )
 
 
+@dataclass(frozen=True)
+class Points:
+    """Draws from the posterior of one vehicle: weights (P,), drifts and offsets (P, K)."""
+
+    weight: Array
+    drift: Array
+    offset: Array
+
+
 TWO_EXPLANATIONS = (
     np.array([0.7, 0.3]),
     np.array([[0.12, 0.0], [0.0, -0.11]]),
@@ -54,15 +63,20 @@ def drawn(states: States, seed: int = 0) -> Points:
 @pytest.mark.parametrize("sd", [0.001, 0.004, 0.006, 0.01, 0.03])
 def test_confidence_is_the_probability_to_be_within_tolerance(sd: float) -> None:
     states = states_of(*TWO_EXPLANATIONS, sd=sd)
-    state, confidence = best_estimates(spread_points(states, 0), states, 0, least=LEAST)
-    same, expected = best_estimates(drawn(states), states, 0, least=LEAST)
-    assert state == same == 0
-    assert confidence == pytest.approx(expected, abs=0.15)
+    state, confidence = best_estimate(states, 0, least=LEAST)
+    points, near = drawn(states), np.ones(DRAWS, bool)
+    for values, mean, least in zip(
+        (points.drift, points.offset), (states.drift[0, 0], states.offset[0, 0]), LEAST, strict=True
+    ):
+        norms = np.maximum(np.linalg.norm(values, axis=1), least)
+        near &= np.linalg.norm(values - mean, axis=1) <= 0.1 * norms
+    assert state == 0
+    assert confidence == pytest.approx(near.mean(), abs=0.15)
 
 
 def test_sharp_states_give_their_own_weight() -> None:
     states = states_of(*TWO_EXPLANATIONS, sd=1e-6)
-    state, confidence = best_estimates(spread_points(states, 0), states, 0, least=LEAST)
+    state, confidence = best_estimate(states, 0, least=LEAST)
     assert state == 0
     assert confidence == pytest.approx(0.7)
 
@@ -71,24 +85,15 @@ def test_states_within_tolerance_of_each_other_count_together() -> None:
     weight = np.array([0.4, 0.3, 0.3])
     drift = np.array([[0.2, 0.0], [0.0, 0.1], [0.0, 0.1004]])
     states = states_of(weight, drift, np.zeros((3, K)), sd=1e-6)
-    state, confidence = best_estimates(spread_points(states, 0), states, 0, least=LEAST)
+    state, confidence = best_estimate(states, 0, least=LEAST)
     assert state in {1, 2}
     assert confidence == pytest.approx(0.6)
 
 
 def test_small_faults_are_counted_with_the_fleets_smallest() -> None:
     states = states_of(np.array([0.5, 0.5]), np.array([[0.0, 0.0], [0.004, 0.0]]), np.zeros((2, K)), sd=1e-7)
-    points = spread_points(states, 0)
-    assert best_estimates(points, states, 0, least=(0.05, 0.05))[1] == pytest.approx(1.0)
-    assert best_estimates(points, states, 0, least=(0.005, 0.05))[1] == pytest.approx(0.5)
-
-
-def test_points_have_the_mean_and_spread_of_the_states() -> None:
-    states = states_of(*TWO_EXPLANATIONS, sd=0.01)
-    points, plain = spread_points(states, 0), drawn(states)
-    assert points.weight.sum() == pytest.approx(1.0)
-    np.testing.assert_allclose(points.weight @ points.drift, plain.weight @ plain.drift, atol=0.003)
-    np.testing.assert_allclose(points.weight @ points.drift**2, plain.weight @ plain.drift**2, rtol=0.1)
+    assert best_estimate(states, 0, least=(0.05, 0.05))[1] == pytest.approx(1.0)
+    assert best_estimate(states, 0, least=(0.005, 0.05))[1] == pytest.approx(0.5)
 
 
 MEAN, SQUARE = np.array([[0.1, -0.1]]), np.array([[0.05, 0.05]])
