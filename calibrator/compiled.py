@@ -9,7 +9,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -35,13 +35,14 @@ def inlined(function: _Function) -> _Function:
     return _compile(function, no_cfunc_wrapper=True, no_cpython_wrapper=True, forceinline=True)
 
 
-def _compile(function: _Function, **options: bool) -> _Function:
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _CACHE or before
+def _compile(function: _Function, **options: Any) -> _Function:
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    config.CACHE_DIR = _CACHE or before
     try:
         return cast("_Function", numba.njit(cache=bool(_CACHE), error_model="numpy", **options)(function))
     finally:
-        numba.config.CACHE_DIR = before
+        config.CACHE_DIR = before
 
 
 def _cache_folder() -> str:

@@ -140,7 +140,10 @@ def estimate_fleet(
     drawn = draw_hyperparameters(learnt, hyperparameters, given=given, carriers=carriers)
     states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in drawn])
     usual = _usual_moments(moments if learning is None else moments.take(learning))
-    vehicles = [_of_vehicle(states, j, hyperparameters.prior, moments, usual, full_scale_a) for j in range(len(rows))]
+    vehicles = [
+        _of_vehicle(states, j, hyperparameters.prior, moments=moments, usual=usual, full_scale_a=full_scale_a)
+        for j in range(len(rows))
+    ]
     return _joined(vehicles, rows, states, hyperparameters, full_scale_a)
 
 
@@ -167,7 +170,7 @@ class _Vehicle:
 
 
 def _of_vehicle(
-    states: States, j: int, prior: FaultPrior, moments: Moments, usual: tuple[Array, Array], full_scale_a: float
+    states: States, j: int, prior: FaultPrior, *, moments: Moments, usual: tuple[Array, Array], full_scale_a: float
 ) -> _Vehicle:
     state, confidence = best_estimate(states, j, least=(prior.relative.low, prior.constant.low))
     drift, offset = states.drift[j, state], states.offset[j, state]

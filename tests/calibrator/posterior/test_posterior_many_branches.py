@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibrator.posterior import relative_states, workspace
+from calibrator.posterior import workspace
 from calibrator.posterior.states import States, enumerate_states
 from tests.calibrator.posterior.simulated_rows import (
     Errors,
@@ -34,15 +34,6 @@ def test_four_branches_lose_next_to_nothing_against_all_supports(
     assert np.quantile(lost, 0.9) < 0.05
     np.testing.assert_allclose(limited.relative[:, 0], exact.relative[:, 0], atol=1e-9)
     np.testing.assert_allclose(limited.constant[:, 0], exact.constant[:, 0], atol=1e-9)
-
-
-def test_up_to_three_branches_nothing_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = rows_of(random_faults(4, vehicles=10, branches=3, sparsity=40.0))
-    exact = enumerate_states(rows, prior_of(3), no_spread(3))
-    monkeypatch.setattr(joint_evidence, "NEGLIGIBLE", 1e9)
-    np.testing.assert_allclose(
-        enumerate_states(rows, prior_of(3), no_spread(3)).log_evidence, exact.log_evidence, rtol=1e-9
-    )
 
 
 @pytest.mark.parametrize("faults", [2, 3])

@@ -14,8 +14,9 @@ from calibrator.evidence.readings import no_readings, with_readings
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, LineMeans, constant_design, relative_design
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.slab import Slab
-from calibrator.posterior.states import MOST_STATES, States, enumerate_states, mean_states
+from calibrator.posterior.states import States, enumerate_states, mean_states
 from calibrator.posterior.supports import Support, constant_supports, relative_supports
+from calibrator.posterior.workspace import MOST_STATES
 from tests.calibrator.posterior.simulated_rows import (
     FULL_SCALE_A,
     Errors,
