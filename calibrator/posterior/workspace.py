@@ -126,11 +126,11 @@ def law_of(prior: FaultPrior) -> Law:
     """The prior as compiled code takes it."""
     K = prior.branches
     log_prior = prior.log_supports()
-    active, size, constant_bits = _supports(K)
+    exact = K <= EXACT_BRANCHES
+    active, size, constant_bits = _supports(K, None if exact else MOST_CONSTANT)
     hardware = (active == 0).any(axis=1, where=np.arange(K + 1) < size[:, None]).astype(np.int64)
     sensors = size - hardware
     share = [log_prior[h : h + K, n : n + K + 1].max() for h, n in zip(hardware, sensors, strict=True)]
-    exact = K <= EXACT_BRANCHES
     return Law(
         branches=K,
         log_prior=log_prior,
@@ -148,14 +148,14 @@ def law_of(prior: FaultPrior) -> Law:
 
 
 @cache
-def _supports(branches: int) -> tuple[Places, Places, Places]:
-    """Relative supports, their sizes, and constant supports as bits."""
+def _supports(branches: int, most: int | None) -> tuple[Places, Places, Places]:
+    """Relative supports, their sizes, and constant supports of at most so many parameters as bits."""
     supports = relative_supports(branches)
     active = np.zeros((len(supports), branches + 1), np.int64)
     for place, support in enumerate(supports):
         active[place, : len(support.active)] = support.active
     size = np.array([len(support.active) for support in supports])
-    constant = constant_supports(branches, most=None if branches <= EXACT_BRANCHES else MOST_CONSTANT)
+    constant = constant_supports(branches, most=most)
     return active, size, np.array([sum(1 << place for place in support.active) for support in constant])
 
 
