@@ -14,6 +14,7 @@ from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.posterior.bench_table import BenchReadings, read_bench_readings, readings_of
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.health import ReferenceHealth
+from calibrator.posterior.model_spread import FEWEST_TRUSTED
 
 __all__ = ["contradicted_readings", "merge_readings", "read_bench", "trust_notices", "trusted_of", "window_notices"]
 
@@ -142,9 +143,17 @@ def contradicted_readings(
     return found
 
 
-def trust_notices(names: Sequence[str], health: ReferenceHealth) -> list[str]:
-    """Trusted vehicles that contradict the trust in them."""
+def trust_notices(names: Sequence[str], trusted: Mask, health: ReferenceHealth) -> list[str]:
+    """Trusted vehicles that contradict the trust in them, or are too few to carry the reference."""
+    carriers = int(np.count_nonzero(trusted)) - len(health.differing)
+    few = bool(trusted.any()) and carriers < FEWEST_TRUSTED
     return [
+        *(
+            [
+                f"only {carriers} of the trusted vehicles can carry the reference, {FEWEST_TRUSTED} are needed: it is the fleet's"
+            ]
+            * few
+        ),
         *(f"vehicle {names[j]} is not trusted: {why}; check it again" for j, why in health.distrusted.items()),
         *(
             f"trusted vehicle {names[j]} does not carry the reference: it differs from the other trusted ones as by a "

@@ -126,7 +126,7 @@ def calibrate_fleet_posterior(
         left_out=left_out,
         notices=(
             *health.warnings,
-            *trust_notices(names, health),
+            *trust_notices(names, trusted, health),
             *doubts,
             *window_notices(vehicles, trusted, equipment.branches, full_scale_a),
             *finding_notices(names, findings, equipment.branches),

@@ -7,7 +7,7 @@ import pytest
 
 from calibrator.drive import Mask
 from calibrator.faults import Faults
-from calibrator.posterior.bench import contradicted_readings
+from calibrator.posterior.bench import contradicted_readings, trust_notices
 from calibrator.posterior.calibration import calibrate_posterior
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.health import ReferenceHealth
@@ -109,3 +109,6 @@ def test_two_trusted_vehicles_are_evidence_and_do_not_carry_the_reference() -> N
     assert (health.distrusted, health.differing) == ({}, ())
     assert posterior.hardware_fault[1] > 0.9
     assert (np.delete(posterior.hardware_fault, 1) < 0.5).all()
+    (notice,) = trust_notices([f"V{j}" for j in range(VEHICLES)], first(2), health)
+    assert notice == "only 2 of the trusted vehicles can carry the reference, 3 are needed: it is the fleet's"
+    assert trust_notices([], first(3), health) == trust_notices([], first(0), health) == []
