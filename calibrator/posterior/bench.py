@@ -146,14 +146,12 @@ def contradicted_readings(
 def trust_notices(names: Sequence[str], trusted: Mask, health: ReferenceHealth) -> list[str]:
     """Trusted vehicles that contradict the trust in them, or are too few to carry the reference."""
     carriers = int(np.count_nonzero(trusted)) - len(health.differing)
-    few = bool(trusted.any()) and carriers < FEWEST_TRUSTED
+    too_few = (
+        f"only {carriers} of the trusted vehicles can carry the reference, {FEWEST_TRUSTED} are needed: "
+        f"it is the fleet's"
+    )
     return [
-        *(
-            [
-                f"only {carriers} of the trusted vehicles can carry the reference, {FEWEST_TRUSTED} are needed: it is the fleet's"
-            ]
-            * few
-        ),
+        *([too_few] if trusted.any() and carriers < FEWEST_TRUSTED else []),
         *(f"vehicle {names[j]} is not trusted: {why}; check it again" for j, why in health.distrusted.items()),
         *(
             f"trusted vehicle {names[j]} does not carry the reference: it differs from the other trusted ones as by a "
