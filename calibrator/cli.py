@@ -40,6 +40,7 @@ from calibrator.command_options import (
     UnseenMinutesOption,
     VehiclesOption,
     WorkersOption,
+    named_vehicles,
     require_heeded_options,
     require_own_options,
     require_truth_where_used,
@@ -215,7 +216,7 @@ def calibrate(
     settings = CalibrationSettings(
         method=method,
         harm_limit=harm_limit,
-        trusted=frozenset(trusted or ()),
+        trusted=named_vehicles(trusted),
         readings=readings,
         sensor_models=sensor_models,
         classifier=classifier,
@@ -224,7 +225,7 @@ def calibrate(
         magnitude=magnitude,
         symmetric=symmetric,
         branches=tuple(branches.split(",")) if branches else None,
-        hold_out=frozenset(hold_out or ()),
+        hold_out=named_vehicles(hold_out),
         unity=unity,
         seed=seed,
     )

@@ -44,6 +44,7 @@ __all__ = [
     "UnseenMinutesOption",
     "VehiclesOption",
     "WorkersOption",
+    "named_vehicles",
     "number_option",
     "require_heeded_options",
     "require_own_options",
@@ -162,9 +163,11 @@ UnmeasuredOption = Annotated[
         help=f"Load without a sensor: mean and sd over vehicles, each 0 to {MAX_UNMEASURED_A:g} [A].",
     ),
 ]
-MinutesOption = Annotated[float, number_option("--minutes", 0.1, MAX_MINUTES, "Length of each built-in trip [min]")]
+MinutesOption = Annotated[
+    float, number_option("--minutes", 0.1, MAX_MINUTES, "Least length of each built-in trip [min]")
+]
 UnseenMinutesOption = Annotated[
-    float, number_option("--unseen-minutes", 0.1, MAX_MINUTES, "Length of each unseen trip [min]")
+    float, number_option("--unseen-minutes", 0.1, MAX_MINUTES, "Least length of each unseen trip [min]")
 ]
 CommonDriveOption = Annotated[bool, typer.Option("--common-drive", help="One trip for all vehicles.")]
 BalancedOption = Annotated[bool, typer.Option("--balanced", help="No hardware faults in half of the vehicles.")]
@@ -173,7 +176,7 @@ HarmLimitOption = Annotated[
 ]
 TrustedOption = Annotated[
     list[str] | None,
-    typer.Option("--trusted", help="Vehicle with bench-checked sensors; three carry the reference (posterior)."),
+    typer.Option("--trusted", help="Vehicles with bench-checked sensors; three carry the reference (posterior)."),
 ]
 ReadingsOption = Annotated[
     Path | None,
@@ -189,7 +192,7 @@ ClassifierOption = Annotated[Classifier, typer.Option("--classifier", help="Tell
 TruthOption = Annotated[Path | None, typer.Option("--truth", help="truth.json, for the perfect classifier.")]
 HoldOutOption = Annotated[
     list[str] | None,
-    typer.Option("--hold-out", help="Calibrate this vehicle, but learn nothing from it for others."),
+    typer.Option("--hold-out", help="Vehicles to calibrate, but to learn nothing from for others."),
 ]
 UnityOption = Annotated[
     str | None, typer.Option("--unity", help="Vehicle whose held-out data is the unity drive (published).")
@@ -215,6 +218,11 @@ ResultsFolderOption = Annotated[
     Path | None,
     typer.Option("--out", help="Folder for NAME.md, NAME.json and NAME.png; FOLDER.md beside it lists all."),
 ]
+
+
+def named_vehicles(values: list[str] | None) -> frozenset[str]:
+    """Vehicles of an option that is given several times, or once with commas; no name has a comma."""
+    return frozenset(name.strip() for value in values or () for name in value.split(","))
 
 
 def require_own_options(context: typer.Context, method: Method) -> None:

@@ -19,10 +19,12 @@ from calibrator.folders import require_new_folder
 from calibrator.options import Method
 from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.fleet import calibrate_fleet_posterior
+from calibrator.posterior.verdict import CONFIDENT
 from calibrator.published.fleet import calibrate_fleet_published
-from calibrator.report.text import dumps, left_out_text, table, undecided_text
+from calibrator.report.text import dumps, left_out_text, reasons_text, table
 from calibrator.results import LeftOut, RunRecord, write_results
 from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import VehicleParameters
 
 __all__ = ["CalibrationReport", "CalibrationSettings", "calibrate_fleet"]
 
@@ -38,7 +40,10 @@ class CalibrationReport:
     verdicts: Mapping[str, int]
     undecided: Mapping[str, str]
     """Vehicles of which it cannot be told what is faulty, and what would decide."""
-    hardware_suspected: int
+    corrected: Mapping[str, str]
+    """Vehicles of which branches are corrected, and which."""
+    hardware_suspected: Mapping[str, str]
+    """Vehicles that are thought to differ from their fleet, and how probable that is."""
     held_back: Mapping[str, int]
     """Branches in which a fault was found that is not applied, by reason."""
     junction_rms_measured_a: float
@@ -57,7 +62,7 @@ class CalibrationReport:
         rows = [
             ("vehicles calibrated", f"{run.vehicles}"),
             *((f"  {verdict}", f"{count}") for verdict, count in self.verdicts.items()),
-            ("  hardware fault suspected", f"{self.hardware_suspected}"),
+            ("  hardware fault suspected", f"{len(self.hardware_suspected)}"),
             ("vehicles left out", f"{len(run.left_out)}"),
             *((f"faults held back, {reason}", f"{count}") for reason, count in self.held_back.items()),
             ("junction sum RMS, median, measured [A]", f"{self.junction_rms_measured_a:.2f}"),
@@ -67,7 +72,9 @@ class CalibrationReport:
         parts = [
             table((f"method {run.method}", ""), rows),
             "\n".join(f"notice: {notice}" for notice in run.notices),
-            undecided_text(self.undecided),
+            reasons_text("corrected", self.corrected),
+            reasons_text("hardware fault suspected", self.hardware_suspected),
+            reasons_text("cannot tell", self.undecided),
             left_out_text(run.left_out),
             f"parameter files: {self.result}/params",
         ]
@@ -174,10 +181,24 @@ def _report(out: Path, outcome: FleetOutcome, run: RunRecord) -> CalibrationRepo
                 branch.held_back for item in parameters for branch in item.branches.values() if branch.held_back
             )
         ),
-        hardware_suspected=sum(item.hardware_fault.suspected for item in parameters),
+        corrected={item.vehicle: _corrections(item) for item in parameters if item.verdict == "corrected"},
+        hardware_suspected={
+            item.vehicle: ""
+            if item.hardware_fault.probability is None
+            else f"probability {item.hardware_fault.probability:.1f}"
+            for item in parameters
+            if item.hardware_fault.suspected
+        },
         junction_rms_measured_a=float(np.median(measured)),
         junction_rms_deployed_a=float(np.median(deployed)),
     )
+
+
+def _corrections(item: VehicleParameters) -> str:
+    """Which branches of a vehicle are corrected, and a low confidence."""
+    names = ", ".join(name for name, branch in item.branches.items() if branch.apply)
+    unsure = item.confidence is not None and item.confidence < CONFIDENT
+    return f"{names} (all of its faults: confidence {item.confidence:.2f})" if unsure else names
 
 
 def _detail_rows(run: RunRecord) -> list[tuple[str, str]]:
@@ -185,4 +206,6 @@ def _detail_rows(run: RunRecord) -> list[tuple[str, str]]:
     snr = run.details.get("simulation_snr_db", {})
     agreeing = run.details.get("reference", {}).get("agreeing_share", {})
     rows = [(f"simulation SNR, median, {name} [dB]", f"{value:.1f}") for name, value in snr.items()]
-    return rows + [(f"vehicles that agree, {name}", f"{value:.0%}") for name, value in agreeing.items()]
+    spread = run.details.get("hyperparameters", {}).get("model_spread", {})
+    rows += [(f"vehicles that agree, {name}", f"{value:.0%}") for name, value in agreeing.items()]
+    return rows + [(f"faultless vehicles differ by, {name}", f"{value:.1%}") for name, value in spread.items()]

@@ -13,11 +13,15 @@ from calibrator.errors import DriveError
 from calibrator.evidence.summary import DriveSummary, summarise
 from calibrator.evidence.zero_current import ZeroCurrent, zero_current_offsets
 from ecu_node.database import VehicleDatabase
+from ecu_node.layout import Layout
 
 __all__ = ["VehicleSummary", "read_vehicle_summary"]
 
 LEAST_DURATION_S = 120.0
 """Valid data below which a vehicle is left out: fewer than four blocks do not tell how sure anything is. [s]"""
+
+MOST_OVER_FULL_SCALE = 10.0
+"""Largest current that is taken for one, over full scale. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +78,8 @@ def read_vehicle_summary(
     """
     layout = database.layout
     drives = [load_drive(entry, database) for entry in entries]
+    for drive in drives:
+        _require_possible(drive, layout)
     delays = estimate_delays(drives, _most_moving_first(drives, equipment.branches))
     samples = [
         align(without_delays(drive, delays.by_branch()), layout, equipment.branches, inputs=equipment.fleet_inputs)
@@ -92,6 +98,20 @@ def read_vehicle_summary(
         zero_current=zero_current_offsets(drives, equipment.branches, database),
         recorded=frozenset.intersection(*(_recorded(drive) for drive in drives)),
     )
+
+
+def _require_possible(drive: Drive, layout: Layout) -> None:
+    """Refuse currents that no sensor of this junction shows, and numbers that are none."""
+    for name, channel in drive.branches.items():
+        largest = float(np.abs(channel.value[channel.good]).max(initial=0.0))
+        if not largest <= MOST_OVER_FULL_SCALE * layout.full_scale_a:
+            raise DriveError(
+                f"drive {drive.name}: branch {name} shows {largest:.3g} A, full scale of the junction being "
+                f"{layout.full_scale_a:g} A; check its signal in the DBC, or full_scale_a in {layout.path.name}"
+            )
+    for name, channel in drive.inputs.items():
+        if not np.isfinite(channel.value[channel.good]).all():
+            raise DriveError(f"drive {drive.name}: input {name} has values that are no numbers; import it again")
 
 
 def _recorded(drive: Drive) -> frozenset[str]:

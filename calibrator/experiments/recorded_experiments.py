@@ -67,7 +67,7 @@ def real_experiment(
     ]
     return ExperimentResult(
         name="real",
-        title="Real drives, each trip a vehicle",
+        title=f"{'Real' if fleet.recorded else 'Built-in'} drives, each trip a vehicle",
         x_label=SPARSITY_LABEL,
         series_label="branches, faults",
         settings=recorded_settings(fleet, effort),

@@ -1,7 +1,7 @@
 """Trips of recordings, or of the built-in vehicle, each of which an experiment gives to a vehicle of its own."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -40,11 +40,14 @@ class RecordedFleet:
         All with the same branches and inputs.
     database : VehicleDatabase
         DBC and layout.
+    recorded : bool
+        Whether they were recorded in a car, or come from the built-in vehicle.
     """
 
     name: str
     trips: tuple[GroundTruth, ...]
     database: VehicleDatabase
+    recorded: bool = True
 
     def __post_init__(self) -> None:
         if len(self.trips) < FEWEST_TRIPS:
@@ -66,9 +69,7 @@ class RecordedFleet:
     def take(self, trips: int, *, duration_s: float) -> "RecordedFleet":
         """First trips, cut to their beginnings."""
         samples = int(duration_s / self.period_s)
-        return RecordedFleet(
-            name=self.name, trips=tuple(trip.part(0, samples) for trip in self.trips[:trips]), database=self.database
-        )
+        return replace(self, trips=tuple(trip.part(0, samples) for trip in self.trips[:trips]))
 
     def with_branches(self, count: int) -> tuple[GroundTruth, ...]:
         """Trips of a fleet of K currents, of which one takes the balance (19).
@@ -161,4 +162,6 @@ def builtin_fleet(
         builtin_trip(random_stream(Purpose.CALIBRATION_TRIP, 0, k), duration_s=duration_s, name=f"builtin-{k}")
         for k in range(trips)
     )
-    return RecordedFleet(name=f"{trips} built-in trips, no recordings", trips=tuple(made), database=database)
+    return RecordedFleet(
+        name=f"{trips} built-in trips, no recordings", trips=tuple(made), database=database, recorded=False
+    )

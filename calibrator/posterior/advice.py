@@ -13,6 +13,8 @@ from ecu_node.layout import Layout
 
 __all__ = ["advise", "deciding_evidence"]
 
+LEAST_RIVAL, LEAST_IN_THE_WAY = 0.02, 1e-4
+"""Probability from which on another explanation is a rival, and from which on it can hold a correction back. [1]"""
 TOLD_APART = 0.002
 """Smallest difference that a zero-current window or a bench check shows: drifts, offsets over full scale. [1]"""
 
@@ -89,18 +91,19 @@ def deciding_evidence(
     Returns
     -------
     str
-        One sentence; empty if there is one explanation.
+        One sentence; empty if no other explanation is probable enough to matter.
     """
-    if len(found) < 2:
+    first, least = found[0], LEAST_IN_THE_WAY if concerned else LEAST_RIVAL
+    others = [other for other in found[1:] if other.probability >= least]
+    if not others:
         return ""
-    first = found[0]
     looked_at = sorted(concerned) if concerned else list(range(len(branches)))
 
     def in_the_way(other: FaultExplanation) -> float:
         apart = np.hypot(other.drift - first.drift, other.offset - first.offset)[looked_at]
         return other.probability * float(np.sum(np.where(apart > TOLD_APART, apart, 0.0)))
 
-    other = max(found[1:], key=in_the_way)
+    other = max(others, key=in_the_way)
     if not in_the_way(other):
         return "" if concerned else "the explanations differ in the vehicle, not in its sensors: inspect the hardware"
     offset, drift = np.abs(first.offset - other.offset), np.abs(first.drift - other.drift)
@@ -116,9 +119,15 @@ def deciding_evidence(
 def _least_known(
     posterior: FleetPosterior, j: int, concerned: Mask, branches: Sequence[str], full_scale_a: float
 ) -> str:
-    """Which sensor of those concerned, or of all if none is, is known least where only one explanation is left."""
-    sd = np.hypot(posterior.drift_sd[j], posterior.offset_sd_a[j] / full_scale_a)
-    k = int(np.argmax(np.where(concerned | ~concerned.any(), sd, -np.inf)))
+    """Which sensor is known least, in parts of the faults found, where only one explanation is left.
+
+    It is one of those concerned, or of all if none is.
+    """
+    faults = posterior.faults
+    sd = (posterior.drift_sd[j], posterior.offset_sd_a[j] / full_scale_a)
+    size = (np.linalg.norm(faults.drift[j]), np.linalg.norm(faults.offset_a[j]) / full_scale_a)
+    doubt = np.max([each / norm if norm else each for each, norm in zip(sd, size, strict=True)], axis=0)
+    k = int(np.argmax(np.where(concerned | ~concerned.any(), doubt, -np.inf)))
     return (
         f"more drives would decide: the {branches[k]} sensor's drift is known to +-{posterior.drift_sd[j, k]:.2%} and "
         f"its offset to +-{posterior.offset_sd_a[j, k]:.2f} A only; record drives in which that current varies"

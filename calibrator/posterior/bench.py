@@ -12,10 +12,14 @@ from calibrator.errors import FleetError
 from calibrator.evidence.readings import TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD, Readings, no_readings
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.posterior.bench_table import BenchReadings, read_bench_readings, readings_of
+from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.health import ReferenceHealth
+from calibrator.posterior.model_spread import FEWEST_TRUSTED
 
-__all__ = ["merge_readings", "read_bench", "trust_notices", "trusted_of", "window_notices"]
+__all__ = ["contradicted_readings", "merge_readings", "read_bench", "trust_notices", "trusted_of", "window_notices"]
 
+LEAST_PROBABILITY = 1e-4
+"""Of the explanations near a bench reading: below, the drives contradict it. [1]"""
 CONTRADICTION = 4.0
 """Standard deviations from which on two readings of one sensor contradict each other. [1]"""
 
@@ -91,9 +95,63 @@ def merge_readings(
     return windows.merged(kept), notices
 
 
-def trust_notices(names: Sequence[str], health: ReferenceHealth) -> list[str]:
-    """Trusted vehicles that contradict the trust in them."""
+def contradicted_readings(
+    posterior: FleetPosterior, bench: BenchReadings, names: Sequence[str], branches: Sequence[str], full_scale_a: float
+) -> dict[tuple[str, str], str]:
+    """Find bench readings that a vehicle's drives contradict: another vehicle's, or a slip.
+
+    Parameters
+    ----------
+    posterior : FleetPosterior
+        Of N vehicles, without these readings.
+    bench : mapping
+        The readings.
+    names, branches : sequence of str
+        Names of the N vehicles and K branches.
+    full_scale_a : float
+        Full scale of the junction. [A]
+
+    Returns
+    -------
+    dict of (str, str) to str
+        What to say of each such sensor; none where the reference is in doubt, as drives contradict nothing then.
+    """
+    if posterior.health is not None and posterior.health.doubtful:
+        return {}
+    states, found = posterior.states, {}
+    for (vehicle, branch), (drift, drift_sd, offset_a, offset_sd_a) in bench.items():
+        if vehicle not in names:
+            continue
+        j, k = names.index(vehicle), posterior.order.index(branches.index(branch))
+        near = np.ones(states.weight.shape[1], bool)
+        for value, sd, told, told_sd in (
+            (drift, drift_sd, states.drift[j, :, k], states.relative_sd[j, :, 1 + k]),
+            (
+                offset_a / full_scale_a,
+                offset_sd_a / full_scale_a,
+                states.offset[j, :, k],
+                states.constant_sd[j, :, states.branches - 1 + k],
+            ),
+        ):
+            if np.isfinite(value):
+                near &= np.abs(value - told) <= CONTRADICTION * np.hypot(sd, told_sd)
+        if states.weight[j] @ near < LEAST_PROBABILITY:
+            found[vehicle, branch] = (
+                f"vehicle {vehicle}: the bench reading of its {branch} sensor is not what its drives show, and is not "
+                f"used; check it again, and whether it is of this vehicle"
+            )
+    return found
+
+
+def trust_notices(names: Sequence[str], trusted: Mask, health: ReferenceHealth) -> list[str]:
+    """Trusted vehicles that contradict the trust in them, or are too few to carry the reference."""
+    carriers = int(np.count_nonzero(trusted)) - len(health.differing)
+    too_few = (
+        f"only {carriers} of the trusted vehicles can carry the reference, {FEWEST_TRUSTED} are needed: "
+        f"it is the fleet's"
+    )
     return [
+        *([too_few] if trusted.any() and carriers < FEWEST_TRUSTED else []),
         *(f"vehicle {names[j]} is not trusted: {why}; check it again" for j, why in health.distrusted.items()),
         *(
             f"trusted vehicle {names[j]} does not carry the reference: it differs from the other trusted ones as by a "

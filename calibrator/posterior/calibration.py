@@ -112,7 +112,7 @@ def calibrate_posterior(
         full_scale_a=full_scale_a,
         trusted=carriers[learnt],
         load=load,
-        load_in_use_a=posterior.hyperparameters.spread.mean[4 * K - 1] * full_scale_a,
+        load_in_use_a=float(posterior.hyperparameters.spread.mean[4 * K - 1] * full_scale_a),
     )
     health = replace(health, distrusted=distrusted, differing=tuple(np.flatnonzero(differing).tolist()))
     return _in_own_order(posterior, health, order)

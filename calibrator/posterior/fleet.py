@@ -17,7 +17,14 @@ from calibrator.errors import FleetError
 from calibrator.evidence.vehicle_summary import VehicleSummary, read_vehicle_summary
 from calibrator.parameter_files import RunIdentity, by_branch, junction_rms_a
 from calibrator.posterior.advice import advise
-from calibrator.posterior.bench import merge_readings, read_bench, trust_notices, trusted_of, window_notices
+from calibrator.posterior.bench import (
+    contradicted_readings,
+    merge_readings,
+    read_bench,
+    trust_notices,
+    trusted_of,
+    window_notices,
+)
 from calibrator.posterior.calibration import calibrate_posterior
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.explain import explanations
@@ -74,17 +81,23 @@ def calibrate_fleet_posterior(
     names = [vehicle.vehicle for vehicle in vehicles]
     learning = require_learning(names, settings, left_out)
     trusted = trusted_of(names, settings.trusted, fleet)
-    readings, doubts = merge_readings(vehicles, bench, equipment.branches)
+    summaries = [vehicle.summary for vehicle in vehicles]
     estimate = partial(
         calibrate_posterior,
         full_scale_a=full_scale_a,
         branches=equipment.branches,
-        readings=readings,
         trusted=trusted if trusted.any() else None,
         learning=np.array(learning),
         load=identity.database.layout.unmeasured_load,
     )
-    posterior = estimate([vehicle.summary for vehicle in vehicles])
+    readings, doubts = merge_readings(vehicles, {}, equipment.branches)
+    posterior = estimate(summaries, readings=readings)
+    if bench:
+        wrong = contradicted_readings(posterior, bench, names, equipment.branches, full_scale_a)
+        used = {sensor: values for sensor, values in bench.items() if sensor not in wrong}
+        readings, doubts = merge_readings(vehicles, used, equipment.branches)
+        doubts += wrong.values()
+        posterior = estimate(summaries, readings=readings)
     assert posterior.health is not None
     trusted[list(posterior.health.distrusted)] = False
     findings = all_linear(vehicles)
@@ -100,7 +113,7 @@ def calibrate_fleet_posterior(
             workers=workers,
         )
     if findings.not_linear.any():
-        posterior = estimate(findings.summaries)
+        posterior = estimate(findings.summaries, readings=readings)
     health = posterior.health
     assert health is not None
     decision = decide(posterior, identity.database.layout, harm_limit=settings.harm_limit, doubtful=health.doubtful)
@@ -113,7 +126,7 @@ def calibrate_fleet_posterior(
         left_out=left_out,
         notices=(
             *health.warnings,
-            *trust_notices(names, health),
+            *trust_notices(names, trusted, health),
             *doubts,
             *window_notices(vehicles, trusted, equipment.branches, full_scale_a),
             *finding_notices(names, findings, equipment.branches),
@@ -187,7 +200,7 @@ def _parameters(
         layout=identity.layout,
         dbc=identity.dbc,
         verdict=deployment.verdicts[j],
-        confidence=_share(posterior.confidence[j]),
+        confidence=None if posterior.health and posterior.health.doubtful else _share(posterior.confidence[j]),
         branches={name: _branch(vehicle, posterior, deployment, (j, k), name=name) for k, name in enumerate(branches)},
         hardware_fault=HardwareFault(
             suspected=bool(deployment.hardware[j]),
@@ -212,6 +225,7 @@ def _branch(
 ) -> BranchParameters:
     k = vehicle.delays.branches.index(name)
     known = bool(vehicle.delays.known[k])
+    in_doubt = posterior.health is not None and place[1] in posterior.health.doubtful
     return BranchParameters(
         drift=float(posterior.faults.drift[place]),
         offset_a=float(posterior.faults.offset_a[place]),
@@ -221,8 +235,8 @@ def _branch(
         held_back=cast("HeldBack", str(deployment.held_back[place])) if deployment.held_back[place] else None,
         delay_s=float(vehicle.delays.delay_s[k]) if known else None,
         delay_sd_s=float(vehicle.delays.sd_s[k]) if known else None,
-        fault_probability=_share(posterior.sensor_fault[place]),
-        harm_probability=_share(posterior.harm[place]),
+        fault_probability=None if in_doubt else _share(posterior.sensor_fault[place]),
+        harm_probability=None if in_doubt else _share(posterior.harm[place]),
         identifiable=bool(posterior.identifiable[place]),
     )
 

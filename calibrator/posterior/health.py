@@ -29,6 +29,8 @@ SURE = 4.0
 """Standard deviations from which on a centre is off. [1]"""
 LEAST_COMMON_GAIN, LEAST_COMMON_OFFSET = 0.003, 0.001
 """Smallest common error that matters: gains, offsets in fractions of full scale. [1]"""
+HALF = 0.7
+"""Size over that of the largest cluster from which on another one is about as large. [1]"""
 ALIKE = 0.25
 """Relative difference up to which distances of second clusters count as one. [1]"""
 SECOND_SHARE, SECOND_GAIN, SECOND_DISTANCE = 0.15, 5.0, 4.0
@@ -145,7 +147,7 @@ def examine_reference(
                 f"an offset that most vehicles share; if the load is known, declare it (docs/method.md)"
             )
     return ReferenceHealth(
-        agreeing_share=tuple(share),
+        agreeing_share=tuple(found[0].share if found and found[0].spread <= MOST_SPREAD else 0.0 for found in slopes),
         mean_distance=tuple(distance),
         least_vehicles=least,
         unmeasured_a=unmeasured_a,
@@ -220,7 +222,7 @@ def _common_gains(rows: FleetRows, branches: Sequence[str], advice: str) -> tupl
     for k in range(1, K):
         row = K + k - 1
         found = _cluster(rows, row)
-        if found and found[0].share >= LEAST_SHARE:
+        if found and found[0].share >= LEAST_SHARE and not _may_be_at_zero(found):
             doubt = SURE * _uncertainty(found[0], _sd(rows, row)[_told(rows, row)])
             if abs(found[0].centre) > max(LEAST_COMMON_GAIN, doubt):
                 off[k] = found[0].centre
@@ -237,6 +239,12 @@ def _common_gains(rows: FleetRows, branches: Sequence[str], advice: str) -> tupl
     return [text], suspects
 
 
+def _may_be_at_zero(found: Sequence[Cluster]) -> bool:
+    """Whether a second cluster obeys the junction law, and is about as large: then not most vehicles share a fault."""
+    second = found[1] if len(found) > 1 else None
+    return second is not None and abs(second.centre) <= LEAST_COMMON_GAIN and second.share >= HALF * found[0].share
+
+
 def _no_cluster(
     slopes: Sequence[Sequence[Cluster]], branches: Sequence[str], doubtful: set[int], vehicles: int, advice: str
 ) -> list[str]:
@@ -246,7 +254,8 @@ def _no_cluster(
         if vehicles > LEAST_AGREEING and not (found and _agree(found[0])):
             doubtful.add(k)
             texts.append(
-                f"no cluster of vehicles agrees in branch {branches[k]}: every sensor of it may be faulty; {advice}"
+                f"no cluster of vehicles agrees in branch {branches[k]}: every sensor of it may be faulty, or its "
+                f"inputs do not tell its current (model_inputs of the layout; a branch that hardly ran); {advice}"
             )
     return texts
 

@@ -11,7 +11,7 @@ from calibrator.posterior.estimate import FleetPosterior
 from ecu_node.layout import Layout
 from ecu_node.parameters import HeldBack, Verdict
 
-__all__ = ["SUSPECTED", "Deployment", "decide"]
+__all__ = ["CONFIDENT", "SUSPECTED", "Deployment", "decide"]
 
 CONFIDENT = 0.95
 """Posterior probability from which on the calibrator says what it found. [1]"""

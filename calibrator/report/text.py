@@ -5,7 +5,7 @@ from typing import Any
 
 import msgspec
 
-__all__ = ["dumps", "left_out_text", "table", "told_once", "undecided_text"]
+__all__ = ["dumps", "left_out_text", "reasons_text", "table", "told_once"]
 
 MOST_NAMES = 6
 """Names told on one line: half a line of a terminal."""
@@ -47,13 +47,13 @@ def told_once(texts: Iterable[tuple[str, str]]) -> list[str]:
     return [f"{_few(found)}: {text}" for text, found in names.items()]
 
 
-def undecided_text(undecided: Mapping[str, str], most: int = 10) -> str:
-    """One line per reason why nothing can be told of vehicles, and what would decide; empty if there is none."""
-    if not undecided:
+def reasons_text(title: str, reasons: Mapping[str, str], most: int = 10) -> str:
+    """What is said of vehicles, one line per text with the vehicles that share it; empty if there is none."""
+    if not reasons:
         return ""
-    lines = told_once((name, reason or "no explanation stands out") for name, reason in undecided.items())
-    more = [f"  and {len(lines) - most} other reasons, see their parameter files"] if len(lines) > most else []
-    return "\n".join(["cannot tell:", *(f"  {line}" for line in lines[:most]), *more])
+    lines = told_once((name, reason or "no more is known") for name, reason in reasons.items())
+    more = [f"  and {len(lines) - most} other lines, see the parameter files"] if len(lines) > most else []
+    return "\n".join([f"{title}:", *(f"  {line}" for line in lines[:most]), *more])
 
 
 def left_out_text(left_out: Mapping[str, str]) -> str:

@@ -51,13 +51,22 @@ def test_explanations_that_differ_in_the_vehicle_alone_ask_for_its_inspection() 
 
 def test_of_a_branch_that_is_held_back_the_explanation_in_its_way_is_looked_at_not_the_second() -> None:
     found = [
-        explanation(0.990, drift=(0.1, 0.0), offset=(0.0, 0.02)),
-        explanation(0.008, drift=(0.2, 0.0), offset=(0.0, 0.02)),
+        explanation(0.958, drift=(0.1, 0.0), offset=(0.0, 0.02)),
+        explanation(0.040, drift=(0.2, 0.0), offset=(0.0, 0.02)),
         explanation(0.002, drift=(0.1, 0.0), offset=(0.02, 0.0)),
     ]
     assert "battery sensor against a reference" in deciding_evidence(found, NAMES, FULL_SCALE_A)
     text = deciding_evidence(found, NAMES, FULL_SCALE_A, concerned={1})
     assert "battery sensor then shows +0.0 A or +8.0 A" in text
+
+
+def test_an_improbable_explanation_is_no_rival_where_nothing_is_held_back() -> None:
+    found = [
+        explanation(0.99, drift=(0.1, 0.0), offset=(0.0, 0.0)),
+        explanation(0.01, drift=(0.0, 0.1), offset=(0.0, 0.0)),
+    ]
+    assert deciding_evidence(found, NAMES, FULL_SCALE_A) == ""
+    assert "check of the" in deciding_evidence(found, NAMES, FULL_SCALE_A, concerned={0})
 
 
 def test_explanations_that_agree_on_the_branch_held_back_do_not_decide_on_it() -> None:
@@ -145,3 +154,24 @@ def test_where_nothing_else_is_in_the_way_more_drives_decide(
     found = explanations(posterior.states, j)[:1]
     text = advise(posterior, decision, j, found, branches=NAMES, layout=database.layout)
     assert text.startswith("more drives would decide: the ")
+
+
+def test_the_fault_that_is_known_least_for_its_size_needs_more_drives(
+    posterior: FleetPosterior, database: VehicleDatabase
+) -> None:
+    faults = replace(
+        posterior.faults,
+        drift=np.tile([0.0, 0.06], (30, 1)),
+        offset_a=np.tile([60.0, 0.0], (30, 1)),
+    )
+    unsure = replace(
+        posterior,
+        faults=faults,
+        drift_sd=np.tile([0.0005, 0.006], (30, 1)),
+        offset_sd_a=np.tile([3.0, 0.5], (30, 1)),
+    )
+    decision = decide(posterior, database.layout, harm_limit=1.0, doubtful=())
+    decision = replace(decision, held_back=np.full_like(decision.held_back, ""))
+    found = [explanation(1.0, drift=(0.0, 0.06), offset=(0.15, 0.0))]
+    text = advise(unsure, decision, 0, found, branches=NAMES, layout=database.layout)
+    assert text.startswith("more drives would decide: the motor sensor's drift is known to +-0.60%")

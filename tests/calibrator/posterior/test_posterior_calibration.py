@@ -7,6 +7,7 @@ import pytest
 
 from calibrator.drive import Mask
 from calibrator.faults import Faults
+from calibrator.posterior.bench import contradicted_readings, trust_notices
 from calibrator.posterior.calibration import calibrate_posterior
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.health import ReferenceHealth
@@ -83,6 +84,24 @@ def test_a_trusted_vehicle_with_a_hardware_fault_does_not_carry_the_reference() 
     assert (np.delete(posterior.hardware_fault, 2) < 0.5).all()
 
 
+def test_a_bench_reading_that_the_drives_contradict_is_found_and_a_possible_one_is_not() -> None:
+    fleet = no_faults(VEHICLES, 2)
+    fleet.offset_a[0, 1] = 40.0
+    posterior, _ = calibrated(fleet, first(0))
+    names = [f"V{j}" for j in range(VEHICLES)]
+    nothing = (np.nan, np.nan)
+    bench = {
+        ("V0", "motor"): (*nothing, 40.0, 0.5),
+        ("V0", "battery"): (0.2, 0.002, *nothing),
+        ("V1", "battery"): (*nothing, -30.0, 0.5),
+        ("V2", "motor"): (0.001, 0.002, 0.1, 0.5),
+        ("gone", "motor"): (0.4, 0.002, *nothing),
+    }
+    found = contradicted_readings(posterior, bench, names, ("battery", "motor"), FULL_SCALE_A)
+    assert set(found) == {("V0", "battery"), ("V1", "battery")}
+    assert found["V1", "battery"].startswith("vehicle V1: the bench reading of its battery sensor is not what its")
+
+
 def test_two_trusted_vehicles_are_evidence_and_do_not_carry_the_reference() -> None:
     fleet = no_faults(VEHICLES, 2)
     fleet = replace(fleet, hardware_drift=np.where(np.arange(VEHICLES) == 1, 0.1, 0.0))
@@ -90,3 +109,6 @@ def test_two_trusted_vehicles_are_evidence_and_do_not_carry_the_reference() -> N
     assert (health.distrusted, health.differing) == ({}, ())
     assert posterior.hardware_fault[1] > 0.9
     assert (np.delete(posterior.hardware_fault, 1) < 0.5).all()
+    (notice,) = trust_notices([f"V{j}" for j in range(VEHICLES)], first(2), health)
+    assert notice == "only 2 of the trusted vehicles can carry the reference, 3 are needed: it is the fleet's"
+    assert trust_notices([], first(3), health) == trust_notices([], first(0), health) == []

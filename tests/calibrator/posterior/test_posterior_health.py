@@ -89,6 +89,16 @@ def test_with_three_branches_the_batch_is_named_alone(branch: int) -> None:
     assert f"in branch {NAMES[branch]};" in health.warnings[0]
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_batch_in_half_of_the_fleet_is_a_second_cluster_and_not_what_most_share(seed: int) -> None:
+    none = np.zeros((16, 3))
+    fleet = Faults(hardware_drift=np.zeros(16), hardware_offset_a=none, drift=none.copy(), offset_a=none.copy())
+    fleet.drift[:8, 0] = 0.06
+    health = examined(fleet, seed=seed)
+    assert not any("breaks the junction law" in text for text in health.warnings)
+    assert any("second cluster" in text and "battery" in text for text in health.warnings)
+
+
 def test_an_offset_that_most_vehicles_share_is_noticed_and_doubted() -> None:
     fleet = random_faults(8, vehicles=60, branches=2, sparsity=80.0)
     offset = fleet.offset_a.copy()

@@ -1,7 +1,7 @@
 """Equal notices of many drives are told once."""
 
 from calibrator.report.notices import Notice, merged_notices
-from calibrator.report.text import left_out_text, told_once, undecided_text
+from calibrator.report.text import left_out_text, reasons_text, told_once
 
 
 def spoilt(bad: int, of: int) -> Notice:
@@ -37,14 +37,14 @@ def test_one_reason_of_many_vehicles_is_one_line() -> None:
     line = "V001, V002, V003, V004, V005, V006 and 38 more: too short"
     assert told_once((name, "too short") for name in names) == [line]
     assert left_out_text(dict.fromkeys(names, "too short")) == f"left out:\n  {line}"
-    assert undecided_text(dict.fromkeys(names, "too short")) == f"cannot tell:\n  {line}"
+    assert reasons_text("cannot tell", dict.fromkeys(names, "too short")) == f"cannot tell:\n  {line}"
 
 
 def test_many_reasons_for_which_nothing_can_be_told_are_cut_short() -> None:
-    lines = undecided_text({f"V{k:03}": f"reason {k}" for k in range(12)}).splitlines()
+    lines = reasons_text("cannot tell", {f"V{k:03}": f"reason {k}" for k in range(12)}).splitlines()
     assert lines[1:3] == ["  V000: reason 0", "  V001: reason 1"]
-    assert lines[-1] == "  and 2 other reasons, see their parameter files"
+    assert lines[-1] == "  and 2 other lines, see the parameter files"
 
 
 def test_nothing_to_tell_is_no_text() -> None:
-    assert (left_out_text({}), undecided_text({})) == ("", "")
+    assert (left_out_text({}), reasons_text("cannot tell", {})) == ("", "")
