@@ -64,11 +64,8 @@ def without_copies(fleet: FleetSource) -> FleetSource:
 def _notice(copy: DriveFile, original: DriveFile) -> str:
     if copy.vehicle == original.vehicle:
         return f"vehicle {copy.vehicle}: drive {copy.name} is the same recording as {original.name}, and counts once"
-    return f"vehicle {copy.vehicle}: drive {copy.name} is left out: same recording as {_label(original)}; {WHOSE}"
-
-
-def _label(entry: DriveFile) -> str:
-    return f"{entry.vehicle}/{entry.name}"
+    same = f"same recording as {original.vehicle}/{original.name}"
+    return f"vehicle {copy.vehicle}: drive {copy.name} is left out: {same}; {WHOSE}"
 
 
 def _groups(entries: Iterable[DriveFile], key: Callable[[Path], Hashable]) -> list[list[DriveFile]]:

@@ -14,6 +14,7 @@ from matplotlib.transforms import ScaledTranslation
 
 from calibrator.drive import Array
 from calibrator.experiments.calibration_experiment import ALL
+from calibrator.experiments.caption import PAPER
 from calibrator.experiments.delay_experiment import LEFT_IN
 from calibrator.experiments.methods import CEILING, PERFECT, POSTERIOR, THRESHOLD, TREE
 from calibrator.experiments.outcome import BINS
@@ -37,7 +38,6 @@ FEW = 30
 MARGIN = 0.08
 """Of the range of values, left and right of them. [1]"""
 SPREAD = "error bars: sd over repetitions"
-PAPER = "paper"
 GREY = "0.6"
 
 

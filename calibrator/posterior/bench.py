@@ -16,7 +16,15 @@ from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.health import ReferenceHealth
 from calibrator.posterior.model_spread import FEWEST_TRUSTED
 
-__all__ = ["contradicted_readings", "merge_readings", "read_bench", "trust_notices", "trusted_of", "window_notices"]
+__all__ = [
+    "believed",
+    "contradicted_readings",
+    "merge_readings",
+    "read_bench",
+    "trust_notices",
+    "trusted_of",
+    "window_notices",
+]
 
 LEAST_PROBABILITY = 1e-4
 """Of the explanations near a bench reading: below, the drives contradict it. [1]"""
@@ -143,9 +151,15 @@ def contradicted_readings(
     return found
 
 
+def believed(trusted: Mask, health: ReferenceHealth | None) -> Mask:
+    """Trusted vehicles less those that break the junction law by themselves, shape (N,)."""
+    distrusted = [] if health is None else list(health.distrusted)
+    return np.asarray(trusted & ~np.isin(np.arange(len(trusted)), distrusted))
+
+
 def trust_notices(names: Sequence[str], trusted: Mask, health: ReferenceHealth) -> list[str]:
     """Trusted vehicles that contradict the trust in them, or are too few to carry the reference."""
-    carriers = int(np.count_nonzero(trusted)) - len(health.differing)
+    carriers = int(np.count_nonzero(believed(trusted, health))) - len(health.differing)
     too_few = (
         f"only {carriers} of the trusted vehicles can carry the reference, {FEWEST_TRUSTED} are needed: "
         f"it is the fleet's"

@@ -1,6 +1,6 @@
 """The default method on a fleet's drive summaries: fleet model, evidence rows, posterior."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -99,13 +99,8 @@ def calibrate_posterior(
         learning=learnt,
         load=None if load is None else load.mean_a / full_scale_a,
     )
-    posterior = estimate(trusted=carriers)
-    differing = carriers & (posterior.hardware_fault > SUSPECTED)
-    if np.count_nonzero(carriers) < FEWEST_TRUSTED:
-        differing[:] = False
-    if differing.any():
-        carriers &= ~differing
-        posterior = estimate(trusted=carriers)
+    posterior, differing = _carried_by(estimate, carriers)
+    carriers &= ~differing
     health = examine_reference(
         rows.take(learnt),
         [names[k] for k in order],
@@ -116,6 +111,15 @@ def calibrate_posterior(
     )
     health = replace(health, distrusted=distrusted, differing=tuple(np.flatnonzero(differing).tolist()))
     return _in_own_order(posterior, health, order)
+
+
+def _carried_by(estimate: Callable[..., FleetPosterior], trusted: Mask) -> tuple[FleetPosterior, Mask]:
+    """Posterior whose reference trusted vehicles carry, and those of them that differ as by a hardware fault."""
+    posterior = estimate(trusted=trusted)
+    if np.count_nonzero(trusted) < FEWEST_TRUSTED:
+        return posterior, np.zeros_like(trusted)
+    differing = np.asarray(trusted & (posterior.hardware_fault > SUSPECTED))
+    return (estimate(trusted=trusted & ~differing) if differing.any() else posterior), differing
 
 
 def _most_moving_first(summaries: Sequence[DriveSummary]) -> list[int]:

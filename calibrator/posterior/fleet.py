@@ -4,7 +4,7 @@ If asked to, the drives are read a second time to find sensors that are not line
 computed anew from the linear parts of all sensors.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import cast
 
@@ -14,10 +14,12 @@ from calibrator.calibration_settings import CalibrationSettings, FleetOutcome, r
 from calibrator.drive import Mask
 from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
+from calibrator.evidence.readings import Readings
 from calibrator.evidence.vehicle_summary import VehicleSummary, read_vehicle_summary
 from calibrator.parameter_files import RunIdentity, by_branch, junction_rms_a
 from calibrator.posterior.advice import advise
 from calibrator.posterior.bench import (
+    believed,
     contradicted_readings,
     merge_readings,
     read_bench,
@@ -25,6 +27,7 @@ from calibrator.posterior.bench import (
     trusted_of,
     window_notices,
 )
+from calibrator.posterior.bench_table import BenchReadings
 from calibrator.posterior.calibration import calibrate_posterior
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.explain import explanations
@@ -81,25 +84,15 @@ def calibrate_fleet_posterior(
     names = [vehicle.vehicle for vehicle in vehicles]
     learning = require_learning(names, settings, left_out)
     trusted = trusted_of(names, settings.trusted, fleet)
-    summaries = [vehicle.summary for vehicle in vehicles]
     estimate = partial(
         calibrate_posterior,
         full_scale_a=full_scale_a,
         branches=equipment.branches,
-        trusted=trusted if trusted.any() else None,
+        trusted=trusted,
         learning=np.array(learning),
         load=identity.database.layout.unmeasured_load,
     )
-    readings, doubts = merge_readings(vehicles, {}, equipment.branches)
-    posterior = estimate(summaries, readings=readings)
-    if bench:
-        wrong = contradicted_readings(posterior, bench, names, equipment.branches, full_scale_a)
-        used = {sensor: values for sensor, values in bench.items() if sensor not in wrong}
-        readings, doubts = merge_readings(vehicles, used, equipment.branches)
-        doubts += wrong.values()
-        posterior = estimate(summaries, readings=readings)
-    assert posterior.health is not None
-    trusted[list(posterior.health.distrusted)] = False
+    posterior, readings, doubts = _first_pass(estimate, vehicles, bench, equipment.branches, full_scale_a)
     findings = all_linear(vehicles)
     if settings.sensor_models:
         findings = find_sensor_models(
@@ -109,7 +102,7 @@ def calibrate_fleet_posterior(
             equipment,
             identity.database,
             learning=np.array(learning),
-            trusted=trusted,
+            trusted=believed(trusted, posterior.health),
             workers=workers,
         )
     if findings.not_linear.any():
@@ -128,11 +121,32 @@ def calibrate_fleet_posterior(
             *health.warnings,
             *trust_notices(names, trusted, health),
             *doubts,
-            *window_notices(vehicles, trusted, equipment.branches, full_scale_a),
+            *window_notices(vehicles, believed(trusted, health), equipment.branches, full_scale_a),
             *finding_notices(names, findings, equipment.branches),
         ),
         details=_details(posterior, equipment.branches),
     )
+
+
+def _first_pass(
+    estimate: Callable[..., FleetPosterior],
+    vehicles: Sequence[VehicleSummary],
+    bench: BenchReadings,
+    branches: Sequence[str],
+    full_scale_a: float,
+) -> tuple[FleetPosterior, Readings, list[str]]:
+    """Posterior of sensors that are taken for linear, the readings that were used, and what is to be said of them."""
+    summaries = [vehicle.summary for vehicle in vehicles]
+    readings, notices = merge_readings(vehicles, {}, branches)
+    posterior = estimate(summaries, readings=readings)
+    if bench:
+        names = [vehicle.vehicle for vehicle in vehicles]
+        wrong = contradicted_readings(posterior, bench, names, branches, full_scale_a)
+        used = {sensor: values for sensor, values in bench.items() if sensor not in wrong}
+        readings, notices = merge_readings(vehicles, used, branches)
+        notices += wrong.values()
+        posterior = estimate(summaries, readings=readings)
+    return posterior, readings, notices
 
 
 def _parameter_files(

@@ -130,30 +130,37 @@ def examine_reference(
             f"to trust its reference; {advice}"
         )
     warnings += _common_offset(rows, doubtful, full_scale_a, load, advice)
-    unmeasured_a = 0.0 if load is None else load.mean_a
-    if load is None:
-        found = unmeasured_load(rows.constant[:, K], _sd(rows, 4 * K - 1))
-        most_a = found.centre * full_scale_a
-        unmeasured_a = most_a if load_in_use_a is None else load_in_use_a
-        doubt_a = max(LEAST_COMMON_OFFSET, SURE * _uncertainty(found, _sd(rows, 4 * K - 1))) * full_scale_a
-        if carried and abs(most_a - unmeasured_a) > doubt_a:
-            warnings.append(
-                f"the currents of most vehicles sum to {most_a:+.1f} A, those of the trusted ones to "
-                f"{unmeasured_a:+.1f} A: the rest is an offset that most vehicles share"
-            )
-        elif abs(most_a) > doubt_a:
-            warnings.append(
-                f"the currents of most vehicles sum to {most_a:+.1f} A: a load without a sensor, as is taken here, or "
-                f"an offset that most vehicles share; if the load is known, declare it (docs/method.md)"
-            )
+    texts, unmeasured_a = _load(rows, full_scale_a, load_in_use_a, carried=bool(carried))
+    warnings += [] if load is not None else texts
     return ReferenceHealth(
         agreeing_share=tuple(found[0].share if found and found[0].spread <= MOST_SPREAD else 0.0 for found in slopes),
         mean_distance=tuple(distance),
         least_vehicles=least,
-        unmeasured_a=unmeasured_a,
+        unmeasured_a=unmeasured_a if load is None else load.mean_a,
         doubtful=tuple(sorted(doubtful - carried)),
         warnings=tuple(warnings),
     )
+
+
+def _load(rows: FleetRows, full_scale_a: float, in_use_a: float | None, *, carried: bool) -> tuple[list[str], float]:
+    """What most vehicles' currents sum to where a load without a sensor can make it, and the load that is taken. [A]"""
+    sd = _sd(rows, 4 * rows.branches - 1)
+    found = unmeasured_load(rows.constant[:, rows.branches], sd)
+    most_a = found.centre * full_scale_a
+    taken_a = most_a if in_use_a is None else in_use_a
+    doubt_a = max(LEAST_COMMON_OFFSET, SURE * _uncertainty(found, sd)) * full_scale_a
+    texts = []
+    if carried and abs(most_a - taken_a) > doubt_a:
+        texts.append(
+            f"the currents of most vehicles sum to {most_a:+.1f} A, those of the trusted ones to {taken_a:+.1f} A: the "
+            f"rest is an offset that most vehicles share"
+        )
+    elif abs(most_a) > doubt_a:
+        texts.append(
+            f"the currents of most vehicles sum to {most_a:+.1f} A: a load without a sensor, as is taken here, or an "
+            f"offset that most vehicles share; if the load is known, declare it (docs/method.md)"
+        )
+    return texts, taken_a
 
 
 def _carried(rows: FleetRows, trusted: Mask | None) -> set[int]:
