@@ -1,17 +1,17 @@
 """Evidence rows of a fleet from its drive summaries, with covariances earned from the spread between blocks."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calibrator.drive import Array, Mask
+from calibrator.drive import Array
 from calibrator.evidence.fleet_model import FleetModel, regress_on_fleet
+from calibrator.evidence.fleet_moments import FleetMoments
 from calibrator.evidence.junction_law import junction_law
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, LineMeans
-from calibrator.evidence.summary import DriveSummary
 
-__all__ = ["collect_rows"]
+__all__ = ["RawRows", "collect_rows"]
 
 LEAST_GAIN = 0.3
 """Slopes and gain ratios below are no sensor's, but those of a branch that hardly moved. [1]"""
@@ -23,71 +23,89 @@ LEAST_SD = np.array([5e-5, 1e-5])
 """Least deviation of relative and constant rows: resolution of the signals and of their interpolation. [1]"""
 
 
-@dataclass(frozen=True)
-class _Raw:
-    """Rows of one vehicle: a (K), -g (K - 1), b (K), c (1), the latter two over full scale.
+@dataclass(frozen=True, kw_only=True)
+class RawRows:
+    """Rows of N vehicles as their own blocks tell them.
 
-    ``means`` (2, K) are those of the fleet model's and the measured currents over full scale. ``covariance`` is of the
-    ratios and of what the lines are at these means: b + a mean, and c and what the other currents make of it. At zero,
-    ratios and constants are correlated by the distance of the means, and no average over vehicles would respect that.
+    Attributes
+    ----------
+    values : ndarray of shape (N, 3K)
+        a (K), -g (K - 1), b (K), c (1), the latter two in fractions of full scale. [1]
+    means : LineMeans
+        Of the fleet model's and of the measured currents.
+    covariance : ndarray of shape (N, 3K, 3K)
+        Of the ratios and of what the lines are at these means: b + a mean, and c and what the other currents make of
+        it. At zero, ratios and constants are correlated by the distance of the means, and no average over vehicles
+        would respect that. [1]
+    blocks : ndarray of int of shape (N,)
+        Number of blocks.
     """
 
     values: Array
-    means: Array
+    means: LineMeans
     covariance: Array
-    blocks: int
+    blocks: NDArray[np.int64]
+
+    def usual_correlation(self) -> Array:
+        """Mean correlation of the rows over the vehicles, shape (3K, 3K). [1]"""
+        return np.asarray(_correlations(self.covariance).mean(axis=0))
+
+    def steadied(self, usual: Array) -> FleetRows:
+        """Rows whose correlations lie between each vehicle's own and the fleet's: few blocks tell few of them.
+
+        Parameters
+        ----------
+        usual : ndarray of shape (3K, 3K)
+            Correlation of the rows that is usual in the fleet. [1]
+
+        Returns
+        -------
+        FleetRows
+            Without bench readings.
+        """
+        blocks = self.blocks[:, None, None]
+        correlation = (blocks * _correlations(self.covariance) + FLEET_BLOCKS * usual) / (blocks + FLEET_BLOCKS)
+        own = range(len(usual))
+        correlation[:, own, own] = 1.0
+        sd = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        return _rows(self.values, self.means, correlation * sd[:, :, None] * sd[:, None, :])
 
 
-def collect_rows(
-    summaries: Sequence[DriveSummary], model: FleetModel, *, full_scale_a: float, learning: Mask | None = None
-) -> FleetRows:
+def collect_rows(fleet: FleetMoments, model: FleetModel, *, full_scale_a: float) -> RawRows:
     """Evidence of every vehicle of a fleet.
 
     Parameters
     ----------
-    summaries : sequence of DriveSummary
-        One per vehicle.
+    fleet : FleetMoments
+        Of N vehicles.
     model : FleetModel
         Of the same fleet.
     full_scale_a : float
         Full scale of the junction. [A]
-    learning : ndarray of bool of shape (N,) or None
-        Vehicles from which the fleet's usual correlation of the rows is learnt; None: all.
 
     Returns
     -------
-    FleetRows
-        Slopes and intercepts over the fleet model, and the junction law; no bench readings.
+    RawRows
+        Slopes and intercepts over the fleet model, and the junction law.
     """
-    raw = [_of_vehicle(summary, model, full_scale_a) for summary in summaries]
-    correlations = np.stack([_correlation(vehicle.covariance) for vehicle in raw])
-    usual = correlations.mean(axis=0) if learning is None else correlations[learning].mean(axis=0)
-    covariance = np.stack([_steadied(vehicle, usual) for vehicle in raw])
-    means = LineMeans(
-        model=np.stack([vehicle.means[0] for vehicle in raw]), measured=np.stack([vehicle.means[1] for vehicle in raw])
-    )
-    return _rows(np.stack([vehicle.values for vehicle in raw]), means, covariance)
-
-
-def _of_vehicle(summary: DriveSummary, model: FleetModel, full_scale_a: float) -> _Raw:
-    K = summary.branches
-    slopes, law = regress_on_fleet(summary, model.read_out), junction_law(summary)
-    estimate = np.concatenate([*(fit.estimate for fit in slopes), law.estimate])
-    influence = np.concatenate([*(fit.influence for fit in slopes), law.influence], axis=1)
-    covariance = influence.T @ influence
-    for k, fit in enumerate([*slopes, law]):
-        part = slice(2 * k, 2 * k + len(fit.estimate))
-        covariance[part, part] += fit.prior_covariance
-    order = [*range(0, 2 * K, 2), *range(2 * K, 3 * K - 1), *range(1, 2 * K, 2), 3 * K - 1]
+    M, K, N = fleet.inputs, fleet.branches, len(fleet)
+    fits = [*regress_on_fleet(fleet, model.read_out), junction_law(fleet)]
+    influence = np.concatenate([fit.influence for fit in fits], axis=1)
+    covariance = fleet.blocks.total(influence[:, :, None] * influence[:, None, :])
+    for k, fit in enumerate(fits):
+        part = slice(2 * k, 2 * k + fit.estimate.shape[1])
+        covariance[:, part, part] += fit.prior_covariance
+    order = np.array([*range(0, 2 * K, 2), *range(2 * K, 3 * K - 1), *range(1, 2 * K, 2), 3 * K - 1])
     unit = np.concatenate([np.ones(K), -np.ones(K - 1), np.full(K + 1, 1.0 / full_scale_a)])
-    inputs = summary.total[-1, : summary.inputs] / summary.total[-1, -1]
-    means = np.stack([np.append(inputs, 1.0) @ model.read_out, summary.mean_a]) / full_scale_a
-    lever = np.zeros((K + 1, 2 * K - 1))
-    lever[:K, :K], lever[K, K:] = np.diag(means[0]), -means[1, 1:]
-    covariance = _turned(covariance[order][:, order] * np.outer(unit, unit), lever)
-    if len(influence) < FEWEST_BLOCKS:
-        covariance = UNKNOWN_VARIANCE * np.eye(3 * K)
-    return _Raw(estimate[order] * unit, means, covariance, len(influence))
+    inputs = fleet.mean[:, -1, [*range(M), -1]]
+    means = LineMeans(model=inputs @ model.read_out / full_scale_a, measured=fleet.mean_a / full_scale_a)
+    lever = np.zeros((N, K + 1, 2 * K - 1))
+    lever[:, range(K), range(K)] = means.model
+    lever[:, K, K:] = -means.measured[:, 1:]
+    covariance = _turned(covariance[:, order[:, None], order] * np.outer(unit, unit), lever)
+    covariance[fleet.blocks.count < FEWEST_BLOCKS] = UNKNOWN_VARIANCE * np.eye(3 * K)
+    estimate = np.concatenate([fit.estimate for fit in fits], axis=1)
+    return RawRows(values=estimate[:, order] * unit, means=means, covariance=covariance, blocks=fleet.blocks.count)
 
 
 def _turned(covariance: Array, lever: Array) -> Array:
@@ -98,19 +116,11 @@ def _turned(covariance: Array, lever: Array) -> Array:
     return np.asarray(turn @ covariance @ np.swapaxes(turn, -1, -2))
 
 
-def _correlation(covariance: Array) -> Array:
-    sd = np.sqrt(np.diag(covariance))
+def _correlations(covariance: Array) -> Array:
+    """Correlations of shape (N, p, p); zero where there is no variance."""
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     safe = np.where(sd > 0.0, sd, np.inf)
-    return np.asarray(covariance / np.outer(safe, safe))
-
-
-def _steadied(vehicle: _Raw, usual: Array) -> Array:
-    """Covariance whose correlations lie between the vehicle's own and the fleet's: few blocks tell few of them."""
-    own = _correlation(vehicle.covariance)
-    correlation = (vehicle.blocks * own + FLEET_BLOCKS * usual) / (vehicle.blocks + FLEET_BLOCKS)
-    np.fill_diagonal(correlation, 1.0)
-    sd = np.sqrt(np.diag(vehicle.covariance))
-    return np.asarray(correlation * np.outer(sd, sd))
+    return np.asarray(covariance / (safe[:, :, None] * safe[:, None, :]))
 
 
 def _rows(values: Array, means: LineMeans, covariance: Array) -> FleetRows:

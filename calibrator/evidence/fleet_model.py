@@ -10,14 +10,13 @@ drive (2), every vehicle is compared on its own drive, so that what its drive do
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from calibrator.drive import Array
-from calibrator.evidence.block_regression import BlockRegression, regress_blocks
-from calibrator.evidence.summary import DriveSummary
+from calibrator.evidence.block_regression import VehicleRegressions, regress_vehicles
+from calibrator.evidence.fleet_moments import FleetMoments
 from calibrator.posterior.cluster import densest_clusters
 
 __all__ = ["FleetModel", "fit_fleet_model", "regress_on_fleet"]
@@ -47,73 +46,77 @@ class FleetModel:
     read_out: Array
 
 
-def fit_fleet_model(summaries: Sequence[DriveSummary]) -> FleetModel:
+def fit_fleet_model(fleet: FleetMoments) -> FleetModel:
     """Learn the fleet model.
 
     Parameters
     ----------
-    summaries : sequence of DriveSummary
-        One per vehicle, with the same inputs and branches.
+    fleet : FleetMoments
+        Of the vehicles to learn from.
 
     Returns
     -------
     FleetModel
         With the scale and zero of the vehicles that agree.
     """
-    totals = [summary.total / summary.total[-1, -1] for summary in summaries]
-    K = summaries[0].branches
-    slopes = np.ones((len(totals), K))
+    K = fleet.branches
+    slopes = np.ones((len(fleet), K))
     for _ in range(ROUNDS):
-        read_out = _fit_read_out(totals, slopes)
-        fits = [regress_on_fleet(summary, read_out) for summary in summaries]
-        values = np.array([[fit.estimate for fit in branches] for branches in fits])
-        sd = np.maximum([[fit.sd for fit in branches] for branches in fits], LEAST_SD)
+        read_out = _fit_read_out(fleet.mean, slopes)
+        fits = regress_on_fleet(fleet, read_out)
+        values = np.stack([fit.estimate for fit in fits], axis=1)
+        sd = np.maximum(np.stack([fit.sd for fit in fits], axis=1), LEAST_SD)
         centre = np.array(
             [[densest_clusters(values[:, k, i], sd[:, k, i])[0].centre for i in (0, 1)] for k in range(K)]
         )
         read_out = read_out * centre[:, 0]
         read_out[-1] += centre[:, 1]
         slopes = values[:, :, 0] / centre[:, 0]
-    return FleetModel(read_out=_on_junction_law(read_out, totals))
+    return FleetModel(read_out=_on_junction_law(read_out, fleet.mean))
 
 
-def regress_on_fleet(summary: DriveSummary, read_out: Array) -> list[BlockRegression]:
-    """Slope and intercept (15) of each branch of one vehicle over the fleet model on its own drives.
+def regress_on_fleet(fleet: FleetMoments, read_out: Array) -> list[VehicleRegressions]:
+    """Slope and intercept (15) of each branch of each vehicle over the fleet model on its own drives.
 
     Parameters
     ----------
-    summary : DriveSummary
-        Of the vehicle.
+    fleet : FleetMoments
+        Of N vehicles.
     read_out : ndarray of shape (M + 1, K)
         Of the fleet model. [A]
 
     Returns
     -------
-    list of K BlockRegression
+    list of K VehicleRegressions
         Of (a_k [1], b_k [A]).
     """
-    M, K = summary.inputs, summary.branches
-    u = [*range(M), -1]
-    gram_u, total = summary.moments[:, u][:, :, u], summary.total
+    M, K = fleet.inputs, fleet.branches
+    u = np.array([*range(M), M + K])
+    gram_u = fleet.moments[:, u[:, None], u]
     found = []
     for k in range(K):
         z = np.column_stack([read_out[:, k], np.append(np.zeros(M), 1.0)])
-        gram = z.T @ gram_u @ z
-        right = summary.moments[:, u, M + k] @ z
-        power = float(total[M + k, M + k] / total[-1, -1])
-        prior = {"prior_mean": np.array([1.0, 0.0]), "prior_precision": np.array([SLOPE_SD**-2, 0.0])}
-        found.append(regress_blocks(gram, right, power, **prior))
+        found.append(
+            regress_vehicles(
+                z.T @ gram_u @ z,
+                fleet.moments[:, u, M + k] @ z,
+                fleet.mean[:, M + k, M + k],
+                fleet.blocks,
+                prior_mean=np.array([1.0, 0.0]),
+                prior_precision=np.array([SLOPE_SD**-2, 0.0]),
+            )
+        )
     return found
 
 
-def _on_junction_law(read_out: Array, totals: Sequence[Array]) -> Array:
+def _on_junction_law(read_out: Array, means: Array) -> Array:
     """Read-outs that sum to zero: ideal currents do, whatever the inputs.
 
     What is left over of the inputs is shared by the branches as their currents' variance. What is left over of the
     constants is the mean load that no branch measures: it is taken from the source, as it does not grow with others.
     """
     M = len(read_out) - 1
-    mean = np.mean(totals, axis=0)
+    mean = means.mean(axis=0)
     u = [*range(M), -1]
     mean_a = mean[-1, u] @ read_out
     variance_a2 = np.diag(read_out.T @ mean[np.ix_(u, u)] @ read_out) - mean_a**2
@@ -124,14 +127,14 @@ def _on_junction_law(read_out: Array, totals: Sequence[Array]) -> Array:
     return projected
 
 
-def _fit_read_out(totals: Sequence[Array], slopes: Array) -> Array:
+def _fit_read_out(means: Array, slopes: Array) -> Array:
     """Least squares of the read-outs about each vehicle's own means, all vehicles alike however long they drove.
 
     As every vehicle has an intercept of its own, its means say nothing of the read-outs; the constants stay zero.
     """
     K = slopes.shape[1]
-    M = len(totals[0]) - 1 - K
-    centred = np.stack([total - np.outer(total[:, -1], total[-1]) for total in totals])
+    M = means.shape[1] - 1 - K
+    centred = means - means[:, :, -1:] * means[:, -1:, :]
     read_out = np.zeros((M + 1, K))
     for k in range(K):
         gram = np.einsum("n,npq->pq", slopes[:, k] ** 2, centred[:, :M, :M])

@@ -13,8 +13,8 @@ share equally as far as the first bound allows.
 import numpy as np
 
 from calibrator.drive import Array
-from calibrator.evidence.block_regression import BlockRegression, regress_blocks
-from calibrator.evidence.summary import DriveSummary
+from calibrator.evidence.block_regression import VehicleRegressions, regress_vehicles
+from calibrator.evidence.fleet_moments import FleetMoments
 
 __all__ = ["junction_law"]
 
@@ -28,52 +28,56 @@ LEAST_WEIGHT = 0.1
 """Of a branch in the junction sum, where its share of the residual is bounded. [1]"""
 
 
-def junction_law(summary: DriveSummary) -> BlockRegression:
+def junction_law(fleet: FleetMoments) -> VehicleRegressions:
     """Regress the first measured current on the others.
 
     Parameters
     ----------
-    summary : DriveSummary
-        Of one vehicle; its first branch should be the one that moves most.
+    fleet : FleetMoments
+        Of N vehicles; the first branch should be the one that moves most.
 
     Returns
     -------
-    BlockRegression
+    VehicleRegressions
         Of (g_2 .. g_K [1], c [A]).
     """
-    M, K = summary.inputs, summary.branches
-    z = [*range(M + 1, M + K), -1]
-    gram, right = summary.moments[:, z][:, :, z], summary.moments[:, z, M]
-    samples, total = summary.moments[:, -1, -1], summary.total
+    M, K = fleet.inputs, fleet.branches
+    z = np.array([*range(M + 1, M + K), M + K])
+    gram, right = fleet.moments[:, z[:, None], z], fleet.moments[:, z, M]
+    samples, currents = fleet.moments[:, -1, -1], fleet.mean[:, M:, M:]
     prior_mean = np.append(-np.ones(K - 1), 0.0)
     prior_precision = np.append(np.full(K - 1, GAIN_SD**-2), 0.0)
-    bound = np.minimum(summary.noise_a2.mean(axis=0), MOST_NOISE * summary.variance_a2)
-    noise: Array = np.zeros(K)
+    usual = fleet.blocks.total(fleet.noise_a2) / fleet.blocks.count[:, None]
+    bound = np.minimum(usual, MOST_NOISE * fleet.variance_a2)
+    noise, others = np.zeros_like(bound), range(K - 1)
     for _ in range(NOISE_ROUNDS):
-        clean = gram - samples[:, None, None] * np.diag(np.append(noise[1:], 0.0))
-        power = float(total[M, M] / total[-1, -1])
-        fit = regress_blocks(clean, right, power, prior_mean=prior_mean, prior_precision=prior_precision)
-        noise = _shared(_residual_a2(total, M, K, fit.estimate), bound, _weights(fit.estimate))
+        clean = gram.copy()
+        clean[:, others, others] -= samples[:, None] * noise[fleet.blocks.vehicle, 1:]
+        fit = regress_vehicles(
+            clean, right, currents[:, 0, 0], fleet.blocks, prior_mean=prior_mean, prior_precision=prior_precision
+        )
+        noise = _shared(_residual_a2(currents, fit.estimate), bound, _weights(fit.estimate))
     return fit
 
 
-def _shared(residual_a2: float, bound_a2: Array, weights: Array) -> Array:
-    """Noise of each current, equal up to its bound, that adds up to the residual at most. [A^2]"""
-    order = np.argsort(bound_a2, kind="stable")
-    bound, weight = bound_a2[order], weights[order]
-    below = np.concatenate([[0.0], np.cumsum(weight * bound)[:-1]])
-    level = (residual_a2 - below) / np.cumsum(weight[::-1])[::-1]
-    reached = np.flatnonzero(level <= bound)
-    return np.minimum(bound_a2, level[reached[0]]) if reached.size else bound_a2
+def _shared(residual_a2: Array, bound_a2: Array, weights: Array) -> Array:
+    """Noise of each current (N, K), equal up to its bound, that adds up to the residual (N,) at most. [A^2]"""
+    order = np.argsort(bound_a2, axis=1, kind="stable")
+    bound, weight = np.take_along_axis(bound_a2, order, axis=1), np.take_along_axis(weights, order, axis=1)
+    below = np.cumsum(weight * bound, axis=1) - weight * bound
+    level = (residual_a2[:, None] - below) / np.cumsum(weight[:, ::-1], axis=1)[:, ::-1]
+    reached = np.asarray(level <= bound)
+    first = np.take_along_axis(level, np.argmax(reached, axis=1)[:, None], axis=1)
+    return np.where(reached.any(axis=1)[:, None], np.minimum(bound_a2, first), bound_a2)
 
 
 def _weights(estimate: Array) -> Array:
-    """Squares of the weights of each branch in the junction sum, first branch 1."""
-    return np.asarray(np.maximum(np.append(1.0, estimate[:-1]) ** 2, LEAST_WEIGHT))
+    """Squares of the weights of each branch in the junction sum, first branch 1, shape (N, K)."""
+    gains = np.concatenate([np.ones((len(estimate), 1)), estimate[:, :-1]], axis=1)
+    return np.asarray(np.maximum(gains**2, LEAST_WEIGHT))
 
 
-def _residual_a2(total: Array, first: int, branches: int, estimate: Array) -> float:
-    """Mean square of what the junction law leaves of the first current. [A^2]"""
-    columns = [*range(first, first + branches), -1]
-    weights = np.concatenate([[1.0], -estimate])
-    return max(float(weights @ total[np.ix_(columns, columns)] @ weights / total[-1, -1]), 0.0)
+def _residual_a2(currents: Array, estimate: Array) -> Array:
+    """Mean square of what the junction law leaves of the first current, shape (N,). [A^2]"""
+    weights = np.concatenate([np.ones((len(estimate), 1)), -estimate], axis=1)
+    return np.asarray(np.maximum(np.einsum("np,npq,nq->n", weights, currents, weights), 0.0))

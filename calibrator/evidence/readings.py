@@ -10,6 +10,7 @@ import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
+from calibrator.faults import Index
 
 __all__ = ["TRUSTED_DRIFT_SD", "TRUSTED_OFFSET_SD", "Readings", "no_readings", "trusted_readings", "with_readings"]
 
@@ -41,6 +42,10 @@ class Readings:
         drift, drift_sd = _weighted((self.drift, self.drift_sd), (other.drift, other.drift_sd))
         offset_a, offset_sd_a = _weighted((self.offset_a, self.offset_sd_a), (other.offset_a, other.offset_sd_a))
         return Readings(drift=drift, drift_sd=drift_sd, offset_a=offset_a, offset_sd_a=offset_sd_a)
+
+    def take(self, index: Index) -> "Readings":
+        """Return the readings of some of the vehicles."""
+        return Readings(**{name: values[index] for name, values in vars(self).items()})
 
     def take_branches(self, order: list[int]) -> "Readings":
         """Return the same readings with the branches in another order."""

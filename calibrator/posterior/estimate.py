@@ -26,7 +26,7 @@ from calibrator.posterior.model_spread import (
 )
 from calibrator.posterior.states import States, enumerate_states, mean_states
 
-__all__ = ["FleetPosterior", "Moments", "estimate_fleet"]
+__all__ = ["FleetLaw", "FleetPosterior", "Moments", "estimate_fleet", "estimate_vehicles", "learn_law"]
 
 MOST_GAIN_SD = 0.1
 """Standard deviation from which on a gain is not told: smaller than the faults that matter. [1]"""
@@ -93,6 +93,26 @@ class FleetPosterior:
         return len(self.confidence)
 
 
+@dataclass(frozen=True, kw_only=True)
+class FleetLaw:
+    """What a fleet tells of its faults and of its drives: with it, every vehicle is estimated by itself.
+
+    Attributes
+    ----------
+    hyperparameters : Hyperparameters
+        The most likely ones.
+    drawn : tuple of Hyperparameters
+        Others that explain the fleet about as well, over which a small fleet is averaged; else the best alone.
+    usual_mean_a, usual_mean_square_a2 : ndarray of shape (K,)
+        Of the fleet's usual drive. [A], [A^2]
+    """
+
+    hyperparameters: Hyperparameters
+    drawn: tuple[Hyperparameters, ...]
+    usual_mean_a: Array
+    usual_mean_square_a2: Array
+
+
 def estimate_fleet(
     rows: FleetRows,
     moments: Moments,
@@ -100,10 +120,33 @@ def estimate_fleet(
     full_scale_a: float,
     given: FaultPrior | None = None,
     trusted: Mask | None = None,
-    learning: Mask | None = None,
     load: float | None = None,
 ) -> FleetPosterior:
-    """Estimate the faults of every vehicle of a fleet.
+    """Learn the law of a fleet, and estimate the faults of each of its vehicles.
+
+    Parameters
+    ----------
+    rows, moments, full_scale_a, given, trusted, load
+        As for :func:`learn_law`.
+
+    Returns
+    -------
+    FleetPosterior
+        In the order of the rows.
+    """
+    law = learn_law(rows, moments, given=given, trusted=trusted, load=load)
+    return estimate_vehicles(rows, moments, law, full_scale_a=full_scale_a)
+
+
+def learn_law(
+    rows: FleetRows,
+    moments: Moments,
+    *,
+    given: FaultPrior | None = None,
+    trusted: Mask | None = None,
+    load: float | None = None,
+) -> FleetLaw:
+    """Learn what the vehicles of a fleet have in common.
 
     Parameters
     ----------
@@ -111,44 +154,65 @@ def estimate_fleet(
         Evidence of N vehicles.
     moments : Moments
         Of their measured currents.
-    full_scale_a : float
-        Full scale of the junction. [A]
     given : FaultPrior or None
         Prior of the faults, if it is known; None: estimated from the fleet.
     trusted : ndarray of bool of shape (N,) or None
         Vehicles that were found faultless, whose rows hold that reading; where at least :data:`FEWEST_TRUSTED` of them
         tell a row, they alone carry its centre.
-    learning : ndarray of bool of shape (N,) or None
-        Vehicles from which hyper-parameters are learnt; None: all.
     load : float or None
         Mean load that no branch measures, in fractions of full scale, if it is known; its spread is then in the
         covariance of the rows. None: estimated from the fleet. [1]
 
     Returns
     -------
-    FleetPosterior
-        In the order of the rows.
+    FleetLaw
+        For these and other vehicles of the fleet.
     """
-    _require_fit(rows, moments, full_scale_a)
-    learnt = rows if learning is None else rows.take(learning)
-    starts, free, carriers = initial_spreads(learnt), np.asarray(free_centres(rows.branches), bool), None
+    _require_fit(rows, moments)
+    starts, free, carriers = initial_spreads(rows), np.asarray(free_centres(rows.branches), bool), None
     if trusted is not None and np.count_nonzero(trusted) >= FEWEST_TRUSTED:
         starts, free, carriers = [trusted_spread(rows, trusted)], uncarried_centres(rows, trusted), rows.take(trusted)
     if load is not None:
         starts, free[4 * rows.branches - 1] = [start.with_load(load) for start in starts], False
-    hyperparameters = estimate_hyperparameters(learnt, starts, given=given, free=free)
-    drawn = draw_hyperparameters(learnt, hyperparameters, given=given, carriers=carriers)
-    states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in drawn])
-    usual = _usual_moments(moments if learning is None else moments.take(learning))
-    vehicles = [
-        _of_vehicle(states, j, hyperparameters.prior, moments=moments, usual=usual, full_scale_a=full_scale_a)
-        for j in range(len(rows))
-    ]
-    return _joined(vehicles, rows, states, hyperparameters, full_scale_a)
+    best = estimate_hyperparameters(rows, starts, given=given, free=free)
+    mean_a = np.median(moments.mean_a, axis=0)
+    return FleetLaw(
+        hyperparameters=best,
+        drawn=tuple(draw_hyperparameters(rows, best, given=given, carriers=carriers)),
+        usual_mean_a=mean_a,
+        usual_mean_square_a2=np.maximum(np.median(moments.mean_square_a2, axis=0), mean_a**2),
+    )
 
 
-def _require_fit(rows: FleetRows, moments: Moments, full_scale_a: float) -> None:
-    """Refuse an empty fleet, moments of another one, and a full scale that is none."""
+def estimate_vehicles(rows: FleetRows, moments: Moments, law: FleetLaw, *, full_scale_a: float) -> FleetPosterior:
+    """Estimate the faults of some vehicles, each by itself.
+
+    Parameters
+    ----------
+    rows : FleetRows
+        Evidence of N vehicles.
+    moments : Moments
+        Of their measured currents.
+    law : FleetLaw
+        Of their fleet.
+    full_scale_a : float
+        Full scale of the junction. [A]
+
+    Returns
+    -------
+    FleetPosterior
+        In the order of the rows.
+    """
+    _require_fit(rows, moments)
+    if not full_scale_a > 0.0:
+        raise FleetError(f"full scale must be positive, not {full_scale_a:g} A")
+    states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in law.drawn])
+    vehicles = [_of_vehicle(states, j, law, moments=moments, full_scale_a=full_scale_a) for j in range(len(rows))]
+    return _joined(vehicles, rows, states, law.hyperparameters, full_scale_a)
+
+
+def _require_fit(rows: FleetRows, moments: Moments) -> None:
+    """Refuse an empty fleet, and moments of another one."""
     if not len(rows):
         raise FleetError("no vehicle to estimate the faults of")
     expected = (len(rows), rows.branches)
@@ -157,8 +221,6 @@ def _require_fit(rows: FleetRows, moments: Moments, full_scale_a: float) -> None
             f"moments of shape {moments.mean_a.shape} and {moments.mean_square_a2.shape} do not fit the evidence: "
             f"expected {expected}"
         )
-    if not full_scale_a > 0.0:
-        raise FleetError(f"full scale must be positive, not {full_scale_a:g} A")
 
 
 @dataclass(frozen=True)
@@ -169,34 +231,25 @@ class _Vehicle:
     harm: Array
 
 
-def _of_vehicle(
-    states: States, j: int, prior: FaultPrior, *, moments: Moments, usual: tuple[Array, Array], full_scale_a: float
-) -> _Vehicle:
+def _of_vehicle(states: States, j: int, law: FleetLaw, *, moments: Moments, full_scale_a: float) -> _Vehicle:
+    prior = law.hyperparameters.prior
     state, confidence = best_estimate(states, j, least=(prior.relative.low, prior.constant.low))
     drift, offset = states.drift[j, state], states.offset[j, state]
     distance = np.concatenate([states.drift[j] - drift, states.offset[j] - offset], axis=1)
     sd = np.concatenate([states.relative_sd[j, :, 1:], states.constant_sd[j, :, states.branches - 1 :]], axis=1)
     variance = np.asarray(states.weight[j] @ (distance**2 + sd**2))
-    mean, mean_square = _true_moments(moments, usual, j, drift=drift, offset_a=offset * full_scale_a)
+    mean, mean_square = _true_moments(moments, law, j, drift=drift, offset_a=offset * full_scale_a)
     mean, mean_square = mean / full_scale_a, mean_square / full_scale_a**2
     harm = harm_probability(states, j, drift, offset, mean=mean, mean_square=mean_square)
     return _Vehicle(state, confidence, variance, harm)
 
 
-def _true_moments(
-    moments: Moments, usual: tuple[Array, Array], j: int, *, drift: Array, offset_a: Array
-) -> tuple[Array, Array]:
+def _true_moments(moments: Moments, law: FleetLaw, j: int, *, drift: Array, offset_a: Array) -> tuple[Array, Array]:
     """Moments of the true currents on the vehicle's own drives and on the fleet's usual one, each of shape (2, K)."""
     mean, square = moments.mean_a[j], moments.mean_square_a2[j]
     own_mean = (mean - offset_a) / (1.0 + drift)
     own_square = np.maximum((square - 2.0 * offset_a * mean + offset_a**2) / (1.0 + drift) ** 2, own_mean**2)
-    return np.stack([own_mean, usual[0]]), np.stack([own_square, usual[1]])
-
-
-def _usual_moments(moments: Moments) -> tuple[Array, Array]:
-    """Mean (K,) [A] and mean square (K,) [A^2] of the fleet's usual drive."""
-    mean, square = np.median(moments.mean_a, axis=0), np.median(moments.mean_square_a2, axis=0)
-    return mean, np.maximum(square, mean**2)
+    return np.stack([own_mean, law.usual_mean_a]), np.stack([own_square, law.usual_mean_square_a2])
 
 
 def _joined(

@@ -70,6 +70,14 @@ class ReferenceHealth:
     distrusted: Mapping[int, str] = field(default_factory=dict)
     differing: tuple[int, ...] = ()
 
+    def of_positions(self, positions: NDArray[np.int64]) -> "ReferenceHealth":
+        """Return the same for a fleet in which the vehicles learnt from have other positions."""
+        return replace(
+            self,
+            distrusted={int(positions[j]): why for j, why in self.distrusted.items()},
+            differing=tuple(positions[list(self.differing)].tolist()),
+        )
+
     def in_order(self, place: NDArray[np.int64]) -> "ReferenceHealth":
         """Return the same for branches in another order: branch k is at position ``place[k]`` here."""
         return replace(

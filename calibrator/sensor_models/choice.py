@@ -18,6 +18,7 @@ from scipy.special import logsumexp
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.evidence.fleet_model import fit_fleet_model
+from calibrator.evidence.fleet_moments import stack_summaries
 from calibrator.sensor_models.families import Family
 from calibrator.sensor_models.fleet_spread import FleetSpread, first_spread, next_spread
 from calibrator.sensor_models.rows import ExcessRows, excess_rows
@@ -90,7 +91,7 @@ def choose_sensor_models(vehicles: Sequence[SensorSummary]) -> list[list[SensorM
         raise FleetError("vehicles differ in branches, inputs or temperature signal; search those that are alike")
     if len(vehicles) < LEAST_VEHICLES:
         return [[SensorModelChoice(log_bayes_factor=0.0)] * v.summary.branches for v in vehicles]
-    read_out = fit_fleet_model([vehicle.summary for vehicle in vehicles]).read_out
+    read_out = fit_fleet_model(stack_summaries([vehicle.summary for vehicle in vehicles])).read_out
     found = [_of_family(family, excess_rows(vehicles, read_out, family)) for family in vehicles[0].families]
     return [
         [max(branch, key=lambda choice: choice.log_bayes_factor) for branch in zip(*vehicle, strict=True)]

@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,9 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.evidence.collect import collect_rows
 from calibrator.evidence.fleet_model import FleetModel, fit_fleet_model
+from calibrator.evidence.fleet_moments import stack_summaries
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, constant_design, relative_design
+from calibrator.evidence.summary import DriveSummary
 from calibrator.faults import Faults
 from tests.calibrator.evidence.simulated_drives import Conditions, no_faults, read_out_of, summaries_of
 
@@ -26,6 +29,11 @@ def random_faults(seed: int, vehicles: int) -> Faults:
         full_scale_a=FULL_SCALE_A,
         balanced=True,
     )
+
+
+def rows_of(summaries: Sequence[DriveSummary], model: FleetModel = TRUE_MODEL, scale_a: float = FULL_SCALE_A) -> FleetRows:
+    raw = collect_rows(stack_summaries(summaries), model, full_scale_a=scale_a)
+    return raw.steadied(raw.usual_correlation())
 
 
 def expected_rows(faults: Faults) -> Array:
@@ -57,7 +65,7 @@ def standardised(rows: FleetRows, faults: Faults) -> Array:
 )
 def test_standardised_residuals_are_standard_normal(conditions: Conditions) -> None:
     faults = random_faults(1, 150)
-    rows = collect_rows(summaries_of(faults, conditions, seed=1), TRUE_MODEL, full_scale_a=FULL_SCALE_A)
+    rows = rows_of(summaries_of(faults, conditions, seed=1))
     z = standardised(rows, faults)
     rms = np.sqrt(np.mean(z**2, axis=0))
     assert 0.75 < np.sqrt(np.mean(z**2)) < 1.25, rms
@@ -70,7 +78,7 @@ def test_standardised_residuals_are_standard_normal(conditions: Conditions) -> N
 def test_rows_are_as_right_over_the_model_learnt_from_the_fleet() -> None:
     faults = random_faults(2, 100)
     summaries = summaries_of(faults, seed=2)
-    rows = collect_rows(summaries, fit_fleet_model(summaries), full_scale_a=FULL_SCALE_A)
+    rows = rows_of(summaries, fit_fleet_model(stack_summaries(summaries)))
     error = errors(rows, faults)[:, TOLD]
     assert np.abs(np.median(error[:, : 2 * K - 1], axis=0)).max() < 0.003
     assert np.abs(np.median(error[:, 2 * K - 1 :], axis=0)).max() < 0.002
@@ -79,13 +87,13 @@ def test_rows_are_as_right_over_the_model_learnt_from_the_fleet() -> None:
 
 def test_full_scale_is_only_the_unit_of_the_constant_rows() -> None:
     summaries = summaries_of(random_faults(3, 10), seed=3)
-    plain, half = (collect_rows(summaries, TRUE_MODEL, full_scale_a=scale) for scale in (400.0, 200.0))
+    plain, half = (rows_of(summaries, scale_a=scale) for scale in (400.0, 200.0))
     np.testing.assert_allclose(half.relative, plain.relative)
     np.testing.assert_allclose(half.constant, 2.0 * plain.constant)
 
 
 def test_bench_readings_are_unknown() -> None:
-    rows = collect_rows(summaries_of(no_faults(3, K)), TRUE_MODEL, full_scale_a=FULL_SCALE_A)
+    rows = rows_of(summaries_of(no_faults(3, K)))
     readings = [i for i in range(5 * K) if i not in TOLD]
     assert (np.diagonal(rows.covariance, axis1=1, axis2=2)[:, readings] == UNKNOWN_VARIANCE).all()
     assert not rows.relative[:, 2 * K - 1 :].any()
@@ -96,7 +104,7 @@ def test_a_reversed_branch_is_unknown_not_a_logarithm_of_a_negative_number() -> 
     faults = no_faults(4, K)
     drift = faults.drift.copy()
     drift[2, 1] = -2.0
-    rows = collect_rows(summaries_of(replace(faults, drift=drift)), TRUE_MODEL, full_scale_a=FULL_SCALE_A)
+    rows = rows_of(summaries_of(replace(faults, drift=drift)))
     assert np.isfinite(rows.relative).all()
     assert rows.covariance[2, 1, 1] == pytest.approx(UNKNOWN_VARIANCE)
     assert rows.relative[2, 1] == 0.0
@@ -105,7 +113,7 @@ def test_a_reversed_branch_is_unknown_not_a_logarithm_of_a_negative_number() -> 
 
 def test_covariances_are_positive_definite_with_few_blocks() -> None:
     summaries = summaries_of(random_faults(5, 6), Conditions(samples=90), seed=5)
-    rows = collect_rows(summaries, TRUE_MODEL, full_scale_a=FULL_SCALE_A)
+    rows = rows_of(summaries)
     assert (np.linalg.eigvalsh(rows.covariance) > 0.0).all()
 
 
@@ -114,11 +122,7 @@ def test_twice_the_driving_halves_the_variance() -> None:
     variances = [
         np.median(
             np.diagonal(
-                collect_rows(
-                    summaries_of(faults, Conditions(samples=samples, noise_a=3.0)),
-                    TRUE_MODEL,
-                    full_scale_a=FULL_SCALE_A,
-                ).covariance,
+                rows_of(summaries_of(faults, Conditions(samples=samples, noise_a=3.0))).covariance,
                 axis1=1,
                 axis2=2,
             )[:, TOLD],

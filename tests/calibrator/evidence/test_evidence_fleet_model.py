@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.evidence.fleet_model import FleetModel, fit_fleet_model, regress_on_fleet
+from calibrator.evidence.fleet_moments import stack_summaries
 from calibrator.evidence.summary import DriveSummary
 from calibrator.faults import Faults, slopes_and_intercepts
 from tests.calibrator.evidence.simulated_drives import Conditions, no_faults, read_out_of, summaries_of
@@ -21,9 +23,13 @@ def one_sided_faults(vehicles: int, share: float) -> Faults:
     return replace(no_faults(vehicles, K), drift=size[0], offset_a=400.0 * size[1])
 
 
-def slopes_of(summaries: list[DriveSummary], model: FleetModel) -> tuple[Array, Array]:
-    fits = [[fit.estimate for fit in regress_on_fleet(summary, model.read_out)] for summary in summaries]
-    return np.array(fits)[:, :, 0], np.array(fits)[:, :, 1]
+def slopes_of(summaries: Sequence[DriveSummary], model: FleetModel) -> tuple[Array, Array]:
+    fits = np.stack([fit.estimate for fit in regress_on_fleet(stack_summaries(summaries), model.read_out)], axis=1)
+    return fits[:, :, 0], fits[:, :, 1]
+
+
+def model_of(summaries: Sequence[DriveSummary]) -> FleetModel:
+    return fit_fleet_model(stack_summaries(summaries))
 
 
 def largest_error(model: FleetModel) -> float:
@@ -35,7 +41,7 @@ def largest_error(model: FleetModel) -> float:
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.5])
 def test_read_outs_are_those_of_faultless_vehicles_however_lopsided_the_faults(share: float) -> None:
     faults = one_sided_faults(40, share)
-    model = fit_fleet_model(summaries_of(faults))
+    model = model_of(summaries_of(faults))
     assert largest_error(model) < 0.005
     assert np.abs(model.read_out[-1]).max() < 0.5
     np.testing.assert_allclose(model.read_out.sum(axis=1), 0.0, atol=1e-9)
@@ -52,7 +58,7 @@ def test_slopes_and_intercepts_are_those_of_the_faults() -> None:
         balanced=True,
     )
     summaries = list(summaries_of(faults, seed=1))
-    a, b = slopes_of(summaries, fit_fleet_model(summaries))
+    a, b = slopes_of(summaries, model_of(summaries))
     slopes, intercepts = slopes_and_intercepts(faults)
     np.testing.assert_allclose(a, slopes, atol=0.02)
     np.testing.assert_allclose(b, intercepts, atol=1.0)
@@ -62,13 +68,13 @@ def test_a_faulty_majority_of_one_branch_does_not_carry_the_reference_away() -> 
     faults = one_sided_faults(60, 0.0)
     drift = faults.drift.copy()
     drift[:35, 0] = np.random.default_rng(2).uniform(0.05, 0.25, 35)
-    model = fit_fleet_model(summaries_of(replace(faults, drift=drift)))
+    model = model_of(summaries_of(replace(faults, drift=drift)))
     assert largest_error(model) < 0.005
 
 
 def test_order_of_the_vehicles_does_not_matter() -> None:
     summaries = list(summaries_of(one_sided_faults(20, 0.3)))
-    plain, reverse = fit_fleet_model(summaries), fit_fleet_model(summaries[::-1])
+    plain, reverse = model_of(summaries), model_of(summaries[::-1])
     np.testing.assert_allclose(reverse.read_out, plain.read_out, atol=1e-6)
 
 
@@ -77,7 +83,7 @@ def test_unit_of_an_input_does_not_matter() -> None:
     scale = np.ones(summaries[0].moments.shape[1])
     scale[0] = 3.6
     scaled = [replace(summary, moments=summary.moments * np.outer(scale, scale)) for summary in summaries]
-    plain, other = fit_fleet_model(summaries), fit_fleet_model(scaled)
+    plain, other = model_of(summaries), model_of(scaled)
     np.testing.assert_allclose(other.read_out[0] * 3.6, plain.read_out[0], atol=1e-5)
     np.testing.assert_allclose(other.read_out[1:], plain.read_out[1:], atol=1e-5)
 
@@ -86,7 +92,7 @@ def test_an_input_given_twice_changes_no_slope() -> None:
     summaries = list(summaries_of(one_sided_faults(20, 0.3)))
     columns = [0, 0, *range(1, summaries[0].moments.shape[1])]
     twice = [replace(summary, moments=summary.moments[:, columns][:, :, columns]) for summary in summaries]
-    plain, other = slopes_of(summaries, fit_fleet_model(summaries)), slopes_of(twice, fit_fleet_model(twice))
+    plain, other = slopes_of(summaries, model_of(summaries)), slopes_of(twice, model_of(twice))
     np.testing.assert_allclose(other[0], plain[0], atol=1e-4)
 
 
@@ -96,8 +102,8 @@ def test_a_branch_that_never_moves_counts_as_faultless_and_unknown() -> None:
         scale = np.ones(summary.moments.shape[1])
         scale[summary.inputs + 2] = 0.0
         summaries.append(replace(summary, moments=summary.moments * np.outer(scale, scale)))
-    model = fit_fleet_model(summaries)
-    fit = regress_on_fleet(summaries[0], model.read_out)[2]
+    model = model_of(summaries)
+    fit = regress_on_fleet(stack_summaries(summaries[:1]), model.read_out)[2].of_vehicle(0)
     assert np.isfinite(model.read_out).all()
     assert fit.estimate[0] == pytest.approx(1.0, abs=0.01)
     assert fit.sd[0] == pytest.approx(0.4, rel=0.05)
@@ -105,6 +111,6 @@ def test_a_branch_that_never_moves_counts_as_faultless_and_unknown() -> None:
 
 def test_one_vehicle_is_its_own_fleet() -> None:
     summaries = list(summaries_of(no_faults(1, K), Conditions(noise_a=0.0)))
-    a, b = slopes_of(summaries, fit_fleet_model(summaries))
+    a, b = slopes_of(summaries, model_of(summaries))
     np.testing.assert_allclose(a, 1.0, atol=1e-3)
     np.testing.assert_allclose(b, 0.0, atol=0.1)

@@ -4,6 +4,7 @@ import pytest
 from calibrator.drive import Array
 from calibrator.evidence.block_regression import BlockRegression
 from calibrator.evidence.collect import LEAST_GAIN
+from calibrator.evidence.fleet_moments import stack_summaries
 from calibrator.evidence.junction_law import junction_law
 from calibrator.evidence.summary import DriveSummary, summarise
 from tests.calibrator.evidence.simulated_drives import PERIOD_S, coloured, samples_of
@@ -32,13 +33,17 @@ def summary_of(
     return summarise([samples_of(np.zeros((samples, 0)), i_m)], period_s=PERIOD_S), truth
 
 
+def law_of(summary: DriveSummary) -> BlockRegression:
+    return junction_law(stack_summaries([summary])).of_vehicle(0)
+
+
 def standardised(fits: list[tuple[BlockRegression, Array]]) -> Array:
     return np.array([(fit.estimate - truth) / fit.sd for fit, truth in fits])
 
 
 def test_gain_ratios_and_constant_are_exact_without_noise() -> None:
     summary, truth = summary_of(1, noise_a=(0.0, 0.0, 0.0), size_a=(80.0, 10.0))
-    fit = junction_law(summary)
+    fit = law_of(summary)
     np.testing.assert_allclose(fit.estimate, truth, rtol=2e-4, atol=1e-3)
 
 
@@ -48,7 +53,7 @@ def test_standardised_errors_are_standard_normal(size_a: tuple[float, ...]) -> N
     fits = []
     for seed in range(120):
         summary, truth = summary_of(seed, noise_a=(0.5,) * K, size_a=size_a, samples=1800)
-        fits.append((junction_law(summary), truth))
+        fits.append((law_of(summary), truth))
     z = standardised(fits)
     rms = np.sqrt(np.mean(z**2, axis=0))
     assert (np.abs(z.mean(axis=0)) < 0.35).all(), z.mean(axis=0)
@@ -59,7 +64,7 @@ def test_noise_on_a_small_branch_does_not_draw_its_gain_to_zero() -> None:
     errors, plain = [], []
     for seed in range(60):
         summary, truth = summary_of(seed, noise_a=(0.5, 0.5, 2.0), size_a=(80.0, 6.0), samples=3600)
-        errors.append(junction_law(summary).estimate[1] / truth[1])
+        errors.append(law_of(summary).estimate[1] / truth[1])
         gram, right = summary.total[1:, 1:], summary.total[0, 1:]
         plain.append(np.linalg.solve(gram, right)[1] / truth[1])
     assert np.mean(plain) < 0.93, "least squares does"
@@ -75,28 +80,28 @@ def test_unit_of_current_only_scales_the_constant() -> None:
         branches=3,
         period_s=PERIOD_S,
     )
-    plain, milli = junction_law(summary), junction_law(scaled)
+    plain, milli = law_of(summary), law_of(scaled)
     np.testing.assert_allclose(milli.estimate, plain.estimate * np.array([1.0, 1.0, 1e3]), rtol=1e-6)
     np.testing.assert_allclose(milli.sd, plain.sd * np.array([1.0, 1.0, 1e3]), rtol=1e-5)
 
 
 def test_order_of_the_consumers_does_not_matter() -> None:
     summary, _ = summary_of(4, noise_a=(0.5, 0.5, 0.5), size_a=(80.0, 10.0))
-    plain, swapped = junction_law(summary), junction_law(summary.take_branches([0, 2, 1]))
+    plain, swapped = law_of(summary), law_of(summary.take_branches([0, 2, 1]))
     np.testing.assert_allclose(swapped.estimate, plain.estimate[[1, 0, 2]], rtol=1e-9)
 
 
 def test_a_load_that_no_branch_measures_moves_the_constant_alone() -> None:
     with_load, truth = summary_of(5, noise_a=(0.5, 0.5, 0.5), size_a=(80.0, 10.0), load_a=3.0)
-    fit = junction_law(with_load)
+    fit = law_of(with_load)
     assert (np.abs(fit.estimate - truth) < 5.0 * fit.sd).all()
     without, _ = summary_of(5, noise_a=(0.5, 0.5, 0.5), size_a=(80.0, 10.0))
-    np.testing.assert_allclose(fit.estimate[:2], junction_law(without).estimate[:2], rtol=1e-6)
+    np.testing.assert_allclose(fit.estimate[:2], law_of(without).estimate[:2], rtol=1e-6)
 
 
 def test_a_branch_that_never_moves_keeps_the_prior_and_says_so() -> None:
     summary, _ = summary_of(6, noise_a=(0.5, 0.5, 0.0), size_a=(80.0, 0.0))
-    fit = junction_law(summary)
+    fit = law_of(summary)
     assert fit.estimate[1] == pytest.approx(-1.0, abs=0.05)
     assert fit.sd[1] == pytest.approx(0.4, rel=0.1)
     assert fit.sd[0] < 0.01
@@ -106,7 +111,7 @@ def test_a_branch_of_noise_alone_gets_a_gain_that_no_sensor_has() -> None:
     rng = np.random.default_rng(7)
     motor = 80.0 * coloured(rng, 3600, 1, 0.98)[:, 0]
     currents = np.column_stack([-motor, motor, np.zeros(3600)]) + rng.normal(size=(3600, 3)) * (0.3, 0.3, 1.0)
-    fit = junction_law(summarise([samples_of(np.zeros((3600, 0)), currents)], period_s=PERIOD_S))
+    fit = law_of(summarise([samples_of(np.zeros((3600, 0)), currents)], period_s=PERIOD_S))
     assert -fit.estimate[1] < LEAST_GAIN
     assert fit.estimate[0] == pytest.approx(-1.0, abs=0.002)
 
@@ -117,5 +122,5 @@ def test_fast_currents_with_equal_noise_are_not_over_corrected() -> None:
         rng = np.random.default_rng(seed)
         consumers = coloured(rng, 3600, 2, 0.8) * np.array([80.0, 8.0])
         currents = np.column_stack([-consumers.sum(axis=1), consumers]) + rng.normal(size=(3600, 3))
-        ratio.append(junction_law(summarise([samples_of(np.zeros((3600, 0)), currents)], period_s=PERIOD_S)).estimate)
+        ratio.append(law_of(summarise([samples_of(np.zeros((3600, 0)), currents)], period_s=PERIOD_S)).estimate)
     np.testing.assert_allclose(np.mean(ratio, axis=0)[:2], -1.0, atol=0.003)
