@@ -68,7 +68,7 @@ def _shared(residual_a2: Array, bound_a2: Array, weights: Array) -> Array:
     level = (residual_a2[:, None] - below) / np.cumsum(weight[:, ::-1], axis=1)[:, ::-1]
     reached = np.asarray(level <= bound)
     first = np.take_along_axis(level, np.argmax(reached, axis=1)[:, None], axis=1)
-    return np.where(reached.any(axis=1)[:, None], np.minimum(bound_a2, first), bound_a2)
+    return np.asarray(np.where(reached.any(axis=1)[:, None], np.minimum(bound_a2, first), bound_a2))
 
 
 def _weights(estimate: Array) -> Array:

@@ -12,7 +12,15 @@ from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
 from calibrator.faults import Index
 
-__all__ = ["TRUSTED_DRIFT_SD", "TRUSTED_OFFSET_SD", "Readings", "no_readings", "trusted_readings", "with_readings"]
+__all__ = [
+    "TRUSTED_DRIFT_SD",
+    "TRUSTED_OFFSET_SD",
+    "Readings",
+    "no_readings",
+    "trusted_readings",
+    "weighted_mean",
+    "with_readings",
+]
 
 TRUSTED_DRIFT_SD = 0.002
 """Accuracy of a bench check of the gain, as of a laboratory shunt. [1]"""
@@ -39,8 +47,8 @@ class Readings:
 
     def merged(self, other: "Readings") -> "Readings":
         """Both together: of a sensor that was read twice the mean, weighted by precision."""
-        drift, drift_sd = _weighted((self.drift, self.drift_sd), (other.drift, other.drift_sd))
-        offset_a, offset_sd_a = _weighted((self.offset_a, self.offset_sd_a), (other.offset_a, other.offset_sd_a))
+        drift, drift_sd = weighted_mean((self.drift, self.drift_sd), (other.drift, other.drift_sd))
+        offset_a, offset_sd_a = weighted_mean((self.offset_a, self.offset_sd_a), (other.offset_a, other.offset_sd_a))
         return Readings(drift=drift, drift_sd=drift_sd, offset_a=offset_a, offset_sd_a=offset_sd_a)
 
     def take(self, index: Index) -> "Readings":
@@ -52,7 +60,7 @@ class Readings:
         return Readings(**{name: values[:, order] for name, values in vars(self).items()})
 
 
-def _weighted(*readings: tuple[Array, Array]) -> tuple[Array, Array]:
+def weighted_mean(*readings: tuple[Array, Array]) -> tuple[Array, Array]:
     """Mean by precision of values with standard deviations, NaN where neither tells, and its standard deviation."""
     told = [np.isfinite(value) & np.isfinite(sd) for value, sd in readings]
     precision = [np.where(there, 1.0 / np.square(sd), 0.0) for there, (_, sd) in zip(told, readings, strict=True)]

@@ -31,7 +31,9 @@ def random_faults(seed: int, vehicles: int) -> Faults:
     )
 
 
-def rows_of(summaries: Sequence[DriveSummary], model: FleetModel = TRUE_MODEL, scale_a: float = FULL_SCALE_A) -> FleetRows:
+def rows_of(
+    summaries: Sequence[DriveSummary], model: FleetModel = TRUE_MODEL, scale_a: float = FULL_SCALE_A
+) -> FleetRows:
     raw = collect_rows(stack_summaries(summaries), model, full_scale_a=scale_a)
     return raw.steadied(raw.usual_correlation())
 

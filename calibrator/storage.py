@@ -1,0 +1,118 @@
+"""Files of a local folder or of object storage (a URL that fsspec knows), each written whole or not at all."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ecu_node.errors import UserError
+from ecu_node.parameters import write_atomically
+
+__all__ = ["Storage", "StorageError", "open_storage"]
+
+
+class StorageError(UserError):
+    """A folder or object storage cannot be read or written."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Storage:
+    """A folder of files.
+
+    Attributes
+    ----------
+    url : str
+        As the user named it: a path, or a URL such as ``s3://bucket/fleet``.
+    """
+
+    url: str
+
+    @property
+    def is_local(self) -> bool:
+        """Whether it is a folder of this machine."""
+        return "://" not in self.url
+
+    def folder(self, name: str) -> "Storage":
+        """Return a folder in this one; it is made when something is written."""
+        return Storage(url=f"{self.url.rstrip('/')}/{name}")
+
+    def names(self) -> list[str]:
+        """Return the names of the files in it, sorted; none if there is no such folder. Hidden ones do not count."""
+        filesystem, root = self._filesystem()
+        try:
+            found = filesystem.ls(root, detail=False)
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+        except Exception as error:  # noqa: BLE001 (each kind of storage has its own)
+            raise self._failed("", "read", error) from None
+        names = [str(path).rstrip("/").rpartition("/")[2] for path in found]
+        return sorted(name for name in names if not name.startswith("."))
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file.
+
+        Raises
+        ------
+        StorageError
+            If it is not there or cannot be read.
+        """
+        content = self.read_if_there(name)
+        if content is None:
+            raise StorageError(f"{self.url}/{name}: no such file")
+        return content
+
+    def read_if_there(self, name: str) -> bytes | None:
+        """Return the content of a file; None if there is none of that name.
+
+        Raises
+        ------
+        StorageError
+            If it cannot be read.
+        """
+        filesystem, root = self._filesystem()
+        try:
+            content: bytes = filesystem.cat_file(f"{root}/{name}")
+        except FileNotFoundError:
+            return None
+        except Exception as error:  # noqa: BLE001
+            raise self._failed(name, "read", error) from None
+        return content
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a file, whole or not at all; one of that name is replaced.
+
+        Raises
+        ------
+        StorageError
+            If it cannot be written.
+        """
+        try:
+            if self.is_local:
+                Path(self.url).mkdir(parents=True, exist_ok=True)
+                write_atomically(Path(self.url) / name, content)
+            else:  # objects appear only when they are complete
+                filesystem, root = self._filesystem()
+                filesystem.makedirs(root, exist_ok=True)
+                filesystem.pipe_file(f"{root}/{name}", content)
+        except Exception as error:  # noqa: BLE001
+            raise self._failed(name, "write", error) from None
+
+    def _filesystem(self) -> tuple[Any, str]:
+        """What fsspec reads and writes the storage with, and the folder's name there."""
+        from fsspec.core import url_to_fs  # noqa: PLC0415 (takes time, and not every command needs it)
+
+        try:
+            filesystem, root = url_to_fs(self.url)
+        except (ImportError, ValueError) as error:
+            first_line = str(error).partition("\n")[0]
+            raise StorageError(f"{self.url}: no way to reach this kind of storage: {first_line}") from None
+        return filesystem, str(root).rstrip("/")
+
+    def _failed(self, name: str, what: str, error: Exception) -> StorageError:
+        reason = getattr(error, "strerror", None) or str(error).partition("\n")[0] or type(error).__name__
+        return StorageError(f"{self.url}{name and '/'}{name}: cannot {what} it: {reason}")
+
+
+def open_storage(place: str | Path) -> Storage:
+    """Storage at a path or URL; a ``file://`` URL is a path."""
+    text = str(place)
+    return Storage(url=text.removeprefix("file://") or "/")

@@ -1,0 +1,173 @@
+"""What a store of summaries is of: summaries add up only if branches, inputs, filters and time base are the same."""
+
+import msgspec
+
+from calibrator.drives.fleet_source import Equipment
+from calibrator.errors import FleetError
+from calibrator.evidence.summary import BLOCK_S
+from calibrator.storage import Storage
+from ecu_node.database import VehicleDatabase
+
+__all__ = ["SCHEMA_VERSION", "StoreIdentity", "read_identity", "store_identity", "write_identity"]
+
+SCHEMA_VERSION = 1
+FILE = "summaries.json"
+FEWEST_BUCKETS, MOST_BUCKETS = 16, 32_768
+"""Of a store: few vehicles are lost with one that is not finished, and a folder can still be listed."""
+VEHICLES_PER_BUCKET = 256
+"""Aimed at: a few megabytes, read in a fraction of a second."""
+
+
+class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What all summaries of a store have in common.
+
+    Attributes
+    ----------
+    schema_version : int
+        Of the store.
+    layout, layout_sha256, dbc_sha256 : str
+        Names and digests of what the signals mean.
+    branches, inputs, fleet_inputs : tuple of str
+        Branches and model inputs of the fleet, see :class:`~calibrator.drives.fleet_source.Equipment`.
+    notices : tuple of str
+        What the layout has and the fleet lacks.
+    period_s, block_s : float
+        Time base and length of a block. [s]
+    buckets : int
+        Number of files that the vehicles are spread over.
+    fleet : str
+        Name of the fleet.
+    fleet_ids : tuple of str
+        Artificial fleets that the drives come from.
+    """
+
+    schema_version: int = SCHEMA_VERSION
+    layout: str
+    layout_sha256: str
+    dbc_sha256: str
+    branches: tuple[str, ...]
+    inputs: tuple[str, ...]
+    fleet_inputs: tuple[str, ...]
+    notices: tuple[str, ...]
+    period_s: float
+    block_s: float
+    buckets: int
+    fleet: str
+    fleet_ids: tuple[str, ...] = ()
+
+    @property
+    def equipment(self) -> Equipment:
+        """Branches and inputs of the fleet."""
+        return Equipment(
+            branches=self.branches, inputs=self.inputs, fleet_inputs=self.fleet_inputs, notices=self.notices
+        )
+
+    def difference(self, other: "StoreIdentity") -> str:
+        """What makes summaries of another store unfit for this one, in words; empty if they fit."""
+        for name in ("layout_sha256", "dbc_sha256", "branches", "fleet_inputs", "period_s", "block_s"):
+            mine, its = getattr(self, name), getattr(other, name)
+            if mine != its:
+                return f"{name} {_short(mine)} against {_short(its)}"
+        return ""
+
+
+def _short(value: object) -> str:
+    text = ", ".join(value) if isinstance(value, tuple) else str(value)
+    return text[:60]
+
+
+def store_identity(
+    equipment: Equipment, database: VehicleDatabase, *, vehicles: int, fleet: str, fleet_ids: frozenset[str]
+) -> StoreIdentity:
+    """Identity of a new store.
+
+    Parameters
+    ----------
+    equipment : Equipment
+        Branches and inputs of the fleet.
+    database : VehicleDatabase
+        DBC and layout.
+    vehicles : int
+        Number of vehicles expected; it decides the number of buckets.
+    fleet : str
+        Name of the fleet.
+    fleet_ids : frozenset of str
+        Artificial fleets that the drives come from.
+
+    Returns
+    -------
+    StoreIdentity
+        Of the present schema.
+    """
+    wanted = 1 << max(vehicles // VEHICLES_PER_BUCKET, 1).bit_length()
+    return StoreIdentity(
+        layout=database.layout.name,
+        layout_sha256=database.layout.digest,
+        dbc_sha256=database.digest,
+        branches=equipment.branches,
+        inputs=equipment.inputs,
+        fleet_inputs=equipment.fleet_inputs,
+        notices=equipment.notices,
+        period_s=database.layout.period_s,
+        block_s=BLOCK_S,
+        buckets=min(max(wanted, FEWEST_BUCKETS), MOST_BUCKETS),
+        fleet=fleet,
+        fleet_ids=tuple(sorted(fleet_ids)),
+    )
+
+
+def write_identity(storage: Storage, identity: StoreIdentity) -> None:
+    """Write the identity of a new store."""
+    storage.write(FILE, msgspec.json.format(msgspec.json.encode(identity), indent=2) + b"\n")
+
+
+def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> StoreIdentity | None:
+    """Read the identity of a store.
+
+    Parameters
+    ----------
+    storage : Storage
+        Folder of the store.
+    database : VehicleDatabase or None
+        DBC and layout it must have been made with; None: any.
+
+    Returns
+    -------
+    StoreIdentity or None
+        None if there is no store.
+
+    Raises
+    ------
+    FleetError
+        If the store is of another version, layout or DBC.
+    """
+    content, where = storage.read_if_there(FILE), f"{storage.url}/{FILE}"
+    if content is None:
+        return None
+    try:
+        raw = msgspec.json.decode(content)
+        version = raw.get("schema_version") if isinstance(raw, dict) else None
+        if version != SCHEMA_VERSION:
+            raise FleetError(
+                f"{where}: schema version {version!r}, expected {SCHEMA_VERSION}; summarise the drives again"
+            )
+        identity = msgspec.convert(raw, StoreIdentity)
+    except (msgspec.DecodeError, msgspec.ValidationError, UnicodeDecodeError) as error:
+        raise FleetError(f"{where}: not a store of summaries: {error}; summarise the drives again") from None
+    if database is not None:
+        _require_made_with(identity, database, where)
+    return identity
+
+
+def _require_made_with(identity: StoreIdentity, database: VehicleDatabase, where: str) -> None:
+    layout = database.layout
+    if (identity.layout_sha256, identity.dbc_sha256) != (layout.digest, database.digest):
+        what = "layout" if identity.layout_sha256 != layout.digest else "DBC"
+        raise FleetError(
+            f"{where}: made with another {what} than {layout.path if what == 'layout' else layout.dbc_path}; "
+            f"summarise the drives again with this one"
+        )
+    if identity.block_s != BLOCK_S:
+        raise FleetError(
+            f"{where}: blocks of {identity.block_s:g} s, expected {BLOCK_S:g} s; summarise the drives again"
+        )

@@ -1,0 +1,113 @@
+"""A store of summaries: ``STORE/summaries.json`` and ``STORE/buckets/NNNNN.parquet``.
+
+Vehicles are spread over a fixed number of buckets by a hash of their names, so that any number of vehicles makes a
+moderate number of files of moderate size, a vehicle is found without an index, and each bucket is a random sample of
+the fleet. A bucket is written whole or not at all.
+"""
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from calibrator.storage import Storage
+from calibrator.summaries.identity import StoreIdentity
+from calibrator.summaries.record import Record
+from calibrator.summaries.table import decode_records, encode_records
+
+__all__ = ["SummaryStore", "bucket_of"]
+
+_HASH_BYTES = 8
+
+
+def bucket_of(vehicle: str, buckets: int) -> int:
+    """Bucket of a vehicle: the same on every machine, and independent of the other vehicles.
+
+    Parameters
+    ----------
+    vehicle : str
+        Name.
+    buckets : int
+        Number of buckets of the store.
+
+    Returns
+    -------
+    int
+        From 0 to buckets - 1.
+    """
+    digest = hashlib.blake2b(vehicle.encode(), digest_size=_HASH_BYTES).digest()
+    return int.from_bytes(digest, "big") % buckets
+
+
+@dataclass(frozen=True, kw_only=True)
+class SummaryStore:
+    """An open store.
+
+    Attributes
+    ----------
+    storage : Storage
+        Where it is.
+    identity : StoreIdentity
+        What its summaries have in common.
+    """
+
+    storage: Storage
+    identity: StoreIdentity
+
+    @property
+    def url(self) -> str:
+        """Where the store is, for messages."""
+        return self.storage.url
+
+    def bucket_of(self, vehicle: str) -> int:
+        """Bucket of a vehicle."""
+        return bucket_of(vehicle, self.identity.buckets)
+
+    def buckets(self) -> list[int]:
+        """Buckets in which there are vehicles, in order."""
+        stems = (name.partition(".")[0] for name in self._files.names())
+        return sorted(int(stem) for stem in stems if stem.isdecimal())
+
+    def by_bucket(self, vehicles: Iterable[str]) -> dict[int, list[str]]:
+        """Vehicles by the bucket that they are in."""
+        found: dict[int, list[str]] = defaultdict(list)
+        for vehicle in vehicles:
+            found[self.bucket_of(vehicle)].append(vehicle)
+        return dict(sorted(found.items()))
+
+    def read(self, bucket: int) -> dict[str, list[Record]]:
+        """Records of a bucket by vehicle, in the order of their names; none if there is no such bucket.
+
+        Raises
+        ------
+        UserError
+            If the bucket cannot be read or is damaged.
+        """
+        name = _file(bucket)
+        content = self._files.read_if_there(name)
+        if content is None:
+            return {}
+        records = decode_records(content, self.identity, f"{self._files.url}/{name}")
+        found: dict[str, list[Record]] = {}
+        for record in records:
+            found.setdefault(record.vehicle, []).append(record)
+        return found
+
+    def write(self, bucket: int, records: Mapping[str, Sequence[Record]]) -> None:
+        """Replace a bucket, whole or not at all.
+
+        Raises
+        ------
+        UserError
+            If it cannot be written.
+        """
+        rows = [record for vehicle in sorted(records) for record in records[vehicle]]
+        self._files.write(_file(bucket), encode_records(rows, self.identity))
+
+    @property
+    def _files(self) -> Storage:
+        return self.storage.folder("buckets")
+
+
+def _file(bucket: int) -> str:
+    return f"{bucket:05d}.parquet"

@@ -1,0 +1,174 @@
+"""Records as Parquet: one row, and one row group, per record, so that one vehicle can be read without the others.
+
+Moments are symmetric, so their upper triangles are stored, row by row, one block after the other. A record has at most
+:data:`MOST_BLOCKS` blocks: of longer drives neighbouring blocks are added, so a vehicle's size on disk and in memory
+does not grow with the hours that it is driven between two summaries.
+"""
+
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from calibrator.drive import Array
+from calibrator.drives.delays import BranchDelays
+from calibrator.errors import FleetError
+from calibrator.evidence.summary import DriveSummary
+from calibrator.evidence.vehicle_summary import VehicleSummary
+from calibrator.evidence.zero_current import ZeroCurrent
+from calibrator.summaries.identity import StoreIdentity
+from calibrator.summaries.record import Record
+
+__all__ = ["MOST_BLOCKS", "SCHEMA", "decode_records", "encode_records"]
+
+MOST_BLOCKS = 256
+"""Of a record: two hours and more; their spread is known to a tenth. [1]"""
+
+_FLOATS, _NAMES = pa.list_(pa.float64()), pa.list_(pa.string())
+SCHEMA = pa.schema(
+    [
+        pa.field("vehicle", pa.string(), nullable=False),
+        pa.field("drives", _NAMES, nullable=False),
+        pa.field("problem", pa.string()),
+        pa.field("moments", _FLOATS, metadata={"shape": "(B, p (p + 1) / 2), p: inputs, branches [A], 1"}),
+        pa.field("noise_a2", _FLOATS, metadata={"shape": "(B, K)", "unit": "A^2"}),
+        pa.field("delay_reference", pa.string()),
+        pa.field("delay_s", _FLOATS, metadata={"shape": "(K,)", "unit": "s"}),
+        pa.field("delay_sd_s", _FLOATS, metadata={"shape": "(K,), infinite where not known", "unit": "s"}),
+        pa.field("zero_offset_a", _FLOATS, metadata={"shape": "(K,), NaN where there was no window", "unit": "A"}),
+        pa.field("zero_sd_a", _FLOATS, metadata={"shape": "(K,)", "unit": "A"}),
+        pa.field("recorded", _NAMES),
+    ]
+)
+
+
+def encode_records(records: Sequence[Record], identity: StoreIdentity) -> bytes:
+    """Write records as a Parquet file.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        With the inputs and branches of the store.
+    identity : StoreIdentity
+        Of the store.
+
+    Returns
+    -------
+    bytes
+        The file.
+    """
+    rows = [_row(record, identity) for record in records]
+    buffer = io.BytesIO()
+    table = pa.Table.from_pylist(rows, schema=SCHEMA)
+    pq.write_table(
+        table,
+        buffer,
+        row_group_size=1,
+        compression="zstd",
+        use_dictionary=False,
+        write_statistics=["vehicle"],
+    )
+    return buffer.getvalue()
+
+
+def decode_records(content: bytes, identity: StoreIdentity, where: str) -> list[Record]:
+    """Read records from a Parquet file.
+
+    Parameters
+    ----------
+    content : bytes
+        The file.
+    identity : StoreIdentity
+        Of its store.
+    where : str
+        Of the file, for messages.
+
+    Returns
+    -------
+    list of Record
+        In the order of the file.
+
+    Raises
+    ------
+    FleetError
+        If the file is cut or no such file.
+    """
+    try:
+        table = pq.read_table(io.BytesIO(content), schema=SCHEMA, use_threads=False)
+        return list(_records(table, identity))
+    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
+        reason = str(error).partition("\n")[0][:120]
+        raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again") from None
+
+
+def _row(record: Record, identity: StoreIdentity) -> dict[str, Any]:
+    row: dict[str, Any] = {"vehicle": record.vehicle, "drives": list(record.drives)}
+    if record.found is None:
+        return {**row, "problem": record.problem}
+    found = record.found
+    summary = _shortened(found.summary)
+    upper = np.triu_indices(summary.moments.shape[1])
+    place = [found.delays.branches.index(name) for name in identity.branches]
+    return {
+        **row,
+        "moments": summary.moments[:, upper[0], upper[1]].ravel(),
+        "noise_a2": summary.noise_a2.ravel(),
+        "delay_reference": found.delays.branches[0],
+        "delay_s": found.delays.delay_s[place],
+        "delay_sd_s": np.where(found.delays.known, found.delays.sd_s, np.inf)[place],
+        "zero_offset_a": found.zero_current.offset_a,
+        "zero_sd_a": found.zero_current.sd_a,
+        "recorded": sorted(found.recorded),
+    }
+
+
+def _shortened(summary: DriveSummary) -> DriveSummary:
+    """The same with neighbouring blocks added until there are few enough; their noise is averaged by samples."""
+    count = len(summary.moments)
+    if count <= MOST_BLOCKS:
+        return summary
+    first = np.arange(0, count, -(-count // MOST_BLOCKS))
+    samples = summary.moments[:, -1, -1]
+    noise = np.add.reduceat(summary.noise_a2 * samples[:, None], first) / np.add.reduceat(samples, first)[:, None]
+    return replace(summary, moments=np.add.reduceat(summary.moments, first), noise_a2=noise, extra=None)
+
+
+def _records(table: pa.Table, identity: StoreIdentity) -> Iterable[Record]:
+    columns = {name: table.column(name).combine_chunks() for name in SCHEMA.names}
+    small = table.drop_columns(["moments", "noise_a2"]).to_pylist()
+    M, K = len(identity.fleet_inputs), len(identity.branches)
+    p = M + K + 1
+    triangles = columns["moments"].values.to_numpy().reshape(-1, p * (p + 1) // 2)
+    moments, upper = np.empty((len(triangles), p, p)), np.triu_indices(p)
+    moments[:, upper[0], upper[1]] = moments[:, upper[1], upper[0]] = triangles
+    noise = columns["noise_a2"].values.to_numpy().reshape(-1, K)
+    stops = columns["noise_a2"].offsets.to_numpy() // K
+    for row, start, stop in zip(small, stops[:-1].tolist(), stops[1:].tolist(), strict=True):
+        if row["problem"] is not None:
+            yield Record(vehicle=row["vehicle"], drives=tuple(row["drives"]), found=None, problem=row["problem"])
+            continue
+        summary = DriveSummary(
+            moments=moments[start:stop], noise_a2=noise[start:stop], branches=K, period_s=identity.period_s
+        )
+        yield Record(
+            vehicle=row["vehicle"], drives=tuple(row["drives"]), found=_vehicle(row, summary, identity.branches)
+        )
+
+
+def _vehicle(row: dict[str, Any], summary: DriveSummary, branches: tuple[str, ...]) -> VehicleSummary:
+    reference = row["delay_reference"]
+    names = (reference, *(name for name in branches if name != reference))
+    place = [branches.index(name) for name in names]
+    sd: Array = np.array(row["delay_sd_s"])[place]
+    return VehicleSummary(
+        vehicle=row["vehicle"],
+        drives=tuple(row["drives"]),
+        summary=summary,
+        delays=BranchDelays(branches=names, delay_s=np.array(row["delay_s"])[place], sd_s=sd, known=np.isfinite(sd)),
+        zero_current=ZeroCurrent(offset_a=np.array(row["zero_offset_a"]), sd_a=np.array(row["zero_sd_a"])),
+        recorded=frozenset(row["recorded"]),
+    )
