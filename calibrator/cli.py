@@ -29,6 +29,7 @@ from calibrator.command_options import (
     ReadingsOption,
     RepetitionsOption,
     ResultsFolderOption,
+    SchedulerOption,
     SeedOption,
     SensorModelsOption,
     SparsityOption,
@@ -180,9 +181,30 @@ def simulate(
 
 
 @app.command()
+def summarise(
+    fleet: Annotated[Path, typer.Argument(help="Drive store, or folder with a folder of logs per vehicle.")],
+    layout: LayoutOption,
+    out: Annotated[str, typer.Option("--out", help="Store of summaries, path or URL; drives are added to one.")],
+    branches: BranchesOption = None,
+    workers: WorkersOption = 2,
+    json: JsonOption = False,
+) -> None:
+    """Reduce drives to what the calibration needs of them: second moments, a few kilobytes per vehicle."""
+    with importing():
+        from calibrator.summarise_fleet import summarise_fleet
+
+    report = summarise_fleet(
+        fleet, _database(layout), out, branches=tuple(branches.split(",")) if branches else None, workers=workers
+    )
+    _print_report(report.as_json() if json else report.as_text())
+
+
+@app.command()
 def calibrate(
     context: typer.Context,
-    fleet: Annotated[Path, typer.Argument(help="Drive store, or folder with a folder of logs per vehicle.")],
+    fleet: Annotated[
+        str, typer.Argument(help="Drive store, folder with a folder of logs per vehicle, or summaries (path or URL).")
+    ],
     layout: LayoutOption,
     out: Annotated[Path, typer.Option("--out", help="Folder of the result, new or empty.")],
     method: Annotated[Method, typer.Option("--method", help="Estimator.")] = Method.POSTERIOR,
@@ -200,6 +222,7 @@ def calibrate(
     unity: UnityOption = None,
     seed: SeedOption = 0,
     workers: WorkersOption = 2,
+    scheduler: SchedulerOption = None,
     json: JsonOption = False,
 ) -> None:
     """Estimate the sensor faults of every vehicle and write its parameter file.
@@ -209,7 +232,9 @@ def calibrate(
     reference: its classifier 'tree' is trained on an artificial fleet of this --sparsity, --magnitude and --seed.
     """
     with importing():
-        from calibrator.fleet import CalibrationSettings, calibrate_fleet
+        from calibrator.calibration_settings import CalibrationSettings
+        from calibrator.fleet import calibrate_fleet
+        from calibrator.run.in_order import Workers
 
     require_truth_where_used(classifier, truth, method)
     require_own_options(context, method)
@@ -220,7 +245,7 @@ def calibrate(
         readings=readings,
         sensor_models=sensor_models,
         classifier=classifier,
-        truth=_truth_of(fleet, truth) if truth is not None else None,
+        truth=_truth_of(Path(fleet), truth) if truth is not None else None,
         sparsity=sparsity,
         magnitude=magnitude,
         symmetric=symmetric,
@@ -229,7 +254,8 @@ def calibrate(
         unity=unity,
         seed=seed,
     )
-    report = calibrate_fleet(fleet, _database(layout), out, settings, workers=workers)
+    where = Workers(processes=workers, scheduler=scheduler)
+    report = calibrate_fleet(fleet, _database(layout), out, settings, workers=where)
     _print_report(report.as_json() if json else report.as_text())
 
 

@@ -33,6 +33,7 @@ __all__ = [
     "ReadingsOption",
     "RepetitionsOption",
     "ResultsFolderOption",
+    "SchedulerOption",
     "SeedOption",
     "SensorModelsOption",
     "SparsityOption",
@@ -132,6 +133,10 @@ def _branches(value: str | None) -> str | None:
 LayoutOption = Annotated[Path, typer.Option("--layout", help="Layout (TOML) that says what the signals mean.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 WorkersOption = Annotated[int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Number of processes.")]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="URL", help="Dask scheduler, tcp://HOST:PORT, instead of processes."),
+]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=MAX_SEED, help="Seed of everything random.")]
 VehiclesOption = Annotated[int, typer.Option("--vehicles", min=1, max=MAX_VEHICLES, help="Number of vehicles N.")]
 CurrentsOption = Annotated[int, typer.Option("--currents", min=2, max=MAX_CURRENTS, help="Number of branches K.")]

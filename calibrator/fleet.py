@@ -1,103 +1,76 @@
-"""Calibration of a fleet: drives -> what a method makes of them -> parameter files and report.
+"""Calibration of a fleet: drives or their summaries -> what a method makes of them -> parameter files and report.
 
-One bad vehicle never stops the fleet; who was left out stands in the report.
+One bad vehicle never stops the fleet; who was left out stands in the report. What a run that was killed has done is
+kept, and the next run to the same place goes on from it.
 """
 
-from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+import hashlib
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-import numpy as np
+import msgspec
 
-from calibrator.calibration_settings import CalibrationSettings, FleetOutcome
+from calibrator.calibration_settings import CalibrationSettings
 from calibrator.drives.copies import without_copies
 from calibrator.drives.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment
 from calibrator.errors import FleetError
 from calibrator.folders import require_new_folder
 from calibrator.options import Method
 from calibrator.parameter_files import RunIdentity
-from calibrator.posterior.fleet import calibrate_fleet_posterior
-from calibrator.posterior.verdict import CONFIDENT
+from calibrator.posterior.fleet import FindModels
 from calibrator.published.fleet import calibrate_fleet_published
-from calibrator.report.text import dumps, left_out_text, reasons_text, table
-from calibrator.results import LeftOut, RunRecord, write_results
+from calibrator.reading_processes import TIME_LIMIT_S
+from calibrator.report.calibration import MOST_NAMED, CalibrationReport, report_of
+from calibrator.results import RunRecord, encode_chunk, join_rows, left_out_of, write_parameter_files, write_run
+from calibrator.run.in_order import Workers
+from calibrator.run.posterior_run import calibrate_store
+from calibrator.run.unfinished import Unfinished, unfinished_run
+from calibrator.sensor_models.fleet import SensorFindings, find_sensor_models
+from calibrator.storage import open_storage
+from calibrator.summaries.identity import read_identity
+from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.summarise import add_drives, open_store
+from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import VehicleParameters
 
-__all__ = ["CalibrationReport", "CalibrationSettings", "calibrate_fleet"]
+__all__ = ["calibrate_fleet"]
 
-METHODS = {Method.POSTERIOR: calibrate_fleet_posterior, Method.PUBLISHED: calibrate_fleet_published}
-
-
-@dataclass(frozen=True, kw_only=True)
-class CalibrationReport:
-    """What a calibration found, in short."""
-
-    result: str
-    run: RunRecord
-    verdicts: Mapping[str, int]
-    undecided: Mapping[str, str]
-    """Vehicles of which it cannot be told what is faulty, and what would decide."""
-    corrected: Mapping[str, str]
-    """Vehicles of which branches are corrected, and which."""
-    hardware_suspected: Mapping[str, str]
-    """Vehicles that are thought to differ from their fleet, and how probable that is."""
-    held_back: Mapping[str, int]
-    """Branches in which a fault was found that is not applied, by reason."""
-    junction_rms_measured_a: float
-    """Median over vehicles. [A]"""
-    junction_rms_deployed_a: float
-    """The same with the parameters that the node applies. [A]"""
-
-    def as_json(self) -> str:
-        """The report as JSON."""
-        values = {name: value for name, value in vars(self).items() if name != "run"}
-        return dumps({**values, "run": self.run})
-
-    def as_text(self) -> str:
-        """The report for people."""
-        run = self.run
-        rows = [
-            ("vehicles calibrated", f"{run.vehicles}"),
-            *((f"  {verdict}", f"{count}") for verdict, count in self.verdicts.items()),
-            ("  hardware fault suspected", f"{len(self.hardware_suspected)}"),
-            ("vehicles left out", f"{len(run.left_out)}"),
-            *((f"faults held back, {reason}", f"{count}") for reason, count in self.held_back.items()),
-            ("junction sum RMS, median, measured [A]", f"{self.junction_rms_measured_a:.2f}"),
-            ("junction sum RMS, median, deployed [A]", f"{self.junction_rms_deployed_a:.2f}"),
-            *_detail_rows(run),
-        ]
-        parts = [
-            table((f"method {run.method}", ""), rows),
-            "\n".join(f"notice: {notice}" for notice in run.notices),
-            reasons_text("corrected", self.corrected),
-            reasons_text("hardware fault suspected", self.hardware_suspected),
-            reasons_text("cannot tell", self.undecided),
-            left_out_text(run.left_out),
-            f"parameter files: {self.result}/params",
-        ]
-        return "\n\n".join(part for part in parts if part)
+LAST_CHUNK = 99_999
+"""Number of the chunk of those of which there is no summary."""
 
 
 def calibrate_fleet(
-    path: Path, database: VehicleDatabase, out: Path, settings: CalibrationSettings, *, workers: int
+    place: str | Path,
+    database: VehicleDatabase,
+    out: Path,
+    settings: CalibrationSettings,
+    *,
+    workers: Workers,
+    time_limit_s: float = TIME_LIMIT_S,
 ) -> CalibrationReport:
     """Calibrate every vehicle of a fleet and write the result folder.
 
     Parameters
     ----------
-    path : Path
-        The fleet, see :func:`calibrator.drives.fleet_source.find_fleet`.
+    place : str or Path
+        The fleet: its drives, see :func:`calibrator.drives.fleet_source.find_fleet`, or path or URL of a store of their
+        summaries.
     database : VehicleDatabase
         DBC and layout.
     out : Path
         Folder of the result, new or empty; it appears only when it is complete.
     settings : CalibrationSettings
         How.
-    workers : int
-        Number of processes.
+    workers : Workers
+        Where it is computed.
+    time_limit_s : float
+        Longest time for reading the drives of one vehicle. [s]
 
     Returns
     -------
@@ -110,6 +83,79 @@ def calibrate_fleet(
         If the fleet as a whole cannot be calibrated.
     """
     require_new_folder(out)
+    storage = open_storage(place)
+    stored = read_identity(storage, database)
+    if stored is not None:
+        _require_drives_unneeded(settings, storage.url)
+        store = SummaryStore(storage=storage, identity=stored)
+        with unfinished_run(out) as unfinished:
+            return _calibrate_store(unfinished, store, _Fleet.of_store(store), database, settings, workers=workers)
+    fleet = _find_drives(Path(storage.url), settings)
+    equipment = probe_equipment(fleet, database, settings.branches)
+    with unfinished_run(out) as unfinished:
+        if settings.method is Method.PUBLISHED:
+            return _calibrate_published(unfinished, fleet, equipment, database, settings, workers=workers)
+        store = _summaries_of(unfinished, fleet, equipment, database)
+        add_drives(store, fleet, database, workers=workers.processes, time_limit_s=time_limit_s, exactly=True)
+        find_models = None
+        if settings.sensor_models:
+            find_models = partial(_find_models, fleet=fleet, equipment=equipment, database=database, workers=workers)
+        return _calibrate_store(
+            unfinished,
+            store,
+            _Fleet.of_drives(fleet, equipment),
+            database,
+            settings,
+            workers=workers,
+            find_models=find_models,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Fleet:
+    """What a result says of its fleet."""
+
+    name: str
+    fleet_ids: tuple[str, ...]
+    equipment: Equipment
+    left_out: Mapping[str, str]
+    notices: tuple[str, ...]
+
+    @classmethod
+    def of_drives(cls, fleet: FleetSource, equipment: Equipment) -> "_Fleet":
+        return cls(
+            name=fleet.path.resolve().name,
+            fleet_ids=tuple(sorted(fleet.fleet_ids)),
+            equipment=equipment,
+            left_out=fleet.left_out,
+            notices=(*fleet.notices, *equipment.notices),
+        )
+
+    @classmethod
+    def of_store(cls, store: SummaryStore) -> "_Fleet":
+        identity = store.identity
+        return cls(
+            name=identity.fleet,
+            fleet_ids=identity.fleet_ids,
+            equipment=identity.equipment,
+            left_out={},
+            notices=identity.notices,
+        )
+
+
+def _require_drives_unneeded(settings: CalibrationSettings, where: str) -> None:
+    """Refuse what summaries do not tell."""
+    needs = {
+        "--method published": settings.method is Method.PUBLISHED,
+        "--sensor-models": settings.sensor_models,
+        "--branches": settings.branches is not None,
+    }
+    for option, wanted in needs.items():
+        if wanted:
+            raise FleetError(f"{where}: a store of summaries, and {option} needs the drives; give the drive store")
+
+
+def _find_drives(path: Path, settings: CalibrationSettings) -> FleetSource:
     fleet = without_copies(find_fleet(path))
     if not fleet.vehicles:
         why = "; ".join(f"{name}: {reason}" for name, reason in fleet.left_out.items())
@@ -124,88 +170,132 @@ def calibrate_fleet(
         raise FleetError(
             f"vehicle {', '.join(sorted(both))} is both held out and trusted: the reference would be learnt from it"
         )
-    equipment = probe_equipment(fleet, database, settings.branches)
-    identity = RunIdentity(
-        database=database,
-        method=settings.method,
-        fleet=path.resolve().name,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
+    return fleet
+
+
+def _summaries_of(
+    unfinished: Unfinished, fleet: FleetSource, equipment: Equipment, database: VehicleDatabase
+) -> SummaryStore:
+    """Store of the summaries read so far; one that was begun with other branches or another layout is begun anew."""
+    storage = open_storage(unfinished.summaries)
+    try:
+        return open_store(storage, equipment, database, fleet)
+    except FleetError:
+        shutil.rmtree(unfinished.summaries, ignore_errors=True)
+        return open_store(storage, equipment, database, fleet)
+
+
+def _find_models(
+    *found: Any, fleet: FleetSource, equipment: Equipment, database: VehicleDatabase, workers: Workers
+) -> SensorFindings:
+    """Second pass over the drives."""
+    vehicles, zero_a, learning, trusted = found
+    return find_sensor_models(
+        vehicles,
+        zero_a,
+        fleet,
+        equipment,
+        database,
+        learning=learning,
+        trusted=trusted,
+        workers=workers.processes,
     )
-    outcome = METHODS[settings.method](fleet, equipment, identity, settings, workers=workers)
-    run = _record(fleet, equipment, identity, settings, outcome)
-    left_out = [LeftOut(vehicle=vehicle, reason=reason) for vehicle, reason in outcome.left_out.items()]
-    write_results(out, outcome.parameters, left_out, run)
-    return _report(out, outcome, run)
 
 
-def _record(
+def _calibrate_store(
+    unfinished: Unfinished,
+    store: SummaryStore,
+    fleet: _Fleet,
+    database: VehicleDatabase,
+    settings: CalibrationSettings,
+    *,
+    workers: Workers,
+    find_models: FindModels | None = None,
+) -> CalibrationReport:
+    """Calibrate from summaries; those that were read here become part of the result."""
+    plan = _plan(store, database, settings)
+    identity = _identity(fleet, database, settings, created=unfinished.begin(plan, _now()))
+    run = calibrate_store(store, settings, identity, unfinished.chunks, workers=workers, find_models=find_models)
+    own = unfinished.summaries if unfinished.summaries.exists() else None
+    return _finish(
+        unfinished, fleet, identity, settings, details=run.learnt.details, notices=run.learnt.notices, summaries=own
+    )
+
+
+def _calibrate_published(
+    unfinished: Unfinished,
     fleet: FleetSource,
     equipment: Equipment,
+    database: VehicleDatabase,
+    settings: CalibrationSettings,
+    *,
+    workers: Workers,
+) -> CalibrationReport:
+    """The published method needs all models at once; its result is one chunk."""
+    about = _Fleet.of_drives(fleet, equipment)
+    identity = _identity(about, database, settings, created=unfinished.begin("", _now()))
+    outcome = calibrate_fleet_published(fleet, equipment, identity, settings, workers=workers.processes)
+    unfinished.chunks.put(0, encode_chunk(outcome.parameters, outcome.left_out))
+    about = replace(about, left_out={})
+    return _finish(unfinished, about, identity, settings, details=outcome.details, notices=outcome.notices)
+
+
+def _now() -> str:
+    """The time, ISO 8601; that of SOURCE_DATE_EPOCH, if it is set, makes results alike to the bit."""
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
+    now = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
+    return now.isoformat(timespec="seconds")
+
+
+def _identity(fleet: _Fleet, database: VehicleDatabase, settings: CalibrationSettings, *, created: str) -> RunIdentity:
+    return RunIdentity(database=database, method=settings.method, fleet=fleet.name, created=created)
+
+
+def _plan(store: SummaryStore, database: VehicleDatabase, settings: CalibrationSettings) -> str:
+    """Digest of all that decides what a run computes."""
+    parts = (__version__, store.identity, store.versions(), database.layout.digest, database.digest, settings.record())
+    return hashlib.blake2b(msgspec.json.encode(parts, order="sorted"), digest_size=16).hexdigest()
+
+
+def _finish(
+    unfinished: Unfinished,
+    fleet: _Fleet,
     identity: RunIdentity,
     settings: CalibrationSettings,
-    outcome: FleetOutcome,
-) -> RunRecord:
-    return RunRecord(
+    *,
+    details: Mapping[str, object],
+    notices: Sequence[str],
+    summaries: Path | None = None,
+) -> CalibrationReport:
+    """Put the chunks together."""
+    chunks, folder = unfinished.chunks, unfinished.result()
+    numbers = chunks.numbers()
+    if fleet.left_out:
+        chunks.put(LAST_CHUNK, encode_chunk([], fleet.left_out))
+    vehicles = join_rows(folder, [chunks.rows(number) for number in chunks.numbers()])
+    left_out = left_out_of(folder, most=MOST_NAMED)
+    if not vehicles:
+        why = next(iter(left_out.values()), "there is none")
+        raise FleetError(f"{fleet.name}: no vehicle can be calibrated; the first: {why}")
+    where = write_parameter_files(folder, {n: chunks.parameters(n) for n in numbers}, vehicles=vehicles)
+    if summaries is not None:
+        shutil.copytree(summaries, folder / summaries.name)
+    run = RunRecord(
         tool=identity.tool,
         method=identity.method.value,
         fleet=identity.fleet,
-        fleet_ids=sorted(fleet.fleet_ids),
+        fleet_ids=list(fleet.fleet_ids),
         layout=identity.database.layout.name,
-        branches=list(equipment.branches),
-        model_inputs=list(equipment.inputs),
+        branches=list(fleet.equipment.branches),
+        model_inputs=list(fleet.equipment.inputs),
         settings=settings.record(),
         created=identity.created,
-        details=dict(outcome.details),
-        vehicles=len(outcome.parameters),
-        left_out=dict(outcome.left_out),
-        notices=[*fleet.notices, *equipment.notices, *outcome.notices],
+        details=dict(details),
+        vehicles=vehicles,
+        left_out=left_out,
+        notices=[*fleet.notices, *notices],
     )
-
-
-def _report(out: Path, outcome: FleetOutcome, run: RunRecord) -> CalibrationReport:
-    parameters = outcome.parameters
-    measured = [item.junction_residual.measured_a for item in parameters]
-    deployed = [
-        item.junction_residual.corrected_a
-        if any(branch.apply for branch in item.branches.values())
-        else item.junction_residual.measured_a
-        for item in parameters
-    ]
-    return CalibrationReport(
-        result=str(out),
-        run=run,
-        verdicts=dict(Counter[str](item.verdict for item in parameters)),
-        undecided={item.vehicle: item.deciding_evidence for item in parameters if item.verdict == "cannot tell"},
-        held_back=dict(
-            Counter[str](
-                branch.held_back for item in parameters for branch in item.branches.values() if branch.held_back
-            )
-        ),
-        corrected={item.vehicle: _corrections(item) for item in parameters if item.verdict == "corrected"},
-        hardware_suspected={
-            item.vehicle: ""
-            if item.hardware_fault.probability is None
-            else f"probability {item.hardware_fault.probability:.1f}"
-            for item in parameters
-            if item.hardware_fault.suspected
-        },
-        junction_rms_measured_a=float(np.median(measured)),
-        junction_rms_deployed_a=float(np.median(deployed)),
-    )
-
-
-def _corrections(item: VehicleParameters) -> str:
-    """Which branches of a vehicle are corrected, and a low confidence."""
-    names = ", ".join(name for name, branch in item.branches.items() if branch.apply)
-    unsure = item.confidence is not None and item.confidence < CONFIDENT
-    return f"{names} (all of its faults: confidence {item.confidence:.2f})" if unsure else names
-
-
-def _detail_rows(run: RunRecord) -> list[tuple[str, str]]:
-    """What a method tells of its run, for people."""
-    snr = run.details.get("simulation_snr_db", {})
-    agreeing = run.details.get("reference", {}).get("agreeing_share", {})
-    rows = [(f"simulation SNR, median, {name} [dB]", f"{value:.1f}") for name, value in snr.items()]
-    spread = run.details.get("hyperparameters", {}).get("model_spread", {})
-    rows += [(f"vehicles that agree, {name}", f"{value:.0%}") for name, value in agreeing.items()]
-    return rows + [(f"faultless vehicles differ by, {name}", f"{value:.1%}") for name, value in spread.items()]
+    write_run(folder, run)
+    report = report_of(folder, run, parameters=where, shown=unfinished.shown)
+    unfinished.finish()
+    return report

@@ -1,26 +1,51 @@
-"""Result of a calibration: ``RESULT/params/VEHICLE.json``, ``RESULT/results.parquet`` and ``RESULT/run.json``.
+"""Result of a calibration: parameter files, ``RESULT/results.parquet`` and ``RESULT/run.json``.
 
-``results.parquet`` has one row per vehicle and branch; a vehicle that was left out has one row without branch. The
-folder appears only when it is complete.
+``results.parquet`` has one row per vehicle and branch; a vehicle that was left out has one row without branch.
+Parameter files are ``RESULT/params/VEHICLE.json`` for up to :data:`MOST_FILES` vehicles. Of a larger fleet they are the
+rows of ``RESULT/parameters/NNNNN.parquet``, by the bucket of the vehicle: a folder of a million files is no use.
+
+A fleet is calibrated in chunks. Each chunk gives a :class:`ChunkResult`; what a result says of the fleet as a whole is
+computed from them.
 """
 
-from collections.abc import Sequence
+import io
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from calibrator.errors import FleetError
-from calibrator.folders import whole_folder
-from ecu_node.parameters import VehicleParameters, write_atomically, write_parameters
+from ecu_node.parameters import VehicleParameters, encode_parameters, write_atomically
 
-__all__ = ["LeftOut", "RunRecord", "read_results", "read_run", "write_results"]
+__all__ = [
+    "LEFT_OUT",
+    "ChunkResult",
+    "RunRecord",
+    "chunk_parameters",
+    "encode_chunk",
+    "join_rows",
+    "left_out_of",
+    "read_results",
+    "read_run",
+    "write_parameter_files",
+    "write_run",
+]
 
 LEFT_OUT = "left out"
 """Stands for the verdict of a vehicle, or of a file of unclear vehicle, that has no parameters."""
+
+MOST_FILES = 10_000
+"""Vehicles whose parameters are files of their own in one folder."""
+PARTS = "parameters"
+PARAMETERS_SCHEMA = pa.schema(
+    [pa.field("vehicle", pa.string(), nullable=False), pa.field("parameters", pa.string(), nullable=False)]
+)
 
 SCHEMA = pa.schema(
     [
@@ -49,14 +74,6 @@ SCHEMA = pa.schema(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class LeftOut:
-    """A vehicle without parameters, and why."""
-
-    vehicle: str
-    reason: str
-
-
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """How a result was made."""
 
@@ -78,35 +95,129 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     notices: list[str]
 
 
-def write_results(
-    out: Path, parameters: Sequence[VehicleParameters], left_out: Sequence[LeftOut], run: RunRecord
-) -> None:
-    """Write a whole result folder, or none.
+@dataclass(frozen=True, kw_only=True)
+class ChunkResult:
+    """What some vehicles of a fleet gave, as files.
+
+    Attributes
+    ----------
+    rows : bytes
+        Their part of ``results.parquet``.
+    parameters : bytes
+        Parquet with the columns ``vehicle`` and ``parameters``, the text of the parameter file.
+    """
+
+    rows: bytes
+    parameters: bytes
+
+
+def encode_chunk(parameters: Sequence[VehicleParameters], left_out: Mapping[str, str]) -> ChunkResult:
+    """Write down what a chunk gave.
 
     Parameters
     ----------
-    out : Path
-        New or empty folder.
     parameters : sequence of VehicleParameters
         One per calibrated vehicle.
-    left_out : sequence of LeftOut
-        The other vehicles.
-    run : RunRecord
-        How it was made.
+    left_out : mapping of str to str
+        Why the other vehicles have none.
+
+    Returns
+    -------
+    ChunkResult
+        In the order of the vehicles' names.
 
     Raises
     ------
-    FleetError
-        If the folder exists and is not empty.
+    ParameterError
+        If a number is not finite.
     """
-    with whole_folder(out) as folder:
-        (folder / "params").mkdir()
-        for item in parameters:
-            write_parameters(item, folder / "params" / f"{item.vehicle}.json")
-        rows = [row for item in parameters for row in _rows(item)]
-        rows += [{"vehicle": v.vehicle, "verdict": LEFT_OUT, "reason": v.reason} for v in left_out]
-        pq.write_table(pa.Table.from_pylist(rows, schema=SCHEMA), folder / "results.parquet", compression="zstd")
-        write_atomically(folder / "run.json", msgspec.json.format(msgspec.json.encode(run), indent=2) + b"\n")
+    ordered = sorted(parameters, key=lambda item: item.vehicle)
+    rows = [row for item in ordered for row in _rows(item)]
+    rows += [{"vehicle": vehicle, "verdict": LEFT_OUT, "reason": left_out[vehicle]} for vehicle in sorted(left_out)]
+    texts = [{"vehicle": item.vehicle, "parameters": encode_parameters(item).decode()} for item in ordered]
+    return ChunkResult(rows=_parquet(rows, SCHEMA), parameters=_parquet(texts, PARAMETERS_SCHEMA))
+
+
+def _parquet(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes:
+    buffer = io.BytesIO()
+    pq.write_table(pa.Table.from_pylist(rows, schema=schema), buffer, compression="zstd")
+    return buffer.getvalue()
+
+
+def chunk_parameters(content: bytes) -> Iterator[tuple[str, bytes]]:
+    """Vehicles and texts of their parameter files, from the parameters of a :class:`ChunkResult`."""
+    table = pq.read_table(io.BytesIO(content), schema=PARAMETERS_SCHEMA, use_threads=False)
+    for row in table.to_pylist():
+        yield row["vehicle"], row["parameters"].encode()
+
+
+def join_rows(folder: Path, parts: Sequence[Path]) -> int:
+    """Join the rows of all chunks to ``results.parquet``; of up to :data:`MOST_FILES` vehicles in order of their names.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the result; it must exist.
+    parts : sequence of Path
+        Files with the rows of each chunk.
+
+    Returns
+    -------
+    int
+        Number of vehicles that have parameters.
+    """
+    path, calibrated = folder / "results.parquet", 0
+    with pq.ParquetWriter(path, SCHEMA, compression="zstd") as writer:
+        for part in parts:
+            table = pq.read_table(part, schema=SCHEMA, use_threads=False)
+            calibrated += len(pc.unique(table.filter(pc.field("branch").is_valid())["vehicle"]))
+            writer.write_table(table)
+    if calibrated <= MOST_FILES:
+        rows = pq.read_table(path, schema=SCHEMA).to_pylist()
+        rows.sort(key=lambda row: (row["verdict"] == LEFT_OUT, row["vehicle"]))  # stable: branches keep their order
+        path.write_bytes(_parquet(rows, SCHEMA))
+    return calibrated
+
+
+def left_out_of(folder: Path, *, most: int) -> dict[str, str]:
+    """Vehicles of ``results.parquet`` that have no parameters, and why; so many at most are named."""
+    rows = pq.read_table(folder / "results.parquet", columns=["vehicle", "branch", "reason"])
+    rows = rows.filter(pc.field("branch").is_null()).slice(0, most)
+    return dict(zip(rows["vehicle"].to_pylist(), rows["reason"].to_pylist(), strict=True))
+
+
+def write_parameter_files(folder: Path, parts: Mapping[int, Path], *, vehicles: int) -> str:
+    """Write the parameter files of a result.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the result; it must exist.
+    parts : mapping of int to Path
+        Files with the parameters of each chunk, by its number.
+    vehicles : int
+        How many there are in all.
+
+    Returns
+    -------
+    str
+        Where they are, within the folder.
+    """
+    if vehicles > MOST_FILES:
+        (folder / PARTS).mkdir()
+        for number, part in parts.items():
+            shutil.copyfile(part, folder / PARTS / f"{number:05d}.parquet")
+        return PARTS
+    (folder / "params").mkdir()
+    for part in parts.values():
+        for vehicle, text in chunk_parameters(part.read_bytes()):
+            write_atomically(folder / "params" / f"{vehicle}.json", text)
+    return "params"
+
+
+def write_run(folder: Path, run: RunRecord) -> None:
+    """Write ``run.json``."""
+    write_atomically(folder / "run.json", msgspec.json.format(msgspec.json.encode(run), indent=2) + b"\n")
 
 
 def read_results(result: Path) -> list[dict[str, Any]]:
@@ -158,6 +269,7 @@ def _rows(item: VehicleParameters) -> list[dict[str, Any]]:
             "junction_rms_measured_a": item.junction_residual.measured_a,
             "junction_rms_corrected_a": item.junction_residual.corrected_a,
             "duration_s": item.provenance.duration_s,
+            "reason": item.deciding_evidence or None,
         }
         for name, branch in item.branches.items()
     ]

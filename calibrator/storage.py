@@ -47,6 +47,13 @@ class Storage:
         names = [str(path).rstrip("/").rpartition("/")[2] for path in found]
         return sorted(name for name in names if not name.startswith("."))
 
+    def versions(self) -> dict[str, str]:
+        """What tells whether a file was changed, by name: size, and time of change or tag where the storage has one."""
+        filesystem, root = self._filesystem()
+        found = {name: filesystem.info(f"{root}/{name}") for name in self.names()}
+        marks = ("size", "mtime", "LastModified", "ETag", "etag", "created")
+        return {name: "-".join(str(about[mark]) for mark in marks if mark in about) for name, about in found.items()}
+
     def read(self, name: str) -> bytes:
         """Return the content of a file.
 

@@ -29,6 +29,7 @@ __all__ = [
     "VehicleParameters",
     "Verdict",
     "check_fit",
+    "encode_parameters",
     "parameter_schema",
     "read_parameters",
     "write_atomically",
@@ -266,6 +267,40 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
             )
 
 
+def encode_parameters(parameters: VehicleParameters) -> bytes:
+    """Text of a parameter file.
+
+    Parameters
+    ----------
+    parameters : VehicleParameters
+        What it says.
+
+    Returns
+    -------
+    bytes
+        JSON.
+
+    Raises
+    ------
+    ParameterError
+        If it could not be read back: a number is not finite, which JSON cannot say, or a field is outside the schema.
+    """
+    content = msgspec.json.encode(parameters)
+    where = f"parameters of {parameters.vehicle}"
+    try:
+        read_back = msgspec.json.decode(content, type=VehicleParameters)
+    except msgspec.DecodeError as error:
+        raise ParameterError(
+            f"{where}: {error}; numbers that are not finite count as null; nothing was written"
+        ) from None
+    if read_back != parameters:
+        raise ParameterError(
+            f"{where}: a standard deviation or the confidence is not finite; leave it out where it is not known; "
+            f"nothing was written"
+        )
+    return msgspec.json.format(content, indent=2) + b"\n"
+
+
 def write_parameters(parameters: VehicleParameters, path: Path) -> None:
     """Write a parameter file, whole or not at all.
 
@@ -279,22 +314,9 @@ def write_parameters(parameters: VehicleParameters, path: Path) -> None:
     Raises
     ------
     ParameterError
-        If what would be written could not be read back: a number is not finite, which JSON cannot say, or a field is
-        outside the schema. Nothing is written.
+        As :func:`encode_parameters`; nothing is written.
     """
-    content = msgspec.json.encode(parameters)
-    try:
-        read_back = msgspec.json.decode(content, type=VehicleParameters)
-    except msgspec.DecodeError as error:
-        raise ParameterError(
-            f"{path}: {error}; numbers that are not finite count as null; nothing was written"
-        ) from None
-    if read_back != parameters:
-        raise ParameterError(
-            f"{path}: a standard deviation or the confidence is not finite; leave it out where it is not known; "
-            f"nothing was written"
-        )
-    write_atomically(path, msgspec.json.format(content, indent=2) + b"\n")
+    write_atomically(path, encode_parameters(parameters))
 
 
 def write_atomically(path: Path, content: bytes) -> None:

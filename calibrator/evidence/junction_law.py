@@ -12,7 +12,7 @@ share equally as far as the first bound allows.
 
 import numpy as np
 
-from calibrator.drive import Array
+from calibrator.drive import Array, Mask
 from calibrator.evidence.block_regression import VehicleRegressions, regress_vehicles
 from calibrator.evidence.fleet_moments import FleetMoments
 
@@ -66,9 +66,10 @@ def _shared(residual_a2: Array, bound_a2: Array, weights: Array) -> Array:
     bound, weight = np.take_along_axis(bound_a2, order, axis=1), np.take_along_axis(weights, order, axis=1)
     below = np.cumsum(weight * bound, axis=1) - weight * bound
     level = (residual_a2[:, None] - below) / np.cumsum(weight[:, ::-1], axis=1)[:, ::-1]
-    reached = np.asarray(level <= bound)
+    reached: Mask = np.less_equal(level, bound)
     first = np.take_along_axis(level, np.argmax(reached, axis=1)[:, None], axis=1)
-    return np.asarray(np.where(reached.any(axis=1)[:, None], np.minimum(bound_a2, first), bound_a2))
+    enough = np.asarray(reached.any(axis=1))
+    return np.asarray(np.where(enough[:, None], np.minimum(bound_a2, first), bound_a2))
 
 
 def _weights(estimate: Array) -> Array:

@@ -1,13 +1,12 @@
 """What the user knows of single sensors, trusted vehicles and bench readings, and where the drives contradict it."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from calibrator.calibration_settings import CalibrationSettings
 from calibrator.drive import Mask
-from calibrator.drives.fleet_source import FleetSource
 from calibrator.errors import FleetError
 from calibrator.evidence.readings import TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD, Readings, no_readings
 from calibrator.evidence.vehicle_summary import VehicleSummary
@@ -17,12 +16,10 @@ from calibrator.posterior.health import ReferenceHealth
 from calibrator.posterior.model_spread import FEWEST_TRUSTED
 
 __all__ = [
-    "believed",
     "contradicted_readings",
     "merge_readings",
     "read_bench",
     "trust_notices",
-    "trusted_of",
     "window_notices",
 ]
 
@@ -33,12 +30,35 @@ CONTRADICTION = 4.0
 
 
 def read_bench(
-    settings: CalibrationSettings, fleet: FleetSource, branches: Sequence[str], *, full_scale_a: float
+    settings: CalibrationSettings,
+    vehicles: Collection[str],
+    branches: Collection[str],
+    *,
+    left_out: Mapping[str, str],
+    full_scale_a: float,
 ) -> BenchReadings:
-    """Read the table of bench readings, if there is one; FleetError if it contradicts the trust in a vehicle."""
+    """Read the table of bench readings, if there is one.
+
+    Parameters
+    ----------
+    settings : CalibrationSettings
+        Names the table, and the trusted vehicles.
+    vehicles, branches, left_out, full_scale_a
+        As for :func:`~calibrator.posterior.bench_table.read_bench_readings`.
+
+    Returns
+    -------
+    mapping
+        The readings by vehicle and branch.
+
+    Raises
+    ------
+    FleetError
+        Also if it contradicts the trust in a vehicle.
+    """
     if settings.readings is None:
         return {}
-    bench = read_bench_readings(settings.readings, fleet, branches, full_scale_a=full_scale_a)
+    bench = read_bench_readings(settings.readings, vehicles, branches, left_out=left_out, full_scale_a=full_scale_a)
     for (vehicle, branch), (drift, drift_sd, offset_a, offset_sd_a) in bench.items():
         if vehicle in settings.trusted and (
             abs(drift) > CONTRADICTION * np.hypot(drift_sd, TRUSTED_DRIFT_SD)
@@ -49,14 +69,6 @@ def read_bench(
                 f"a trusted vehicle is one whose sensors were all found faultless"
             )
     return bench
-
-
-def trusted_of(names: Sequence[str], wanted: frozenset[str], fleet: FleetSource) -> Mask:
-    """Which vehicles are trusted, shape (N,); FleetError if one that should be cannot be used."""
-    missing = wanted - set(names)
-    if missing:
-        raise FleetError(f"{fleet.path}: no usable vehicle {', '.join(sorted(missing))} to trust")
-    return np.array([name in wanted for name in names])
 
 
 def merge_readings(
@@ -151,15 +163,9 @@ def contradicted_readings(
     return found
 
 
-def believed(trusted: Mask, health: ReferenceHealth | None) -> Mask:
-    """Trusted vehicles less those that break the junction law by themselves, shape (N,)."""
-    distrusted = [] if health is None else list(health.distrusted)
-    return np.asarray(trusted & ~np.isin(np.arange(len(trusted)), distrusted))
-
-
 def trust_notices(names: Sequence[str], trusted: Mask, health: ReferenceHealth) -> list[str]:
     """Trusted vehicles that contradict the trust in them, or are too few to carry the reference."""
-    carriers = int(np.count_nonzero(believed(trusted, health))) - len(health.differing)
+    carriers = int(np.count_nonzero(trusted)) - len(health.distrusted) - len(health.differing)
     too_few = (
         f"only {carriers} of the trusted vehicles can carry the reference, {FEWEST_TRUSTED} are needed: "
         f"it is the fleet's"

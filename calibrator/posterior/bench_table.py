@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrator.drives.fleet_source import FleetSource
 from calibrator.errors import FleetError
 from calibrator.evidence.readings import Readings
 from calibrator.posterior.slab import WIDEST
@@ -30,7 +29,12 @@ BenchReadings = Mapping[tuple[str, str], tuple[float, float, float, float]]
 
 
 def read_bench_readings(
-    path: Path, fleet: FleetSource, branches: Collection[str], *, full_scale_a: float
+    path: Path,
+    vehicles: Collection[str],
+    branches: Collection[str],
+    *,
+    left_out: Mapping[str, str],
+    full_scale_a: float,
 ) -> BenchReadings:
     """Read a table of bench readings.
 
@@ -38,10 +42,10 @@ def read_bench_readings(
     ----------
     path : Path
         CSV file with a header.
-    fleet : FleetSource
-        Whose vehicles may stand in it.
-    branches : collection of str
+    vehicles, branches : collection of str
         Names that may stand in it.
+    left_out : mapping of str to str
+        Vehicles that have no usable drive, and why.
     full_scale_a : float
         Full scale of the junction. [A]
 
@@ -73,7 +77,7 @@ def read_bench_readings(
             if len(cells) > len(header):
                 raise FleetError(f"{place}: {len(cells)} cells, and the header has {len(header)} columns")
             row = dict(zip(header, (cell.strip() for cell in cells), strict=False))
-            sensor = _sensor(row, fleet, branches, place)
+            sensor = _sensor(row, vehicles, branches, left_out=left_out, place=place)
             if sensor in found:
                 raise FleetError(f"{place}: the {sensor[1]} sensor of {sensor[0]} stands there twice; give it one line")
             found[sensor] = _reading(row, place, full_scale_a)
@@ -97,12 +101,19 @@ def _check_header(header: Sequence[str], path: Path) -> None:
     )
 
 
-def _sensor(row: Mapping[str, str], fleet: FleetSource, branches: Collection[str], place: str) -> tuple[str, str]:
+def _sensor(
+    row: Mapping[str, str],
+    vehicles: Collection[str],
+    branches: Collection[str],
+    *,
+    left_out: Mapping[str, str],
+    place: str,
+) -> tuple[str, str]:
     """Vehicle and branch of a line."""
     vehicle, branch = row.get("vehicle", ""), row.get("branch", "")
-    if vehicle in fleet.left_out:
-        raise FleetError(f"{place}: vehicle {vehicle!r} is left out: {fleet.left_out[vehicle]}")
-    for name, known, what in ((vehicle, fleet.vehicles.keys(), "vehicle"), (branch, branches, "branch")):
+    if vehicle in left_out and vehicle not in vehicles:
+        raise FleetError(f"{place}: vehicle {vehicle!r} is left out: {left_out[vehicle]}")
+    for name, known, what in ((vehicle, vehicles, "vehicle"), (branch, branches, "branch")):
         if name not in known:
             raise FleetError(f"{place}: no {what} {name!r} in this fleet; known are {_some(known)}")
     return vehicle, branch

@@ -1,288 +1,265 @@
-"""The default method on a real fleet: drives -> summaries -> evidence -> posterior -> parameter files.
+"""The default method on a fleet: its reference from some vehicles, then the parameters of any others, a few at a time.
 
-If asked to, the drives are read a second time to find sensors that are not linear; if there are any, the posterior is
-computed anew from the linear parts of all sensors.
+If asked to, the drives are read a second time to find sensors that are not linear; if there are any, the reference is
+learnt anew from the linear parts of all sensors.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
-from typing import cast
 
 import numpy as np
 
-from calibrator.calibration_settings import CalibrationSettings, FleetOutcome, require_learning
-from calibrator.drive import Mask
-from calibrator.drives.fleet_source import Equipment, FleetSource
-from calibrator.errors import FleetError
+from calibrator.calibration_settings import CalibrationSettings, require_learning
+from calibrator.drive import Array, Mask
 from calibrator.evidence.readings import Readings
-from calibrator.evidence.vehicle_summary import VehicleSummary, read_vehicle_summary
-from calibrator.parameter_files import RunIdentity, by_branch, junction_rms_a
-from calibrator.posterior.advice import advise
-from calibrator.posterior.bench import (
-    believed,
-    contradicted_readings,
-    merge_readings,
-    read_bench,
-    trust_notices,
-    trusted_of,
-    window_notices,
-)
+from calibrator.evidence.summary import DriveSummary
+from calibrator.evidence.vehicle_summary import VehicleSummary
+from calibrator.parameter_files import RunIdentity, by_branch
+from calibrator.posterior.bench import contradicted_readings, merge_readings, trust_notices, window_notices
 from calibrator.posterior.bench_table import BenchReadings
-from calibrator.posterior.calibration import calibrate_posterior
-from calibrator.posterior.estimate import FleetPosterior
-from calibrator.posterior.explain import explanations
+from calibrator.posterior.calibration import FleetReference, estimate_summaries, learn_reference
 from calibrator.posterior.second_pass import finding_notices, tell_sensors, without_sensor_models
-from calibrator.posterior.verdict import Deployment, decide
-from calibrator.sensor_models.fleet import SensorFindings, all_linear, find_sensor_models
-from calibrator.vehicles import read_vehicles
-from ecu_node.parameters import (
-    BranchParameters,
-    Explanation,
-    HardwareFault,
-    HeldBack,
-    JunctionResidual,
-    VehicleParameters,
-)
+from calibrator.posterior.vehicle_parameters import impossible_vehicles, vehicle_parameters
+from calibrator.posterior.verdict import decide
+from calibrator.sensor_models.choice import SensorModelChoice
+from calibrator.sensor_models.fleet import SensorFindings, all_linear
+from ecu_node.parameters import VehicleParameters
 
-__all__ = ["calibrate_fleet_posterior"]
+__all__ = ["FindModels", "FleetTask", "Learnt", "learn_fleet"]
 
-UNTOLD = 0.05
-"""Probability of other explanations up to which they are not told. [1]"""
-MOST_TOLD, LEAST_TOLD = 3, 0.02
-"""Explanations that are told, and the least probability of one after the first. [1]"""
+FindModels = Callable[[Sequence[VehicleSummary], Array, Mask, Mask], SensorFindings]
+"""Second pass: vehicles, offsets found with linear sensors (N, K) [A], learning and trusted ones -> findings."""
 
 
-def calibrate_fleet_posterior(
-    fleet: FleetSource, equipment: Equipment, identity: RunIdentity, settings: CalibrationSettings, *, workers: int
-) -> FleetOutcome:
-    """Calibrate a fleet by the sparse posterior.
+@dataclass(frozen=True, kw_only=True)
+class FleetTask:
+    """All that it takes to calibrate vehicles of a fleet whose reference is known.
+
+    Attributes
+    ----------
+    reference : FleetReference
+        Of the fleet.
+    identity : RunIdentity
+        For the parameter files.
+    branches : tuple of str
+        Names of the K branches.
+    harm_limit : float
+        Largest probability of harm with which a branch is corrected. [1]
+    bench : mapping
+        Bench readings that are used.
+    believed : frozenset of str
+        Trusted vehicles that do not break the junction law.
+    fleet_size : int
+        Vehicles of the fleet that can be used.
+    not_linear : mapping of str to (sequence of SensorModelChoice, DriveSummary)
+        Of the vehicles that have sensors that are not linear, or may have: models and linear parts.
+    """
+
+    reference: FleetReference
+    identity: RunIdentity
+    branches: tuple[str, ...]
+    harm_limit: float
+    bench: BenchReadings
+    believed: frozenset[str]
+    fleet_size: int
+    not_linear: Mapping[str, tuple[Sequence[SensorModelChoice], DriveSummary]] = field(default_factory=dict)
+
+    def calibrate(self, vehicles: Sequence[VehicleSummary]) -> tuple[list[VehicleParameters], dict[str, str]]:
+        """Calibrate some vehicles; what comes out does not depend on which others are among them.
+
+        Parameters
+        ----------
+        vehicles : sequence of VehicleSummary
+            N of them.
+
+        Returns
+        -------
+        parameters : list of VehicleParameters
+            Of those whose currents a sensor can show.
+        left_out : dict of str to str
+            Why the others have none.
+        """
+        if not vehicles:
+            return [], {}
+        findings = self._findings(vehicles)
+        readings, _ = merge_readings(vehicles, self.bench, self.branches)
+        posterior = estimate_summaries(
+            findings.summaries,
+            self.reference,
+            readings=readings,
+            believed=np.array([vehicle.vehicle in self.believed for vehicle in vehicles]),
+        )
+        layout, health = self.identity.database.layout, self.reference.health
+        decision = decide(posterior, layout, harm_limit=self.harm_limit, doubtful=health.doubtful)
+        deployment = without_sensor_models(decision, findings)
+        impossible = impossible_vehicles(posterior, self.branches)
+        parameters = [
+            tell_sensors(
+                vehicle_parameters(
+                    vehicle,
+                    posterior,
+                    deployment,
+                    position=j,
+                    branches=self.branches,
+                    identity=self.identity,
+                    fleet_size=self.fleet_size,
+                ),
+                findings.choices[j],
+            )
+            for j, vehicle in enumerate(vehicles)
+            if j not in impossible
+        ]
+        return parameters, {vehicles[j].vehicle: why for j, why in impossible.items()}
+
+    def _findings(self, vehicles: Sequence[VehicleSummary]) -> SensorFindings:
+        linear = all_linear(vehicles)
+        found = [self.not_linear.get(vehicle.vehicle) for vehicle in vehicles]
+        return SensorFindings(
+            choices=[row if it is None else it[0] for it, row in zip(found, linear.choices, strict=True)],
+            summaries=[part if it is None else it[1] for it, part in zip(found, linear.summaries, strict=True)],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learnt:
+    """What the first pass found.
+
+    Attributes
+    ----------
+    task : FleetTask
+        For the second pass.
+    notices : tuple of str
+        What the user should know.
+    details : mapping of str to JSON values
+        For the record of the run.
+    """
+
+    task: FleetTask
+    notices: tuple[str, ...]
+    details: Mapping[str, object]
+
+
+def learn_fleet(
+    vehicles: Sequence[VehicleSummary],
+    settings: CalibrationSettings,
+    bench: BenchReadings,
+    *,
+    branches: tuple[str, ...],
+    identity: RunIdentity,
+    fleet_size: int,
+    find_models: FindModels | None = None,
+) -> Learnt:
+    """Learn the reference of a fleet.
 
     Parameters
     ----------
-    fleet, equipment : FleetSource, Equipment
-        The fleet, its branches and inputs.
-    identity : RunIdentity
-        For the parameter files.
+    vehicles : sequence of VehicleSummary
+        All to learn from, all that are trusted, and all that were checked on a bench.
     settings : CalibrationSettings
         How.
-    workers : int
-        Number of processes.
+    bench : mapping
+        Bench readings.
+    branches : tuple of str
+        Names of the K branches.
+    identity : RunIdentity
+        Of the run.
+    fleet_size : int
+        Vehicles of the fleet that can be used.
+    find_models : callable or None
+        Second pass over the drives; None: all sensors count as linear.
 
     Returns
     -------
-    FleetOutcome
-        Parameters of every vehicle that could be used.
+    Learnt
+        With which every vehicle can be calibrated.
 
     Raises
     ------
     FleetError
-        If too few vehicles can be used, or a trusted one is not there.
+        If too few vehicles can be learnt from.
     """
-    full_scale_a = identity.database.layout.full_scale_a
-    bench = read_bench(settings, fleet, equipment.branches, full_scale_a=full_scale_a)
-    vehicles, left_out = read_vehicles(read_vehicle_summary, fleet, equipment, identity.database, workers=workers)
     names = [vehicle.vehicle for vehicle in vehicles]
-    learning = require_learning(names, settings, left_out)
-    trusted = trusted_of(names, settings.trusted, fleet)
-    estimate = partial(
-        calibrate_posterior,
-        full_scale_a=full_scale_a,
-        branches=equipment.branches,
-        trusted=trusted,
-        learning=np.array(learning),
-        load=identity.database.layout.unmeasured_load,
-    )
-    posterior, readings, doubts = _first_pass(estimate, vehicles, bench, equipment.branches, full_scale_a)
-    findings = all_linear(vehicles)
-    if settings.sensor_models:
-        findings = find_sensor_models(
-            vehicles,
-            posterior.faults.offset_a,
-            fleet,
-            equipment,
-            identity.database,
-            learning=np.array(learning),
-            trusted=believed(trusted, posterior.health),
-            workers=workers,
-        )
-    if findings.not_linear.any():
-        posterior = estimate(findings.summaries, readings=readings)
-    health = posterior.health
-    assert health is not None
-    decision = decide(posterior, identity.database.layout, harm_limit=settings.harm_limit, doubtful=health.doubtful)
-    left_out |= _impossible(vehicles, posterior, equipment.branches)
-    parameters = _parameter_files(vehicles, posterior, decision, findings, equipment=equipment, identity=identity)
-    if not parameters:
-        raise FleetError(f"{fleet.path}: no vehicle can be calibrated; the first: {next(iter(left_out.values()))}")
-    return FleetOutcome(
-        parameters=parameters,
-        left_out=left_out,
-        notices=(
-            *health.warnings,
-            *trust_notices(names, trusted, health),
-            *doubts,
-            *window_notices(vehicles, believed(trusted, health), equipment.branches, full_scale_a),
-            *finding_notices(names, findings, equipment.branches),
-        ),
-        details=_details(posterior, equipment.branches),
-    )
-
-
-def _first_pass(
-    estimate: Callable[..., FleetPosterior],
-    vehicles: Sequence[VehicleSummary],
-    bench: BenchReadings,
-    branches: Sequence[str],
-    full_scale_a: float,
-) -> tuple[FleetPosterior, Readings, list[str]]:
-    """Posterior of sensors that are taken for linear, the readings that were used, and what is to be said of them."""
-    summaries = [vehicle.summary for vehicle in vehicles]
-    readings, notices = merge_readings(vehicles, {}, branches)
-    posterior = estimate(summaries, readings=readings)
-    if bench:
-        names = [vehicle.vehicle for vehicle in vehicles]
-        wrong = contradicted_readings(posterior, bench, names, branches, full_scale_a)
-        used = {sensor: values for sensor, values in bench.items() if sensor not in wrong}
-        readings, notices = merge_readings(vehicles, used, branches)
-        notices += wrong.values()
-        posterior = estimate(summaries, readings=readings)
-    return posterior, readings, notices
-
-
-def _parameter_files(
-    vehicles: Sequence[VehicleSummary],
-    posterior: FleetPosterior,
-    decision: Deployment,
-    findings: SensorFindings,
-    *,
-    equipment: Equipment,
-    identity: RunIdentity,
-) -> list[VehicleParameters]:
-    """One per vehicle whose currents a sensor can show."""
-    deployment, possible = without_sensor_models(decision, findings), _possible(posterior)
-    return [
-        tell_sensors(
-            _parameters(vehicle, posterior, deployment, position=j, branches=equipment.branches, identity=identity),
-            findings.choices[j],
-        )
-        for j, vehicle in enumerate(vehicles)
-        if possible[j].all()
-    ]
-
-
-def _possible(posterior: FleetPosterior) -> Mask:
-    """Branches whose drift a sensor can have, shape (N, K)."""
-    return np.asarray(np.abs(posterior.faults.drift) < 1.0)
-
-
-def _impossible(
-    vehicles: Sequence[VehicleSummary], posterior: FleetPosterior, branches: Sequence[str]
-) -> dict[str, str]:
-    """Why vehicles whose currents no sensor can show have no parameters."""
-    possible = _possible(posterior)
-    return {
-        vehicle.vehicle: (
-            f"its {branches[int(np.argmin(possible[j]))]} current does not follow its inputs as in the rest of the "
-            f"fleet: parked, stuck, or another kind of vehicle? record a drive in which it is used"
-        )
-        for j, vehicle in enumerate(vehicles)
-        if not possible[j].all()
-    }
-
-
-def _parameters(
-    vehicle: VehicleSummary,
-    posterior: FleetPosterior,
-    deployment: Deployment,
-    *,
-    position: int,
-    branches: Sequence[str],
-    identity: RunIdentity,
-) -> VehicleParameters:
-    """Write down what was found for one vehicle."""
-    j = position
-    faults, corrected, zeros = posterior.faults.take(j), deployment.corrected[j], np.zeros(len(branches))
-    moments = (vehicle.summary.mean_a, vehicle.summary.mean_product_a2)
-    deployed = {"drift": np.where(corrected, faults.drift, 0.0), "offset_a": np.where(corrected, faults.offset_a, 0.0)}
-    open_question = deployment.verdicts[j] == "cannot tell" or posterior.confidence[j] < 1.0 - UNTOLD
-    told: list[Explanation] = []
-    decisive = ""
-    if open_question or (deployment.held_back[j] != "").any():
-        told, decisive = _explanations(posterior, deployment, j, branches, identity)
-    return VehicleParameters(
-        vehicle=vehicle.vehicle,
-        layout=identity.layout,
-        dbc=identity.dbc,
-        verdict=deployment.verdicts[j],
-        confidence=None if posterior.health and posterior.health.doubtful else _share(posterior.confidence[j]),
-        branches={name: _branch(vehicle, posterior, deployment, (j, k), name=name) for k, name in enumerate(branches)},
-        hardware_fault=HardwareFault(
-            suspected=bool(deployment.hardware[j]),
-            drift=float(faults.hardware_drift),
-            offset_a=by_branch(branches, faults.hardware_offset_a),
-            probability=_share(posterior.hardware_fault[j]),
-        ),
-        explanations=told,
-        deciding_evidence=decisive,
-        junction_residual=JunctionResidual(
-            measured_a=junction_rms_a(*moments, drift=zeros, offset_a=zeros),
-            corrected_a=junction_rms_a(*moments, **deployed),
-        ),
-        provenance=identity.provenance(
-            fleet_size=len(posterior), drives=vehicle.drives, duration_s=vehicle.summary.duration_s
-        ),
-    )
-
-
-def _branch(
-    vehicle: VehicleSummary, posterior: FleetPosterior, deployment: Deployment, place: tuple[int, int], *, name: str
-) -> BranchParameters:
-    k = vehicle.delays.branches.index(name)
-    known = bool(vehicle.delays.known[k])
-    in_doubt = posterior.health is not None and place[1] in posterior.health.doubtful
-    return BranchParameters(
-        drift=float(posterior.faults.drift[place]),
-        offset_a=float(posterior.faults.offset_a[place]),
-        drift_sd=float(posterior.drift_sd[place]),
-        offset_sd_a=float(posterior.offset_sd_a[place]),
-        apply=bool(deployment.corrected[place]),
-        held_back=cast("HeldBack", str(deployment.held_back[place])) if deployment.held_back[place] else None,
-        delay_s=float(vehicle.delays.delay_s[k]) if known else None,
-        delay_sd_s=float(vehicle.delays.sd_s[k]) if known else None,
-        fault_probability=None if in_doubt else _share(posterior.sensor_fault[place]),
-        harm_probability=None if in_doubt else _share(posterior.harm[place]),
-        identifiable=bool(posterior.identifiable[place]),
-    )
-
-
-def _explanations(
-    posterior: FleetPosterior, deployment: Deployment, j: int, branches: Sequence[str], identity: RunIdentity
-) -> tuple[list[Explanation], str]:
-    """The competing explanations of one vehicle, and what would decide between them."""
+    learning = np.array(require_learning(names, settings, {}))
+    trusted = np.array([name in settings.trusted for name in names])
     layout = identity.database.layout
-    names = [branches[k] for k in posterior.order]
-    found = explanations(posterior.states, j)
-    told = [
-        Explanation(
-            probability=_share(each.probability),
-            drift={name: float(d) for name, d in zip(names, each.drift, strict=True) if d},
-            offset_a={name: float(o * layout.full_scale_a) for name, o in zip(names, each.offset, strict=True) if o},
-            hardware_drift=each.hardware_drift,
-            hardware_offset_a={
-                name: float(o * layout.full_scale_a) for name, o in zip(names, each.hardware_offset, strict=True) if o
-            },
+    learn = partial(
+        _learn,
+        learning=learning,
+        trusted=trusted,
+        learner=partial(
+            learn_reference, full_scale_a=layout.full_scale_a, branches=branches, load=layout.unmeasured_load
+        ),
+    )
+    summaries = [vehicle.summary for vehicle in vehicles]
+    readings, doubts = merge_readings(vehicles, {}, branches)
+    reference, believed = learn(summaries, readings)
+    if bench:
+        checked = np.array([any(name == vehicle for vehicle, _ in bench) for name in names])
+        posterior = estimate_summaries(
+            [part for part, use in zip(summaries, checked, strict=True) if use],
+            reference,
+            readings=readings.take(checked),
+            believed=believed[checked],
         )
-        for n, each in enumerate(found[:MOST_TOLD])
-        if not n or each.probability >= LEAST_TOLD
-    ]
-    return told, advise(posterior, deployment, j, found, branches=branches, layout=layout)
+        checked_names = [name for name, use in zip(names, checked, strict=True) if use]
+        wrong = contradicted_readings(posterior, bench, checked_names, branches, layout.full_scale_a)
+        bench = {sensor: values for sensor, values in bench.items() if sensor not in wrong}
+        readings, doubts = merge_readings(vehicles, bench, branches)
+        doubts += wrong.values()
+        reference, believed = learn(summaries, readings)
+    findings = all_linear(vehicles)
+    if find_models is not None:
+        zero_a = estimate_summaries(summaries, reference, readings=readings, believed=believed).faults.offset_a
+        findings = find_models(vehicles, zero_a, learning, believed)
+    if findings.not_linear.any():
+        reference, believed = learn(findings.summaries, readings)
+    told = findings.not_linear.any(axis=1) | findings.undecided.any(axis=1)
+    learners = [name for name, use in zip(names, learning, strict=True) if use]
+    return Learnt(
+        task=FleetTask(
+            reference=reference,
+            identity=identity,
+            branches=branches,
+            harm_limit=settings.harm_limit,
+            bench=bench,
+            believed=frozenset(name for name, use in zip(names, believed, strict=True) if use),
+            fleet_size=fleet_size,
+            not_linear={names[j]: (findings.choices[j], findings.summaries[j]) for j in np.flatnonzero(told).tolist()},
+        ),
+        notices=(
+            *reference.health.warnings,
+            *trust_notices(learners, trusted[learning], reference.health),
+            *doubts,
+            *window_notices(vehicles, believed, branches, layout.full_scale_a),
+            *finding_notices(names, findings, branches),
+        ),
+        details=_details(reference, branches),
+    )
 
 
-def _details(posterior: FleetPosterior, branches: Sequence[str]) -> dict[str, object]:
-    health, learnt = posterior.health, posterior.hyperparameters
-    assert health is not None
+def _learn(
+    summaries: Sequence[DriveSummary],
+    readings: Readings,
+    *,
+    learning: Mask,
+    trusted: Mask,
+    learner: Callable[..., FleetReference],
+) -> tuple[FleetReference, Mask]:
+    """Reference of those that may be learnt from, and which of all vehicles are believed to be faultless."""
+    learners = np.flatnonzero(learning)
+    reference = learner(
+        [summaries[j] for j in learners.tolist()], readings=readings.take(learning), trusted=trusted[learning]
+    )
+    believed = trusted.copy()
+    believed[learners[list(reference.health.distrusted)]] = False
+    return reference, believed
+
+
+def _details(reference: FleetReference, branches: Sequence[str]) -> dict[str, object]:
+    health, learnt = reference.health, reference.law.hyperparameters
     prior, spread = learnt.prior, np.sqrt(np.diag(learnt.spread.covariance))
-    ordered = [branches[k] for k in posterior.order]
+    ordered = [branches[k] for k in reference.order]
     return {
         "reference": {
             "agreeing_share": dict(zip(branches, health.agreeing_share, strict=True)),
@@ -299,8 +276,3 @@ def _details(posterior: FleetPosterior, branches: Sequence[str]) -> dict[str, ob
             "log_evidence": learnt.log_evidence,
         },
     }
-
-
-def _share(value: float) -> float:
-    """A probability, free of rounding beyond its range."""
-    return float(np.clip(value, 0.0, 1.0))

@@ -1,7 +1,9 @@
 """One record of a store: what one reading of a vehicle's drives gave. Records of a vehicle add up."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +15,7 @@ from calibrator.evidence.summary import DriveSummary
 from calibrator.evidence.vehicle_summary import LEAST_DURATION_S, VehicleSummary
 from calibrator.evidence.zero_current import ZeroCurrent
 
-__all__ = ["Record", "joined_records"]
+__all__ = ["Outline", "Record", "joined_records", "outline_of", "source_version"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +28,8 @@ class Record:
         Name.
     drives : tuple of str
         Names of the drives.
+    sources : tuple of str
+        Which version of each drive's file was read, see :func:`source_version`.
     found : VehicleSummary or None
         What they tell; None if they cannot be used.
     problem : str
@@ -34,8 +38,54 @@ class Record:
 
     vehicle: str
     drives: tuple[str, ...]
+    sources: tuple[str, ...]
     found: VehicleSummary | None
     problem: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outline:
+    """What there is of one vehicle.
+
+    Attributes
+    ----------
+    vehicle : str
+        Name.
+    drives : tuple of str
+        Names of the drives that can be used.
+    problem : str
+        Why the vehicle cannot be calibrated; empty if it can.
+    """
+
+    vehicle: str
+    drives: tuple[str, ...]
+    problem: str
+
+
+def source_version(path: Path) -> str:
+    """Size and time of the last change of a drive's file; empty if there is no such file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return ""
+    return f"{status.st_size}-{status.st_mtime_ns}"
+
+
+def outline_of(vehicle: str, rows: Sequence[Mapping[str, Any]]) -> Outline:
+    """Outline of a vehicle from the rows of its records, without their moments."""
+    usable = [row for row in rows if row["problem"] is None]
+    drives = tuple(name for row in usable for name in row["drives"])
+    problem = "" if usable else str(rows[-1]["problem"])
+    return Outline(
+        vehicle=vehicle, drives=drives, problem=problem or _too_short(sum(row["duration_s"] for row in usable), drives)
+    )
+
+
+def _too_short(duration_s: float, drives: Sequence[str]) -> str:
+    """Why so much data cannot be used; empty if it can."""
+    if duration_s >= LEAST_DURATION_S:
+        return ""
+    return f"{duration_s:.1f} s of usable data in {len(drives)} drives; at least {LEAST_DURATION_S:.0f} s are needed"
 
 
 def joined_records(records: Sequence[Record]) -> VehicleSummary:
@@ -61,11 +111,10 @@ def joined_records(records: Sequence[Record]) -> VehicleSummary:
     if not usable:
         raise DriveError(records[-1].problem)
     found = usable[0] if len(usable) == 1 else _added(usable)
-    if found.summary.duration_s < LEAST_DURATION_S:
-        raise DriveError(
-            f"{found.summary.duration_s:.1f} s of usable data in {len(found.drives)} drives; at least "
-            f"{LEAST_DURATION_S:.0f} s are needed"
-        )
+    if problem := _too_short(found.summary.duration_s, found.drives):
+        raise DriveError(problem)
+    if not np.isfinite(found.summary.moments).all():
+        raise DriveError("its summary holds numbers that are not finite; summarise its drives again")
     return found
 
 

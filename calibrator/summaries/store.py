@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from calibrator.storage import Storage
 from calibrator.summaries.identity import StoreIdentity
-from calibrator.summaries.record import Record
-from calibrator.summaries.table import decode_records, encode_records
+from calibrator.summaries.record import Outline, Record
+from calibrator.summaries.table import decode_outlines, decode_records, encode_records
 
 __all__ = ["SummaryStore", "bucket_of"]
 
@@ -68,6 +68,10 @@ class SummaryStore:
         stems = (name.partition(".")[0] for name in self._files.names())
         return sorted(int(stem) for stem in stems if stem.isdecimal())
 
+    def versions(self) -> dict[str, str]:
+        """What tells whether a bucket was changed, by file."""
+        return self._files.versions()
+
     def by_bucket(self, vehicles: Iterable[str]) -> dict[int, list[str]]:
         """Vehicles by the bucket that they are in."""
         found: dict[int, list[str]] = defaultdict(list)
@@ -92,6 +96,11 @@ class SummaryStore:
         for record in records:
             found.setdefault(record.vehicle, []).append(record)
         return found
+
+    def outlines(self, bucket: int) -> list[Outline]:
+        """What there is of each vehicle of a bucket; raises as :meth:`read`."""
+        content = self._files.read(_file(bucket))
+        return decode_outlines(content, f"{self._files.url}/{_file(bucket)}")
 
     def write(self, bucket: int, records: Mapping[str, Sequence[Record]]) -> None:
         """Replace a bucket, whole or not at all.

@@ -3,7 +3,7 @@
 The store is its own checkpoint: buckets that are there are not made again, and what a killed run has left is whole.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,7 +17,7 @@ from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
 from calibrator.report.progress import progress_bar
 from calibrator.storage import Storage
 from calibrator.summaries.identity import read_identity, store_identity, write_identity
-from calibrator.summaries.record import Record
+from calibrator.summaries.record import Record, source_version
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
@@ -44,9 +44,7 @@ class Added:
     problems: Mapping[str, str]
 
 
-def open_store(
-    storage: Storage, equipment: Equipment, database: VehicleDatabase, fleet: FleetSource
-) -> SummaryStore:
+def open_store(storage: Storage, equipment: Equipment, database: VehicleDatabase, fleet: FleetSource) -> SummaryStore:
     """Open the store at a place, or make one for a fleet.
 
     Parameters
@@ -89,6 +87,7 @@ def add_drives(
     *,
     workers: int,
     time_limit_s: float = TIME_LIMIT_S,
+    exactly: bool = False,
 ) -> Added:
     """Summarise the drives of a fleet that a store does not have yet.
 
@@ -104,6 +103,8 @@ def add_drives(
         Number of processes.
     time_limit_s : float
         Longest time for the drives of one vehicle. [s]
+    exactly : bool
+        Whether the store is to hold these drives alone: what it has of others is removed.
 
     Returns
     -------
@@ -111,61 +112,95 @@ def add_drives(
         What was read. A vehicle whose drives cannot be used has a record that says why.
     """
     by_bucket = store.by_bucket(fleet.vehicles)
+    if exactly:
+        _remove_others(store, fleet)
     problems: dict[str, str] = {}
     vehicles = drives = seen = 0
     summarise = partial(_summarise, equipment=store.identity.equipment, database=database)
     with progress_bar("summarise drives", len(fleet.vehicles), "vehicles") as progress:
-        results = read_in_processes(
-            summarise, _new_drives(store, fleet, by_bucket), workers=workers, limit_s=time_limit_s
-        )
+        entries = (new.entries for bucket, names in by_bucket.items() for new in _new(store, fleet, bucket, names))
+        results = read_in_processes(summarise, entries, workers=workers, limit_s=time_limit_s)
         for bucket, names in by_bucket.items():
-            records = store.read(bucket)
-            new = {name: _not_yet(fleet.vehicles[name], records.get(name, [])) for name in names}
-            for name, entries in new.items():
-                if entries:
-                    record = _record(name, entries, next(results))
-                    records[name] = [*records.get(name, []), record]
-                    vehicles, drives = vehicles + 1, drives + len(entries)
-                    if record.problem:
-                        problems[name] = record.problem
-                seen += 1
-                progress(seen)
-            if any(new.values()):
+            new = _new(store, fleet, bucket, names)
+            records = store.read(bucket) if new else {}
+            for vehicle, outcome in zip(new, results, strict=False):
+                record = _record(vehicle.entries, outcome)
+                records[vehicle.name] = [*vehicle.kept, record]
+                vehicles, drives = vehicles + 1, drives + len(vehicle.entries)
+                if record.problem:
+                    problems[vehicle.name] = record.problem
+                progress(seen + vehicles)
+            if new:
                 store.write(bucket, records)
+            seen += len(names) - len(new)
+            progress(seen + vehicles)
     return Added(vehicles=vehicles, drives=drives, problems=problems)
 
 
-def _new_drives(
-    store: SummaryStore, fleet: FleetSource, by_bucket: Mapping[int, Sequence[str]]
-) -> Iterator[tuple[DriveFile, ...]]:
-    """Drives to read of each vehicle that has any, in the order of the buckets."""
-    for bucket, names in by_bucket.items():
+def _remove_others(store: SummaryStore, fleet: FleetSource) -> None:
+    """Remove what a store has of drives that are not, or no longer, those of the fleet."""
+    for bucket in store.buckets():
         records = store.read(bucket)
-        for name in names:
-            entries = _not_yet(fleet.vehicles[name], records.get(name, []))
-            if entries:
-                yield entries
+        kept = {name: [item for item in items if _is_of(item, fleet)] for name, items in records.items()}
+        if any(len(kept[name]) < len(items) for name, items in records.items()):
+            store.write(bucket, kept)
 
 
-def _not_yet(entries: Sequence[DriveFile], records: Sequence[Record]) -> tuple[DriveFile, ...]:
-    """Drives that no record holds."""
-    there = {name for record in records for name in record.drives}
-    return tuple(entry for entry in entries if entry.name not in there)
+def _is_of(record: Record, fleet: FleetSource) -> bool:
+    """Whether all drives of a record are the fleet's, as they are now."""
+    versions = {entry.name: source_version(entry.path) for entry in fleet.vehicles.get(record.vehicle, ())}
+    known = zip(record.drives, record.sources, strict=True)
+    return all(versions.get(drive) == source for drive, source in known)
 
 
-def _record(name: str, entries: Sequence[DriveFile], outcome: "Record | Unread") -> Record:
-    if isinstance(outcome, Unread):
-        drives = tuple(entry.name for entry in entries)
-        return Record(vehicle=name, drives=drives, found=None, problem=outcome.reason)
-    return outcome
+@dataclass(frozen=True, kw_only=True)
+class _New:
+    """Drives of a vehicle to be read, and its records that stay."""
+
+    name: str
+    entries: tuple[DriveFile, ...]
+    kept: tuple[Record, ...]
+
+
+def _new(store: SummaryStore, fleet: FleetSource, bucket: int, names: Sequence[str]) -> list[_New]:
+    """Vehicles of a bucket that have drives which no record holds as they are now.
+
+    A record is made anew with all its drives if one of them was changed, and what could not be used is tried again.
+    """
+    records, found = store.read(bucket), []
+    for name in names:
+        versions = {entry.name: source_version(entry.path) for entry in fleet.vehicles[name]}
+        kept = tuple(record for record in records.get(name, []) if _stays(record, versions))
+        there = {drive for record in kept for drive in record.drives}
+        entries = tuple(entry for entry in fleet.vehicles[name] if entry.name not in there)
+        if entries:
+            found.append(_New(name=name, entries=entries, kept=kept))
+    return found
+
+
+def _stays(record: Record, versions: Mapping[str, str]) -> bool:
+    """Whether a record is still right, or cannot be made anew as not all of its drives are given."""
+    if record.problem:
+        return False
+    known = zip(record.drives, record.sources, strict=True)
+    return not versions.keys() >= set(record.drives) or all(versions[drive] == source for drive, source in known)
+
+
+def _record(entries: Sequence[DriveFile], outcome: "Record | Unread") -> Record:
+    return _unusable(entries, outcome.reason) if isinstance(outcome, Unread) else outcome
 
 
 def _summarise(entries: tuple[DriveFile, ...], *, equipment: Equipment, database: VehicleDatabase) -> Record:
     """Record of some drives of one vehicle. One thread: the processes share the cores."""
-    vehicle, drives = entries[0].vehicle, tuple(entry.name for entry in entries)
     with threadpool_limits(1):
         try:
+            sources = tuple(source_version(entry.path) for entry in entries)
             found = read_vehicle_summary(entries, equipment, database)
         except UserError as error:
-            return Record(vehicle=vehicle, drives=drives, found=None, problem=str(error))
-    return Record(vehicle=vehicle, drives=drives, found=found)
+            return _unusable(entries, str(error))
+    return Record(vehicle=found.vehicle, drives=found.drives, sources=sources, found=found)
+
+
+def _unusable(entries: Sequence[DriveFile], problem: str) -> Record:
+    drives = tuple(entry.name for entry in entries)
+    return Record(vehicle=entries[0].vehicle, drives=drives, sources=("",) * len(drives), found=None, problem=problem)

@@ -8,6 +8,7 @@ does not grow with the hours that it is driven between two summaries.
 import io
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,9 @@ from calibrator.evidence.summary import DriveSummary
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.evidence.zero_current import ZeroCurrent
 from calibrator.summaries.identity import StoreIdentity
-from calibrator.summaries.record import Record
+from calibrator.summaries.record import Outline, Record, outline_of
 
-__all__ = ["MOST_BLOCKS", "SCHEMA", "decode_records", "encode_records"]
+__all__ = ["MOST_BLOCKS", "SCHEMA", "decode_outlines", "decode_records", "encode_records"]
 
 MOST_BLOCKS = 256
 """Of a record: two hours and more; their spread is known to a tenth. [1]"""
@@ -33,7 +34,9 @@ SCHEMA = pa.schema(
     [
         pa.field("vehicle", pa.string(), nullable=False),
         pa.field("drives", _NAMES, nullable=False),
+        pa.field("sources", _NAMES, nullable=False),
         pa.field("problem", pa.string()),
+        pa.field("duration_s", pa.float64(), metadata={"unit": "s"}),
         pa.field("moments", _FLOATS, metadata={"shape": "(B, p (p + 1) / 2), p: inputs, branches [A], 1"}),
         pa.field("noise_a2", _FLOATS, metadata={"shape": "(B, K)", "unit": "A^2"}),
         pa.field("delay_reference", pa.string()),
@@ -105,8 +108,41 @@ def decode_records(content: bytes, identity: StoreIdentity, where: str) -> list[
         raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again") from None
 
 
+def decode_outlines(content: bytes, where: str) -> list[Outline]:
+    """Read what there is of each vehicle, without its moments.
+
+    Parameters
+    ----------
+    content : bytes
+        A file of :func:`encode_records`.
+    where : str
+        Of the file, for messages.
+
+    Returns
+    -------
+    list of Outline
+        One per vehicle, in the order of the file.
+
+    Raises
+    ------
+    FleetError
+        If the file is cut or no such file.
+    """
+    try:
+        columns = ["vehicle", "drives", "problem", "duration_s"]
+        rows = pq.read_table(io.BytesIO(content), columns=columns, use_threads=False).to_pylist()
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).partition("\n")[0][:120]
+        raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again") from None
+    return [outline_of(name, list(group)) for name, group in groupby(rows, key=lambda row: str(row["vehicle"]))]
+
+
 def _row(record: Record, identity: StoreIdentity) -> dict[str, Any]:
-    row: dict[str, Any] = {"vehicle": record.vehicle, "drives": list(record.drives)}
+    row: dict[str, Any] = {
+        "vehicle": record.vehicle,
+        "drives": list(record.drives),
+        "sources": list(record.sources),
+    }
     if record.found is None:
         return {**row, "problem": record.problem}
     found = record.found
@@ -115,6 +151,7 @@ def _row(record: Record, identity: StoreIdentity) -> dict[str, Any]:
     place = [found.delays.branches.index(name) for name in identity.branches]
     return {
         **row,
+        "duration_s": summary.duration_s,
         "moments": summary.moments[:, upper[0], upper[1]].ravel(),
         "noise_a2": summary.noise_a2.ravel(),
         "delay_reference": found.delays.branches[0],
@@ -148,14 +185,18 @@ def _records(table: pa.Table, identity: StoreIdentity) -> Iterable[Record]:
     noise = columns["noise_a2"].values.to_numpy().reshape(-1, K)
     stops = columns["noise_a2"].offsets.to_numpy() // K
     for row, start, stop in zip(small, stops[:-1].tolist(), stops[1:].tolist(), strict=True):
-        if row["problem"] is not None:
-            yield Record(vehicle=row["vehicle"], drives=tuple(row["drives"]), found=None, problem=row["problem"])
-            continue
-        summary = DriveSummary(
-            moments=moments[start:stop], noise_a2=noise[start:stop], branches=K, period_s=identity.period_s
-        )
+        found = None
+        if row["problem"] is None:
+            summary = DriveSummary(
+                moments=moments[start:stop], noise_a2=noise[start:stop], branches=K, period_s=identity.period_s
+            )
+            found = _vehicle(row, summary, identity.branches)
         yield Record(
-            vehicle=row["vehicle"], drives=tuple(row["drives"]), found=_vehicle(row, summary, identity.branches)
+            vehicle=row["vehicle"],
+            drives=tuple(row["drives"]),
+            sources=tuple(row["sources"]),
+            found=found,
+            problem=row["problem"] or "",
         )
 
 

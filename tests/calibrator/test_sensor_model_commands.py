@@ -12,11 +12,13 @@ import pytest
 from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.artificial.ground_truth import GroundTruth, with_branches
 from calibrator.artificial.random_fleet import draw_faults
+from calibrator.calibration_settings import CalibrationSettings
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.store import write_drive
 from calibrator.faults import measured_currents, true_currents
-from calibrator.fleet import CalibrationSettings, calibrate_fleet
+from calibrator.fleet import calibrate_fleet
 from calibrator.results import read_run
+from calibrator.run.in_order import Workers
 from calibrator.sensor_models.families import FAMILIES
 from calibrator.sensor_models.families import GainBySign as GainBySignSensor
 from ecu_node.database import read_database
@@ -35,7 +37,7 @@ Calibrated = Mapping[str, VehicleParameters]
 
 def calibrate_here(store: Path, out: Path, settings: CalibrationSettings) -> Calibrated:
     """The same in this process, which need not start others."""
-    calibrate_fleet(store, read_database(read_layout(LAYOUT)), out, settings, workers=1)
+    calibrate_fleet(store, read_database(read_layout(LAYOUT)), out, settings, workers=Workers(processes=1))
     return {path.stem: read_parameters(path) for path in sorted((out / "params").iterdir())}
 
 

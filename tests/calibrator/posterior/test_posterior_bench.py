@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from calibrator.calibration_settings import CalibrationSettings
-from calibrator.drive import DriveFile
 from calibrator.drives.delays import BranchDelays
-from calibrator.drives.fleet_source import FleetSource
 from calibrator.errors import FleetError
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.evidence.zero_current import ZeroCurrent
@@ -16,11 +14,7 @@ from calibrator.posterior.bench import merge_readings, read_bench
 from tests.calibrator.evidence.simulated_drives import no_faults, summaries_of
 
 BRANCHES = ("battery", "motor")
-FLEET = FleetSource(
-    path=Path("fleet"),
-    vehicles={name: (DriveFile(vehicle=name, name="d", path=Path("d")),) for name in ("V1", "V2")},
-    left_out={},
-)
+VEHICLES = ("V1", "V2")
 
 
 def vehicles_that_showed(offset_a: float, sd_a: float) -> list[VehicleSummary]:
@@ -49,20 +43,20 @@ def test_a_trusted_vehicle_that_was_read_as_faulty_is_refused(tmp_path: Path, li
     path = bench_file(tmp_path, line)
     trusting = CalibrationSettings(trusted=frozenset({"V1"}), readings=path)
     with pytest.raises(FleetError, match=r"the motor sensor of V1 was read as faulty, and V1 is trusted"):
-        read_bench(trusting, FLEET, BRANCHES, full_scale_a=400.0)
+        read_bench(trusting, VEHICLES, BRANCHES, left_out={}, full_scale_a=400.0)
     others = CalibrationSettings(trusted=frozenset({"V2"}), readings=path)
-    assert set(read_bench(others, FLEET, BRANCHES, full_scale_a=400.0)) == {("V1", "motor")}
+    assert set(read_bench(others, VEHICLES, BRANCHES, left_out={}, full_scale_a=400.0)) == {("V1", "motor")}
 
 
 def test_a_trusted_vehicle_may_be_read_as_faultless(tmp_path: Path) -> None:
     settings = CalibrationSettings(
         trusted=frozenset({"V1"}), readings=bench_file(tmp_path, "V1,motor,0.001,0.002,0.1,0.2")
     )
-    assert len(read_bench(settings, FLEET, BRANCHES, full_scale_a=400.0)) == 1
+    assert len(read_bench(settings, VEHICLES, BRANCHES, left_out={}, full_scale_a=400.0)) == 1
 
 
 def test_no_table_is_no_reading() -> None:
-    assert read_bench(CalibrationSettings(), FLEET, BRANCHES, full_scale_a=400.0) == {}
+    assert read_bench(CalibrationSettings(), VEHICLES, BRANCHES, left_out={}, full_scale_a=400.0) == {}
 
 
 def test_a_window_and_a_reading_that_agree_count_together() -> None:

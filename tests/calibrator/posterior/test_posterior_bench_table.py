@@ -5,22 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrator.drive import DriveFile
-from calibrator.drives.fleet_source import FleetSource
 from calibrator.errors import FleetError
 from calibrator.posterior.bench_table import BenchReadings, read_bench_readings, readings_of
 
 VEHICLES, BRANCHES = ("V1", "V2"), ("battery", "motor")
 HEADER = "vehicle,branch,drift,drift_sd,offset_a,offset_sd_a"
-FLEET = FleetSource(
-    path=Path("fleet"),
-    vehicles={name: (DriveFile(vehicle=name, name="d", path=Path("d")),) for name in VEHICLES},
-    left_out={"copy": "same recording as V1"},
-)
+LEFT_OUT = {"copy": "same recording as V1"}
 
 
 def read(path: Path) -> BenchReadings:
-    return read_bench_readings(path, FLEET, BRANCHES, full_scale_a=400.0)
+    return read_bench_readings(path, VEHICLES, BRANCHES, left_out=LEFT_OUT, full_scale_a=400.0)
 
 
 def write(folder: Path, *lines: str) -> Path:

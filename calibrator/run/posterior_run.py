@@ -1,0 +1,126 @@
+"""The default method on a store of summaries: two passes, each chunk kept until the result is whole."""
+
+from dataclasses import dataclass
+from functools import partial
+
+from threadpoolctl import threadpool_limits
+
+from calibrator.calibration_settings import CalibrationSettings
+from calibrator.errors import FleetError
+from calibrator.parameter_files import RunIdentity
+from calibrator.posterior.bench import read_bench
+from calibrator.posterior.fleet import FindModels, Learnt, learn_fleet
+from calibrator.report.progress import progress_bar
+from calibrator.run.first_pass import Census, read_sample, take_census
+from calibrator.run.in_order import Workers
+from calibrator.run.second_pass import calibrate_bucket
+from calibrator.run.unfinished import Chunks
+from calibrator.summaries.store import SummaryStore
+
+__all__ = ["PosteriorRun", "calibrate_store"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosteriorRun:
+    """What a run found besides its chunks.
+
+    Attributes
+    ----------
+    census : Census
+        Who there was.
+    learnt : Learnt
+        The reference, with notices and details.
+    """
+
+    census: Census
+    learnt: Learnt
+
+
+def calibrate_store(
+    store: SummaryStore,
+    settings: CalibrationSettings,
+    identity: RunIdentity,
+    chunks: Chunks,
+    *,
+    workers: Workers,
+    find_models: FindModels | None = None,
+) -> PosteriorRun:
+    """Calibrate every vehicle of a store.
+
+    Parameters
+    ----------
+    store : SummaryStore
+        The fleet.
+    settings : CalibrationSettings
+        How.
+    identity : RunIdentity
+        Of the run.
+    chunks : Chunks
+        Those that are done, and where the others are put, one per bucket.
+    workers : Workers
+        Where it is computed.
+    find_models : callable or None
+        Second pass over the drives for sensors that are not linear; None: all count as linear.
+
+    Returns
+    -------
+    PosteriorRun
+        The chunks are all there then.
+
+    Raises
+    ------
+    UserError
+        If the fleet as a whole cannot be calibrated.
+    """
+    census = take_census(store, workers)
+    _require_known(settings, store, census)
+    learnt = _learn(store, census, settings, identity, find_models)
+    todo = [bucket for bucket in store.buckets() if not chunks.done(bucket)]
+    calibrate = partial(calibrate_bucket, store=store, task=learnt.task)
+    before = sum(len(names) for bucket, names in census.usable.items() if bucket not in set(todo))
+    with progress_bar("calibrate", census.size, "vehicles") as progress:
+        progress(before)
+        for bucket, result in zip(todo, workers.map(calibrate, todo), strict=True):
+            chunks.put(bucket, result)
+            before += len(census.usable[bucket])
+            progress(before)
+    return PosteriorRun(census=census, learnt=learnt)
+
+
+def _learn(
+    store: SummaryStore,
+    census: Census,
+    settings: CalibrationSettings,
+    identity: RunIdentity,
+    find_models: FindModels | None,
+) -> Learnt:
+    """The reference, in one thread, so that it is the same wherever it is learnt."""
+    branches, usable = store.identity.branches, {name for names in census.usable.values() for name in names}
+    bench = read_bench(
+        settings,
+        usable,
+        branches,
+        left_out=census.left_out,
+        full_scale_a=identity.database.layout.full_scale_a,
+    )
+    checked = {vehicle for vehicle, _ in bench}
+    with threadpool_limits(1):
+        return learn_fleet(
+            read_sample(store, census, settings, checked, everyone=find_models is not None),
+            settings,
+            bench,
+            branches=branches,
+            identity=identity,
+            fleet_size=census.size,
+            find_models=find_models,
+        )
+
+
+def _require_known(settings: CalibrationSettings, store: SummaryStore, census: Census) -> None:
+    """Refuse names of vehicles that there are not."""
+    for names, what in ((settings.hold_out, "hold out"), (settings.trusted, "trust")):
+        usable = {name for name in names if census.holds(name, store.bucket_of(name))}
+        unknown = sorted(names - usable - (census.left_out.keys() if what == "hold out" else set()))
+        if unknown:
+            reasons = [f"; {name}: {census.left_out[name]}" for name in unknown if name in census.left_out]
+            raise FleetError(f"{store.url}: no usable vehicle {', '.join(unknown)} to {what}{''.join(reasons)}")
