@@ -233,7 +233,7 @@ def _calibrate_published(
 ) -> CalibrationReport:
     """The published method needs all models at once; its result is one chunk."""
     about = _Fleet.of_drives(fleet, equipment)
-    identity = _identity(about, database, settings, created=unfinished.begin("", _now()))
+    identity = _identity(about, database, settings, created=unfinished.begin(None, _now()))
     outcome = calibrate_fleet_published(fleet, equipment, identity, settings, workers=workers.processes)
     unfinished.chunks.put(0, encode_chunk(outcome.parameters, outcome.left_out))
     about = replace(about, left_out={})

@@ -99,7 +99,7 @@ def regress_on_fleet(fleet: FleetMoments, read_out: Array) -> list[VehicleRegres
         found.append(
             regress_vehicles(
                 z.T @ gram_u @ z,
-                fleet.moments[:, u, M + k] @ z,
+                (fleet.moments[:, None, u, M + k] @ z)[:, 0],
                 fleet.mean[:, M + k, M + k],
                 fleet.blocks,
                 prior_mean=np.array([1.0, 0.0]),

@@ -84,13 +84,13 @@ class Unfinished:
         """What was computed."""
         return Chunks(folder=self.folder / CHUNKS)
 
-    def begin(self, plan: str, note: str) -> str:
+    def begin(self, plan: str | None, note: str) -> str:
         """Keep the chunks that are there if they were computed by the same plan, else remove them.
 
         Parameters
         ----------
-        plan : str
-            What the run computes, and from what; one line.
+        plan : str or None
+            What the run computes, and from what; one line. None: begin anew.
         note : str
             What the run is told by, such as its time; one line.
 
@@ -101,11 +101,11 @@ class Unfinished:
         """
         path = self.folder / PLAN
         before, _, noted = path.read_text().partition("\n") if path.exists() else ("", "", "")
-        if before == plan:
+        if plan is not None and before == plan:
             return noted
         shutil.rmtree(self.folder / CHUNKS, ignore_errors=True)
         (self.folder / CHUNKS).mkdir()
-        write_atomically(path, f"{plan}\n{note}".encode())
+        write_atomically(path, f"{plan or ''}\n{note}".encode())
         return note
 
     def result(self) -> Path:

@@ -71,7 +71,7 @@ def encode_records(records: Sequence[Record], identity: StoreIdentity) -> bytes:
         table,
         buffer,
         row_group_size=1,
-        compression="zstd",
+        compression="snappy",
         use_dictionary=False,
         write_statistics=["vehicle"],
     )
@@ -101,8 +101,7 @@ def decode_records(content: bytes, identity: StoreIdentity, where: str) -> list[
         If the file is cut or no such file.
     """
     try:
-        table = pq.read_table(io.BytesIO(content), schema=SCHEMA, use_threads=False)
-        return list(_records(table, identity))
+        return list(_records(_table(content), identity))
     except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
         reason = str(error).partition("\n")[0][:120]
         raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again") from None
@@ -129,12 +128,19 @@ def decode_outlines(content: bytes, where: str) -> list[Outline]:
         If the file is cut or no such file.
     """
     try:
-        columns = ["vehicle", "drives", "problem", "duration_s"]
-        rows = pq.read_table(io.BytesIO(content), columns=columns, use_threads=False).to_pylist()
-    except (pa.ArrowException, OSError) as error:
+        rows = _table(content, ["vehicle", "drives", "problem", "duration_s"]).to_pylist()
+    except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).partition("\n")[0][:120]
         raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again") from None
     return [outline_of(name, list(group)) for name, group in groupby(rows, key=lambda row: str(row["vehicle"]))]
+
+
+def _table(content: bytes, columns: list[str] | None = None) -> pa.Table:
+    """Some columns of a file; without the detour over data sets, which takes twice as long for many row groups."""
+    file = pq.ParquetFile(pa.BufferReader(content), pre_buffer=False)
+    if not file.schema_arrow.equals(SCHEMA):
+        raise ValueError("its columns are not those of summaries")
+    return file.read(columns=columns, use_threads=False)
 
 
 def _row(record: Record, identity: StoreIdentity) -> dict[str, Any]:
