@@ -32,6 +32,7 @@ from calibrator.command_options import (
     SchedulerOption,
     SeedOption,
     SensorModelsOption,
+    SinceOption,
     SparsityOption,
     SymmetricOption,
     TrustedOption,
@@ -223,6 +224,7 @@ def calibrate(
     seed: SeedOption = 0,
     workers: WorkersOption = 2,
     scheduler: SchedulerOption = None,
+    since: SinceOption = None,
     json: JsonOption = False,
 ) -> None:
     """Estimate the sensor faults of every vehicle and write its parameter file.
@@ -255,7 +257,7 @@ def calibrate(
         seed=seed,
     )
     where = Workers(processes=workers, scheduler=scheduler)
-    report = calibrate_fleet(fleet, _database(layout), out, settings, workers=where)
+    report = calibrate_fleet(fleet, _database(layout), out, settings, workers=where, since=since)
     _print_report(report.as_json() if json else report.as_text())
 
 

@@ -36,6 +36,7 @@ __all__ = [
     "SchedulerOption",
     "SeedOption",
     "SensorModelsOption",
+    "SinceOption",
     "SparsityOption",
     "SymmetricOption",
     "TrustedOption",
@@ -53,7 +54,7 @@ __all__ = [
 ]
 
 OWN_OPTIONS = {
-    Method.POSTERIOR: ("harm_limit", "trusted", "readings", "sensor_models"),
+    Method.POSTERIOR: ("harm_limit", "trusted", "readings", "sensor_models", "scheduler", "since"),
     Method.PUBLISHED: ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity", "seed"),
 }
 """What only one method heeds."""
@@ -145,6 +146,10 @@ BranchesOption = Annotated[
 ]
 DrivesOption = Annotated[str, typer.Option("--drives", help="Drive store with the trips to drive, or 'builtin'.")]
 SymmetricOption = Annotated[bool, typer.Option("--symmetric", help="The fleet's mean is the ideal vehicle (22).")]
+SinceOption = Annotated[
+    Path | None,
+    typer.Option("--since", help="Earlier result: vehicles without new drives keep its parameters (posterior)."),
+]
 SparsityOption = Annotated[
     float, number_option("--sparsity", 0, 100, "Share of zero fault parameters of an artificial fleet [%]")
 ]

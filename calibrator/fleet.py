@@ -30,6 +30,7 @@ from calibrator.report.calibration import MOST_NAMED, CalibrationReport, report_
 from calibrator.results import RunRecord, encode_chunk, join_rows, left_out_of, write_parameter_files, write_run
 from calibrator.run.in_order import Workers
 from calibrator.run.posterior_run import calibrate_store
+from calibrator.run.previous import open_previous
 from calibrator.run.unfinished import Unfinished, unfinished_run
 from calibrator.sensor_models.fleet import SensorFindings, find_sensor_models
 from calibrator.storage import open_storage
@@ -38,6 +39,7 @@ from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.summarise import add_drives, open_store
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
+from ecu_node.layout import file_digest
 
 __all__ = ["calibrate_fleet"]
 
@@ -53,6 +55,7 @@ def calibrate_fleet(
     *,
     workers: Workers,
     time_limit_s: float = TIME_LIMIT_S,
+    since: Path | None = None,
 ) -> CalibrationReport:
     """Calibrate every vehicle of a fleet and write the result folder.
 
@@ -71,6 +74,9 @@ def calibrate_fleet(
         Where it is computed.
     time_limit_s : float
         Longest time for reading the drives of one vehicle. [s]
+    since : Path or None
+        Earlier result to go on from: vehicles without new drives keep its parameters. A store must hold the earlier
+        drives as well; of a folder of drives, those that the earlier result has are not read again.
 
     Returns
     -------
@@ -89,15 +95,23 @@ def calibrate_fleet(
         _require_drives_unneeded(settings, storage.url)
         store = SummaryStore(storage=storage, identity=stored)
         with unfinished_run(out) as unfinished:
-            return _calibrate_store(unfinished, store, _Fleet.of_store(store), database, settings, workers=workers)
-    fleet = _find_drives(Path(storage.url), settings)
-    equipment = probe_equipment(fleet, database, settings.branches)
+            return _calibrate_store(
+                unfinished, store, _Fleet.of_store(store), database, settings, workers=workers, since=since
+            )
+    fleet = _find_drives(Path(storage.url), settings, everyone=since is None)
     with unfinished_run(out) as unfinished:
         if settings.method is Method.PUBLISHED:
-            return _calibrate_published(unfinished, fleet, equipment, database, settings, workers=workers)
-        store = _summaries_of(unfinished, fleet, equipment, database)
-        add_drives(store, fleet, database, workers=workers.processes, time_limit_s=time_limit_s, exactly=True)
-        find_models = None
+            return _calibrate_published(unfinished, fleet, database, settings, workers=workers)
+        store = _summaries_of(unfinished, fleet, database, settings, since)
+        add_drives(
+            store,
+            fleet,
+            database,
+            workers=workers.processes,
+            time_limit_s=time_limit_s,
+            exactly=since is None,
+        )
+        find_models, equipment = None, store.identity.equipment
         if settings.sensor_models:
             find_models = partial(_find_models, fleet=fleet, equipment=equipment, database=database, workers=workers)
         return _calibrate_store(
@@ -108,6 +122,7 @@ def calibrate_fleet(
             settings,
             workers=workers,
             find_models=find_models,
+            since=since,
         )
 
 
@@ -155,13 +170,14 @@ def _require_drives_unneeded(settings: CalibrationSettings, where: str) -> None:
             raise FleetError(f"{where}: a store of summaries, and {option} needs the drives; give the drive store")
 
 
-def _find_drives(path: Path, settings: CalibrationSettings) -> FleetSource:
+def _find_drives(path: Path, settings: CalibrationSettings, *, everyone: bool) -> FleetSource:
+    """Drives of a fleet; if they are everyone's, vehicles that the settings name must be among them."""
     fleet = without_copies(find_fleet(path))
     if not fleet.vehicles:
         why = "; ".join(f"{name}: {reason}" for name, reason in fleet.left_out.items())
         raise FleetError(f"{path}: no drive that is one vehicle's alone; {why}")
     for names, what in ((settings.hold_out, "hold out"), (settings.trusted, "trust")):
-        unknown = sorted(names - fleet.vehicles.keys())
+        unknown = sorted(names - fleet.vehicles.keys()) if everyone else []
         if unknown:
             reasons = [f"; {name}: {fleet.left_out[name]}" for name in unknown if name in fleet.left_out]
             raise FleetError(f"{path}: no vehicle {', '.join(unknown)} to {what}{''.join(reasons)}")
@@ -174,14 +190,31 @@ def _find_drives(path: Path, settings: CalibrationSettings) -> FleetSource:
 
 
 def _summaries_of(
-    unfinished: Unfinished, fleet: FleetSource, equipment: Equipment, database: VehicleDatabase
+    unfinished: Unfinished,
+    fleet: FleetSource,
+    database: VehicleDatabase,
+    settings: CalibrationSettings,
+    since: Path | None,
 ) -> SummaryStore:
     """Store of the summaries read so far; one that was begun with other branches or another layout is begun anew."""
-    storage = open_storage(unfinished.summaries)
+    folder = unfinished.summaries
+    storage = open_storage(folder)
+    if since is not None:
+        if not (since / folder.name).is_dir():
+            raise FleetError(
+                f"{since}: holds no summaries; add the new drives to the store it was made from with 'calibrator "
+                f"summarise', and give that store"
+            )
+        if read_identity(storage) is None:
+            shutil.copytree(since / folder.name, folder, dirs_exist_ok=True)
+        identity = read_identity(storage, database)
+        assert identity is not None
+        return SummaryStore(storage=storage, identity=identity)
+    equipment = probe_equipment(fleet, database, settings.branches)
     try:
         return open_store(storage, equipment, database, fleet)
     except FleetError:
-        shutil.rmtree(unfinished.summaries, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
         return open_store(storage, equipment, database, fleet)
 
 
@@ -211,11 +244,21 @@ def _calibrate_store(
     *,
     workers: Workers,
     find_models: FindModels | None = None,
+    since: Path | None = None,
 ) -> CalibrationReport:
     """Calibrate from summaries; those that were read here become part of the result."""
-    plan = _plan(store, database, settings)
+    plan = _plan(store, database, settings, since)
     identity = _identity(fleet, database, settings, created=unfinished.begin(plan, _now()))
-    run = calibrate_store(store, settings, identity, unfinished.chunks, workers=workers, find_models=find_models)
+    previous = None if since is None else open_previous(since, identity, store.identity.branches)
+    run = calibrate_store(
+        store,
+        settings,
+        identity,
+        unfinished.chunks,
+        workers=workers,
+        find_models=find_models,
+        previous=previous,
+    )
     own = unfinished.summaries if unfinished.summaries.exists() else None
     return _finish(
         unfinished, fleet, identity, settings, details=run.learnt.details, notices=run.learnt.notices, summaries=own
@@ -225,13 +268,13 @@ def _calibrate_store(
 def _calibrate_published(
     unfinished: Unfinished,
     fleet: FleetSource,
-    equipment: Equipment,
     database: VehicleDatabase,
     settings: CalibrationSettings,
     *,
     workers: Workers,
 ) -> CalibrationReport:
     """The published method needs all models at once; its result is one chunk."""
+    equipment = probe_equipment(fleet, database, settings.branches)
     about = _Fleet.of_drives(fleet, equipment)
     identity = _identity(about, database, settings, created=unfinished.begin(None, _now()))
     outcome = calibrate_fleet_published(fleet, equipment, identity, settings, workers=workers.processes)
@@ -251,9 +294,17 @@ def _identity(fleet: _Fleet, database: VehicleDatabase, settings: CalibrationSet
     return RunIdentity(database=database, method=settings.method, fleet=fleet.name, created=created)
 
 
-def _plan(store: SummaryStore, database: VehicleDatabase, settings: CalibrationSettings) -> str:
+def _plan(store: SummaryStore, database: VehicleDatabase, settings: CalibrationSettings, since: Path | None) -> str:
     """Digest of all that decides what a run computes."""
-    parts = (__version__, store.identity, store.versions(), database.layout.digest, database.digest, settings.record())
+    parts = (
+        __version__,
+        store.identity,
+        store.versions(),
+        database.layout.digest,
+        database.digest,
+        settings.record(),
+        None if since is None else (str(since.absolute()), file_digest(since / "run.json")),
+    )
     return hashlib.blake2b(msgspec.json.encode(parts, order="sorted"), digest_size=16).hexdigest()
 
 

@@ -70,6 +70,7 @@ SCHEMA = pa.schema(
         pa.field("junction_rms_corrected_a", pa.float64(), metadata={"unit": "A"}),
         pa.field("duration_s", pa.float64(), metadata={"unit": "s"}),
         pa.field("reason", pa.string()),
+        pa.field("moved", pa.string()),
     ]
 )
 
@@ -111,7 +112,11 @@ class ChunkResult:
     parameters: bytes
 
 
-def encode_chunk(parameters: Sequence[VehicleParameters], left_out: Mapping[str, str]) -> ChunkResult:
+def encode_chunk(
+    parameters: Sequence[VehicleParameters],
+    left_out: Mapping[str, str],
+    moved: Mapping[tuple[str, str], str] | None = None,
+) -> ChunkResult:
     """Write down what a chunk gave.
 
     Parameters
@@ -120,6 +125,8 @@ def encode_chunk(parameters: Sequence[VehicleParameters], left_out: Mapping[str,
         One per calibrated vehicle.
     left_out : mapping of str to str
         Why the other vehicles have none.
+    moved : mapping of (str, str) to str, or None
+        What has moved since an earlier result, by vehicle and branch.
 
     Returns
     -------
@@ -133,6 +140,8 @@ def encode_chunk(parameters: Sequence[VehicleParameters], left_out: Mapping[str,
     """
     ordered = sorted(parameters, key=lambda item: item.vehicle)
     rows = [row for item in ordered for row in _rows(item)]
+    for row in rows:
+        row["moved"] = (moved or {}).get((row["vehicle"], row["branch"]))
     rows += [{"vehicle": vehicle, "verdict": LEFT_OUT, "reason": left_out[vehicle]} for vehicle in sorted(left_out)]
     texts = [{"vehicle": item.vehicle, "parameters": encode_parameters(item).decode()} for item in ordered]
     return ChunkResult(rows=_parquet(rows, SCHEMA), parameters=_parquet(texts, PARAMETERS_SCHEMA))

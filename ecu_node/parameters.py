@@ -29,6 +29,7 @@ __all__ = [
     "VehicleParameters",
     "Verdict",
     "check_fit",
+    "decode_parameters",
     "encode_parameters",
     "parameter_schema",
     "read_parameters",
@@ -187,12 +188,17 @@ def read_parameters(path: Path) -> VehicleParameters:
         content = path.read_bytes()
     except OSError as error:
         raise UnfitError(Reason.NO_PARAMETERS, f"{path}: cannot read the parameter file: {error.strerror}") from None
+    return decode_parameters(content, str(path))
+
+
+def decode_parameters(content: bytes, where: str) -> VehicleParameters:
+    """Parameters from the text of a parameter file; `where` it is from, for messages. Raises as its reading does."""
     try:
         return msgspec.json.decode(content, type=VehicleParameters)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise UnfitError(
             Reason.MALFORMED_PARAMETERS,
-            f"{path}: not a parameter file: {_why_not(error, content)}; write it anew with 'calibrator calibrate'",
+            f"{where}: not a parameter file: {_why_not(error, content)}; write it anew with 'calibrator calibrate'",
         ) from None
 
 

@@ -19,6 +19,7 @@ from calibrator.parameter_files import RunIdentity, by_branch
 from calibrator.posterior.bench import contradicted_readings, merge_readings, trust_notices, window_notices
 from calibrator.posterior.bench_table import BenchReadings
 from calibrator.posterior.calibration import FleetReference, estimate_summaries, learn_reference
+from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.second_pass import finding_notices, tell_sensors, without_sensor_models
 from calibrator.posterior.vehicle_parameters import impossible_vehicles, vehicle_parameters
 from calibrator.posterior.verdict import decide
@@ -82,14 +83,7 @@ class FleetTask:
         """
         if not vehicles:
             return [], {}
-        findings = self._findings(vehicles)
-        readings, _ = merge_readings(vehicles, self.bench, self.branches)
-        posterior = estimate_summaries(
-            findings.summaries,
-            self.reference,
-            readings=readings,
-            believed=np.array([vehicle.vehicle in self.believed for vehicle in vehicles]),
-        )
+        findings, posterior = self._findings(vehicles), self.estimate(vehicles)
         layout, health = self.identity.database.layout, self.reference.health
         decision = decide(posterior, layout, harm_limit=self.harm_limit, doubtful=health.doubtful)
         deployment = without_sensor_models(decision, findings)
@@ -111,6 +105,16 @@ class FleetTask:
             if j not in impossible
         ]
         return parameters, {vehicles[j].vehicle: why for j, why in impossible.items()}
+
+    def estimate(self, vehicles: Sequence[VehicleSummary]) -> FleetPosterior:
+        """Posterior of some vehicles, at least one, in their order."""
+        readings, _ = merge_readings(vehicles, self.bench, self.branches)
+        return estimate_summaries(
+            self._findings(vehicles).summaries,
+            self.reference,
+            readings=readings,
+            believed=np.array([vehicle.vehicle in self.believed for vehicle in vehicles]),
+        )
 
     def _findings(self, vehicles: Sequence[VehicleSummary]) -> SensorFindings:
         linear = all_linear(vehicles)

@@ -30,6 +30,7 @@ _COLUMNS = (
     "junction_rms_measured_a",
     "junction_rms_corrected_a",
     "reason",
+    "moved",
 )
 
 
@@ -50,6 +51,8 @@ class CalibrationReport:
     """Vehicles that are thought to differ from their fleet, and how probable that is."""
     held_back: Mapping[str, int]
     """Branches in which a fault was found that is not applied, by reason."""
+    moved: Mapping[str, str]
+    """Vehicles with sensors that have moved since an earlier result, and how."""
     junction_rms_measured_a: float
     """Median over vehicles. [A]"""
     junction_rms_deployed_a: float
@@ -77,6 +80,7 @@ class CalibrationReport:
             table((f"method {run.method}", ""), rows),
             "\n".join(f"notice: {notice}" for notice in run.notices),
             reasons_text("corrected", self.corrected),
+            reasons_text("moved since the earlier result", self.moved),
             reasons_text("hardware fault suspected", self.hardware_suspected),
             reasons_text("cannot tell", self.undecided),
             left_out_text(run.left_out),
@@ -122,6 +126,7 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
             for name, probability in _named(vehicles.filter(pc.field("hardware_fault")), "hardware_probability").items()
         },
         held_back=_counts(rows["held_back"].drop_null()),
+        moved=_moved(rows.filter(pc.field("moved").is_valid())),
         junction_rms_measured_a=float(np.median(measured_a)),
         junction_rms_deployed_a=float(np.median(deployed_a)),
     )
@@ -134,6 +139,14 @@ def _counts(values: pa.ChunkedArray) -> dict[str, int]:
 def _named(rows: pa.Table, column: str) -> dict[str, Any]:
     some = rows.slice(0, MOST_NAMED)
     return dict(zip(some["vehicle"].to_pylist(), some[column].to_pylist(), strict=True))
+
+
+def _moved(rows: pa.Table) -> dict[str, str]:
+    """Which branches of vehicles have moved, and how."""
+    found: dict[str, list[str]] = {}
+    for row in rows.select(["vehicle", "branch", "moved"]).slice(0, MOST_NAMED).to_pylist():
+        found.setdefault(row["vehicle"], []).append(f"{row['branch']} {row['moved']}")
+    return {name: "; ".join(texts) for name, texts in found.items()}
 
 
 def _corrections(rows: pa.Table) -> dict[str, str]:

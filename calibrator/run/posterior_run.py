@@ -13,6 +13,7 @@ from calibrator.posterior.fleet import FindModels, Learnt, learn_fleet
 from calibrator.report.progress import progress_bar
 from calibrator.run.first_pass import Census, read_sample, take_census
 from calibrator.run.in_order import Workers
+from calibrator.run.previous import PreviousResult
 from calibrator.run.second_pass import calibrate_bucket
 from calibrator.run.unfinished import Chunks
 from calibrator.summaries.store import SummaryStore
@@ -44,6 +45,7 @@ def calibrate_store(
     *,
     workers: Workers,
     find_models: FindModels | None = None,
+    previous: PreviousResult | None = None,
 ) -> PosteriorRun:
     """Calibrate every vehicle of a store.
 
@@ -61,6 +63,8 @@ def calibrate_store(
         Where it is computed.
     find_models : callable or None
         Second pass over the drives for sensors that are not linear; None: all count as linear.
+    previous : PreviousResult or None
+        Earlier result, whose parameters stay for vehicles that have not driven since.
 
     Returns
     -------
@@ -76,7 +80,7 @@ def calibrate_store(
     _require_known(settings, store, census)
     learnt = _learn(store, census, settings, identity, find_models)
     todo = [bucket for bucket in store.buckets() if not chunks.done(bucket)]
-    calibrate = partial(calibrate_bucket, store=store, task=learnt.task)
+    calibrate = partial(calibrate_bucket, store=store, task=learnt.task, previous=previous)
     before = sum(len(names) for bucket, names in census.usable.items() if bucket not in set(todo))
     with progress_bar("calibrate", census.size, "vehicles") as progress:
         progress(before)
