@@ -30,7 +30,7 @@ from calibrator.report.calibration import MOST_NAMED, CalibrationReport, report_
 from calibrator.results import RunRecord, encode_chunk, join_rows, left_out_of, write_parameter_files, write_run
 from calibrator.run.in_order import Workers
 from calibrator.run.posterior_run import calibrate_store
-from calibrator.run.previous import open_previous
+from calibrator.run.previous import PreviousResult, require_previous
 from calibrator.run.unfinished import Unfinished, unfinished_run
 from calibrator.sensor_models.fleet import SensorFindings, find_sensor_models
 from calibrator.storage import open_storage
@@ -247,9 +247,10 @@ def _calibrate_store(
     since: Path | None = None,
 ) -> CalibrationReport:
     """Calibrate from summaries; those that were read here become part of the result."""
+    if since is not None:
+        require_previous(since, database, store.identity.branches)
     plan = _plan(store, database, settings, since)
     identity = _identity(fleet, database, settings, created=unfinished.begin(plan, _now()))
-    previous = None if since is None else open_previous(since, identity, store.identity.branches)
     run = calibrate_store(
         store,
         settings,
@@ -257,7 +258,7 @@ def _calibrate_store(
         unfinished.chunks,
         workers=workers,
         find_models=find_models,
-        previous=previous,
+        previous=None if since is None else PreviousResult(folder=since),
     )
     own = unfinished.summaries if unfinished.summaries.exists() else None
     return _finish(

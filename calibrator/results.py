@@ -143,7 +143,10 @@ def encode_chunk(
     for row in rows:
         row["moved"] = (moved or {}).get((row["vehicle"], row["branch"]))
     rows += [{"vehicle": vehicle, "verdict": LEFT_OUT, "reason": left_out[vehicle]} for vehicle in sorted(left_out)]
-    texts = [{"vehicle": item.vehicle, "parameters": encode_parameters(item).decode()} for item in ordered]
+    texts = [
+        {"vehicle": item.vehicle, "parameters": encode_parameters(item, f"parameters of {item.vehicle}").decode()}
+        for item in ordered
+    ]
     return ChunkResult(rows=_parquet(rows, SCHEMA), parameters=_parquet(texts, PARAMETERS_SCHEMA))
 
 

@@ -273,13 +273,15 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
             )
 
 
-def encode_parameters(parameters: VehicleParameters) -> bytes:
+def encode_parameters(parameters: VehicleParameters, where: str) -> bytes:
     """Text of a parameter file.
 
     Parameters
     ----------
     parameters : VehicleParameters
         What it says.
+    where : str
+        Where it is to stand, for messages.
 
     Returns
     -------
@@ -292,7 +294,6 @@ def encode_parameters(parameters: VehicleParameters) -> bytes:
         If it could not be read back: a number is not finite, which JSON cannot say, or a field is outside the schema.
     """
     content = msgspec.json.encode(parameters)
-    where = f"parameters of {parameters.vehicle}"
     try:
         read_back = msgspec.json.decode(content, type=VehicleParameters)
     except msgspec.DecodeError as error:
@@ -322,7 +323,7 @@ def write_parameters(parameters: VehicleParameters, path: Path) -> None:
     ParameterError
         As :func:`encode_parameters`; nothing is written.
     """
-    write_atomically(path, encode_parameters(parameters))
+    write_atomically(path, encode_parameters(parameters, str(path)))
 
 
 def write_atomically(path: Path, content: bytes) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 from calibrator.errors import FleetError
 from calibrator.evidence.readings import TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD
 from calibrator.options import Method
-from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.results import PARTS, chunk_parameters, read_run
+from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters, decode_parameters, read_parameters
 
-__all__ = ["PreviousResult", "moved_sensors", "open_previous"]
+__all__ = ["PreviousResult", "moved_sensors", "require_previous"]
 
 SURE = 4.0
 """Standard deviations from which on a sensor has moved. [1]"""
@@ -42,22 +42,17 @@ class PreviousResult:
         return {name: read_parameters(path) for name, path in paths.items() if path.exists()}
 
 
-def open_previous(folder: Path, identity: RunIdentity, branches: Sequence[str]) -> PreviousResult:
-    """Open an earlier result.
+def require_previous(folder: Path, database: VehicleDatabase, branches: Sequence[str]) -> None:
+    """Refuse an earlier result that a run cannot go on from.
 
     Parameters
     ----------
     folder : Path
         Where it is.
-    identity : RunIdentity
+    database : VehicleDatabase
         Of the run that goes on from it.
     branches : sequence of str
         Of the fleet.
-
-    Returns
-    -------
-    PreviousResult
-        The result.
 
     Raises
     ------
@@ -67,12 +62,11 @@ def open_previous(folder: Path, identity: RunIdentity, branches: Sequence[str]) 
     run = read_run(folder)
     if run.method != Method.POSTERIOR.value:
         raise FleetError(f"{folder}: a result of the method {run.method}; --since goes on from one of the posterior")
-    if run.layout != identity.database.layout.name or run.branches != list(branches):
+    if run.layout != database.layout.name or run.branches != list(branches):
         raise FleetError(
             f"{folder}: a result of layout {run.layout} with branches {', '.join(run.branches)}; this fleet is of "
-            f"layout {identity.database.layout.name} with {', '.join(branches)}: calibrate it without --since"
+            f"layout {database.layout.name} with {', '.join(branches)}: calibrate it without --since"
         )
-    return PreviousResult(folder=folder)
 
 
 def moved_sensors(

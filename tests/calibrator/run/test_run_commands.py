@@ -1,0 +1,148 @@
+"""Whole runs as a user types them: killed and gone on with, with any number of workers, on a cluster, from a result."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from calibrator.results import read_results, read_run
+from calibrator.summaries.store import SummaryStore
+from ecu_node.database import VehicleDatabase
+from tests.calibrator.evidence.simulated_drives import Conditions, summaries_of
+from tests.calibrator.run.test_run_passes import faults_of_vehicle
+from tests.calibrator.summaries.small_stores import random_faults, record_of, small_store
+
+LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
+VEHICLES = 60
+ENVIRONMENT = {**os.environ, "SOURCE_DATE_EPOCH": "1700000000", "OMP_NUM_THREADS": "1"}
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "calibrator", *map(str, arguments)]
+
+
+def calibrate(store: str, out: Path, *options: object) -> subprocess.CompletedProcess[str]:
+    line = command("calibrate", store, "--layout", LAYOUT, "--out", out, *options)
+    return subprocess.run(line, capture_output=True, text=True, check=False, timeout=300, env=ENVIRONMENT)
+
+
+def contents(result: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(result)): path.read_bytes() for path in sorted(result.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def store(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -> SummaryStore:
+    return small_store(tmp_path_factory.mktemp("fleet") / "store", database, random_faults(VEHICLES))
+
+
+@pytest.fixture(scope="module")
+def result(store: SummaryStore) -> Path:
+    out = Path(store.url).parent / "result"
+    run = calibrate(store.url, out, "--workers", 1)
+    assert run.returncode == 0, run.stderr
+    return out
+
+
+def test_a_result_has_every_vehicle_once_in_order(result: Path) -> None:
+    rows = read_results(result)
+    assert [row["vehicle"] for row in rows[::2]] == [f"V{j:03d}" for j in range(VEHICLES)]
+    assert sorted(path.stem for path in (result / "params").iterdir()) == [f"V{j:03d}" for j in range(VEHICLES)]
+    assert read_run(result).vehicles == VEHICLES
+    assert not (result.parent / ".result.unfinished").exists()
+
+
+def test_the_result_is_the_same_for_any_number_of_workers(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+    run = calibrate(store.url, tmp_path / "two", "--workers", 2)
+    assert run.returncode == 0, run.stderr
+    assert contents(tmp_path / "two") == contents(result)
+
+
+def test_a_run_that_is_killed_goes_on_where_it_stopped(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+    out, chunks = tmp_path / "out", tmp_path / ".out.unfinished" / "chunks"
+    line = command("calibrate", store.url, "--layout", LAYOUT, "--out", out, "--workers", 1)
+    written: dict[str, int] = {}
+    for wanted in (1, 4, 9):
+        with subprocess.Popen(line, stderr=subprocess.PIPE, env=ENVIRONMENT) as run:
+            until = time.monotonic() + 120.0
+            while len(list(chunks.glob("*.rows.parquet"))) < wanted and time.monotonic() < until:
+                time.sleep(0.002)
+            run.send_signal(signal.SIGKILL)
+        found = {path.name: path.stat().st_mtime_ns for path in chunks.glob("*.rows.parquet")}
+        assert len(found) >= wanted
+        assert written.items() <= found.items(), "chunks that are done are not made again"
+        assert not out.exists()
+        written = found
+    run_on = calibrate(store.url, out, "--workers", 1)
+    assert run_on.returncode == 0, run_on.stderr
+    assert contents(out) == contents(result)
+
+
+def test_other_settings_do_not_go_on_from_what_was_computed(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+    unfinished = tmp_path / ".out.unfinished"
+    (unfinished / "chunks").mkdir(parents=True)
+    (unfinished / "plan").write_text("another plan\n1999")
+    (unfinished / "chunks" / "00000.rows.parquet").write_bytes(b"nonsense")
+    run = calibrate(store.url, tmp_path / "out", "--workers", 1)
+    assert run.returncode == 0, run.stderr
+    assert contents(tmp_path / "out") == contents(result)
+
+
+def test_a_second_run_to_the_same_place_is_refused(store: SummaryStore, tmp_path: Path) -> None:
+    line = command("calibrate", store.url, "--layout", LAYOUT, "--out", tmp_path / "out", "--workers", 1)
+    with subprocess.Popen(line, stderr=subprocess.PIPE, env=ENVIRONMENT) as first:
+        until = time.monotonic() + 120.0
+        while not (tmp_path / ".out.unfinished" / "plan").exists() and time.monotonic() < until:
+            time.sleep(0.01)
+        second = calibrate(store.url, tmp_path / "out", "--workers", 1)
+        first.kill()
+    assert second.returncode == 1
+    assert "another run is writing this result; wait for it or choose another --out" in second.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--method", "published"), "a store of summaries, and --method published needs the drives"),
+        (("--sensor-models",), "a store of summaries, and --sensor-models needs the drives"),
+        (("--branches", "battery,motor"), "a store of summaries, and --branches needs the drives"),
+        (("--trusted", "V777"), "no usable vehicle V777 to trust"),
+        (("--hold-out", "V777"), "no usable vehicle V777 to hold out"),
+        (("--scheduler", "tcp://127.0.0.1:9"), "tcp://127.0.0.1:9: no Dask scheduler answers"),
+    ],
+)
+def test_what_summaries_do_not_tell_is_refused_in_one_line(
+    store: SummaryStore, tmp_path: Path, options: tuple[str, ...], message: str
+) -> None:
+    run = calibrate(store.url, tmp_path / "out", *options)
+    assert run.returncode == 1
+    assert message in run.stderr.splitlines()[-1]
+    assert "Traceback" not in run.stderr
+
+
+def test_since_an_earlier_result_only_those_who_drove_are_calibrated(
+    store: SummaryStore, result: Path, database: VehicleDatabase, tmp_path: Path
+) -> None:
+    shutil.copytree(store.url, tmp_path / "store")
+    grown = SummaryStore(storage=type(store.storage)(url=str(tmp_path / "store")), identity=store.identity)
+    bucket = grown.bucket_of("V007")
+    records = grown.read(bucket)
+    (new,) = summaries_of(faults_of_vehicle(7, drift=0.05), Conditions(model_error_a=0.5), seed=5)
+    grown.write(bucket, {**records, "V007": [*records["V007"], record_of("V007", new, ("d2",))]})
+    run = calibrate(grown.url, tmp_path / "out", "--since", result, "--workers", 1)
+    assert run.returncode == 0, run.stderr
+    assert "moved since the earlier result:" in run.stdout
+    assert "V007: battery drift" in run.stdout
+    before, after = contents(result / "params"), contents(tmp_path / "out" / "params")
+    assert [name for name in before if before[name] != after[name]] == ["V007.json"]
+
+
+def test_since_what_is_no_result_is_refused(store: SummaryStore, tmp_path: Path) -> None:
+    run = calibrate(store.url, tmp_path / "out", "--since", tmp_path / "nothing")
+    assert run.returncode == 1
+    assert "not a result of 'calibrator calibrate'" in run.stderr
+    assert "Traceback" not in run.stderr

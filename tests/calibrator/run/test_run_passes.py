@@ -1,0 +1,189 @@
+"""The two passes over a store: every vehicle by itself, in any company, and none stops the others."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from calibrator.calibration_settings import CalibrationSettings
+from calibrator.errors import FleetError
+from calibrator.faults import Faults
+from calibrator.options import Method
+from calibrator.parameter_files import RunIdentity
+from calibrator.posterior.fleet import FleetTask, learn_fleet
+from calibrator.results import ChunkResult, chunk_parameters
+from calibrator.run.first_pass import read_sample, take_census
+from calibrator.run.in_order import Workers
+from calibrator.run.previous import PreviousResult
+from calibrator.run.second_pass import calibrate_bucket
+from calibrator.storage import open_storage
+from calibrator.summaries.record import Record
+from calibrator.summaries.store import SummaryStore
+from ecu_node.database import VehicleDatabase
+from tests.calibrator.evidence.simulated_drives import Conditions, summaries_of
+from tests.calibrator.summaries.small_stores import BRANCHES, random_faults, record_of, small_store
+
+VEHICLES = 60
+ONE = Workers(processes=1)
+
+
+@pytest.fixture(scope="module")
+def store(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -> SummaryStore:
+    return small_store(tmp_path_factory.mktemp("store"), database, random_faults(VEHICLES))
+
+
+@pytest.fixture(scope="module")
+def task(store: SummaryStore, database: VehicleDatabase) -> FleetTask:
+    census, settings = take_census(store, ONE), CalibrationSettings()
+    identity = RunIdentity(
+        database=database, method=Method.POSTERIOR, fleet="small", created="2026-01-01T00:00:00+00:00"
+    )
+    sample = read_sample(store, census, settings, (), everyone=False)
+    return learn_fleet(sample, settings, {}, branches=BRANCHES, identity=identity, fleet_size=census.size).task
+
+
+def texts(chunk: ChunkResult) -> dict[str, bytes]:
+    return dict(chunk_parameters(chunk.parameters))
+
+
+def rows(chunk: ChunkResult) -> list[dict[str, object]]:
+    found: list[dict[str, object]] = pq.read_table(pa.BufferReader(chunk.rows)).to_pylist()
+    return found
+
+
+def rewritten(store: SummaryStore, folder: Path, bucket: int, records: Mapping[str, Sequence[Record]]) -> SummaryStore:
+    """A store with one bucket of other content."""
+    other = SummaryStore(storage=open_storage(folder), identity=store.identity)
+    other.write(bucket, records)
+    return other
+
+
+def fullest(store: SummaryStore) -> int:
+    return max(store.buckets(), key=lambda bucket: len(store.outlines(bucket)))
+
+
+def test_what_is_found_for_a_vehicle_does_not_depend_on_those_beside_it(
+    store: SummaryStore, task: FleetTask, tmp_path: Path
+) -> None:
+    bucket = fullest(store)
+    records = store.read(bucket)
+    together = texts(calibrate_bucket(bucket, store=store, task=task))
+    assert len(together) >= 5
+    for name, items in records.items():
+        alone = rewritten(store, tmp_path, bucket, {name: items})
+        assert texts(calibrate_bucket(bucket, store=alone, task=task)) == {name: together[name]}
+
+
+def test_a_vehicle_that_cannot_be_estimated_does_not_stop_the_others(
+    store: SummaryStore, task: FleetTask, tmp_path: Path
+) -> None:
+    bucket = fullest(store)
+    records = store.read(bucket)
+    expected = texts(calibrate_bucket(bucket, store=store, task=task))
+    bad, *others = records
+    found = records[bad][0].found
+    assert found is not None
+    huge = replace(found.summary, moments=found.summary.moments * 1e200)
+    spoilt = {**records, bad: [replace(records[bad][0], found=replace(found, summary=huge))]}
+    chunk = calibrate_bucket(bucket, store=rewritten(store, tmp_path, bucket, spoilt), task=task)
+    assert {name: text for name, text in texts(chunk).items() if name != bad} == {
+        name: expected[name] for name in others
+    }
+
+
+def test_a_vehicle_without_usable_drives_is_left_out_with_its_reason(
+    store: SummaryStore, task: FleetTask, tmp_path: Path
+) -> None:
+    bucket = fullest(store)
+    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
+    records["V999"] = [Record(vehicle="V999", drives=("x",), sources=("",), found=None, problem="drive x: cut")]
+    other = rewritten(store, tmp_path, bucket, records)
+    (left_out,) = [row for row in rows(calibrate_bucket(bucket, store=other, task=task)) if row["branch"] is None]
+    assert (left_out["vehicle"], left_out["verdict"], left_out["reason"]) == ("V999", "left out", "drive x: cut")
+    assert take_census(other, ONE).left_out == {"V999": "drive x: cut"}
+
+
+def test_the_sample_is_the_whole_of_a_small_fleet_less_those_held_out(store: SummaryStore) -> None:
+    census = take_census(store, ONE)
+    names = {item.vehicle for item in read_sample(store, census, CalibrationSettings(), (), everyone=False)}
+    assert names == {f"V{j:03d}" for j in range(VEHICLES)}
+    held_out = CalibrationSettings(hold_out=frozenset({"V003", "V004"}))
+    assert names - {item.vehicle for item in read_sample(store, census, held_out, ("V004",), everyone=False)} == {
+        "V003"
+    }
+
+
+def test_the_sample_of_a_large_fleet_is_of_fixed_size_and_holds_those_that_were_checked(
+    store: SummaryStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("calibrator.run.first_pass.MOST_LEARNT", 10)
+    census = take_census(store, ONE)
+    last = census.usable[max(census.usable)][-1]
+    settings = CalibrationSettings(trusted=frozenset({last}))
+    sample = [item.vehicle for item in read_sample(store, census, settings, (), everyone=False)]
+    assert last in sample
+    assert len(sample) == 11
+
+
+def test_too_few_vehicles_are_refused(database: VehicleDatabase, tmp_path: Path) -> None:
+    lonely = small_store(tmp_path, database, random_faults(1))
+    with pytest.raises(FleetError, match="1 usable vehicle to learn from, at least 2 are needed"):
+        read_sample(lonely, take_census(lonely, ONE), CalibrationSettings(), (), everyone=False)
+
+
+def previous_of(folder: Path, chunk: ChunkResult, bucket: int) -> PreviousResult:
+    (folder / "parameters").mkdir(parents=True)
+    (folder / "parameters" / f"{bucket:05d}.parquet").write_bytes(chunk.parameters)
+    return PreviousResult(folder=folder)
+
+
+def faults_of_vehicle(j: int, **changes: float) -> Faults:
+    """Faults of vehicle j of the store, with changes to its battery sensor."""
+    faults = random_faults(VEHICLES).take(slice(j, j + 1))
+    drift, offset_a = faults.drift.copy(), faults.offset_a.copy()
+    drift[0, 0] += changes.get("drift", 0.0)
+    offset_a[0, 0] += changes.get("offset_a", 0.0)
+    return replace(faults, drift=drift, offset_a=offset_a)
+
+
+def test_vehicles_that_have_not_driven_since_keep_their_parameters(
+    store: SummaryStore, task: FleetTask, tmp_path: Path
+) -> None:
+    bucket = fullest(store)
+    first = calibrate_bucket(bucket, store=store, task=task)
+    later = replace(task, identity=replace(task.identity, created="2027-01-01T00:00:00+00:00"))
+    again = calibrate_bucket(bucket, store=store, task=later, previous=previous_of(tmp_path, first, bucket))
+    assert texts(again) == texts(first)
+
+
+@pytest.mark.parametrize(("changes", "text"), [({}, None), ({"drift": 0.04}, "drift"), ({"offset_a": 12.0}, "offset")])
+def test_a_sensor_that_moved_is_told_and_calibrated_from_the_new_drives(
+    store: SummaryStore, task: FleetTask, tmp_path: Path, changes: dict[str, float], text: str | None
+) -> None:
+    bucket = fullest(store)
+    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
+    name = min(records)
+    previous = previous_of(tmp_path / "r", calibrate_bucket(bucket, store=store, task=task), bucket)
+    faults = faults_of_vehicle(int(name[1:]), **changes)
+    (new,) = summaries_of(faults, Conditions(model_error_a=0.5), seed=77)
+    records[name] = [*records[name], record_of(name, new, ("d2",))]
+    later = replace(task, identity=replace(task.identity, created="2027-01-01T00:00:00+00:00"))
+    chunk = calibrate_bucket(
+        bucket, store=rewritten(store, tmp_path / "s", bucket, records), task=later, previous=previous
+    )
+    moved = {str(row["branch"]): str(row["moved"]) for row in rows(chunk) if row["moved"] is not None}
+    if text is None:
+        assert not moved
+        assert b'"d1",\n      "d2"' in texts(chunk)[name]
+        return
+    assert list(moved) == ["battery"]
+    assert text in moved["battery"]
+    (battery,) = [row for row in rows(chunk) if row["vehicle"] == name and row["branch"] == "battery"]
+    assert battery["drift"] == pytest.approx(faults.drift[0, 0], abs=0.01)
+    assert battery["offset_a"] == pytest.approx(faults.offset_a[0, 0], abs=1.0)
+    assert b'"d1"' not in texts(chunk)[name]
+    assert np.isfinite(float(str(battery["drift_sd"])))

@@ -1,0 +1,78 @@
+"""Stores of summaries of small fleets whose faults are known."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calibrator.artificial.random_fleet import draw_faults
+from calibrator.drives.delays import BranchDelays
+from calibrator.drives.fleet_source import Equipment
+from calibrator.evidence.summary import BLOCK_S, DriveSummary
+from calibrator.evidence.vehicle_summary import VehicleSummary
+from calibrator.evidence.zero_current import ZeroCurrent
+from calibrator.faults import Faults
+from calibrator.storage import Storage, open_storage
+from calibrator.summaries.identity import StoreIdentity, store_identity, write_identity
+from calibrator.summaries.record import Record
+from calibrator.summaries.store import SummaryStore
+from ecu_node.database import VehicleDatabase
+from tests.calibrator.evidence.simulated_drives import PERIOD_S, Conditions, summaries_of
+
+BRANCHES = ("battery", "motor")
+EQUIPMENT = Equipment(
+    branches=BRANCHES, inputs=("speed",), fleet_inputs=("speed", "torque", "voltage"), notices=("a notice",)
+)
+CONDITIONS = Conditions(model_error_a=0.5)
+
+
+def random_faults(vehicles: int, seed: int = 0) -> Faults:
+    return draw_faults(
+        np.random.default_rng(seed),
+        vehicles=vehicles,
+        branches=len(BRANCHES),
+        sparsity=80.0,
+        magnitude=(0.05, 0.25),
+        full_scale_a=400.0,
+        balanced=True,
+    )
+
+
+def record_of(name: str, summary: DriveSummary, drives: Sequence[str] = ("d1",)) -> Record:
+    K = len(BRANCHES)
+    found = VehicleSummary(
+        vehicle=name,
+        drives=tuple(drives),
+        summary=summary,
+        delays=BranchDelays(
+            branches=("motor", "battery"),
+            delay_s=np.array([0.0, 0.02]),
+            sd_s=np.array([0.0, 0.001]),
+            known=np.ones(K, bool),
+        ),
+        zero_current=ZeroCurrent(offset_a=np.array([np.nan, 1.5]), sd_a=np.array([np.nan, 0.1])),
+        recorded=frozenset({"speed", "torque"}),
+    )
+    return Record(vehicle=name, drives=tuple(drives), sources=("1-2",) * len(drives), found=found)
+
+
+def identity_of(database: VehicleDatabase, vehicles: int) -> StoreIdentity:
+    identity = store_identity(EQUIPMENT, database, vehicles=vehicles, fleet="small", fleet_ids=frozenset())
+    return StoreIdentity(
+        **{name: getattr(identity, name) for name in identity.__struct_fields__} | {"period_s": PERIOD_S}
+    )
+
+
+def small_store(
+    storage: Storage | Path, database: VehicleDatabase, faults: Faults, *, seed: int = 1, first: int = 0
+) -> SummaryStore:
+    """A store of vehicles V000 and so on, one drive each."""
+    place = open_storage(storage) if isinstance(storage, Path) else storage
+    store = SummaryStore(storage=place, identity=identity_of(database, len(faults)))
+    write_identity(place, store.identity)
+    names = [f"V{first + j:03d}" for j in range(len(faults))]
+    summaries = dict(zip(names, summaries_of(faults, CONDITIONS, seed=seed), strict=True))
+    for bucket, inside in store.by_bucket(names).items():
+        store.write(bucket, {name: [record_of(name, summaries[name])] for name in inside})
+    assert store.identity.block_s == BLOCK_S
+    return store

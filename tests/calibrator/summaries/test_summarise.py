@@ -1,0 +1,124 @@
+"""Drives into a store: each is read once, changes are noticed, bad ones are tried again."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrator.drive import Channel, Drive
+from calibrator.drives.fleet_source import Equipment, find_fleet
+from calibrator.drives.store import write_drive
+from calibrator.errors import FleetError
+from calibrator.storage import open_storage
+from calibrator.summaries.record import joined_records
+from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.summarise import Added, add_drives, open_store
+from ecu_node.database import VehicleDatabase
+
+EQUIPMENT = Equipment(branches=("battery", "motor"), inputs=("speed",), fleet_inputs=("speed",), notices=())
+
+
+def write(store: Path, vehicle: str, name: str, database: VehicleDatabase, *, scale: float = 1.0) -> None:
+    rng = np.random.default_rng([ord(letter) for letter in vehicle + name])
+    time_s = 0.1 * np.arange(3000)
+    speed = 30.0 + 20.0 * np.sin(0.3 * time_s + rng.random())
+
+    def channel(value: np.ndarray[tuple[int], np.dtype[np.float64]]) -> Channel:
+        return Channel(time_s=time_s, value=value, good=np.ones(len(time_s), bool))
+
+    battery = scale * (2.0 * speed + rng.normal(size=len(time_s)))
+    branches = {"battery": channel(battery), "motor": channel(-battery)}
+    write_drive(
+        store, Drive(vehicle=vehicle, name=name, branches=branches, inputs={"speed": channel(speed)}), database.layout
+    )
+
+
+def add(drives: Path, out: Path, database: VehicleDatabase, *, exactly: bool = False) -> tuple[Added, SummaryStore]:
+    fleet = find_fleet(drives)
+    store = open_store(open_storage(out), EQUIPMENT, database, fleet)
+    return add_drives(store, fleet, database, workers=1, exactly=exactly), store
+
+
+def drives_in(store: SummaryStore) -> dict[str, list[tuple[str, ...]]]:
+    return {
+        name: [record.drives for record in records]
+        for bucket in store.buckets()
+        for name, records in store.read(bucket).items()
+    }
+
+
+def test_each_drive_is_read_once(tmp_path: Path, database: VehicleDatabase) -> None:
+    drives, out = tmp_path / "drives", tmp_path / "summaries"
+    for vehicle in ("V1", "V2"):
+        write(drives, vehicle, "a", database)
+    first, store = add(drives, out, database)
+    assert (first.vehicles, first.drives, first.problems) == (2, 2, {})
+    again, _ = add(drives, out, database)
+    assert (again.vehicles, again.drives) == (0, 0)
+    write(drives, "V2", "b", database)
+    more, store = add(drives, out, database)
+    assert (more.vehicles, more.drives) == (1, 1)
+    assert drives_in(store) == {"V1": [("a",)], "V2": [("a",), ("b",)]}
+
+
+def test_two_drives_added_one_after_the_other_are_as_both_at_once(tmp_path: Path, database: VehicleDatabase) -> None:
+    for name in ("a", "b"):
+        write(tmp_path / "both", "V1", name, database)
+    _, at_once = add(tmp_path / "both", tmp_path / "s1", database)
+    for name in ("a", "b"):
+        write(tmp_path / "later", "V1", name, database)
+        _, later = add(tmp_path / "later", tmp_path / "s2", database)
+    totals = [joined_records(store.read(store.bucket_of("V1"))["V1"]).summary.total for store in (at_once, later)]
+    np.testing.assert_allclose(totals[1], totals[0], rtol=2e-3)
+    assert totals[1][-1, -1] == totals[0][-1, -1]
+
+
+def test_a_drive_that_was_changed_is_read_again(tmp_path: Path, database: VehicleDatabase) -> None:
+    drives, out = tmp_path / "drives", tmp_path / "summaries"
+    write(drives, "V1", "a", database)
+    _, store = add(drives, out, database)
+    before = joined_records(store.read(store.bucket_of("V1"))["V1"]).summary.total
+    write(drives, "V1", "a", database, scale=1.5)
+    again, store = add(drives, out, database)
+    assert again.drives == 1
+    after = joined_records(store.read(store.bucket_of("V1"))["V1"]).summary.total
+    assert after[1, 1] == pytest.approx(2.25 * before[1, 1], rel=1e-6)
+    assert drives_in(store) == {"V1": [("a",)]}
+
+
+def test_a_bad_drive_costs_its_vehicle_and_is_tried_again(tmp_path: Path, database: VehicleDatabase) -> None:
+    drives, out = tmp_path / "drives", tmp_path / "summaries"
+    for vehicle in ("V1", "V2"):
+        write(drives, vehicle, "a", database)
+    path = drives / "drives" / "V1" / "a.parquet"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:1000])
+    added, store = add(drives, out, database)
+    assert list(added.problems) == ["V1"]
+    assert "not a drive" in added.problems["V1"]
+    path.write_bytes(whole)
+    again, store = add(drives, out, database)
+    assert (again.vehicles, again.problems) == (1, {})
+    assert drives_in(store) == {"V1": [("a",)], "V2": [("a",)]}
+
+
+def test_a_store_that_is_to_hold_these_drives_alone_loses_the_others(tmp_path: Path, database: VehicleDatabase) -> None:
+    drives, out = tmp_path / "drives", tmp_path / "summaries"
+    for vehicle in ("V1", "V2"):
+        write(drives, vehicle, "a", database)
+    add(drives, out, database)
+    (drives / "drives" / "V1" / "a.parquet").unlink()
+    (drives / "drives" / "V1").rmdir()
+    _, store = add(drives, out, database, exactly=True)
+    assert drives_in(store) == {"V2": [("a",)]}
+
+
+def test_drives_of_other_branches_cannot_be_added(tmp_path: Path, database: VehicleDatabase) -> None:
+    drives, out = tmp_path / "drives", tmp_path / "summaries"
+    write(drives, "V1", "a", database)
+    add(drives, out, database)
+    other = Equipment(branches=("battery", "dcdc"), inputs=("speed",), fleet_inputs=("speed",), notices=())
+    with pytest.raises(
+        FleetError, match="cannot be added to this store: branches battery, motor against battery, dcdc"
+    ):
+        open_store(open_storage(out), other, database, find_fleet(drives))

@@ -1,0 +1,180 @@
+"""Summaries on disk: nothing is lost, records add up, and nothing that does not fit gets in."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from calibrator.errors import DriveError, FleetError
+from calibrator.evidence.summary import DriveSummary
+from calibrator.storage import Storage, StorageError, open_storage
+from calibrator.summaries.identity import SCHEMA_VERSION, read_identity, write_identity
+from calibrator.summaries.record import Record, joined_records
+from calibrator.summaries.store import SummaryStore, bucket_of
+from calibrator.summaries.table import MOST_BLOCKS
+from ecu_node.database import VehicleDatabase
+from tests.calibrator.evidence.simulated_drives import Conditions, no_faults, summaries_of
+from tests.calibrator.summaries.small_stores import identity_of, random_faults, record_of, small_store
+
+VEHICLES = 40
+
+
+@pytest.fixture(scope="module")
+def store(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -> SummaryStore:
+    return small_store(tmp_path_factory.mktemp("store"), database, random_faults(VEHICLES))
+
+
+def all_records(store: SummaryStore) -> list[Record]:
+    return [record for bucket in store.buckets() for items in store.read(bucket).values() for record in items]
+
+
+def summary_of(samples: int, seed: int = 1) -> DriveSummary:
+    return summaries_of(no_faults(1, 2), Conditions(samples=samples), seed=seed)[0]
+
+
+def test_what_is_read_is_what_was_written(store: SummaryStore) -> None:
+    records = {record.vehicle: record for record in all_records(store)}
+    assert sorted(records) == [f"V{j:03d}" for j in range(VEHICLES)]
+    for name, summary in zip(
+        sorted(records), summaries_of(random_faults(VEHICLES), Conditions(model_error_a=0.5), seed=1), strict=True
+    ):
+        expected, found = record_of(name, summary).found, records[name].found
+        assert expected is not None
+        assert found is not None
+        np.testing.assert_allclose(found.summary.moments, expected.summary.moments, rtol=1e-15)
+        np.testing.assert_array_equal(found.summary.noise_a2, expected.summary.noise_a2)
+        assert found.delays.by_branch() == expected.delays.by_branch()
+        np.testing.assert_array_equal(found.zero_current.offset_a, expected.zero_current.offset_a)
+        assert (found.drives, found.recorded) == (expected.drives, expected.recorded)
+        assert records[name].sources == ("1-2",)
+
+
+def test_any_tool_can_read_it(store: SummaryStore) -> None:
+    files = f"{store.url}/buckets/*.parquet"
+    count, seconds = duckdb.execute(
+        f"SELECT count(DISTINCT vehicle), sum(duration_s) FROM read_parquet('{files}')"
+    ).fetchall()[0]
+    assert count == VEHICLES
+    assert seconds == pytest.approx(VEHICLES * 1800.0)
+
+
+def test_each_vehicle_has_a_row_group_of_its_own(store: SummaryStore) -> None:
+    for path in Path(store.url).glob("buckets/*.parquet"):
+        about = pq.read_metadata(path)
+        assert about.num_row_groups == about.num_rows
+
+
+def test_the_bucket_of_a_vehicle_depends_on_its_name_alone() -> None:
+    assert [bucket_of(name, 16) for name in ("V1", "V2", "WBA123")] == [8, 9, 13]
+    counts = np.bincount([bucket_of(f"V{j}", 64) for j in range(6400)], minlength=64)
+    assert counts.min() > 60
+    assert counts.max() < 145
+
+
+def test_records_of_a_vehicle_add_up(store: SummaryStore) -> None:
+    parts = [summary_of(900, seed) for seed in (1, 2)]
+    both = joined_records([record_of("V1", part, (f"d{k}",)) for k, part in enumerate(parts)])
+    assert both.drives == ("d0", "d1")
+    np.testing.assert_allclose(both.summary.total, parts[0].total + parts[1].total)
+    assert len(both.summary.moments) == len(parts[0].moments) + len(parts[1].moments)
+    assert both.zero_current.sd_a[1] == pytest.approx(0.1 / np.sqrt(2.0))
+
+
+def test_a_long_drive_is_shortened_and_its_sums_stay(tmp_path: Path, database: VehicleDatabase) -> None:
+    long = summary_of(30 * (MOST_BLOCKS + 40))
+    store = SummaryStore(storage=open_storage(tmp_path), identity=identity_of(database, 1))
+    store.write(3, {"V1": [record_of("V1", long)]})
+    (record,) = store.read(3)["V1"]
+    assert record.found is not None
+    kept = record.found.summary
+    assert len(kept.moments) <= MOST_BLOCKS < len(long.moments)
+    np.testing.assert_allclose(kept.total, long.total, rtol=1e-12)
+    assert kept.noise_a2.mean() == pytest.approx(long.noise_a2.mean(), rel=0.02)
+
+
+def test_drives_too_short_by_themselves_count_together() -> None:
+    parts = [record_of("V1", summary_of(90, seed), (f"d{seed}",)) for seed in (1, 2)]
+    with pytest.raises(DriveError, match=r"90\.0 s of usable data in 1 drives; at least 120 s are needed"):
+        joined_records(parts[:1])
+    assert joined_records(parts).summary.duration_s == 180.0
+
+
+def test_a_record_without_data_says_why_and_does_not_spoil_the_others() -> None:
+    bad = Record(vehicle="V1", drives=("x",), sources=("",), found=None, problem="drive x: cut")
+    with pytest.raises(DriveError, match="drive x: cut"):
+        joined_records([bad])
+    assert joined_records([bad, record_of("V1", summary_of(600))]).drives == ("d1",)
+
+
+def test_numbers_that_are_not_finite_are_refused() -> None:
+    summary = summary_of(600)
+    summary.moments[3, 1, 1] = np.nan
+    with pytest.raises(DriveError, match="not finite; summarise its drives again"):
+        joined_records([record_of("V1", summary)])
+
+
+@pytest.mark.parametrize("damage", [b"", b"PAR1", b"x" * 5000])
+def test_a_damaged_bucket_is_named(tmp_path: Path, database: VehicleDatabase, damage: bytes) -> None:
+    store = small_store(tmp_path, database, no_faults(2, 2))
+    path = next((tmp_path / "buckets").iterdir())
+    path.write_bytes(damage)
+    with pytest.raises(FleetError, match=rf"{path.name}: damaged file of summaries: .*; remove it and summarise again"):
+        store.read(int(path.stem))
+    with pytest.raises(FleetError, match="damaged file of summaries"):
+        store.outlines(int(path.stem))
+
+
+def test_a_bucket_that_is_not_there_is_empty(store: SummaryStore) -> None:
+    assert store.read(999) == {}
+    with pytest.raises(StorageError, match=r"00999\.parquet: no such file"):
+        store.outlines(999)
+
+
+def test_object_storage_holds_the_same(database: VehicleDatabase) -> None:
+    store = small_store(Storage(url="memory://fleet/one"), database, random_faults(4))
+    assert len(all_records(store)) == 4
+    assert read_identity(open_storage("memory://fleet/one"), database) == store.identity
+    assert set(store.versions()) == {f"{bucket:05d}.parquet" for bucket in store.buckets()}
+
+
+def test_storage_of_an_unknown_kind_is_refused_in_one_line() -> None:
+    with pytest.raises(StorageError, match=r"^nokind://x: no way to reach this kind of storage: "):
+        open_storage("nokind://x").names()
+
+
+def test_a_store_of_another_layout_version_or_content_is_refused(tmp_path: Path, database: VehicleDatabase) -> None:
+    storage, identity = open_storage(tmp_path), identity_of(database, 1)
+    assert read_identity(storage, database) is None
+    write_identity(storage, identity)
+    path = tmp_path / "summaries.json"
+    text = path.read_text()
+    for change, message in (
+        ((identity.layout_sha256, "0" * 64), "made with another layout than"),
+        ((identity.dbc_sha256, "0" * 64), "made with another DBC than"),
+        ((f'"schema_version": {SCHEMA_VERSION}', '"schema_version": 99'), "schema version 99, expected"),
+        (('"block_s": 30.0', '"block_s": 60.0'), "blocks of 60 s, expected 30 s"),
+        (("{", "[", 1), "not a store of summaries"),
+        (('"branches"', '"branchs"'), "not a store of summaries"),
+    ):
+        path.write_text(text.replace(*change))
+        with pytest.raises(FleetError, match=message):
+            read_identity(storage, database)
+
+
+def test_what_does_not_fit_a_store_is_told(database: VehicleDatabase) -> None:
+    identity = identity_of(database, 1)
+    assert identity.difference(identity) == ""
+    other = type(identity)(
+        **{**{n: getattr(identity, n) for n in identity.__struct_fields__}, "branches": ("battery", "dcdc")}
+    )
+    assert identity.difference(other) == "branches battery, motor against battery, dcdc"
+
+
+def test_records_with_another_order_of_branches_are_told_apart(store: SummaryStore) -> None:
+    record = all_records(store)[0]
+    assert record.found is not None
+    assert record.found.delays.branches == ("motor", "battery")
+    assert replace(record, problem="x").problem == "x"
