@@ -33,6 +33,7 @@ from calibrator.command_options import (
     SensorModelsOption,
     SparsityOption,
     SymmetricOption,
+    TimeLimitOption,
     TrustedOption,
     TruthOption,
     UnityOption,
@@ -49,6 +50,7 @@ from calibrator.errors import LogError
 from calibrator.folders import require_new_folder, require_possible_folder
 from calibrator.interrupts import importing
 from calibrator.options import Classifier, ExperimentName, Method
+from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.report.progress import progress_bar
 from calibrator.report.text import dumps
 from ecu_node import __version__
@@ -111,6 +113,7 @@ def import_(
     layout: LayoutOption,
     out: Annotated[Path, typer.Option("--out", help="Drive store to write to; drives are added to one that exists.")],
     workers: WorkersOption = 2,
+    time_limit: TimeLimitOption = TIME_LIMIT_S,
     json: JsonOption = False,
 ) -> None:
     """Turn CAN logs of one or many vehicles into drives."""
@@ -118,7 +121,7 @@ def import_(
         from calibrator.recordings.import_logs import import_logs
 
     require_possible_folder(out)
-    report = import_logs(logs, _database(layout), out, workers=workers)
+    report = import_logs(logs, _database(layout), out, workers=workers, limit_s=time_limit)
     _print_report(report.as_json() if json else report.as_text())
     if not report.drives and not report.already_there:
         raise LogError(f"none of the logs could be used; {out} was not changed")
@@ -200,6 +203,7 @@ def calibrate(
     unity: UnityOption = None,
     seed: SeedOption = 0,
     workers: WorkersOption = 2,
+    time_limit: TimeLimitOption = TIME_LIMIT_S,
     json: JsonOption = False,
 ) -> None:
     """Estimate the sensor faults of every vehicle and write its parameter file.
@@ -228,6 +232,7 @@ def calibrate(
         hold_out=named_vehicles(hold_out),
         unity=unity,
         seed=seed,
+        time_limit_s=time_limit,
     )
     report = calibrate_fleet(fleet, _database(layout), out, settings, workers=workers)
     _print_report(report.as_json() if json else report.as_text())

@@ -37,6 +37,7 @@ __all__ = [
     "SensorModelsOption",
     "SparsityOption",
     "SymmetricOption",
+    "TimeLimitOption",
     "TrustedOption",
     "TruthOption",
     "UnityOption",
@@ -67,6 +68,8 @@ MAX_VEHICLES = 100_000
 MAX_CURRENTS = 16
 MAX_SEED = 2**32 - 1
 MAX_WORKERS = 256
+MAX_TIME_LIMIT_S = 86_400.0
+"""A day. [s]"""
 MAX_MINUTES = 240.0
 """A trip's log is made in memory, at some 250 frames per second. [min]"""
 MAX_DELAY_MS = 1000.0
@@ -132,6 +135,10 @@ def _branches(value: str | None) -> str | None:
 LayoutOption = Annotated[Path, typer.Option("--layout", help="Layout (TOML) that says what the signals mean.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 WorkersOption = Annotated[int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Number of processes.")]
+TimeLimitOption = Annotated[
+    float,
+    number_option("--time-limit", 1, MAX_TIME_LIMIT_S, "Longest time to read one log, or one vehicle of a fleet [s]"),
+]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=MAX_SEED, help="Seed of everything random.")]
 VehiclesOption = Annotated[int, typer.Option("--vehicles", min=1, max=MAX_VEHICLES, help="Number of vehicles N.")]
 CurrentsOption = Annotated[int, typer.Option("--currents", min=2, max=MAX_CURRENTS, help="Number of branches K.")]

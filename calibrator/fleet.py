@@ -124,7 +124,7 @@ def calibrate_fleet(
         raise FleetError(
             f"vehicle {', '.join(sorted(both))} is both held out and trusted: the reference would be learnt from it"
         )
-    equipment = probe_equipment(fleet, database, settings.branches)
+    equipment = probe_equipment(fleet, database, settings.branches, limit_s=settings.time_limit_s)
     identity = RunIdentity(
         database=database,
         method=settings.method,

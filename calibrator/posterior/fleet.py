@@ -80,7 +80,10 @@ def calibrate_fleet_posterior(
     """
     full_scale_a = identity.database.layout.full_scale_a
     bench = read_bench(settings, fleet, equipment.branches, full_scale_a=full_scale_a)
-    vehicles, left_out = read_vehicles(read_vehicle_summary, fleet, equipment, identity.database, workers=workers)
+    limit_s = settings.time_limit_s
+    vehicles, left_out = read_vehicles(
+        read_vehicle_summary, fleet, equipment, identity.database, workers=workers, limit_s=limit_s
+    )
     names = [vehicle.vehicle for vehicle in vehicles]
     learning = require_learning(names, settings, left_out)
     trusted = trusted_of(names, settings.trusted, fleet)
@@ -104,6 +107,7 @@ def calibrate_fleet_posterior(
             learning=np.array(learning),
             trusted=believed(trusted, posterior.health),
             workers=workers,
+            limit_s=limit_s,
         )
     if findings.not_linear.any():
         posterior = estimate(findings.summaries, readings=readings)
