@@ -29,7 +29,7 @@ START_S = 120.0
 """Time for a worker to start on a busy machine, which does not count as reading. [s]"""
 AHEAD_PER_WORKER = 4
 """Files read before it is the turn of their results: others go on while one takes long, and few wait in memory."""
-PRELOADED = ["can", "cantools", "numpy", "pyarrow.parquet", "threadpoolctl"]
+PRELOADED = ["can", "cantools", "numba", "numpy", "pyarrow.parquet", "threadpoolctl"]
 """Slow to import, so imported once, for all workers. Not this package: the fork server may find another copy of it."""
 
 _REMEDY = "remove the file if it is damaged, cut it if it is long"
