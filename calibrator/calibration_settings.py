@@ -8,6 +8,7 @@ from typing import Any
 from calibrator.artificial.truth import FleetTruth
 from calibrator.errors import FleetError
 from calibrator.options import Classifier, Method
+from calibrator.reading_processes import TIME_LIMIT_S
 from ecu_node.layout import file_digest
 from ecu_node.parameters import VehicleParameters
 
@@ -53,6 +54,8 @@ class CalibrationSettings:
         Vehicle whose held-out inputs are the unity drive; None: the one with the longest.
     seed : int
         Seed of the training fleet.
+    time_limit_s : float
+        Longest time to read one vehicle, in whatever method; one that takes longer is left out. [s]
     """
 
     method: Method = Method.POSTERIOR
@@ -69,6 +72,7 @@ class CalibrationSettings:
     symmetric: bool = False
     unity: str | None = None
     seed: int = 0
+    time_limit_s: float = TIME_LIMIT_S
 
     def record(self) -> dict[str, Any]:
         """What the method in use heeds, for the record of a run."""

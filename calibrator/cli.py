@@ -35,6 +35,7 @@ from calibrator.command_options import (
     SinceOption,
     SparsityOption,
     SymmetricOption,
+    TimeLimitOption,
     TrustedOption,
     TruthOption,
     UnityOption,
@@ -51,6 +52,7 @@ from calibrator.errors import LogError
 from calibrator.folders import require_new_folder, require_possible_folder
 from calibrator.interrupts import importing
 from calibrator.options import Classifier, ExperimentName, Method
+from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.report.progress import progress_bar
 from calibrator.report.text import dumps
 from ecu_node import __version__
@@ -113,6 +115,7 @@ def import_(
     layout: LayoutOption,
     out: Annotated[Path, typer.Option("--out", help="Drive store to write to; drives are added to one that exists.")],
     workers: WorkersOption = 2,
+    time_limit: TimeLimitOption = TIME_LIMIT_S,
     json: JsonOption = False,
 ) -> None:
     """Turn CAN logs of one or many vehicles into drives."""
@@ -120,7 +123,7 @@ def import_(
         from calibrator.recordings.import_logs import import_logs
 
     require_possible_folder(out)
-    report = import_logs(logs, _database(layout), out, workers=workers)
+    report = import_logs(logs, _database(layout), out, workers=workers, limit_s=time_limit)
     _print_report(report.as_json() if json else report.as_text())
     if not report.drives and not report.already_there:
         raise LogError(f"none of the logs could be used; {out} was not changed")
@@ -188,6 +191,7 @@ def summarise(
     out: Annotated[str, typer.Option("--out", help="Store of summaries, path or URL; drives are added to one.")],
     branches: BranchesOption = None,
     workers: WorkersOption = 2,
+    time_limit: TimeLimitOption = TIME_LIMIT_S,
     json: JsonOption = False,
 ) -> None:
     """Reduce drives to what the calibration needs of them: second moments, a few kilobytes per vehicle."""
@@ -195,7 +199,12 @@ def summarise(
         from calibrator.summarise_fleet import summarise_fleet
 
     report = summarise_fleet(
-        fleet, _database(layout), out, branches=tuple(branches.split(",")) if branches else None, workers=workers
+        fleet,
+        _database(layout),
+        out,
+        branches=tuple(branches.split(",")) if branches else None,
+        workers=workers,
+        time_limit_s=time_limit,
     )
     _print_report(report.as_json() if json else report.as_text())
 
@@ -225,6 +234,7 @@ def calibrate(
     workers: WorkersOption = 2,
     scheduler: SchedulerOption = None,
     since: SinceOption = None,
+    time_limit: TimeLimitOption = TIME_LIMIT_S,
     json: JsonOption = False,
 ) -> None:
     """Estimate the sensor faults of every vehicle and write its parameter file.
@@ -255,6 +265,7 @@ def calibrate(
         hold_out=named_vehicles(hold_out),
         unity=unity,
         seed=seed,
+        time_limit_s=time_limit,
     )
     where = Workers(processes=workers, scheduler=scheduler)
     report = calibrate_fleet(fleet, _database(layout), out, settings, workers=where, since=since)

@@ -39,6 +39,7 @@ __all__ = [
     "SinceOption",
     "SparsityOption",
     "SymmetricOption",
+    "TimeLimitOption",
     "TrustedOption",
     "TruthOption",
     "UnityOption",
@@ -69,6 +70,8 @@ MAX_VEHICLES = 100_000
 MAX_CURRENTS = 16
 MAX_SEED = 2**32 - 1
 MAX_WORKERS = 256
+MAX_TIME_LIMIT_S = 86_400.0
+"""A day. [s]"""
 MAX_MINUTES = 240.0
 """A trip's log is made in memory, at some 250 frames per second. [min]"""
 MAX_DELAY_MS = 1000.0
@@ -137,6 +140,10 @@ WorkersOption = Annotated[int, typer.Option("--workers", min=1, max=MAX_WORKERS,
 SchedulerOption = Annotated[
     str | None,
     typer.Option("--scheduler", metavar="URL", help="Dask scheduler, tcp://HOST:PORT, instead of processes."),
+]
+TimeLimitOption = Annotated[
+    float,
+    number_option("--time-limit", 1, MAX_TIME_LIMIT_S, "Longest time to read one log, or one vehicle of a fleet [s]"),
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=MAX_SEED, help="Seed of everything random.")]
 VehiclesOption = Annotated[int, typer.Option("--vehicles", min=1, max=MAX_VEHICLES, help="Number of vehicles N.")]

@@ -25,7 +25,6 @@ from calibrator.options import Method
 from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.fleet import FindModels
 from calibrator.published.fleet import calibrate_fleet_published
-from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.report.calibration import MOST_NAMED, CalibrationReport, report_of
 from calibrator.results import RunRecord, encode_chunk, join_rows, left_out_of, write_parameter_files, write_run
 from calibrator.run.in_order import Workers
@@ -54,7 +53,6 @@ def calibrate_fleet(
     settings: CalibrationSettings,
     *,
     workers: Workers,
-    time_limit_s: float = TIME_LIMIT_S,
     since: Path | None = None,
 ) -> CalibrationReport:
     """Calibrate every vehicle of a fleet and write the result folder.
@@ -72,8 +70,6 @@ def calibrate_fleet(
         How.
     workers : Workers
         Where it is computed.
-    time_limit_s : float
-        Longest time for reading the drives of one vehicle. [s]
     since : Path or None
         Earlier result to go on from: vehicles without new drives keep its parameters. A store must hold the earlier
         drives as well; of a folder of drives, those that the earlier result has are not read again.
@@ -108,12 +104,14 @@ def calibrate_fleet(
             fleet,
             database,
             workers=workers.processes,
-            time_limit_s=time_limit_s,
+            time_limit_s=settings.time_limit_s,
             exactly=since is None,
         )
         find_models, equipment = None, store.identity.equipment
         if settings.sensor_models:
-            find_models = partial(_find_models, fleet=fleet, equipment=equipment, database=database, workers=workers)
+            find_models = partial(
+                _find_models, fleet=fleet, database=database, settings=settings, store=store, workers=workers
+            )
         return _calibrate_store(
             unfinished,
             store,
@@ -210,7 +208,7 @@ def _summaries_of(
         identity = read_identity(storage, database)
         assert identity is not None
         return SummaryStore(storage=storage, identity=identity)
-    equipment = probe_equipment(fleet, database, settings.branches)
+    equipment = probe_equipment(fleet, database, settings.branches, limit_s=settings.time_limit_s)
     try:
         return open_store(storage, equipment, database, fleet)
     except FleetError:
@@ -219,7 +217,12 @@ def _summaries_of(
 
 
 def _find_models(
-    *found: Any, fleet: FleetSource, equipment: Equipment, database: VehicleDatabase, workers: Workers
+    *found: Any,
+    fleet: FleetSource,
+    store: SummaryStore,
+    database: VehicleDatabase,
+    settings: CalibrationSettings,
+    workers: Workers,
 ) -> SensorFindings:
     """Second pass over the drives."""
     vehicles, zero_a, learning, trusted = found
@@ -227,11 +230,12 @@ def _find_models(
         vehicles,
         zero_a,
         fleet,
-        equipment,
+        store.identity.equipment,
         database,
         learning=learning,
         trusted=trusted,
         workers=workers.processes,
+        limit_s=settings.time_limit_s,
     )
 
 
@@ -275,7 +279,7 @@ def _calibrate_published(
     workers: Workers,
 ) -> CalibrationReport:
     """The published method needs all models at once; its result is one chunk."""
-    equipment = probe_equipment(fleet, database, settings.branches)
+    equipment = probe_equipment(fleet, database, settings.branches, limit_s=settings.time_limit_s)
     about = _Fleet.of_drives(fleet, equipment)
     identity = _identity(about, database, settings, created=unfinished.begin(None, _now()))
     outcome = calibrate_fleet_published(fleet, equipment, identity, settings, workers=workers.processes)

@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext
 from typing import Any, Generic, TypeVar
@@ -28,7 +29,7 @@ START_S = 120.0
 """Time for a worker to start on a busy machine, which does not count as reading. [s]"""
 AHEAD_PER_WORKER = 4
 """Files read before it is the turn of their results: others go on while one takes long, and few wait in memory."""
-PRELOADED = ["can", "cantools", "numpy", "pyarrow.parquet", "threadpoolctl"]
+PRELOADED = ["can", "cantools", "numba", "numpy", "pyarrow.parquet", "threadpoolctl"]
 """Slow to import, so imported once, for all workers. Not this package: the fork server may find another copy of it."""
 
 _REMEDY = "remove the file if it is damaged, cut it if it is long"
@@ -73,11 +74,12 @@ def read_in_processes(
     Yields
     ------
     object or Unread
-        What `read` returns, in the order of the sources, or why it did not return. What it raises is raised here.
+        What `read` returns, in the order of the sources, or why it did not return. What it raises is raised here, when
+        it is the turn of its source.
     """
     with tempfile.TemporaryDirectory(prefix="calibrator-") as folder, _crew(read, folder, workers, limit_s) as crew:
         waiting = enumerate(sources)
-        done: dict[int, _Content | Unread] = {}
+        done: dict[int, _Content | Unread | _Raised] = {}
         turn = taken = 0
         while True:
             while taken - turn < AHEAD_PER_WORKER * workers and crew.has_room():
@@ -89,7 +91,7 @@ def read_in_processes(
             if turn == taken:
                 return
             if turn in done:
-                yield done.pop(turn)
+                yield _result(done.pop(turn))
                 turn += 1
             else:
                 done |= crew.collect()
@@ -120,7 +122,7 @@ class _Crew(Generic[_Source, _Content]):
         with suppress(OSError):  # it died just now, which the pipe's end tells
             worker.pipe.send(source)
 
-    def collect(self) -> "dict[int, _Content | Unread]":
+    def collect(self) -> "dict[int, _Content | Unread | _Raised]":
         """Wait for what happens next; results by the number of their source, none if one was begun."""
         patience_s = min(worker.deadline_s for worker in self.busy.values()) - time.monotonic()
         heard = set(wait(list(self.busy), max(patience_s, 0.0)))
@@ -129,8 +131,8 @@ class _Crew(Generic[_Source, _Content]):
         results = self._messages([worker for pipe, worker in self.busy.items() if pipe in heard])
         return results | dict([self._end(worker, _too_long(self.limit_s)) for worker in late])
 
-    def _messages(self, workers: "list[_Worker]") -> "dict[int, _Content | Unread]":
-        results: dict[int, _Content | Unread] = {}
+    def _messages(self, workers: "list[_Worker]") -> "dict[int, _Content | Unread | _Raised]":
+        results: dict[int, _Content | Unread | _Raised] = {}
         for worker in workers:
             try:
                 message = worker.pipe.recv()
@@ -140,8 +142,6 @@ class _Crew(Generic[_Source, _Content]):
                 continue
             if isinstance(message, _Begun):
                 worker.deadline_s = time.monotonic() + self.limit_s
-            elif isinstance(message, _Raised):
-                raise message.error
             else:
                 self.idle.append(self.busy.pop(worker.pipe))
                 results[worker.number] = message
@@ -164,15 +164,12 @@ class _Worker:
 
     @staticmethod
     def start(read: Callable[[Any], Any], folder: str) -> "_Worker":
-        """Start a process; it inherits that SIGINT is ignored."""
+        """Start a process. Ctrl-C waits until it is there, and never reaches it."""
         context = _context()
         ours, theirs = context.Pipe()
         process = context.Process(target=_work, args=(theirs, read, folder), daemon=True)
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        try:
+        with _interrupts_held():
             process.start()
-        finally:
-            signal.signal(signal.SIGINT, before)
         theirs.close()
         return _Worker(process=process, pipe=ours)
 
@@ -198,6 +195,12 @@ class _Raised:
     error: BaseException
 
 
+def _result(outcome: "_Content | Unread | _Raised") -> "_Content | Unread":
+    if isinstance(outcome, _Raised):
+        raise outcome.error
+    return outcome
+
+
 @contextmanager
 def _crew(read: Callable[[Any], Any], folder: str, size: int, limit_s: float) -> "Iterator[_Crew[Any, Any]]":
     crew: _Crew[Any, Any] = _Crew(read=read, folder=folder, size=size, limit_s=limit_s)
@@ -206,6 +209,17 @@ def _crew(read: Callable[[Any], Any], folder: str, size: int, limit_s: float) ->
     finally:
         for worker in [*crew.idle, *crew.busy.values()]:
             worker.end()
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Within the block SIGINT waits; processes that are started in it never get one."""
+    resource_tracker.ensure_running()  # its start, else within the block, would let SIGINT through
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _context() -> ForkServerContext:

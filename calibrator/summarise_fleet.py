@@ -76,7 +76,7 @@ def summarise_fleet(
         If the drives do not fit the store, or it cannot be written.
     """
     source = without_copies(find_fleet(fleet))
-    equipment = probe_equipment(source, database, branches)
+    equipment = probe_equipment(source, database, branches, limit_s=time_limit_s)
     store = open_store(open_storage(out), equipment, database, source)
     added = add_drives(store, source, database, workers=workers, time_limit_s=time_limit_s)
     return SummariseReport(

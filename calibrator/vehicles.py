@@ -1,15 +1,15 @@
 """Read all vehicles of a fleet in parallel; one bad vehicle never stops the fleet."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TypeVar
 
-from joblib import delayed
 from threadpoolctl import threadpool_limits
 
 from calibrator.drive import DriveFile
 from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
-from calibrator.interrupts import in_processes
+from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
 from calibrator.report.progress import progress_bar
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
@@ -21,7 +21,13 @@ ReadVehicle = Callable[[Sequence[DriveFile], Equipment, VehicleDatabase], Vehicl
 
 
 def read_vehicles(
-    read: "ReadVehicle[Vehicle]", fleet: FleetSource, equipment: Equipment, database: VehicleDatabase, *, workers: int
+    read: "ReadVehicle[Vehicle]",
+    fleet: FleetSource,
+    equipment: Equipment,
+    database: VehicleDatabase,
+    *,
+    workers: int,
+    limit_s: float = TIME_LIMIT_S,
 ) -> tuple[list[Vehicle], dict[str, str]]:
     """Read every vehicle.
 
@@ -37,6 +43,8 @@ def read_vehicles(
         DBC and layout.
     workers : int
         Number of processes.
+    limit_s : float
+        Longest time for one vehicle; one that takes longer is left out. [s]
 
     Returns
     -------
@@ -50,7 +58,8 @@ def read_vehicles(
     FleetError
         If no vehicle can be used.
     """
-    found, errors = read_each(dict.fromkeys(fleet.vehicles, read), fleet, equipment, database, workers=workers)
+    readers = dict.fromkeys(fleet.vehicles, read)
+    found, errors = read_each(readers, fleet, equipment, database, workers=workers, limit_s=limit_s)
     left_out = {**fleet.left_out, **errors}
     if not found:
         reason = next(iter(left_out.values()), "")
@@ -65,6 +74,7 @@ def read_each(
     database: VehicleDatabase,
     *,
     workers: int,
+    limit_s: float = TIME_LIMIT_S,
 ) -> tuple[dict[str, Vehicle], dict[str, str]]:
     """Read some vehicles, each in its own way.
 
@@ -72,7 +82,7 @@ def read_each(
     ----------
     readers : mapping of str to callable
         Makes what is needed of a vehicle from its drives, by name of the vehicle; each can go to another process.
-    fleet, equipment, database, workers
+    fleet, equipment, database, workers, limit_s
         As for :func:`read_vehicles`.
 
     Returns
@@ -82,26 +92,28 @@ def read_each(
     errors : dict of str to str
         Why the others cannot, by name.
     """
-    tasks = (delayed(_read_one)(read, fleet.vehicles[name], equipment, database) for name, read in readers.items())
+    read_one = partial(_read_one, equipment=equipment, database=database)
+    sources = ((read, fleet.vehicles[name]) for name, read in readers.items())
     found: dict[str, Vehicle] = {}
     errors: dict[str, str] = {}
     with progress_bar("read drives", len(readers), "vehicles") as progress:
-        outcomes = in_processes(tasks, workers=workers)
-        for done, (name, (vehicle, error)) in enumerate(zip(readers, outcomes, strict=True), start=1):
-            if vehicle is None:
-                errors[name] = error
+        outcomes = read_in_processes(read_one, sources, workers=workers, limit_s=limit_s)
+        for done, (name, outcome) in enumerate(zip(readers, outcomes, strict=True), start=1):
+            if isinstance(outcome, Unread):
+                errors[name] = outcome.reason
             else:
-                found[name] = vehicle
+                found[name] = outcome
             progress(done)
     return found, errors
 
 
 def _read_one(
-    read: "ReadVehicle[Vehicle]", entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase
-) -> tuple[Vehicle | None, str]:
+    source: "tuple[ReadVehicle[Vehicle], Sequence[DriveFile]]", equipment: Equipment, database: VehicleDatabase
+) -> Vehicle | Unread:
     """One vehicle, or the text of the error. One thread: the processes share the cores."""
+    read, entries = source
     with threadpool_limits(1):
         try:
-            return read(entries, equipment, database), ""
+            return read(entries, equipment, database)
         except UserError as error:
-            return None, str(error)
+            return Unread(reason=str(error))

@@ -13,11 +13,15 @@ junction law holds for it too.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from calibrator.compiled import compiled, inlined
 from calibrator.drive import Array, Channel, Mask
 
 __all__ = ["Band", "ChargeCurve", "charge_curve"]
 
+_Curve = tuple[Array, Array, NDArray[np.int64]]
+"""Instants and pieces of a :class:`ChargeCurve`, and which line each place of the windows was found on last."""
 GAP_PERIODS = 3.5
 """Good samples farther apart than this many median distances leave a gap: two lost frames in a row are bridged. [1]"""
 
@@ -64,7 +68,7 @@ class ChargeCurve:
         Parameters
         ----------
         time_s : ndarray of shape (T,)
-            Instants that the samples cover by at least W on both sides. [s]
+            Increasing instants that the samples cover by at least W on both sides. [s]
         band : Band
             Windows w and W.
 
@@ -73,14 +77,7 @@ class ChargeCurve:
         x, slope : ndarray of shape (T,)
             Band of the current [A] and its derivative by time [A/s].
         """
-        centre = 2.0 * self._integrals(time_s)
-
-        def mean(half_s: float) -> Array:
-            outside = self._integrals(time_s + half_s) + self._integrals(time_s - half_s)
-            return np.asarray((outside - centre) / half_s**2)
-
-        x, slope = mean(band.short_s) - mean(band.long_s)
-        return x, slope
+        return _band(time_s, self.time_s, self.pieces, (band.short_s, band.long_s))
 
     def covers(self, time_s: Array, margin_s: float) -> Mask:
         """Whether this much time on both sides of each instant lies within the samples and touches no gap."""
@@ -89,15 +86,45 @@ class ChargeCurve:
         gap_s = np.interp(last, self.time_s, self.gap_s) - np.interp(first, self.time_s, self.gap_s)
         return np.asarray(inside & (gap_s <= 0.0))
 
-    def _integrals(self, time_s: Array) -> Array:
-        """Integral of the charge, and charge, at instants within the samples; shape (2, T)."""
-        k = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.time_s) - 2)
-        h = time_s - self.time_s[k]
-        integral, charge, current, slope = self.pieces[:, k]
-        return np.stack([
-            integral + h * (charge + h * (current / 2.0 + h * slope / 6.0)),
-            charge + h * (current + h * slope / 2.0),
-        ])  # fmt: skip
+
+@compiled
+def _band(time_s: Array, known_s: Array, pieces: Array, windows_s: tuple[float, float]) -> tuple[Array, Array]:
+    """Band and its slope, shape (T,) each; of increasing instants each finds its lines beside those of the last."""
+    x, slope = np.empty(len(time_s)), np.empty(len(time_s))
+    curve = (known_s, pieces, np.zeros(5, np.int64))
+    short_s, long_s = windows_s
+    for j in range(len(time_s)):
+        t = time_s[j]
+        p, q = _integrals(t, curve, 0)
+        near_p, near_q = _outside(t, short_s, curve, 1)
+        far_p, far_q = _outside(t, long_s, curve, 3)
+        x[j] = (near_p - 2.0 * p) / short_s**2 - (far_p - 2.0 * p) / long_s**2
+        slope[j] = (near_q - 2.0 * q) / short_s**2 - (far_q - 2.0 * q) / long_s**2
+    return x, slope
+
+
+@inlined
+def _outside(t: float, half_s: float, curve: _Curve, place: int) -> tuple[float, float]:
+    """Sums of both integrals at the two ends of a window around t."""
+    after_p, after_q = _integrals(t + half_s, curve, place)
+    before_p, before_q = _integrals(t - half_s, curve, place + 1)
+    return after_p + before_p, after_q + before_q
+
+
+@inlined
+def _integrals(t: float, curve: _Curve, place: int) -> tuple[float, float]:
+    """Integral of the charge, and charge, at t within the samples."""
+    known_s, pieces, lines = curve
+    k, last = lines[place], len(known_s) - 2
+    while k < last and known_s[k + 1] <= t:
+        k += 1
+    while k > 0 and known_s[k] > t:
+        k -= 1
+    lines[place] = k
+    h = t - known_s[k]
+    integral, charge, current, slope = pieces[0, k], pieces[1, k], pieces[2, k], pieces[3, k]
+    p = integral + h * (charge + h * (current / 2.0 + h * slope / 6.0))
+    return p, charge + h * (current + h * slope / 2.0)
 
 
 def charge_curve(channel: Channel) -> ChargeCurve | None:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrator.compiled import compiled
 from calibrator.drive import Array
 from calibrator.drives.charge import Band, ChargeCurve
 
@@ -116,12 +117,24 @@ def _block_moments(stretches: Sequence[Stretch], band: Band, gain: Array, delay_
     e, e_slope = x @ gains, slope @ gains
     x, slope = x[:, 1:], slope[:, 1:]
     instrument = _huber_weight(e)[:, None] * np.hstack([x, _strong(slope)])
-    starts = _all_starts(stretches)
-    columns = [*x.T, *(gain * slope).T, e]
-    moments = np.stack([np.add.reduceat(instrument * column[:, None], starts, axis=0) for column in columns], axis=2)
+    columns = np.column_stack([x, gain * slope, e, e_slope])
+    sums = _block_sums(instrument, columns, _all_starts(stretches))
     own = np.arange(len(gain), 2 * len(gain))
-    moments[:, own, own] -= np.add.reduceat(instrument[:, own] * e_slope[:, None], starts, axis=0)
-    return moments
+    sums[:, own, own] -= sums[:, own, -1]
+    return sums[:, :, :-1]
+
+
+@compiled
+def _block_sums(instrument: Array, columns: Array, starts: NDArray[np.intp]) -> Array:
+    """Sums over each block of the products of instruments (T, p) and columns (T, c), shape (B, p, c)."""
+    instants, size = instrument.shape
+    sums = np.zeros((len(starts), size, columns.shape[1]))
+    for b in range(len(starts)):
+        for t in range(starts[b], starts[b + 1] if b + 1 < len(starts) else instants):
+            for i in range(size):
+                for j in range(columns.shape[1]):
+                    sums[b, i, j] += instrument[t, i] * columns[t, j]
+    return sums
 
 
 def _bands(stretch: Stretch, band: Band, delay_s: Array) -> tuple[Array, Array]:

@@ -2,7 +2,9 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from calibrator.drives.align import choose_inputs
 from calibrator.drives.fleet_id import read_fleet_ids
 from calibrator.drives.store import list_drives, read_drive_file
 from calibrator.errors import FleetError
+from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
 from calibrator.recordings.readers import read_drive
 from calibrator.recordings.sources import find_logs
 from ecu_node.database import VehicleDatabase
@@ -57,6 +60,14 @@ class Equipment:
     inputs: tuple[str, ...]
     fleet_inputs: tuple[str, ...]
     notices: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Names:
+    """Branches and inputs that a drive has."""
+
+    branches: tuple[str, ...]
+    inputs: tuple[str, ...]
 
 
 def find_fleet(path: Path) -> FleetSource:
@@ -121,7 +132,9 @@ def load_drive(entry: DriveFile, database: VehicleDatabase) -> Drive:
     return read_drive(entry.path, database, vehicle=entry.vehicle, name=entry.name)
 
 
-def probe_equipment(fleet: FleetSource, database: VehicleDatabase, branches: Sequence[str] | None) -> Equipment:
+def probe_equipment(
+    fleet: FleetSource, database: VehicleDatabase, branches: Sequence[str] | None, *, limit_s: float = TIME_LIMIT_S
+) -> Equipment:
     """Learn from some vehicles which branches and inputs the fleet has.
 
     A branch counts if more than half of the vehicles looked at have it; later, a vehicle that lacks it is left out.
@@ -134,6 +147,8 @@ def probe_equipment(fleet: FleetSource, database: VehicleDatabase, branches: Seq
         DBC and layout.
     branches : sequence of str, optional
         Different branches to use instead of those found.
+    limit_s : float
+        Longest time for one drive. [s]
 
     Returns
     -------
@@ -148,7 +163,7 @@ def probe_equipment(fleet: FleetSource, database: VehicleDatabase, branches: Seq
         If a branch is asked for that the layout does not have.
     """
     layout = database.layout
-    drives, errors = _some_drives(fleet, database)
+    drives, errors = _probed(fleet, database, limit_s)
     if not drives:
         raise FleetError(
             f"{fleet.path}: none of the first {len(errors)} vehicles can be read; the first says: {errors[0]}"
@@ -182,15 +197,28 @@ def _distinct(branches: Sequence[str], layout: Layout) -> tuple[str, ...]:
     return tuple(branches)
 
 
-def _some_drives(fleet: FleetSource, database: VehicleDatabase) -> tuple[list[Drive], list[UserError]]:
-    """First drive of the first vehicles that can be read, and the errors met before."""
-    drives: list[Drive] = []
-    errors: list[UserError] = []
-    for entries in fleet.vehicles.values():
-        if len(drives) == PROBED_VEHICLES:
-            break
-        try:
-            drives.append(load_drive(entries[0], database))
-        except UserError as error:
-            errors.append(error)
-    return drives, errors
+def _probed(fleet: FleetSource, database: VehicleDatabase, limit_s: float) -> tuple[list[_Names], list[str]]:
+    """Names in the first drive of the first vehicles that can be read, and the errors met before."""
+    first = [entries[0] for entries in fleet.vehicles.values()]
+    found: list[_Names] = []
+    errors: list[str] = []
+    with closing(read_in_processes(partial(_names, database=database), first, workers=1, limit_s=limit_s)) as read:
+        for entry, names in zip(first, read, strict=True):
+            if isinstance(names, Unread):
+                errors.append(f"{entry.path}: {names.reason}")
+            elif isinstance(names, str):
+                errors.append(names)
+            else:
+                found.append(names)
+            if len(found) == PROBED_VEHICLES:
+                break
+    return found, errors
+
+
+def _names(entry: DriveFile, database: VehicleDatabase) -> _Names | str:
+    """Names in one drive, or the text of the error."""
+    try:
+        drive = load_drive(entry, database)
+    except UserError as error:
+        return str(error)
+    return _Names(branches=tuple(drive.branches), inputs=tuple(drive.inputs))

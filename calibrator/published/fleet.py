@@ -57,7 +57,9 @@ def calibrate_fleet_published(
     FleetError
         If too few vehicles can be used.
     """
-    vehicles, left_out = read_vehicles(read_vehicle_model, fleet, equipment, identity.database, workers=workers)
+    vehicles, left_out = read_vehicles(
+        read_vehicle_model, fleet, equipment, identity.database, workers=workers, limit_s=settings.time_limit_s
+    )
     vehicles = _without_misfits(vehicles, settings.hold_out, equipment, left_out)
     learning = require_learning([vehicle.vehicle for vehicle in vehicles], settings, left_out)
     unity = _unity_vehicle([v for v, used in zip(vehicles, learning, strict=True) if used], settings.unity)

@@ -26,6 +26,10 @@ _FILE_HEADER_BYTES = 144
 _CONTAINER = 10
 _CONTAINER_HEADER_BYTES = 16
 _STORED, _DEFLATE = 0, 2
+_LONGEST_PADDING = 3
+"""Behind an object; the last one may lack it. [byte]"""
+BATCH_BYTES = 1 << 21
+"""Content of containers that is taken apart at a time: array operations on it cost more than their calls. [byte]"""
 
 
 def read_blf(file: BinaryIO, name: str) -> Frames:
@@ -62,9 +66,20 @@ def read_blf(file: BinaryIO, name: str) -> Frames:
 
 
 def _parts(file: BinaryIO) -> Iterator[Frames]:
-    """Frames container by container."""
+    """Frames of some containers at a time."""
     size, start_ns = _file_header(file)
     stream = ObjectStream(start_ns)
+    for batch in _batches(_containers(file)):
+        yield from _batch_frames(stream, batch)
+    position = file.tell()
+    if stream.is_cut:
+        raise BlfDamageError(position, "the last object is cut")
+    if size > position + _LONGEST_PADDING:
+        raise BlfDamageError(position, f"the file ends, but its header says {size} bytes")
+
+
+def _containers(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
+    """Content of each container, and the byte at which it starts."""
     position = file.tell()
     while head := file.read(OBJECT_HEADER.size):
         if len(head) < OBJECT_HEADER.size:
@@ -77,12 +92,36 @@ def _parts(file: BinaryIO) -> Iterator[Frames]:
             raise BlfDamageError(position, f"an object of {length} bytes starts, but the file ends before")
         file.read(length % 4)
         if kind == _CONTAINER:
-            yield stream.frames(_container_content(content, position), position)
+            yield _container_content(content, position), position
         position += length + length % 4
-    if stream.is_cut:
-        raise BlfDamageError(position, "the last object is cut")
-    if size > position:
-        raise BlfDamageError(position, f"the file ends, but its header says {size} bytes")
+
+
+def _batches(containers: Iterator[tuple[bytes, int]]) -> Iterator[list[tuple[bytes, int]]]:
+    """Containers of some size together; those before a damage come before its error."""
+    batch: list[tuple[bytes, int]] = []
+    damage: BlfDamageError | None = None
+    try:
+        for container in containers:
+            batch.append(container)
+            if sum(len(content) for content, _ in batch) >= BATCH_BYTES:
+                yield batch
+                batch = []
+    except BlfDamageError as error:
+        damage = error
+    yield batch
+    if damage is not None:
+        raise damage
+
+
+def _batch_frames(stream: ObjectStream, batch: list[tuple[bytes, int]]) -> Iterator[Frames]:
+    """Frames of containers, one by one if they are damaged, so that the damaged one is named."""
+    if not batch:
+        return
+    try:
+        frames = iter([stream.frames(b"".join(content for content, _ in batch), batch[0][1])])
+    except BlfDamageError:
+        frames = (stream.frames(content, position) for content, position in batch)
+    yield from frames
 
 
 def _file_header(file: BinaryIO) -> tuple[int, int]:

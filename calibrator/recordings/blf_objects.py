@@ -76,6 +76,8 @@ _BODY_AT = {1: 32, 2: 40}
 _SIGNATURE = b"LOBJ"
 _LONGEST_PADDING = 4
 """Between objects. [byte]"""
+_PADDING = _HEADER.itemsize + _FD_64.itemsize + FD_BYTES
+"""Room behind the last object, so that fields may be taken before it is known whether they are whole. [byte]"""
 _TEN_MICROSECONDS = 1
 """Flag of the unit of time; nanoseconds otherwise."""
 _TEN_MICROSECONDS_NS = 10_000
@@ -123,14 +125,14 @@ class ObjectStream:
         return bool(self._tail.strip(b"\0"))
 
     def frames(self, content: bytes, position: int) -> Frames:
-        """Frames of the next container.
+        """Frames of the next container, or of several joined.
 
         Parameters
         ----------
         content : bytes
-            Its content, decompressed.
+            The content, decompressed.
         position : int
-            Byte of the file where the container starts, for messages.
+            Byte of the file where the (first) container starts, for messages.
 
         Returns
         -------
@@ -140,13 +142,13 @@ class ObjectStream:
         Raises
         ------
         BlfDamageError
-            If something else than an object is met, or one of impossible size.
+            If something else than an object is met, or one of impossible size; the stream is then as before.
         """
-        data = self._tail + content
-        at, end = _objects(data, position)
-        self._tail = data[end:]
-        padded = np.frombuffer(data + bytes(_HEADER.itemsize + _FD_64.itemsize + FD_BYTES), np.uint8)
-        return _frames(padded, at, position, self._start_ns)
+        data = b"".join([self._tail, content, bytes(_PADDING)])
+        at, end = _objects(data[:-_PADDING], position)
+        frames = _frames(np.frombuffer(data, np.uint8), at, position, self._start_ns)
+        self._tail = data[end:-_PADDING]
+        return frames
 
 
 def _objects(data: bytes, position: int) -> tuple[_Index, int]:
@@ -214,10 +216,11 @@ def _frames(buffer: _Bytes, at: _Index, position: int, start_ns: int) -> Frames:
         frames, kept = _as_frames(buffer, payload_at, columns, _time_ns(heads, start_ns))
         parts.append(frames)
         places.append(which[kept])
-    joined = concatenate_frames(parts)
-    ordered = joined.take(np.argsort(np.concatenate([np.zeros(0, np.int64), *places]), kind="stable"))
+    joined = concatenate_frames(parts) if len(parts) != 1 else parts[0]
+    if len(parts) > 1:
+        joined = joined.take(np.argsort(np.concatenate(places), kind="stable"))
     errors = int(np.isin(header["kind"], _ERROR_KINDS).sum())
-    return replace(ordered, error_frames=errors, damaged=joined.damaged + unknown)
+    return replace(joined, error_frames=errors, damaged=joined.damaged + unknown)
 
 
 def _time_ns(header: NDArray[np.void], start_ns: int) -> _Index:

@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-
-from joblib import delayed
 
 from calibrator.drive import DriveFile
 from calibrator.drives.fleet_id import read_fleet_ids, write_fleet_ids
 from calibrator.drives.store import has_drive, write_drive
-from calibrator.interrupts import in_processes
+from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
 from calibrator.recordings.readers import read_recording
 from calibrator.recordings.sources import find_logs
 from calibrator.report.notices import Notice, merged_notices
@@ -61,7 +60,9 @@ class ImportReport:
         return "\n\n".join(part for part in parts if part)
 
 
-def import_logs(logs: Sequence[Path], database: VehicleDatabase, store: Path, *, workers: int) -> ImportReport:
+def import_logs(
+    logs: Sequence[Path], database: VehicleDatabase, store: Path, *, workers: int, limit_s: float = TIME_LIMIT_S
+) -> ImportReport:
     """Read logs and add their drives to a store.
 
     Parameters
@@ -74,6 +75,8 @@ def import_logs(logs: Sequence[Path], database: VehicleDatabase, store: Path, *,
         Folder of the store; made if there is none.
     workers : int
         Number of processes.
+    limit_s : float
+        Longest time for one log; one that takes longer is left out. [s]
 
     Returns
     -------
@@ -84,13 +87,16 @@ def import_logs(logs: Sequence[Path], database: VehicleDatabase, store: Path, *,
     left_out = {f"problem {k + 1}": str(problem) for k, problem in enumerate(found.problems)}
     drives: list[ImportedDrive] = []
     already_there: list[str] = []
-    runs = in_processes((delayed(_import_one)(log, database, store) for log in found.logs), workers=workers)
+    read = partial(_import_one, database=database, store=store)
+    runs = read_in_processes(read, found.logs, workers=workers, limit_s=limit_s)
     with progress_bar("import", len(found.logs), "logs") as progress:
         for done, (log, outcome) in enumerate(zip(found.logs, runs, strict=True), start=1):
             if isinstance(outcome, ImportedDrive):
                 drives.append(outcome)
             elif outcome is None:
                 already_there.append(f"{log.vehicle}/{log.name}")
+            elif isinstance(outcome, Unread):
+                left_out[f"{log.vehicle}/{log.name}"] = f"{log.path}: {outcome.reason}"
             else:
                 left_out[f"{log.vehicle}/{log.name}"] = outcome
             progress(done)

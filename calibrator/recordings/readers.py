@@ -182,7 +182,7 @@ class _Source:
 
     def __init__(self, frames: Frames, database: VehicleDatabase, where: str) -> None:
         self.time = repaired_time(frames.time_ns)
-        self._frames = frames.take(self.time.order)
+        self._frames = frames.take(self.time.order) if self.time.disordered or self.time.clock_steps else frames
         self._database = database
         self._where = where
         self._messages: dict[str, tuple[Frames, Array, Mask]] = {}

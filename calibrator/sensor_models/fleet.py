@@ -16,6 +16,7 @@ from calibrator.drives.delays import without_delays
 from calibrator.drives.fleet_source import Equipment, FleetSource, load_drive
 from calibrator.evidence.summary import DriveSummary
 from calibrator.evidence.vehicle_summary import VehicleSummary
+from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.sensor_models.choice import LEAST_VEHICLES, LINEAR, SensorModelChoice, choose_sensor_models
 from calibrator.sensor_models.linear_part import linear_summary
 from calibrator.sensor_models.summary import SensorSummary, summarise_sensors
@@ -72,6 +73,7 @@ def find_sensor_models(
     learning: Mask,
     trusted: Mask,
     workers: int,
+    limit_s: float = TIME_LIMIT_S,
 ) -> SensorFindings:
     """Read the drives again and choose the sensor model of every branch.
 
@@ -89,6 +91,8 @@ def find_sensor_models(
         Vehicles whose sensors were found faultless on a bench, hence linear.
     workers : int
         Number of processes.
+    limit_s : float
+        Longest time for one vehicle. [s]
 
     Returns
     -------
@@ -102,7 +106,7 @@ def find_sensor_models(
         )
         for j, vehicle in enumerate(vehicles)
     }
-    found, errors = read_each(readers, fleet, equipment, database, workers=workers)
+    found, errors = read_each(readers, fleet, equipment, database, workers=workers, limit_s=limit_s)
     notices += [f"sensor models: {name} counts as linear: {reason}" for name, reason in errors.items()]
     names = [vehicle.vehicle for vehicle in vehicles]
     learners = [name for name, learns in zip(names, learning, strict=True) if learns and name in found]

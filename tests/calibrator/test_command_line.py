@@ -1,11 +1,13 @@
 """Wrong options, Ctrl-C and closed pipes."""
 
+import gzip
 import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -255,6 +257,29 @@ def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(delay_s: 
         _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (INTERRUPTED, f"{MESSAGE}\n")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.5, 2.0])
+def test_ctrl_c_while_logs_are_read_ends_readers_too_in_one_line(delay_s: float, tmp_path: Path) -> None:
+    log, temporary = tmp_path / "V1" / "endless.log.gz", tmp_path / "temporary"
+    log.parent.mkdir()
+    temporary.mkdir()
+    log.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)
+    command = [
+        *(sys.executable, "-m", "calibrator", "import", str(log.parent), "--workers", "1"),
+        *("--layout", str(LAYOUT), "--out", str(tmp_path / "store")),
+    ]
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    options: dict[str, Any] = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True, "env": environment}
+    with subprocess.Popen(command, **options) as process:
+        while not list(temporary.iterdir()):  # the folder of the readers: they are about to start
+            assert process.poll() is None
+            time.sleep(0.01)
+        time.sleep(delay_s)
+        os.killpg(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=60)  # also waits for all that have its stderr
+    assert (process.returncode, errors) == (INTERRUPTED, f"{MESSAGE}\n")
+    assert not list(temporary.iterdir())
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["simulate", "--help"]])

@@ -231,6 +231,16 @@ def test_copy_of_a_vehicle_cannot_be_trusted(broken_fleet: Path, tmp_path: Path)
         (("calibrate", ".", "--layout", "none.toml", "--out", "x"), 1, "none.toml: cannot read the layout"),
         (("score", "nowhere", "--truth", "none.json"), 1, "none.json: cannot read the truth"),
         (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--classifier", "perfect"), 2, "is told the truth"),
+        (
+            ("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--time-limit", "0"),
+            2,
+            "0: expected a number from 1 to",
+        ),
+        (
+            ("import", ".", "--layout", LAYOUT, "--out", "x", "--time-limit", "soon"),
+            2,
+            "soon: expected a number from 1",
+        ),
         (("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--symmetric"), 2, "belongs to --method published, not"),
         (
             ("calibrate", ".", "--layout", LAYOUT, "--out", "x", "--method", "published", "--trusted", "V001"),

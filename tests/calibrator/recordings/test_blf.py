@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibrator.errors import LogError
+from calibrator.recordings import blf
 from calibrator.recordings.blf import read_blf
 from calibrator.recordings.frame_arrays import FrameCollector, Frames
 
@@ -31,10 +32,13 @@ def written(messages: Sequence[can.Message], *, container_bytes: int = 1 << 17, 
 
 def of_objects(*objects: bytes) -> bytes:
     """A file with one stored container of these objects, without a date."""
+    return struct.pack("<4sL", b"LOGG", 144).ljust(144, b"\0") + a_container(*objects)
+
+
+def a_container(*objects: bytes) -> bytes:
     inner = b"".join(each + bytes(len(each) % 4) for each in objects)
     container = struct.pack("<H6xL4x", 0, len(inner)) + inner
-    header = struct.pack("<4sL", b"LOGG", 144).ljust(144, b"\0")
-    return header + struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(container), 10) + container
+    return struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(container), 10) + container
 
 
 def an_object(kind: int, body: bytes, *, version: int = 1, flags: int = 2, time: int = 1000) -> bytes:
@@ -181,3 +185,20 @@ def test_a_container_of_an_unknown_method_is_refused() -> None:
     content[144 + 16] = 9
     with pytest.raises(LogError, match="compressed by a method 9 that is not known"):
         read_blf(io.BytesIO(content), "x.blf")
+
+
+@pytest.mark.parametrize("batch_bytes", [1, 100, 1 << 21])
+def test_how_many_containers_are_taken_apart_at_a_time_changes_nothing(
+    batch_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(blf, "BATCH_BYTES", batch_bytes)
+    messages = [can.Message(timestamp=START + k, arbitration_id=k, data=bytes([k])) for k in range(100)]
+    assert len(assert_the_same(written(messages, container_bytes=150))) == 100
+
+
+@pytest.mark.parametrize("wrong", [b"LOBJ" + bytes(60), b"no object" + bytes(40)])
+def test_a_damaged_container_among_others_is_named_with_the_frames_before_it(wrong: bytes) -> None:
+    sound = an_object(CLASSIC, classic(0x123, b"\1"))
+    before = of_objects(sound, sound) + a_container(sound)
+    with pytest.raises(LogError, match=f"at byte {len(before)} .*; 3 frames before it are readable"):
+        read_blf(io.BytesIO(before + a_container(wrong) + a_container(sound)), "x.blf")

@@ -1,4 +1,6 @@
-from typing import Literal
+from collections.abc import Sequence
+from math import isfinite, nan
+from typing import Any, Literal
 
 import cantools
 import numpy as np
@@ -21,6 +23,17 @@ BO_ 100 Mux: 8 A
  SG_ Always : 4|4@1+ (1,0) [0|0] "" A
  SG_ First m0 : 8|16@1+ (0.1,0) [0|0] "A" A
  SG_ Second m1 : 8|16@1- (0.5,-3) [0|0] "A" A
+"""
+NESTED = """VERSION ""
+BU_: A
+BO_ 100 Mux: 8 A
+ SG_ Top M : 0|4@1+ (1,0) [0|0] "" A
+ SG_ Sub m1M : 4|4@1+ (1,0) [0|0] "" A
+ SG_ Page m0 : 8|16@1+ (0.1,0) [0|0] "A" A
+ SG_ SubPage m2 : 8|16@1- (0.5,-3) [0|0] "A" A
+SG_MUL_VAL_ 100 Sub Top 1-1, 3-4;
+SG_MUL_VAL_ 100 Page Top 0-0;
+SG_MUL_VAL_ 100 SubPage Sub 2-3;
 """
 
 
@@ -56,6 +69,13 @@ def one_signal(
     return Message(1, "M", size, [signal]), signal
 
 
+def by_cantools(message: Message, row: bytes) -> dict[str, Any]:
+    """All signals that the frame holds whole."""
+    values = message.decode(row, decode_choices=False, allow_truncated=True)
+    assert isinstance(values, dict)
+    return values
+
+
 def decoded_by_cantools(message: Message, row: bytes, *, scaling: bool = True) -> float:
     values = message.decode(row, decode_choices=False, scaling=scaling)
     assert isinstance(values, dict)
@@ -64,21 +84,100 @@ def decoded_by_cantools(message: Message, row: bytes, *, scaling: bool = True) -
     return value
 
 
+SIZES = st.sampled_from([1, 2, 7, 8, 12, 48, 64])
+BYTE_ORDERS: tuple[Literal["little_endian", "big_endian"], ...] = ("little_endian", "big_endian")
+
+
+def a_signal(
+    draw: st.DrawFn, size: int, name: str, *, first: int = 0, under: str | None = None, pages: Sequence[int] = ()
+) -> Signal:
+    """Any signal within some bytes from the first on; if it is under another, on some pages of that one."""
+    is_float = draw(st.booleans()) and size >= 2
+    floats = st.sampled_from([bits for bits in (16, 32, 64) if bits <= 8 * size])
+    length = draw(floats if is_float else st.integers(1, min(64, 8 * size)))
+    return Signal(
+        name,
+        *draw(places(first, size, length)),
+        is_signed=not is_float and draw(st.booleans()),
+        conversion=BaseConversion.factory(scale=draw(SCALES), offset=draw(OFFSETS), is_float=is_float),
+        multiplexer_signal=under,
+        multiplexer_ids=list(pages) if under else None,
+    )
+
+
+SCALES = st.one_of(st.sampled_from([1, 4, -3, 0.02, -0.1]), st.floats(1e-6, 1e3), st.floats(-1e3, -1e-6))
+OFFSETS = st.sampled_from([0, -1000, 500.0, 0.25])
+
+
+@st.composite
+def places(
+    draw: st.DrawFn, first: int, size: int, length: int
+) -> tuple[int, int, Literal["little_endian", "big_endian"]]:
+    """Start bit, length and byte order of a signal within some bytes."""
+    bit = draw(st.integers(0, 8 * size - length)) + 8 * first
+    byte_order = draw(st.sampled_from(BYTE_ORDERS))
+    return (bit if byte_order == "little_endian" else 8 * (bit // 8) + 7 - bit % 8), length, byte_order
+
+
 @st.composite
 def signals(draw: st.DrawFn) -> tuple[Message, Signal]:
-    size = draw(st.sampled_from([1, 2, 7, 8, 12, 48, 64]))
-    is_float = draw(st.booleans()) and size >= 2
-    length = draw(
-        st.sampled_from([b for b in (16, 32, 64) if b <= 8 * size]) if is_float else st.integers(1, min(64, 8 * size))
-    )
-    first = draw(st.integers(0, 8 * size - length))
-    byte_order: Literal["little_endian", "big_endian"] = draw(st.sampled_from(["little_endian", "big_endian"]))
-    start = first if byte_order == "little_endian" else 8 * (first // 8) + 7 - first % 8
-    signed = not is_float and draw(st.booleans())
-    scale, offset = draw(st.sampled_from([(1, 0), (0.02, 0), (-0.1, 500.0), (4, -1000)]))
-    return one_signal(
-        start, length, byte_order=byte_order, signed=signed, is_float=is_float, scale=scale, offset=offset, size=size
-    )
+    size = draw(SIZES)
+    signal = a_signal(draw, size, "S")
+    return Message(1, "M", size, [signal]), signal
+
+
+@st.composite
+def multiplexed_messages(draw: st.DrawFn) -> Message:
+    """Pages within pages: a selector, another one on some of its pages, and signals on every page of both."""
+    size = draw(st.sampled_from([8, 12, 64]))
+    inner = draw(st.lists(st.integers(1, size - 1), min_size=4, max_size=4, unique=True))
+    (a, b, c, d, e), ends = sorted([0, *inner]), [*sorted(inner), size]  # cantools decodes nothing that overlaps
+    pages, sub_pages = (list(range(1 << draw(st.integers(1, 3)))) for _ in range(2))
+    split, sub_split = draw(st.integers(1, len(pages) - 1)), draw(st.integers(1, len(sub_pages) - 1))
+    selectors = [
+        Signal("Top", *draw(places(a, ends[0] - a, len(pages).bit_length() - 1)), is_multiplexer=True),
+        Signal(
+            "Sub",
+            *draw(places(b, ends[1] - b, len(sub_pages).bit_length() - 1)),
+            is_multiplexer=True,
+            multiplexer_signal="Top",
+            multiplexer_ids=pages[split:],
+        ),
+    ]
+    leaves = [
+        a_signal(draw, ends[2] - c, "Always", first=c),
+        a_signal(draw, ends[3] - d, "Both", first=d, under="Top", pages=pages),
+        a_signal(draw, ends[4] - e, "Page", first=e, under="Top", pages=pages[:split]),
+        a_signal(draw, ends[4] - e, "SubPage", first=e, under="Sub", pages=sub_pages[:sub_split]),
+        a_signal(draw, ends[4] - e, "SubRest", first=e, under="Sub", pages=sub_pages[sub_split:]),
+    ]
+    return Message(1, "M", size, [*selectors, *leaves])
+
+
+@given(multiplexed_messages(), st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=8))
+def test_every_page_within_pages_decodes_as_cantools_decodes_it(message: Message, rows: list[bytes]) -> None:
+    rows = [row[: message.length] for row in rows]
+    expected = [by_cantools(message, row) for row in rows]
+    for signal in message.signals:
+        decoded = decode_signal(message, signal, *payloads(rows, 64 if message.length > 8 else 8))
+        present = [signal.name in values for values in expected]
+        values = [float(values.get(signal.name, 0.0)) for values in expected]
+        assert decoded.present.tolist() == present
+        np.testing.assert_allclose(decoded.value[present], np.array(values)[present], rtol=1e-15)
+        assert decoded.good.tolist() == [there and isfinite(v) for there, v in zip(present, values, strict=True)]
+
+
+@given(signals(), st.lists(st.binary(max_size=64), min_size=1, max_size=8))
+def test_a_frame_of_any_length_is_good_where_cantools_finds_the_signal(
+    pair: tuple[Message, Signal], rows: list[bytes]
+) -> None:
+    message, signal = pair
+    decoded = decode_signal(message, signal, *payloads(rows, 64))
+    for k, row in enumerate(rows):
+        values = by_cantools(message, row)
+        value = float(values.get("S", nan))
+        np.testing.assert_allclose(decoded.value[k], value, rtol=1e-15)
+        assert decoded.good[k] == isfinite(value)
 
 
 @given(signals(), st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=5))
@@ -172,6 +271,16 @@ def test_a_multiplexed_signal_is_present_only_on_its_page() -> None:
     assert first.good.tolist() == first.present.tolist()
     np.testing.assert_allclose(first.value[first.good], 0.7)
     np.testing.assert_allclose(second.value[second.good], 0.5)
+
+
+def test_extended_multiplexing_of_a_dbc_is_pages_within_pages() -> None:
+    database = cantools.database.load_string(NESTED)
+    assert isinstance(database, Database)
+    message = database.get_message_by_name("Mux")
+    rows = [bytes([page, 7, 0, 0, 0, 0, 0, 0]) for page in (0x00, 0x21, 0x31, 0x33, 0x41, 0x22)]
+    decoded = decode_signal(message, message.get_signal_by_name("SubPage"), *payloads(rows, 8))
+    assert decoded.good.tolist() == decoded.present.tolist() == [False, True, True, True, False, False]
+    np.testing.assert_allclose(decoded.value[decoded.good], 0.5)
 
 
 def test_a_frame_too_short_for_its_multiplexer_is_not_good() -> None:

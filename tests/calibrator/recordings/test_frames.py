@@ -60,7 +60,7 @@ def test_every_format_gives_the_frames_that_were_logged(tmp_path: Path, suffix: 
     assert frames.damaged == 0
 
 
-@pytest.mark.parametrize("suffix", PYTHON_CAN_FORMATS)
+@pytest.mark.parametrize("suffix", [*PYTHON_CAN_FORMATS, ".mf4"])
 def test_a_gzipped_log_gives_the_same_frames(tmp_path: Path, suffix: str) -> None:
     path = write_log(tmp_path / f"drive{suffix}", some_messages())
     packed = tmp_path / f"packed{suffix}.gz"
@@ -68,7 +68,7 @@ def test_a_gzipped_log_gives_the_same_frames(tmp_path: Path, suffix: str) -> Non
     assert contents(read_frames(packed)) == contents(read_frames(path))
 
 
-@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf"])
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".mf4"])
 def test_can_fd_frames_keep_all_their_bytes(tmp_path: Path, suffix: str) -> None:
     messages = [
         can.Message(timestamp=1.7e9 + k, arbitration_id=0x123, is_extended_id=False, is_fd=True, data=bytes(range(n)))

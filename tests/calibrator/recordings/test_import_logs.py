@@ -1,5 +1,11 @@
+import gzip
 import json
+import multiprocessing
+import os
 import re
+import signal
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -78,3 +84,37 @@ def test_the_store_knows_which_artificial_fleet_its_drives_are_of(
 ) -> None:
     imported([fleet / "logs" / "V001" / "drive.log.gz"], tmp_path, database)
     assert read_fleet_ids(tmp_path) == read_fleet_ids(fleet / "logs") != frozenset()
+
+
+def write_endless_log(path: Path) -> None:
+    """A log of blank lines, small as a file, that takes minutes to read."""
+    path.parent.mkdir(parents=True)
+    path.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)
+
+
+def kill_first_reader() -> None:
+    while not multiprocessing.active_children():
+        time.sleep(0.01)
+    os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
+
+
+def test_a_log_that_takes_too_long_costs_itself_only(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+    endless = tmp_path / "logs" / "V000" / "endless.log.gz"
+    write_endless_log(endless)
+    logs = [endless, fleet / "logs"]
+    report = import_logs(logs, database, tmp_path / "store", workers=1, limit_s=5.0)
+    assert [drive.vehicle for drive in report.drives] == ["V001", "V002"]
+    assert list(report.left_out) == ["V000/endless"]
+    assert report.left_out["V000/endless"].startswith(f"{endless}: reading took more than 5 s and was ended; ")
+
+
+def test_a_log_whose_reader_is_killed_costs_itself_only(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+    endless = tmp_path / "logs" / "V000" / "endless.log.gz"
+    write_endless_log(endless)
+    killer = threading.Thread(target=kill_first_reader)
+    killer.start()
+    report = imported([endless, fleet / "logs"], tmp_path / "store", database)
+    killer.join()
+    assert [drive.vehicle for drive in report.drives] == ["V001", "V002"]
+    reason = f"{endless}: the process that read it was killed by SIGKILL; "
+    assert report.left_out["V000/endless"].startswith(reason)
