@@ -9,7 +9,7 @@ from calibrator.drive import Array, Mask
 from calibrator.evidence.fleet_model import FleetModel, regress_on_fleet
 from calibrator.evidence.junction_law import junction_law
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, LineMeans
-from calibrator.evidence.summary import DriveSummary
+from calibrator.evidence.summary import DriveSummary, common_bank
 
 __all__ = ["collect_rows"]
 
@@ -58,7 +58,13 @@ def collect_rows(
     -------
     FleetRows
         Slopes and intercepts over the fleet model, and the junction law; no bench readings.
+
+    Raises
+    ------
+    DriveError
+        If the summaries were made with different filter banks.
     """
+    common_bank(summaries)
     raw = [_of_vehicle(summary, model, full_scale_a) for summary in summaries]
     correlations = np.stack([_correlation(vehicle.covariance) for vehicle in raw])
     usual = correlations.mean(axis=0) if learning is None else correlations[learning].mean(axis=0)

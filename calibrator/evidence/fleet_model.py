@@ -17,7 +17,7 @@ import numpy as np
 
 from calibrator.drive import Array
 from calibrator.evidence.block_regression import BlockRegression, regress_blocks
-from calibrator.evidence.summary import DriveSummary
+from calibrator.evidence.summary import DriveSummary, common_bank
 from calibrator.posterior.cluster import densest_clusters
 
 __all__ = ["FleetModel", "fit_fleet_model", "regress_on_fleet"]
@@ -59,7 +59,13 @@ def fit_fleet_model(summaries: Sequence[DriveSummary]) -> FleetModel:
     -------
     FleetModel
         With the scale and zero of the vehicles that agree.
+
+    Raises
+    ------
+    DriveError
+        If the summaries were made with different filter banks.
     """
+    common_bank(summaries)
     totals = [summary.total / summary.total[-1, -1] for summary in summaries]
     K = summaries[0].branches
     slopes = np.ones((len(totals), K))
