@@ -177,9 +177,11 @@ class Summariser:
         Number of branches K.
     extra : int
         Number of extra columns E.
+    settling : int
+        Samples after the start of a drive that are not used, if they are more than the bank needs.
     """
 
-    def __init__(self, bank: FilterBank, *, branches: int, extra: int = 0) -> None:
+    def __init__(self, bank: FilterBank, *, branches: int, extra: int = 0, settling: int = 0) -> None:
         self.bank = bank
         self.branches = branches
         self._block = max(round(BLOCK_S / bank.period_s), 1)
@@ -189,7 +191,8 @@ class Summariser:
         self._used = np.zeros(rows, np.bool_)
         self._currents = np.full((rows, branches), np.nan)
         self._filled = 0
-        self._state = bank.start()
+        self._settling = settling
+        self._state = bank.start(settling=settling)
         self._moments: list[Array] = []
         self._extra: list[Array] = []
         self._noise: list[Array] = []
@@ -220,7 +223,7 @@ class Summariser:
     def end_drive(self) -> None:
         """End a drive: its last block is closed, short as it may be, and the filters forget it."""
         self._close()
-        self._state = self.bank.start()
+        self._state = self.bank.start(settling=self._settling)
 
     def summary(self) -> DriveSummary:
         """Return the summary of the drives that ended.
@@ -233,7 +236,7 @@ class Summariser:
         moments = np.concatenate([np.zeros((0, self._columns, self._columns)), *self._moments])
         if not len(moments):
             raise DriveError(
-                f"no {BLOCK_S:.0f} s of drive in which {LEAST_SHARE:.0%} of the samples are valid{self._settling()}"
+                f"no {BLOCK_S:.0f} s of drive in which {LEAST_SHARE:.0%} of the samples are valid{self._settled()}"
             )
         return DriveSummary(
             moments=moments,
@@ -244,10 +247,9 @@ class Summariser:
             extra=np.concatenate(self._extra) if self._table.shape[1] > self._columns else None,
         )
 
-    def _settling(self) -> str:
-        if not self.bank.settling:
-            return ""
-        return f" once its filter bank has settled, {self.bank.settling * self.bank.period_s:.0f} s after a start"
+    def _settled(self) -> str:
+        settling_s = self._state.settling * self.bank.period_s
+        return f" once its filter bank has settled, {settling_s:.0f} s after a start" if settling_s else ""
 
     def _take(self, inputs: Array, currents_a: Array, valid: Mask, extra: Array | None) -> None:
         rows = slice(self._filled, self._filled + len(inputs))

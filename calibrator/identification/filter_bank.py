@@ -13,6 +13,7 @@ settle: its columns are the plain inputs.
 """
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from calibrator.drive import Array, Mask
 from calibrator.errors import DriveError
 from calibrator.identification.state_space import Complex
 
-__all__ = ["BankState", "FilterBank", "low_passes", "plain_bank", "read_bank"]
+__all__ = ["BankState", "FilterBank", "low_pass_bank", "low_passes", "plain_bank", "read_bank"]
 
 LONGEST_HOLD_S = 1.0
 """Time that an input may keep its last valid value: currents of a drive seldom change more within. [s]"""
@@ -118,10 +119,25 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         gains = np.concatenate([1.0 - real, 1.0 - pairs.real, -pairs.imag])
         return A, np.kron(gains[:, None], np.eye(M))
 
-    def start(self) -> "BankState":
-        """State before the first sample of a drive."""
+    def start(self, *, settling: int = 0) -> "BankState":
+        """State before the first sample of a drive.
+
+        Parameters
+        ----------
+        settling : int
+            Samples after a start that are not used, if they are more than :attr:`settling`: that of another bank, to be
+            compared with.
+
+        Returns
+        -------
+        BankState
+            To run the bank from.
+        """
         return BankState(
-            states=np.zeros(self.states), held=np.zeros(len(self.input_names)), counters=np.array([NEVER, 0])
+            states=np.zeros(self.states),
+            held=np.zeros(len(self.input_names)),
+            counters=np.array([NEVER, 0]),
+            settling=max(settling, self.settling),
         )
 
     def run(self, inputs: Array, valid: Mask, state: "BankState") -> tuple[Array, Mask]:
@@ -150,7 +166,7 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     def run_into(self, columns: Array, used: Mask, inputs: Array, valid: Mask, state: "BankState") -> None:
         """As :meth:`run`, into the first W columns of rows that are at hand; those not used become zero throughout."""
         real, pairs = _by_kind(self.complex_poles)
-        limits = np.array([self.holding, self.settling])
+        limits = np.array([self.holding, state.settling])
         M = len(self.input_names)
         poles = (np.repeat(real, M), np.repeat(pairs.real, M), np.repeat(pairs.imag, M))
         samples = (np.ascontiguousarray(inputs, np.float64), np.ascontiguousarray(valid))
@@ -178,11 +194,14 @@ class BankState:
         Last valid input.
     counters : ndarray of int of shape (2,)
         Samples since the last valid input, and samples until the filters have settled.
+    settling : int
+        Samples after a start that are not used.
     """
 
     states: Array
     held: Array
     counters: NDArray[np.int64]
+    settling: int
 
 
 def plain_bank(input_names: tuple[str, ...], *, period_s: float) -> FilterBank:
@@ -206,6 +225,12 @@ def low_passes(time_constants_s: Array, *, period_s: float) -> Poles:
         As :class:`FilterBank` has them.
     """
     return tuple((float(pole), 0.0) for pole in np.exp(-period_s / np.asarray(time_constants_s)))
+
+
+def low_pass_bank(input_names: tuple[str, ...], time_constants_s: Sequence[float], *, period_s: float) -> FilterBank:
+    """Bank of the inputs and of first-order low-passes of each, by their time constants. [s]"""
+    poles = low_passes(np.array(time_constants_s), period_s=period_s)
+    return FilterBank(input_names=input_names, period_s=period_s, poles=poles)
 
 
 def read_bank(path: Path) -> FilterBank:
