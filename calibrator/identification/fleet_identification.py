@@ -15,7 +15,7 @@ from calibrator.errors import DriveError
 from calibrator.evidence.vehicle_summary import read_samples, read_vehicle_summary
 from calibrator.identification.filter_bank import FilterBank, low_pass_bank
 from calibrator.identification.pooled_bank import pooled_bank
-from calibrator.identification.read_out import fit_read_outs, needs_own_model
+from calibrator.identification.read_out import far_below_fleet, fit_read_outs
 from calibrator.identification.state_space import StateSpaceModel
 from calibrator.identification.vehicle_model import identify_vehicle
 from calibrator.report.text import dumps, left_out_text, table
@@ -27,9 +27,9 @@ __all__ = ["IdentificationReport", "OwnModel", "identify_fleet", "own_model", "r
 POOLED_VEHICLES = 8
 """Vehicles that a bank is chosen from: more of them hardly move its poles. [1]"""
 OWN_GAIN_DB = 3.0
-"""By how much a model of its own must simulate better than the shared bank, mean over branches. [dB]"""
+"""By how much a model of its own must simulate its worst branch better than the shared bank does its. [dB]"""
 EXACT_DB = 60.0
-"""Better simulation than this counts as no better: what is left is rounding of the signals. [dB]"""
+"""Better simulation than this counts as no better: what is left is the rounding of signals. [dB]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +98,7 @@ class IdentificationReport:
             (name, _figure(row.median_db), _figure(row.worst_db), row.worst_vehicle)
             for name, row in self._rows().items()
         ]
-        own = [f"  {name}: {_means(self.snr_db[name], found)}" for name, found in self.own.items()]
+        own = [f"  {name}: {_compared(self.snr_db[name], found)}" for name, found in self.own.items()]
         parts = [
             f"filter bank {self.bank.identity} of {len(self.bank.input_names)} inputs: {self.bank.described()}",
             table(("simulation SNR [dB]", "median", "worst", "vehicle"), rows),
@@ -159,7 +159,7 @@ def identify_fleet(
     )
     read_outs = fit_read_outs([vehicle.summary for vehicle in vehicles])
     snr_db = {vehicle.vehicle: read_outs.snr_db[j] for j, vehicle in enumerate(vehicles)}
-    different = [vehicle.vehicle for vehicle, is_so in zip(vehicles, needs_own_model(read_outs), strict=True) if is_so]
+    different = [vehicle.vehicle for vehicle, far in zip(vehicles, far_below_fleet(read_outs), strict=True) if far]
     readers = {name: partial(_read_own_model, shared_db=snr_db[name]) for name in different}
     own, _ = read_each(readers, fleet, equipment, database, workers=workers) if different else ({}, {})
     return IdentificationReport(
@@ -199,7 +199,7 @@ def own_model(drives: Sequence[Samples], shared_db: Array, *, period_s: float, v
     Returns
     -------
     OwnModel or None
-        None if a model of its own simulates hardly better: the bank is not what it lacks.
+        None if a model of its own simulates hardly better: its sensors are noisy, or its inputs do not tell enough.
 
     Raises
     ------
@@ -207,8 +207,8 @@ def own_model(drives: Sequence[Samples], shared_db: Array, *, period_s: float, v
         If no model can be identified.
     """
     found = identify_vehicle(drives, period_s=period_s, vehicle=vehicle, names=())
-    shared, own = _comparable_db(shared_db, found.snr_db)
-    if not shared.size or np.mean(own - shared) < OWN_GAIN_DB:
+    shared, own = _worst_db(shared_db, found.snr_db)
+    if not own - shared >= OWN_GAIN_DB:  # nor where neither tells anything
         return None
     return OwnModel(model=found.model, snr_db=found.snr_db)
 
@@ -254,12 +254,14 @@ def _figure(value_db: float) -> str:
     return f"{value_db:.1f}" if np.isfinite(value_db) else "-"
 
 
-def _means(shared_db: Array, own: OwnModel) -> str:
-    shared, alone = (float(np.mean(values)) for values in _comparable_db(shared_db, own.snr_db))
-    return f"{shared:.1f} dB with the bank, {alone:.1f} dB with a model of order {own.model.order}"
+def _compared(shared_db: Array, own: OwnModel) -> str:
+    shared, alone = _worst_db(shared_db, own.snr_db)
+    return f"worst branch {shared:.1f} dB with the bank, {alone:.1f} dB with a model of order {own.model.order}"
 
 
-def _comparable_db(shared_db: Array, own_db: Array) -> tuple[Array, Array]:
-    """Ratios of the branches that both tell something of, at most :data:`EXACT_DB`."""
+def _worst_db(shared_db: Array, own_db: Array) -> tuple[float, float]:
+    """Worst of the branches that both tell something of, at most :data:`EXACT_DB`; NaN where there is none."""
     told = ~(np.isnan(shared_db) | np.isnan(own_db))
-    return np.minimum(shared_db[told], EXACT_DB), np.minimum(own_db[told], EXACT_DB)
+    if not told.any():
+        return np.nan, np.nan
+    return min(float(shared_db[told].min()), EXACT_DB), min(float(own_db[told].min()), EXACT_DB)

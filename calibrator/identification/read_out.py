@@ -17,7 +17,7 @@ from calibrator.evidence.summary import DriveSummary, common_bank
 from calibrator.identification.filter_bank import FilterBank
 from calibrator.identification.state_space import StateSpaceModel, snr_from_power
 
-__all__ = ["ReadOuts", "fit_read_outs", "needs_own_model", "state_space_model"]
+__all__ = ["ReadOuts", "far_below_fleet", "fit_read_outs", "state_space_model"]
 
 RIDGE = 1e-12
 """Added to standardised second moments: above rounding, far below any signal. [1]"""
@@ -27,12 +27,10 @@ FIRST_HELD_OUT = 2
 """So that three blocks already have one to judge from, amid the others."""
 CONSTANT = 1e-12
 """Variance over mean square below which a column counts as constant: rounding. [1]"""
-LEAST_MISFIT = 1e-4
-"""Power of the simulation error beyond noise over that of the signal that bends no slope noticeably: 40 dB. [1]"""
-NOISE_EXCESS = 0.2
-"""Share of the noise by which its own estimate may be wrong. [1]"""
-FLEET_MISFIT = 4.0
-"""How much more misfit than the fleet's median makes a vehicle different: 6 dB. [1]"""
+GOOD_DB = 40.0
+"""Simulation this good bends no slope noticeably. [dB]"""
+BELOW_FLEET_DB = 6.0
+"""How far below the fleet's median a branch is simulated that may not share its dynamics. [dB]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,10 +52,6 @@ class ReadOuts:
     snr_db : ndarray of shape (N, K)
         Simulation signal-to-noise ratio on held-out blocks, of read-outs of the others; NaN for a constant current, or
         where no block could be held out. [dB]
-    misfit : ndarray of shape (N, K)
-        Power of the simulation error on these blocks beyond the sensor's noise, over that of the current. [1]
-    noise : ndarray of shape (N, K)
-        Power of the sensor's noise over that of the current. [1]
     """
 
     bank: str
@@ -66,8 +60,6 @@ class ReadOuts:
     residual_a2: Array
     mean_inputs: Array
     snr_db: Array
-    misfit: Array
-    noise: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,13 +92,9 @@ def fit_read_outs(summaries: Sequence[DriveSummary]) -> ReadOuts:
     bank, K = common_bank(summaries), summaries[0].branches
     total = np.stack([summary.total for summary in summaries])
     held_out = np.stack([summary.moments[_held_out(summary)].sum(axis=0) for summary in summaries])
-    noise_a2 = np.stack([_noise_a2(summary) for summary in summaries])
     fit, judged = _solve(total, K), _solve(total - held_out, K)
     signal = _variance(held_out)[:, -K - 1 : -1]
     error = np.diagonal(_residual(held_out, judged), axis1=1, axis2=2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        noise = np.where(signal > 0.0, noise_a2 / signal, np.nan)
-        misfit = np.where(signal > 0.0, np.maximum(error - noise_a2, 0.0) / signal, np.nan)
     return ReadOuts(
         bank=bank,
         coefficients=fit.coefficients,
@@ -114,13 +102,11 @@ def fit_read_outs(summaries: Sequence[DriveSummary]) -> ReadOuts:
         residual_a2=_residual(total, fit),
         mean_inputs=fit.mean_inputs,
         snr_db=snr_from_power(signal, error),
-        misfit=misfit,
-        noise=noise,
     )
 
 
-def needs_own_model(read_outs: ReadOuts) -> Mask:
-    """Tell which vehicles the shared bank may not fit.
+def far_below_fleet(read_outs: ReadOuts) -> Mask:
+    """Tell which vehicles the shared bank may not fit; a noisy sensor looks the same until a model of its own is tried.
 
     Parameters
     ----------
@@ -130,12 +116,10 @@ def needs_own_model(read_outs: ReadOuts) -> Mask:
     Returns
     -------
     ndarray of bool of shape (N,)
-        True where the misfit of a branch is far above the fleet's median, and above what its noise could be.
+        True where the simulation of a branch is far below the fleet's median, and not good anyway.
     """
-    misfit = np.nan_to_num(read_outs.misfit)
-    usual = np.median(misfit, axis=0)
-    limit = np.maximum(FLEET_MISFIT * usual, LEAST_MISFIT) + NOISE_EXCESS * np.nan_to_num(read_outs.noise)
-    return np.asarray(np.any(misfit > limit, axis=1))
+    usual_db = np.median(np.where(np.isnan(read_outs.snr_db), np.inf, read_outs.snr_db), axis=0)
+    return np.asarray(np.any(read_outs.snr_db < np.minimum(usual_db - BELOW_FLEET_DB, GOOD_DB), axis=1))
 
 
 def state_space_model(bank: FilterBank, read_outs: ReadOuts, vehicle: int) -> StateSpaceModel:
@@ -181,13 +165,6 @@ def state_space_model(bank: FilterBank, read_outs: ReadOuts, vehicle: int) -> St
 
 def _held_out(summary: DriveSummary) -> Mask:
     return np.asarray(np.arange(len(summary.moments)) % FOLDS == FIRST_HELD_OUT)
-
-
-def _noise_a2(summary: DriveSummary) -> Array:
-    """White noise of each current in the held-out blocks, shape (K,); zero if there are none. [A^2]"""
-    held_out = _held_out(summary)
-    samples = summary.moments[held_out, -1, -1]
-    return np.asarray(samples @ summary.noise_a2[held_out] / max(samples.sum(), 1.0))
 
 
 def _solve(moments: Array, branches: int) -> _Fit:
