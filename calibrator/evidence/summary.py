@@ -210,7 +210,13 @@ class Summariser:
             Samples that may be used.
         extra : ndarray of shape (T, E) or None
             Extra columns, finite where valid.
+
+        Raises
+        ------
+        DriveError
+            If the arrays do not belong together, or are not of the bank's inputs.
         """
+        self._require_shapes(inputs, currents_a, valid, extra)
         start = 0
         while start < len(inputs):
             stop = start + min(len(self._table) - self._filled, len(inputs) - start)
@@ -247,6 +253,16 @@ class Summariser:
             extra=np.concatenate(self._extra) if self._table.shape[1] > self._columns else None,
         )
 
+    def _require_shapes(self, inputs: Array, currents_a: Array, valid: Mask, extra: Array | None) -> None:
+        T, E = len(inputs), self._table.shape[1] - self._columns
+        found = [inputs.shape, currents_a.shape, valid.shape, (T, 0) if extra is None else extra.shape]
+        wanted = [(T, len(self.bank.input_names)), (T, self.branches), (T,), (T, E)]
+        if found != wanted:
+            raise DriveError(
+                f"inputs, currents, mask and extra columns of shapes {', '.join(map(str, found))}; "
+                f"expected {', '.join(map(str, wanted))}"
+            )
+
     def _settled(self) -> str:
         settling_s = self._state.settling * self.bank.period_s
         return f" once its filter bank has settled, {settling_s:.0f} s after a start" if settling_s else ""
@@ -254,7 +270,7 @@ class Summariser:
     def _take(self, inputs: Array, currents_a: Array, valid: Mask, extra: Array | None) -> None:
         rows = slice(self._filled, self._filled + len(inputs))
         table, used = self._table[rows], self._used[rows]
-        self.bank.run_into(table, used, inputs, valid, self._state)
+        self._state.run_into(table, used, inputs, valid)
         _put(np.ascontiguousarray(currents_a, np.float64), used, table, self.bank.width)
         if extra is not None:
             table[used, self._columns :] = extra[used]

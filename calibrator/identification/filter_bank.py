@@ -133,11 +133,13 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         BankState
             To run the bank from.
         """
+        (real, pairs), M = _by_kind(self.complex_poles), len(self.input_names)
         return BankState(
             states=np.zeros(self.states),
-            held=np.zeros(len(self.input_names)),
+            held=np.zeros(M),
             counters=np.array([NEVER, 0]),
-            settling=max(settling, self.settling),
+            limits=np.array([self.holding, max(settling, self.settling)]),
+            poles=(np.repeat(real, M), np.repeat(pairs.real, M), np.repeat(pairs.imag, M)),
         )
 
     def run(self, inputs: Array, valid: Mask, state: "BankState") -> tuple[Array, Mask]:
@@ -160,17 +162,8 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             Valid samples of settled filters.
         """
         columns, used = np.zeros((len(inputs), self.width)), np.zeros(len(inputs), np.bool_)
-        self.run_into(columns, used, inputs, valid, state)
+        state.run_into(columns, used, inputs, valid)
         return columns, used
-
-    def run_into(self, columns: Array, used: Mask, inputs: Array, valid: Mask, state: "BankState") -> None:
-        """As :meth:`run`, into the first W columns of rows that are at hand; those not used become zero throughout."""
-        real, pairs = _by_kind(self.complex_poles)
-        limits = np.array([self.holding, state.settling])
-        M = len(self.input_names)
-        poles = (np.repeat(real, M), np.repeat(pairs.real, M), np.repeat(pairs.imag, M))
-        samples = (np.ascontiguousarray(inputs, np.float64), np.ascontiguousarray(valid))
-        _filter(samples, poles, limits, (state.states, state.held, state.counters), (columns, used))
 
     def to_json(self) -> bytes:
         """Text of a bank file."""
@@ -184,7 +177,7 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 @dataclass(frozen=True, kw_only=True)
 class BankState:
-    """What a bank remembers between two pieces of a drive; its arrays are changed by running it.
+    """What a bank remembers between two pieces of a drive: running it changes the first three arrays.
 
     Attributes
     ----------
@@ -194,14 +187,28 @@ class BankState:
         Last valid input.
     counters : ndarray of int of shape (2,)
         Samples since the last valid input, and samples until the filters have settled.
-    settling : int
-        Samples after a start that are not used.
+    limits : ndarray of int of shape (2,)
+        Samples that an input may keep its value, and samples after a start that are not used.
+    poles : tuple of ndarray
+        One per state: real poles, real parts of the others, their imaginary parts.
     """
 
     states: Array
     held: Array
     counters: NDArray[np.int64]
-    settling: int
+    limits: NDArray[np.int64]
+    poles: tuple[Array, Array, Array]
+
+    @property
+    def settling(self) -> int:
+        """Samples after a start that are not used."""
+        return int(self.limits[1])
+
+    def run_into(self, columns: Array, used: Mask, inputs: Array, valid: Mask) -> None:
+        """Filter as :meth:`FilterBank.run`, into the first W columns of rows at hand; those not used become zero."""
+        samples = (np.ascontiguousarray(inputs, np.float64), np.ascontiguousarray(valid))
+        memory = (self.states, self.held, self.counters)
+        _filter(samples, self.poles, self.limits, memory, (columns, used))
 
 
 def plain_bank(input_names: tuple[str, ...], *, period_s: float) -> FilterBank:

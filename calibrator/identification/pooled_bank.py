@@ -93,6 +93,8 @@ def _candidates(vehicles: Sequence[Sequence[Samples]], period_s: float) -> Itera
 def _pooled_poles(vehicles: Sequence[Sequence[Samples]], period_s: float) -> Iterator[Complex]:
     """Poles of systems of several orders; none if the vehicles have too little data, or inputs that tell nothing."""
     drives = [drive for vehicle in vehicles for drive in vehicle if drive.valid.any()]
+    if not drives:
+        return
     M, K = drives[0].inputs.shape[1], drives[0].currents_a.shape[1]
     moments = reduce(add, (standardised_moments(drive.inputs, drive.currents_a, drive.valid) for drive in drives))
     try:

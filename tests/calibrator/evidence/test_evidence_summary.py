@@ -122,6 +122,12 @@ def test_a_drive_can_come_sample_by_sample() -> None:
     assert_same(summariser.summary(), summarise([drive], period_s=PERIOD_S, bank=a_bank(2.0)))
 
 
+def test_a_piece_that_does_not_fit_is_refused() -> None:
+    drive = a_drive(9)
+    with pytest.raises(DriveError, match=r"of shapes \(300, 3\), \(300, 2\), .*; expected \(300, 3\), \(300, 3\)"):
+        Summariser(a_bank(2.0), branches=3).add(drive.inputs, drive.currents_a[:, 1:], drive.valid)
+
+
 def test_a_drive_shorter_than_its_bank_settles_is_refused_with_the_reason() -> None:
     with pytest.raises(DriveError, match="once its filter bank has settled, 300 s after a start"):
         summarise([a_drive(7, samples=200)], period_s=PERIOD_S, bank=a_bank(100.0))

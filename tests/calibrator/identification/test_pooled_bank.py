@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -75,3 +77,9 @@ def test_an_input_that_stands_still_in_all_vehicles_does_no_harm() -> None:
 def test_drives_too_short_to_hold_a_block_out_are_refused() -> None:
     with pytest.raises(DriveError, match="none of 2 vehicles has three blocks of varied, valid samples"):
         pooled_bank(pool([static_vehicle()] * 2, samples=400), period_s=PERIOD_S)
+
+
+def test_drives_without_a_valid_sample_are_refused() -> None:
+    ((drive,),) = pool([static_vehicle()], samples=2000)
+    with pytest.raises(DriveError, match="none of 1 vehicles has three blocks of varied, valid samples"):
+        pooled_bank([[replace(drive, valid=np.zeros(2000, bool))]], period_s=PERIOD_S)
