@@ -10,6 +10,7 @@ from rich.console import Console
 
 from calibrator.command_options import (
     BalancedOption,
+    BankOption,
     BranchesOption,
     ClassifierOption,
     CommonDriveOption,
@@ -25,6 +26,7 @@ from calibrator.command_options import (
     MagnitudeOption,
     MinutesOption,
     NoiseOption,
+    PolesOption,
     QuickOption,
     ReadingsOption,
     RepetitionsOption,
@@ -45,11 +47,12 @@ from calibrator.command_options import (
     WorkersOption,
     named_vehicles,
     require_heeded_options,
+    require_one_bank,
     require_own_options,
     require_truth_where_used,
 )
 from calibrator.errors import LogError
-from calibrator.folders import require_new_folder, require_possible_folder
+from calibrator.folders import require_new_folder, require_possible_file, require_possible_folder
 from calibrator.interrupts import importing
 from calibrator.options import Classifier, ExperimentName, Method
 from calibrator.reading_processes import TIME_LIMIT_S
@@ -59,6 +62,7 @@ from ecu_node import __version__
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import UserError
 from ecu_node.layout import read_layout
+from ecu_node.parameters import write_atomically
 
 if TYPE_CHECKING:
     from calibrator.artificial.truth import FleetTruth
@@ -190,12 +194,14 @@ def summarise(
     layout: LayoutOption,
     out: Annotated[str, typer.Option("--out", help="Store of summaries, path or URL; drives are added to one.")],
     branches: BranchesOption = None,
+    bank: BankOption = None,
     workers: WorkersOption = 2,
     time_limit: TimeLimitOption = TIME_LIMIT_S,
     json: JsonOption = False,
 ) -> None:
     """Reduce drives to what the calibration needs of them: second moments, a few kilobytes per vehicle."""
     with importing():
+        from calibrator.identification.filter_bank import read_bank
         from calibrator.summarise_fleet import summarise_fleet
 
     report = summarise_fleet(
@@ -203,9 +209,45 @@ def summarise(
         _database(layout),
         out,
         branches=tuple(branches.split(",")) if branches else None,
+        bank=read_bank(bank) if bank is not None else None,
         workers=workers,
         time_limit_s=time_limit,
     )
+    _print_report(report.as_json() if json else report.as_text())
+
+
+@app.command()
+def identify(
+    fleet: Annotated[Path, typer.Argument(help="Drive store, or folder with a folder of logs per vehicle.")],
+    layout: LayoutOption,
+    bank: BankOption = None,
+    poles: PolesOption = None,
+    out: Annotated[Path | None, typer.Option("--out", help="File to write the filter bank to (JSON).")] = None,
+    workers: WorkersOption = 2,
+    json: JsonOption = False,
+) -> None:
+    """Choose the filter bank that a fleet's vehicles share, and tell how well it simulates each of them.
+
+    Without --bank or --poles it is chosen from some vehicles, by how well it simulates blocks of their drives that were
+    held out. A vehicle whose own dynamics differ too much gets a model of its own, and is named.
+    """
+    with importing():
+        from calibrator.identification.filter_bank import read_bank
+        from calibrator.identification.fleet_identification import identify_fleet
+
+    require_one_bank(bank, poles)
+    if out is not None:
+        require_possible_file(out)
+    report = identify_fleet(
+        fleet,
+        _database(layout),
+        bank=read_bank(bank) if bank is not None else None,
+        time_constants_s=[float(number) for number in poles.split(",")] if poles else [],
+        workers=workers,
+    )
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(out, report.bank.to_json())
     _print_report(report.as_json() if json else report.as_text())
 
 

@@ -14,6 +14,7 @@ from calibrator.options import Classifier, ExperimentName, Method
 
 __all__ = [
     "BalancedOption",
+    "BankOption",
     "BranchesOption",
     "ClassifierOption",
     "CommonDriveOption",
@@ -29,6 +30,7 @@ __all__ = [
     "MagnitudeOption",
     "MinutesOption",
     "NoiseOption",
+    "PolesOption",
     "QuickOption",
     "ReadingsOption",
     "RepetitionsOption",
@@ -50,6 +52,7 @@ __all__ = [
     "named_vehicles",
     "number_option",
     "require_heeded_options",
+    "require_one_bank",
     "require_own_options",
     "require_truth_where_used",
 ]
@@ -76,6 +79,8 @@ MAX_MINUTES = 240.0
 """A trip's log is made in memory, at some 250 frames per second. [min]"""
 MAX_DELAY_MS = 1000.0
 """The branch signals of a real car lag each other by tens to hundreds of milliseconds. [ms]"""
+SHORTEST_POLE_S, LONGEST_POLE_S = 0.01, 600.0
+"""Time constants of low-passes: from below the time base of any layout to ten minutes. [s]"""
 MAX_UNMEASURED_A = 1000.0
 """More than the full scale of any car's junction. [A]"""
 
@@ -120,6 +125,18 @@ def _unmeasured(value: tuple[float, float]) -> tuple[float, float]:
     if not all(0 <= number <= MAX_UNMEASURED_A for number in value):
         raise typer.BadParameter(
             f"{value[0]:g} {value[1]:g}: expected mean and standard deviation from 0 to {MAX_UNMEASURED_A:g} A"
+        )
+    return value
+
+
+def _time_constants(value: str | None) -> str | None:
+    try:
+        numbers = [] if value is None else [float(number) for number in value.split(",")]
+    except ValueError:
+        numbers = [math.nan]
+    if not all(SHORTEST_POLE_S <= number <= LONGEST_POLE_S for number in numbers):  # nor is not-a-number
+        raise typer.BadParameter(
+            f"{value}: expected time constants with commas, each from {SHORTEST_POLE_S:g} to {LONGEST_POLE_S:g} s"
         )
     return value
 
@@ -214,6 +231,17 @@ HoldOutOption = Annotated[
 UnityOption = Annotated[
     str | None, typer.Option("--unity", help="Vehicle whose held-out data is the unity drive (published).")
 ]
+BankOption = Annotated[
+    Path | None, typer.Option("--bank", help="Filter bank to use, a file that 'identify --out' wrote.")
+]
+PolesOption = Annotated[
+    str | None,
+    typer.Option(
+        "--poles",
+        callback=_time_constants,
+        help=f"Low-passes to use: time constants with commas, each {SHORTEST_POLE_S:g} to {LONGEST_POLE_S:g} [s].",
+    ),
+]
 QuickOption = Annotated[bool, typer.Option("--quick", help="Small and fast: shows that it runs, not the figures.")]
 RepetitionsOption = Annotated[
     int | None,
@@ -240,6 +268,18 @@ ResultsFolderOption = Annotated[
 def named_vehicles(values: list[str] | None) -> frozenset[str]:
     """Vehicles of an option that is given several times, or once with commas; no name has a comma."""
     return frozenset(name.strip() for value in values or () for name in value.split(","))
+
+
+def require_one_bank(bank: Path | None, poles: str | None) -> None:
+    """Refuse a bank file together with poles: only one of them can be used.
+
+    Raises
+    ------
+    typer.BadParameter
+        If both are given.
+    """
+    if bank is not None and poles is not None:
+        raise typer.BadParameter("a bank has its own poles; give --bank or --poles", param_hint="--poles")
 
 
 def require_own_options(context: typer.Context, method: Method) -> None:

@@ -19,6 +19,9 @@ _Function = TypeVar("_Function", bound=Callable[..., object])
 CACHE_VARIABLE = "CALIBRATOR_CACHE"
 """Environment variable that names another folder than the user's cache folder."""
 
+COMPILED = ("posterior", "evidence", "identification")
+"""Folders of this package with compiled functions."""
+
 
 def compiled(function: _Function) -> _Function:
     """Compile a function; division by zero gives infinity, as in arrays."""
@@ -47,7 +50,8 @@ def _compile(function: _Function, **options: Any) -> _Function:
 
 def _cache_folder() -> str:
     """Folder of compiled code of this source, made if missing; empty if it cannot be made."""
-    sources = [Path(__file__), *sorted((Path(__file__).parent / "posterior").glob("*.py"))]
+    package = Path(__file__).parent
+    sources = [Path(__file__), *(path for name in COMPILED for path in sorted((package / name).glob("*.py")))]
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
     usual = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "calibrator"
     folder = Path(os.environ.get(CACHE_VARIABLE) or usual) / digest

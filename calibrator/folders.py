@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 
 from calibrator.errors import FleetError
 
-__all__ = ["require_new_folder", "require_possible_folder", "whole_folder"]
+__all__ = ["require_new_folder", "require_possible_file", "require_possible_folder", "whole_folder"]
 
 
 def require_possible_folder(out: Path) -> None:
@@ -18,6 +18,13 @@ def require_possible_folder(out: Path) -> None:
     Rights alone do not tell (a read-only disk, /proc), so a folder is made for a moment.
     """
     _require_possible(out.absolute(), out)
+
+
+def require_possible_file(out: Path) -> None:
+    """Raise FleetError, before any work is done, if a file cannot be written or replaced."""
+    if out.is_dir():
+        raise FleetError(f"{out}: is a folder; name a file in it")
+    require_possible_folder(out.absolute().parent)
 
 
 def require_new_folder(out: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from calibrator.drives.copies import without_copies
 from calibrator.drives.fleet_source import find_fleet, probe_equipment
+from calibrator.identification.filter_bank import FilterBank
 from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.report.text import dumps, left_out_text
 from calibrator.storage import open_storage
@@ -45,6 +46,7 @@ def summarise_fleet(
     out: str,
     *,
     branches: tuple[str, ...] | None,
+    bank: FilterBank | None = None,
     workers: int,
     time_limit_s: float = TIME_LIMIT_S,
 ) -> SummariseReport:
@@ -60,6 +62,8 @@ def summarise_fleet(
         Path or URL of the store; made if there is none.
     branches : tuple of str or None
         Branches to use; None: those that the fleet has.
+    bank : FilterBank or None
+        Filters of their inputs; None: those of the store, or the plain inputs for a new one.
     workers : int
         Number of processes.
     time_limit_s : float
@@ -77,7 +81,7 @@ def summarise_fleet(
     """
     source = without_copies(find_fleet(fleet))
     equipment = probe_equipment(source, database, branches, limit_s=time_limit_s)
-    store = open_store(open_storage(out), equipment, database, source)
+    store = open_store(open_storage(out), equipment, database, source, bank=bank)
     added = add_drives(store, source, database, workers=workers, time_limit_s=time_limit_s)
     return SummariseReport(
         store=out,

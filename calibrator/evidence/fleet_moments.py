@@ -8,7 +8,7 @@ import numpy as np
 
 from calibrator.drive import Array
 from calibrator.evidence.block_regression import Blocks
-from calibrator.evidence.summary import DriveSummary
+from calibrator.evidence.summary import DriveSummary, common_bank
 
 __all__ = ["FleetMoments", "stack_summaries"]
 
@@ -78,7 +78,13 @@ def stack_summaries(summaries: Sequence[DriveSummary], order: Sequence[int] | No
     -------
     FleetMoments
         Without extra columns.
+
+    Raises
+    ------
+    DriveError
+        If the summaries were made with different filter banks.
     """
+    common_bank(summaries)
     M, K = summaries[0].inputs, summaries[0].branches
     chosen = list(range(K)) if order is None else list(order)
     columns = np.array([*range(M), *(M + k for k in chosen), M + K])

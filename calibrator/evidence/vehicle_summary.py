@@ -6,16 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrator.drive import Array, Drive, DriveFile
-from calibrator.drives.align import align
+from calibrator.drives.align import Samples, align
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.drives.fleet_source import Equipment, load_drive
 from calibrator.errors import DriveError
 from calibrator.evidence.summary import DriveSummary, summarise
 from calibrator.evidence.zero_current import ZeroCurrent, zero_current_offsets
+from calibrator.identification.filter_bank import FilterBank
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
-__all__ = ["VehicleSummary", "read_vehicle_summary"]
+__all__ = ["VehicleSummary", "read_samples", "read_vehicle_summary"]
 
 LEAST_DURATION_S = 120.0
 """Valid data below which a vehicle is left out: fewer than four blocks do not tell how sure anything is. [s]"""
@@ -52,8 +53,29 @@ class VehicleSummary:
     recorded: frozenset[str]
 
 
+def read_samples(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> list[Samples]:
+    """Read the drives of one vehicle as aligned samples, delays taken out.
+
+    Parameters
+    ----------
+    entries, equipment, database
+        As for :func:`read_vehicle_summary`.
+
+    Returns
+    -------
+    list of Samples
+        One per drive, with the inputs of the fleet model.
+
+    Raises
+    ------
+    UserError
+        If a drive cannot be read, or there is too little valid data; the message says which and how much.
+    """
+    return _aligned(entries, equipment, database).samples
+
+
 def read_vehicle_summary(
-    entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase
+    entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase, *, bank: FilterBank | None = None
 ) -> VehicleSummary:
     """Read the drives of one vehicle and summarise them.
 
@@ -65,6 +87,8 @@ def read_vehicle_summary(
         Branches and model inputs of the fleet.
     database : VehicleDatabase
         DBC and layout.
+    bank : FilterBank or None
+        Filters of the fleet model's inputs; None: the plain inputs.
 
     Returns
     -------
@@ -76,6 +100,27 @@ def read_vehicle_summary(
     UserError
         If a drive cannot be read, or there is too little valid data; the message says which and how much.
     """
+    vehicle = _aligned(entries, equipment, database)
+    return VehicleSummary(
+        vehicle=entries[0].vehicle,
+        drives=tuple(entry.name for entry in entries),
+        summary=summarise(vehicle.samples, period_s=database.layout.period_s, bank=bank),
+        delays=vehicle.delays,
+        zero_current=zero_current_offsets(vehicle.drives, equipment.branches, database),
+        recorded=frozenset.intersection(*(_recorded(drive) for drive in vehicle.drives)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _AlignedDrives:
+    """Drives of one vehicle as they are, the delays of its branches, and the drives on one time base without them."""
+
+    drives: list[Drive]
+    delays: BranchDelays
+    samples: list[Samples]
+
+
+def _aligned(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> _AlignedDrives:
     layout = database.layout
     drives = [load_drive(entry, database) for entry in entries]
     for drive in drives:
@@ -90,14 +135,7 @@ def read_vehicle_summary(
         raise DriveError(
             f"{duration_s:.1f} s of usable data in {len(entries)} drives; at least {LEAST_DURATION_S:.0f} s are needed"
         )
-    return VehicleSummary(
-        vehicle=entries[0].vehicle,
-        drives=tuple(entry.name for entry in entries),
-        summary=summarise(samples, period_s=layout.period_s),
-        delays=delays,
-        zero_current=zero_current_offsets(drives, equipment.branches, database),
-        recorded=frozenset.intersection(*(_recorded(drive) for drive in drives)),
-    )
+    return _AlignedDrives(drives=drives, delays=delays, samples=samples)
 
 
 def _require_possible(drive: Drive, layout: Layout) -> None:

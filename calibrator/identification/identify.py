@@ -20,11 +20,19 @@ import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import DriveError
-from calibrator.identification.lagged_moments import lagged_moments
-from calibrator.identification.modal_fit import fit_read_out, stable_modes
+from calibrator.identification.lagged_moments import LaggedMoments, lagged_moments
+from calibrator.identification.modal_fit import Modes, fit_read_out, stable_modes
 from calibrator.identification.state_space import StateSpaceModel, valid_or_all
 
-__all__ = ["ORDERS", "choose_order", "identify"]
+__all__ = [
+    "BLOCK_ROWS",
+    "ORDERS",
+    "choose_order",
+    "identify",
+    "observability",
+    "standardised_moments",
+    "subspace_modes",
+]
 
 ORDERS = (0, 1, 2, 3, 4, 6, 8)
 """Orders to choose from: a power train as seen at 10 Hz has few modes. [1]"""
@@ -68,8 +76,8 @@ def identify(inputs: Array, currents: Array, *, order: int | None = None, valid:
     if order is None:
         order = choose_order(inputs, currents, valid=mask)
     data = _standardise(inputs, currents, mask)
-    observability = _observability(data, order) if order else np.zeros((currents.shape[1], 0))
-    return data.in_units(_model_from_subspace(data, observability, order))
+    observed = _observability(data, order) if order else np.zeros((currents.shape[1], 0))
+    return data.in_units(_model_from_subspace(data, observed, order))
 
 
 def choose_order(inputs: Array, currents: Array, *, valid: Mask | None = None) -> int:
@@ -99,12 +107,12 @@ def choose_order(inputs: Array, currents: Array, *, valid: Mask | None = None) -
     if not rest.size:
         raise DriveError(f"no valid sample in the last {len(inputs) - stop} of {len(inputs)}: cannot compare orders")
     data = _standardise(inputs[:stop], currents[:stop], mask[:stop])
-    observability = _observability(data, max(ORDERS))
+    observed = _observability(data, max(ORDERS))
     bridged = _bridged(inputs, mask)
     scale = np.where(currents[mask].std(axis=0) > 0.0, currents[mask].std(axis=0), 1.0)
     errors = []
     for order in ORDERS:
-        model = data.in_units(_model_from_subspace(data, observability, order))
+        model = data.in_units(_model_from_subspace(data, observed, order))
         simulated = model.simulate(bridged, initial_state=model.x0)[rest]
         power = np.mean(((currents[rest] - simulated) / scale) ** 2, axis=0)
         errors.append(float(np.mean(10.0 * np.log10(power + RIDGE))))
@@ -194,30 +202,90 @@ def _bridged(inputs: Array, mask: Mask) -> Array:
     return np.stack([np.interp(time, good, channel[good]) for channel in inputs.T], axis=1)
 
 
-def _observability(data: _Standardised, order: int) -> Array:
-    """Weighted left singular vectors of future currents on the past, (BLOCK_ROWS * K, order), PO-MOESP."""
-    M, K, s = data.u.shape[1], data.y.shape[1], BLOCK_ROWS
-    moments = lagged_moments(np.hstack([data.u, data.y]), 2 * s, data.mask)
-    size = 2 * s * (M + K)
+def standardised_moments(inputs: Array, currents: Array, valid: Mask) -> LaggedMoments:
+    """Second moments of the lagged data of one drive, every channel of mean 0 and deviation 1.
+
+    Parameters
+    ----------
+    inputs, currents, valid
+        As in :func:`identify`.
+
+    Returns
+    -------
+    LaggedMoments
+        Of 2 * :data:`BLOCK_ROWS` lags of (inputs, currents).
+    """
+    return _lagged(_standardise(inputs, currents, valid))
+
+
+def observability(moments: LaggedMoments, *, inputs: int) -> Array:
+    """Extended observability matrix from standardised data of one system, PO-MOESP.
+
+    Parameters
+    ----------
+    moments : LaggedMoments
+        Of 2 * :data:`BLOCK_ROWS` lags of (inputs, currents); of several vehicles, they add up.
+    inputs : int
+        Number of inputs M.
+
+    Returns
+    -------
+    ndarray of shape (BLOCK_ROWS * K, BLOCK_ROWS * K)
+        Weighted left singular vectors of future currents on the past: the first n columns are a system of order n.
+
+    Raises
+    ------
+    DriveError
+        If there are too few rows of lagged data.
+    """
+    size, s = len(moments.gram), BLOCK_ROWS
     if moments.rows < ROWS_PER_COLUMN * size:
         raise DriveError(
             f"only {moments.rows} stretches of {2 * s} valid samples in a row, at least {ROWS_PER_COLUMN * size} are "
             "needed: the drive is too short or has too many gaps"
         )
-    index = np.arange(size).reshape(2 * s, M + K)
-    future_u, future_y = index[s:, :M].ravel(), index[s:, M:].ravel()
+    index = np.arange(size).reshape(2 * s, -1)
+    future_u, future_y = index[s:, :inputs].ravel(), index[s:, inputs:].ravel()
     past = index[:s].ravel()
     rows = np.concatenate([future_u, past, future_y])
     gram = moments.gram[np.ix_(rows, rows)] / moments.rows
     L = np.linalg.cholesky(gram + RIDGE * np.eye(size))
     block = L[-len(future_y) :, len(future_u) : len(future_u) + len(past)]
     left, singular, _ = np.linalg.svd(block)
-    return np.asarray(left[:, :order] * np.sqrt(singular[:order]))
+    return np.asarray(left[:, : len(singular)] * np.sqrt(singular))
 
 
-def _model_from_subspace(data: _Standardised, observability: Array, order: int) -> StateSpaceModel:
+def subspace_modes(observed: Array, branches: int, order: int) -> Modes:
+    """Stable modes of the system of some order in an extended observability matrix, by shift invariance.
+
+    Parameters
+    ----------
+    observed : ndarray of shape (BLOCK_ROWS * K, at least order)
+        From :func:`observability`.
+    branches : int
+        Number of currents K.
+    order : int
+        Order n.
+
+    Returns
+    -------
+    Modes
+        Poles inside the unit circle.
+    """
+    blocks = observed[:, :order]
+    A = np.linalg.lstsq(blocks[:-branches], blocks[branches:], rcond=None)[0] if order else np.zeros((0, 0))
+    return stable_modes(A, blocks[:branches])
+
+
+def _lagged(data: _Standardised) -> LaggedMoments:
+    return lagged_moments(np.hstack([data.u, data.y]), 2 * BLOCK_ROWS, data.mask)
+
+
+def _observability(data: _Standardised, order: int) -> Array:
+    """First columns of the extended observability matrix, (BLOCK_ROWS * K, order)."""
+    return observability(_lagged(data), inputs=data.u.shape[1])[:, :order]
+
+
+def _model_from_subspace(data: _Standardised, observed: Array, order: int) -> StateSpaceModel:
     """Model of standardised data for the first columns of the observability matrix."""
-    K = data.y.shape[1]
-    blocks = observability[:, :order]
-    A = np.linalg.lstsq(blocks[:-K], blocks[K:], rcond=None)[0] if order else np.zeros((0, 0))
-    return fit_read_out(stable_modes(A, blocks[:K]), data.u, data.y, data.mask, ridge=RIDGE)
+    return fit_read_out(subspace_modes(observed, data.y.shape[1], order), data.u, data.y, data.mask, ridge=RIDGE)

@@ -29,6 +29,10 @@ class LaggedMoments:
     gram: Array
     rows: int
 
+    def __add__(self, other: "LaggedMoments") -> "LaggedMoments":
+        """Moments of both recordings, each about its own mean."""
+        return LaggedMoments(gram=self.gram + other.gram, rows=self.rows + other.rows)
+
 
 def lagged_moments(z: Array, lags: int, valid: Mask) -> LaggedMoments:
     """Sum the second moments of all rows of lagged data that hold valid samples only.

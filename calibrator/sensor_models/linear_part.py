@@ -48,6 +48,7 @@ def linear_summary(vehicle: SensorSummary, choices: Sequence[SensorModelChoice])
         noise_a2=summary.noise_a2,
         branches=K,
         period_s=summary.period_s,
+        bank=summary.bank,
     )
 
 

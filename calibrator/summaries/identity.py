@@ -5,6 +5,7 @@ import msgspec
 from calibrator.drives.fleet_source import Equipment
 from calibrator.errors import FleetError
 from calibrator.evidence.summary import BLOCK_S
+from calibrator.identification.filter_bank import FilterBank
 from calibrator.storage import Storage
 from ecu_node.database import VehicleDatabase
 
@@ -31,8 +32,10 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         Branches and model inputs of the fleet, see :class:`~calibrator.drives.fleet_source.Equipment`.
     notices : tuple of str
         What the layout has and the fleet lacks.
-    period_s, block_s : float
-        Time base and length of a block. [s]
+    bank : FilterBank
+        Filters of the fleet inputs.
+    block_s : float
+        Length of a block. [s]
     buckets : int
         Number of files that the vehicles are spread over.
     fleet : str
@@ -49,7 +52,7 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     inputs: tuple[str, ...]
     fleet_inputs: tuple[str, ...]
     notices: tuple[str, ...]
-    period_s: float
+    bank: FilterBank
     block_s: float
     buckets: int
     fleet: str
@@ -64,7 +67,7 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     def difference(self, other: "StoreIdentity") -> str:
         """What makes summaries of another store unfit for this one, in words; empty if they fit."""
-        for name in ("layout_sha256", "dbc_sha256", "branches", "fleet_inputs", "period_s", "block_s"):
+        for name in ("layout_sha256", "dbc_sha256", "branches", "fleet_inputs", "bank", "block_s"):
             mine, its = getattr(self, name), getattr(other, name)
             if mine != its:
                 return f"{name} {_short(mine)} against {_short(its)}"
@@ -73,11 +76,18 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 def _short(value: object) -> str:
     text = ", ".join(value) if isinstance(value, tuple) else str(value)
+    text = value.identity if isinstance(value, FilterBank) else text
     return text[:60]
 
 
 def store_identity(
-    equipment: Equipment, database: VehicleDatabase, *, vehicles: int, fleet: str, fleet_ids: frozenset[str]
+    equipment: Equipment,
+    database: VehicleDatabase,
+    *,
+    vehicles: int,
+    fleet: str,
+    fleet_ids: frozenset[str],
+    bank: FilterBank | None = None,
 ) -> StoreIdentity:
     """Identity of a new store.
 
@@ -93,6 +103,8 @@ def store_identity(
         Name of the fleet.
     fleet_ids : frozenset of str
         Artificial fleets that the drives come from.
+    bank : FilterBank or None
+        Filters of the fleet inputs; None: the plain inputs.
 
     Returns
     -------
@@ -108,7 +120,7 @@ def store_identity(
         inputs=equipment.inputs,
         fleet_inputs=equipment.fleet_inputs,
         notices=equipment.notices,
-        period_s=database.layout.period_s,
+        bank=bank or FilterBank(input_names=equipment.fleet_inputs, period_s=database.layout.period_s),
         block_s=BLOCK_S,
         buckets=min(max(wanted, FEWEST_BUCKETS), MOST_BUCKETS),
         fleet=fleet,

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,6 @@ from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
 from calibrator.errors import DriveError
 from calibrator.evidence.readings import weighted_mean
-from calibrator.evidence.summary import DriveSummary
 from calibrator.evidence.vehicle_summary import LEAST_DURATION_S, VehicleSummary
 from calibrator.evidence.zero_current import ZeroCurrent
 
@@ -119,17 +120,10 @@ def joined_records(records: Sequence[Record]) -> VehicleSummary:
 
 
 def _added(parts: Sequence[VehicleSummary]) -> VehicleSummary:
-    first = parts[0]
-    summaries = [part.summary for part in parts]
     return VehicleSummary(
-        vehicle=first.vehicle,
+        vehicle=parts[0].vehicle,
         drives=tuple(name for part in parts for name in part.drives),
-        summary=DriveSummary(
-            moments=np.concatenate([summary.moments for summary in summaries]),
-            noise_a2=np.concatenate([summary.noise_a2 for summary in summaries]),
-            branches=first.summary.branches,
-            period_s=first.summary.period_s,
-        ),
+        summary=reduce(add, [part.summary for part in parts]),
         delays=_best_delays([part.delays for part in parts]),
         zero_current=_mean_reading([part.zero_current for part in parts]),
         recorded=frozenset.intersection(*(part.recorded for part in parts)),

@@ -16,7 +16,7 @@ from calibrator.evidence.vehicle_summary import read_vehicle_summary
 from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
 from calibrator.report.progress import progress_bar
 from calibrator.storage import Storage
-from calibrator.summaries.identity import read_identity, store_identity, write_identity
+from calibrator.summaries.identity import StoreIdentity, read_identity, store_identity, write_identity
 from calibrator.summaries.record import Record, source_version
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
@@ -44,7 +44,14 @@ class Added:
     problems: Mapping[str, str]
 
 
-def open_store(storage: Storage, equipment: Equipment, database: VehicleDatabase, fleet: FleetSource) -> SummaryStore:
+def open_store(
+    storage: Storage,
+    equipment: Equipment,
+    database: VehicleDatabase,
+    fleet: FleetSource,
+    *,
+    bank: FilterBank | None = None,
+) -> SummaryStore:
     """Open the store at a place, or make one for a fleet.
 
     Parameters
@@ -53,6 +60,8 @@ def open_store(storage: Storage, equipment: Equipment, database: VehicleDatabase
         Where it is, or will be.
     equipment, database, fleet : Equipment, VehicleDatabase, FleetSource
         Whose drives are to be added.
+    bank : FilterBank or None
+        Filters of their inputs; None: those of the store, or the plain inputs for a new one.
 
     Returns
     -------
@@ -64,14 +73,22 @@ def open_store(storage: Storage, equipment: Equipment, database: VehicleDatabase
     FleetError
         If there is a store of another layout, other branches or other inputs.
     """
+    identity = read_identity(storage, database)
+    if bank is None and identity is not None and identity.fleet_inputs == equipment.fleet_inputs:
+        bank = identity.bank
+    if bank is not None and bank.input_names != equipment.fleet_inputs:
+        raise FleetError(
+            f"the filter bank is for the inputs {', '.join(bank.input_names)}, this fleet has "
+            f"{', '.join(equipment.fleet_inputs)}; choose a bank for it with 'calibrator identify'"
+        )
     wanted = store_identity(
         equipment,
         database,
+        bank=bank,
         vehicles=len(fleet.vehicles),
         fleet=fleet.path.resolve().name,
         fleet_ids=fleet.fleet_ids,
     )
-    identity = read_identity(storage, database)
     if identity is None:
         write_identity(storage, wanted)
         return SummaryStore(storage=storage, identity=wanted)
@@ -116,7 +133,7 @@ def add_drives(
         _remove_others(store, fleet)
     problems: dict[str, str] = {}
     vehicles = drives = seen = 0
-    summarise = partial(_summarise, equipment=store.identity.equipment, database=database)
+    summarise = partial(_summarise, store=store.identity, database=database)
     with progress_bar("summarise drives", len(fleet.vehicles), "vehicles") as progress:
         entries = (new.entries for bucket, names in by_bucket.items() for new in _new(store, fleet, bucket, names))
         results = read_in_processes(summarise, entries, workers=workers, limit_s=time_limit_s)
@@ -190,12 +207,12 @@ def _record(entries: Sequence[DriveFile], outcome: "Record | Unread") -> Record:
     return _unusable(entries, outcome.reason) if isinstance(outcome, Unread) else outcome
 
 
-def _summarise(entries: tuple[DriveFile, ...], *, equipment: Equipment, database: VehicleDatabase) -> Record:
+def _summarise(entries: tuple[DriveFile, ...], *, store: StoreIdentity, database: VehicleDatabase) -> Record:
     """Record of some drives of one vehicle. One thread: the processes share the cores."""
     with threadpool_limits(1):
         try:
             sources = tuple(source_version(entry.path) for entry in entries)
-            found = read_vehicle_summary(entries, equipment, database)
+            found = read_vehicle_summary(entries, store.equipment, database, bank=store.bank)
         except UserError as error:
             return _unusable(entries, str(error))
     return Record(vehicle=found.vehicle, drives=found.drives, sources=sources, found=found)

@@ -37,7 +37,7 @@ SCHEMA = pa.schema(
         pa.field("sources", _NAMES, nullable=False),
         pa.field("problem", pa.string()),
         pa.field("duration_s", pa.float64(), metadata={"unit": "s"}),
-        pa.field("moments", _FLOATS, metadata={"shape": "(B, p (p + 1) / 2), p: inputs, branches [A], 1"}),
+        pa.field("moments", _FLOATS, metadata={"shape": "(B, p (p + 1) / 2), p: filtered inputs, branches [A], 1"}),
         pa.field("noise_a2", _FLOATS, metadata={"shape": "(B, K)", "unit": "A^2"}),
         pa.field("delay_reference", pa.string()),
         pa.field("delay_s", _FLOATS, metadata={"shape": "(K,)", "unit": "s"}),
@@ -183,7 +183,7 @@ def _shortened(summary: DriveSummary) -> DriveSummary:
 def _records(table: pa.Table, identity: StoreIdentity) -> Iterable[Record]:
     columns = {name: table.column(name).combine_chunks() for name in SCHEMA.names}
     small = table.drop_columns(["moments", "noise_a2"]).to_pylist()
-    M, K = len(identity.fleet_inputs), len(identity.branches)
+    M, K = identity.bank.width, len(identity.branches)
     p = M + K + 1
     triangles = columns["moments"].values.to_numpy().reshape(-1, p * (p + 1) // 2)
     moments, upper = np.empty((len(triangles), p, p)), np.triu_indices(p)
@@ -194,7 +194,11 @@ def _records(table: pa.Table, identity: StoreIdentity) -> Iterable[Record]:
         found = None
         if row["problem"] is None:
             summary = DriveSummary(
-                moments=moments[start:stop], noise_a2=noise[start:stop], branches=K, period_s=identity.period_s
+                moments=moments[start:stop],
+                noise_a2=noise[start:stop],
+                branches=K,
+                period_s=identity.bank.period_s,
+                bank=identity.bank.identity,
             )
             found = _vehicle(row, summary, identity.branches)
         yield Record(

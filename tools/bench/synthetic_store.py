@@ -145,6 +145,7 @@ def _measured(trip: DriveSummary, faults: Faults) -> DriveSummary:
         noise_a2=trip.noise_a2 * gain**2,
         branches=trip.branches,
         period_s=trip.period_s,
+        bank=trip.bank,
     )
 
 

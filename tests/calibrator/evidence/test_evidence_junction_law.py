@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -74,12 +76,7 @@ def test_noise_on_a_small_branch_does_not_draw_its_gain_to_zero() -> None:
 def test_unit_of_current_only_scales_the_constant() -> None:
     summary, _ = summary_of(3, noise_a=(0.5, 0.5, 0.5), size_a=(80.0, 10.0))
     scale = np.array([1e3, 1e3, 1e3, 1.0])
-    scaled = DriveSummary(
-        moments=summary.moments * np.outer(scale, scale),
-        noise_a2=1e6 * summary.noise_a2,
-        branches=3,
-        period_s=PERIOD_S,
-    )
+    scaled = replace(summary, moments=summary.moments * np.outer(scale, scale), noise_a2=1e6 * summary.noise_a2)
     plain, milli = law_of(summary), law_of(scaled)
     np.testing.assert_allclose(milli.estimate, plain.estimate * np.array([1.0, 1.0, 1e3]), rtol=1e-6)
     np.testing.assert_allclose(milli.sd, plain.sd * np.array([1.0, 1.0, 1e3]), rtol=1e-5)

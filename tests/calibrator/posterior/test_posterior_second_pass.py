@@ -27,7 +27,7 @@ LINEAR = SensorModelChoice(log_bayes_factor=-3.0)
 UNDECIDED = SensorModelChoice(log_bayes_factor=2.0, undecided=True)
 BY_SIGN = SensorModelChoice(model="gain by sign", excess=0.1, excess_sd=0.02, log_bayes_factor=30.0)
 WARM = SensorModelChoice(model="temperature", excess=0.002, excess_sd=0.0002, reference=5.0, log_bayes_factor=30.0)
-SUMMARY = DriveSummary(moments=np.ones((1, 4, 4)), noise_a2=np.ones((1, 2)), branches=2, period_s=0.1)
+SUMMARY = DriveSummary(moments=np.ones((1, 4, 4)), noise_a2=np.ones((1, 2)), branches=2, period_s=0.1, bank="plain")
 
 
 def findings(*choices: Sequence[SensorModelChoice]) -> SensorFindings:

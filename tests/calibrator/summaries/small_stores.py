@@ -1,6 +1,7 @@
 """Stores of summaries of small fleets whose faults are known."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from calibrator.evidence.summary import BLOCK_S, DriveSummary
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.evidence.zero_current import ZeroCurrent
 from calibrator.faults import Faults
+from calibrator.identification.filter_bank import FilterBank
 from calibrator.storage import Storage, open_storage
 from calibrator.summaries.identity import StoreIdentity, store_identity, write_identity
 from calibrator.summaries.record import Record
@@ -43,7 +45,7 @@ def record_of(name: str, summary: DriveSummary, drives: Sequence[str] = ("d1",))
     found = VehicleSummary(
         vehicle=name,
         drives=tuple(drives),
-        summary=summary,
+        summary=replace(summary, bank=FilterBank(input_names=EQUIPMENT.fleet_inputs, period_s=PERIOD_S).identity),
         delays=BranchDelays(
             branches=("motor", "battery"),
             delay_s=np.array([0.0, 0.02]),
@@ -57,10 +59,8 @@ def record_of(name: str, summary: DriveSummary, drives: Sequence[str] = ("d1",))
 
 
 def identity_of(database: VehicleDatabase, vehicles: int) -> StoreIdentity:
-    identity = store_identity(EQUIPMENT, database, vehicles=vehicles, fleet="small", fleet_ids=frozenset())
-    return StoreIdentity(
-        **{name: getattr(identity, name) for name in identity.__struct_fields__} | {"period_s": PERIOD_S}
-    )
+    bank = FilterBank(input_names=EQUIPMENT.fleet_inputs, period_s=PERIOD_S)
+    return store_identity(EQUIPMENT, database, vehicles=vehicles, fleet="small", fleet_ids=frozenset(), bank=bank)
 
 
 def small_store(
