@@ -13,6 +13,7 @@ from calibrator.drive import DriveFile
 from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
 from calibrator.evidence.vehicle_summary import read_vehicle_summary
+from calibrator.identification.filter_bank import FilterBank
 from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
 from calibrator.report.progress import progress_bar
 from calibrator.storage import Storage
