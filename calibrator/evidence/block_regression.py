@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array
 
-__all__ = ["BlockRegression", "Blocks", "VehicleRegressions", "regress_blocks", "regress_vehicles"]
+__all__ = ["BlockRegression", "Blocks", "VehicleRegressions", "products", "regress_blocks", "regress_vehicles"]
 
 ROUNDS = 3
 """rho depends on the estimate and the estimate, weakly, on rho. [1]"""
@@ -82,8 +82,8 @@ class Blocks:
         return np.diff(np.append(self.first, len(self.vehicle)))
 
     def total(self, values: Array) -> Array:
-        """Sums over the blocks of each vehicle, shape (N, ...) of (B, ...)."""
-        return np.asarray(np.add.reduceat(values, self.first, axis=0))
+        """Sums over the blocks of each vehicle, shape (N, ...) of (B, ...); whatever stands beside it."""
+        return np.asarray(np.add.reduceat(np.ascontiguousarray(values), self.first, axis=0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,9 +152,9 @@ def regress_vehicles(
     rho = least
     for _ in range(ROUNDS):
         inverse = _inverses(Z + rho[:, None, None] * np.diag(prior_precision))
-        estimate = np.einsum("npq,nq->np", inverse, y + rho[:, None] * prior_precision * prior_mean)
-        scores = right - np.einsum("bpq,bq->bp", gram, estimate[blocks.vehicle])
-        turned = np.einsum("bpq,bq->bp", inverse[blocks.vehicle], scores)
+        estimate = products(inverse, y + rho[:, None] * prior_precision * prior_mean)
+        scores = right - products(gram, estimate[blocks.vehicle])
+        turned = products(inverse[blocks.vehicle], scores)
         rho = np.maximum(blocks.total(np.sum(scores * turned, axis=1)) / p, least)
     turned -= (blocks.total(turned) / count[:, None])[blocks.vehicle]
     widened = np.sqrt(np.maximum(count, TOO_FEW + 1.0) / np.maximum(count - TOO_FEW, 1.0))
@@ -165,6 +165,14 @@ def regress_vehicles(
         prior_covariance=prior_part,
         blocks=blocks,
     )
+
+
+def products(matrices: Array, vectors: Array) -> Array:
+    """Each matrix times its vector, shape (N, q) of (N, q, p) and (N, p).
+
+    The same to the bit for any N, which neither matmul nor einsum promise: these choose their way by the whole shape.
+    """
+    return np.asarray(np.sum(np.ascontiguousarray(matrices) * vectors[:, None, :], axis=2))
 
 
 def _inverses(matrices: Array) -> Array:

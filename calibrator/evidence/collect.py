@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrator.drive import Array
+from calibrator.evidence.block_regression import products
 from calibrator.evidence.fleet_model import FleetModel, regress_on_fleet
 from calibrator.evidence.fleet_moments import FleetMoments
 from calibrator.evidence.junction_law import junction_law
@@ -97,8 +98,9 @@ def collect_rows(fleet: FleetMoments, model: FleetModel, *, full_scale_a: float)
         covariance[:, part, part] += fit.prior_covariance
     order = np.array([*range(0, 2 * K, 2), *range(2 * K, 3 * K - 1), *range(1, 2 * K, 2), 3 * K - 1])
     unit = np.concatenate([np.ones(K), -np.ones(K - 1), np.full(K + 1, 1.0 / full_scale_a)])
-    inputs = fleet.mean[:, None, -1, [*range(M), -1]]
-    means = LineMeans(model=(inputs @ model.read_out)[:, 0] / full_scale_a, measured=fleet.mean_a / full_scale_a)
+    inputs = fleet.mean[:, -1, [*range(M), -1]]
+    ideal_a = products(np.broadcast_to(model.read_out.T, (N, K, M + 1)), inputs)
+    means = LineMeans(model=ideal_a / full_scale_a, measured=fleet.mean_a / full_scale_a)
     lever = np.zeros((N, K + 1, 2 * K - 1))
     lever[:, range(K), range(K)] = means.model
     lever[:, K, K:] = -means.measured[:, 1:]

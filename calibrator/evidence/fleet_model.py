@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrator.drive import Array
-from calibrator.evidence.block_regression import VehicleRegressions, regress_vehicles
+from calibrator.evidence.block_regression import VehicleRegressions, products, regress_vehicles
 from calibrator.evidence.fleet_moments import FleetMoments
 from calibrator.posterior.cluster import densest_clusters
 
@@ -92,14 +92,16 @@ def regress_on_fleet(fleet: FleetMoments, read_out: Array) -> list[VehicleRegres
     """
     M, K = fleet.inputs, fleet.branches
     u = np.array([*range(M), M + K])
-    gram_u = fleet.moments[:, u[:, None], u]
+    gram_u = np.ascontiguousarray(fleet.moments[:, u[:, None], u])
+    turn = np.zeros((len(gram_u), 2, M + 1))
     found = []
     for k in range(K):
         z = np.column_stack([read_out[:, k], np.append(np.zeros(M), 1.0)])
+        turn[:] = z.T
         found.append(
             regress_vehicles(
                 z.T @ gram_u @ z,
-                (fleet.moments[:, None, u, M + k] @ z)[:, 0],
+                products(turn, fleet.moments[:, u, M + k]),
                 fleet.mean[:, M + k, M + k],
                 fleet.blocks,
                 prior_mean=np.array([1.0, 0.0]),

@@ -13,7 +13,7 @@ share equally as far as the first bound allows.
 import numpy as np
 
 from calibrator.drive import Array, Mask
-from calibrator.evidence.block_regression import VehicleRegressions, regress_vehicles
+from calibrator.evidence.block_regression import VehicleRegressions, products, regress_vehicles
 from calibrator.evidence.fleet_moments import FleetMoments
 
 __all__ = ["junction_law"]
@@ -81,4 +81,4 @@ def _weights(estimate: Array) -> Array:
 def _residual_a2(currents: Array, estimate: Array) -> Array:
     """Mean square of what the junction law leaves of the first current, shape (N,). [A^2]"""
     weights = np.concatenate([np.ones((len(estimate), 1)), -estimate], axis=1)
-    return np.asarray(np.maximum(np.einsum("np,npq,nq->n", weights, currents, weights), 0.0))
+    return np.asarray(np.maximum(np.sum(weights * products(currents, weights), axis=1), 0.0))

@@ -108,7 +108,10 @@ def _what_holds(
 def _calibrate(vehicles: Sequence[VehicleSummary], task: FleetTask, found: _Found) -> None:
     """All together, or one after the other if one of them cannot be estimated."""
     try:
-        parameters, left_out = task.calibrate(vehicles)
+        with np.errstate(
+            over="ignore", invalid="ignore", divide="ignore"
+        ):  # what comes of it is not finite, and refused
+            parameters, left_out = task.calibrate(vehicles)
     except _BAD_VEHICLE as error:
         if len(vehicles) == 1:
             found.left_out[vehicles[0].vehicle] = f"its evidence cannot be used: {error}; look at its recordings"

@@ -131,7 +131,7 @@ def test_since_an_earlier_result_only_those_who_drove_are_calibrated(
     grown = SummaryStore(storage=type(store.storage)(url=str(tmp_path / "store")), identity=store.identity)
     bucket = grown.bucket_of("V007")
     records = grown.read(bucket)
-    (new,) = summaries_of(faults_of_vehicle(7, drift=0.05), Conditions(model_error_a=0.5), seed=5)
+    (new,) = summaries_of(faults_of_vehicle(7, drift=0.08), Conditions(model_error_a=0.5), seed=5)
     grown.write(bucket, {**records, "V007": [*records["V007"], record_of("V007", new, ("d2",))]})
     run = calibrate(grown.url, tmp_path / "out", "--since", result, "--workers", 1)
     assert run.returncode == 0, run.stderr
