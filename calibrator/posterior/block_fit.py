@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.compiled import compiled, inlined
+from calibrator.compiled import inlined, inner
 from calibrator.drive import Array
 from calibrator.posterior.slab import Slab
 from calibrator.posterior.small_matrices import (
@@ -127,7 +127,7 @@ def scratch_of(size: int) -> Scratch:
     return Scratch(*places, *vectors, *matrices)
 
 
-@compiled
+@inner
 def open_directions(A: Array, active: Places, count: int, spacing: Array, room: Scratch) -> int:
     """Which of the active parameters are pivots, as bits: the first that is open, until none is.
 
@@ -289,7 +289,7 @@ def weigh_nodes(
     return int(number)
 
 
-@compiled
+@inner
 def fit_node(
     rows: Normal,
     active: Places,
@@ -321,7 +321,8 @@ def fit_node(
         theta[room.pivots[p]] = nodes.values[held, q, p]
     for p in range(held):
         variance = nodes.sd[held, q, p] ** 2
-        room.right[:fitted] = -room.lever[:fitted, p]
+        for i in range(fitted):
+            room.right[i] = -room.lever[i, p]
         for i in range(fitted):
             for j in range(fitted):
                 covariance[room.fitted[i], room.fitted[j]] += variance * room.right[i] * room.right[j]

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from calibrator.compiled import compiled, inner
+from calibrator.compiled import compiled, inlined
 from calibrator.posterior.block_fit import Normal, fit_node
 from calibrator.posterior.constant_states import (
     bits_of,
@@ -49,53 +49,49 @@ def enumerate_vehicles(law: Law, evidence: Evidence, room: Room, found: Found) -
         Becomes the result.
     """
     for j in range(len(evidence.relative)):
-        _enumerate_vehicle(law, evidence, j, room, found)
+        number = weigh_relative(law, evidence, j, room)
+        sharpest(law, evidence, j, room)
+        room.seen[:] = -1
+        room.visited[:] = False
+        room.kept[0], room.best[0], room.best[1] = 0, -np.inf, 0.0
+        supports, size = law.constant_bits, law.grown
+        while len(supports):
+            weigh_constants(law, evidence, j, number, supports, room)
+            wanted = grown(law, size, room) if size else 0
+            supports = room.wanted[:wanted]
+            size += 1
+        found.log_total[j] = room.best[0] + math.log(room.best[1])
+        found.number[j] = _write_states(law, evidence, j, room, found)
 
 
-@inner
-def _enumerate_vehicle(law: Law, evidence: Evidence, j: int, room: Room, found: Found) -> None:
-    number = weigh_relative(law, evidence, j, room)
-    sharpest(law, evidence, j, room)
-    room.seen[:] = -1
-    room.visited[:] = False
-    kept, best, total = weigh_constants(law, evidence, j, number, law.constant_bits, room, (0, -np.inf, 0.0))
-    size = law.grown
-    while size:
-        wanted = grown(law, size, kept, best, room)
-        if not wanted:
-            break
-        kept, best, total = weigh_constants(law, evidence, j, number, room.wanted[:wanted], room, (kept, best, total))
-        size += 1
-    found.log_total[j] = best + math.log(total)
-    found.number[j] = _write_states(law, evidence, j, room, kept, found)
-
-
-@inner
-def _write_states(law: Law, evidence: Evidence, j: int, room: Room, kept: int, found: Found) -> int:
+@inlined
+def _write_states(law: Law, evidence: Evidence, j: int, room: Room, found: Found) -> int:
     """Work out the parameters of the best states until next to no weight is left; how many they are."""
+    kept = room.kept[0]
     for i in range(kept):
         room.top_order[i] = i
-    sort_falling(room.top_log, room.top_order, kept)
+    sort_falling(room.top_log, room.top_order, kept, room.order_work)
     left, written = 1.0, 0
     while written < kept and left > UNTOLD:
         left -= math.exp(room.top_log[room.top_order[written]] - found.log_total[j])
         found.log_weight[j, written] = room.top_log[room.top_order[written]]
         written += 1
     # One relative state after the other, as each is worked out anew.
-    for m in range(len(room.order)):
-        taken = False
-        for i in range(written):
-            place = room.top_order[i]
-            if room.top[place, 0] == m:
-                if not taken:
-                    take_relative(law, evidence, j, room.order[m], room)
-                    room.pattern_known[:] = False
-                    taken = True
-                _write_state(law, evidence, j, room, place, found, i)
+    for i in range(written):
+        m = room.top[room.top_order[i], 0]
+        if m < 0:
+            continue
+        take_relative(law, evidence, j, room.order[m], room)
+        room.pattern_known[:] = False
+        for place in range(i, written):
+            entry = room.top_order[place]
+            if room.top[entry, 0] == m:
+                _write_state(law, evidence, j, room, entry, found, place)
+                room.top[entry, 0] = -1
     return written
 
 
-@inner
+@inlined
 def _write_state(law: Law, evidence: Evidence, j: int, room: Room, entry: int, found: Found, place: int) -> None:
     """Parameters of one state: constant ones, and relative ones as these move them.
 

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from calibrator.compiled import inner
+from calibrator.compiled import inlined, inner
+from calibrator.evidence.rows import MOST_TURN
 from calibrator.posterior.block_fit import fit_node, open_directions, weigh_nodes
 from calibrator.posterior.small_matrices import LOG_2PI, normal_form, sort_falling
 from calibrator.posterior.workspace import Evidence, Law, Room
@@ -13,13 +14,11 @@ __all__ = ["take_relative", "weigh_relative"]
 
 POSSIBLE_DRIFT = (-0.9, 9.0)
 """Beyond it the scale between measured and true currents vanishes or explodes. [1]"""
-MOST_TURN = 3.0
-"""Largest logarithm by which a ratio can be off."""
 NEGLIGIBLE = 25.0
 """Relative states so far below the best (logarithm) are dropped: constant rows hardly ever make that good. [1]"""
 
 
-@inner
+@inlined
 def weigh_relative(law: Law, evidence: Evidence, j: int, room: Room) -> int:
     """Write down the logarithms of all relative states and their order; how many go on."""
     Q = room.weights.shape[0]
@@ -45,7 +44,7 @@ def weigh_relative(law: Law, evidence: Evidence, j: int, room: Room) -> int:
         if room.relative_log[state] >= best - NEGLIGIBLE:
             room.order[kept] = state
             kept += 1
-    sort_falling(room.relative_log, room.order, kept)
+    sort_falling(room.relative_log, room.order, kept, room.order_work)
     return min(kept, law.most_relative)
 
 
@@ -86,7 +85,7 @@ def take_relative(law: Law, evidence: Evidence, j: int, state: int, room: Room) 
     return float(room.relative_log[state] - law.best_share[s] - log_change)
 
 
-@inner
+@inlined
 def _turn(law: Law, evidence: Evidence, j: int, room: Room) -> None:
     """What turning about the means adds to the constant rows and their derivative, as :class:`LineMeans` tells."""
     K = law.branches
