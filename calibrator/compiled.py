@@ -1,11 +1,11 @@
 """Compilation of numerical loops: what is written as plain Python runs as machine code.
 
-A function so marked may use numbers, arrays, tuples and other such functions only. It makes no new array: results are
-written into those that it is given. So numba need not count references to arrays at every call, which takes several
+A function so marked may use numbers, arrays, tuples and other such functions only. If it makes no new array, and writes
+its results into those that it is given, numba need not count references to arrays at every call, which takes several
 times as long as the arithmetic of small matrices.
 
-Compilation takes about half a minute. Its result is kept in the user's cache folder, one folder per state of source,
-Python, numba and processor. Of several processes that need it at the same time one compiles, and the others wait.
+Compilation of the estimator takes about half a minute. The result is kept in the user's cache folder, one folder per
+state of source, Python, numba and processor. Of several processes that need it at once one compiles, and others wait.
 """
 
 import fcntl
@@ -19,12 +19,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, Generic, ParamSpec, TypeVar, cast
+from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar, cast
 
 import llvmlite.binding
 import numba as _numba
 
-__all__ = ["compiled", "inlined", "inner"]
+__all__ = ["compiled", "in_place", "inlined", "inner"]
 
 numba: Any = _numba  # its type hints leave out options and the compilation for given types
 
@@ -44,6 +44,9 @@ PREFIX = "compiled-"
 class compiled(Generic[_Parameters, _Result]):  # noqa: N801 (a decorator)
     """Compile a function that Python calls, when it is first called; division by zero gives infinity, as in arrays."""
 
+    makes_arrays = True
+    takes_long = False
+
     def __init__(self, function: Callable[_Parameters, _Result]) -> None:
         self._function = function
         self._ready: Callable[_Parameters, _Result] | None = None
@@ -51,13 +54,37 @@ class compiled(Generic[_Parameters, _Result]):  # noqa: N801 (a decorator)
     def __call__(self, *args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
         """Call it."""
         if self._ready is None:
-            self._ready = _ready(self._function, args)
+            self._ready = self._compile(tuple(numba.typeof(value) for value in args))
         return self._ready(*args, **kwargs)
+
+    def _compile(self, types: tuple[Any, ...]) -> Callable[_Parameters, _Result]:
+        """Machine code for arguments of these types, from the cache if it is there."""
+        if numba.config.DISABLE_JIT:  # to debug what is compiled
+            return self._function
+        plan, folder = _Plan(self._function, types, {"_nrt": self.makes_arrays}), _cache_folder()
+        if folder is None:
+            if self.takes_long:
+                _say(f"in every run, as its cache cannot be written; {CACHE_VARIABLE} can name another folder")
+            return cast("Callable[_Parameters, _Result]", _without_cache(plan))
+        with _alone(folder):
+            os.utime(folder)
+            if not any(folder.rglob(f"*.{self._function.__qualname__}-*.nbc")):
+                _forget_others(folder)
+                if self.takes_long:
+                    _say("once")
+            return cast("Callable[_Parameters, _Result]", _from_cache(plan, folder))
+
+
+class in_place(compiled[_Parameters, _Result]):  # noqa: N801 (a decorator)
+    """The same for the estimator: a function that makes no array, and whose compilation the user is told of."""
+
+    makes_arrays = False
+    takes_long = True
 
 
 def inner(function: _Function) -> _Function:
-    """Compile a function that compiled functions alone call."""
-    return cast("_Function", _dispatcher(function, no_cpython_wrapper=True))
+    """Compile a function that compiled functions alone call, and that makes no array."""
+    return cast("_Function", _dispatcher(function, no_cpython_wrapper=True, _nrt=False))
 
 
 def inlined(function: _Function) -> _Function:
@@ -66,46 +93,40 @@ def inlined(function: _Function) -> _Function:
 
 
 def _dispatcher(function: Callable[..., object], **options: Any) -> Any:
-    # _nrt: numba's run time, which counts references and allocates.
-    return numba.njit(error_model="numpy", no_cfunc_wrapper=True, _nrt=False, **options)(function)
+    # _nrt: numba's run time, which makes arrays and counts references to them.
+    return numba.njit(error_model="numpy", no_cfunc_wrapper=True, **options)(function)
 
 
-def _ready(function: Callable[_Parameters, _Result], args: tuple[object, ...]) -> Callable[_Parameters, _Result]:
-    """Machine code for arguments of these types, from the cache if it is there."""
-    folder, types = _cache_folder(), tuple(numba.typeof(value) for value in args)
-    if folder is None:
-        _say(f"in every run, as its cache cannot be written; {CACHE_VARIABLE} can name another folder")
-        return cast("Callable[_Parameters, _Result]", _without_cache(function, types))
-    with _alone(folder):
-        os.utime(folder)
-        if not any(folder.rglob(f"*.{function.__qualname__}-*.nbc")):
-            _say("once")
-            _forget_others(folder)
-        return cast("Callable[_Parameters, _Result]", _from_cache(function, types, folder))
+class _Plan(NamedTuple):
+    """What is to be compiled, for arguments of which types, and how."""
+
+    function: Callable[..., object]
+    types: tuple[Any, ...]
+    options: dict[str, Any]
 
 
-def _from_cache(function: Callable[..., object], types: tuple[Any, ...], folder: Path) -> Any:
+def _from_cache(plan: _Plan, folder: Path) -> Any:
     """Machine code from the folder, or compiled and written there, or only compiled if that cannot be done."""
-    dispatcher = _cached_dispatcher(function, folder)
+    dispatcher = _cached_dispatcher(plan, folder)
     try:
-        dispatcher.compile(types)
+        dispatcher.compile(plan.types)
     except (OSError, EOFError, pickle.UnpicklingError):
         if not dispatcher.signatures:  # what is there cannot be read: the machine went down as it was written, say
             _clear(folder)
-            return _without_cache(function, types)
+            return _without_cache(plan)
     return dispatcher
 
 
-def _without_cache(function: Callable[..., object], types: tuple[Any, ...]) -> Any:
-    dispatcher = _dispatcher(function)
-    dispatcher.compile(types)
+def _without_cache(plan: _Plan) -> Any:
+    dispatcher = _dispatcher(plan.function, **plan.options)
+    dispatcher.compile(plan.types)
     return dispatcher
 
 
-def _cached_dispatcher(function: Callable[..., object], folder: Path) -> Any:
+def _cached_dispatcher(plan: _Plan, folder: Path) -> Any:
     before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
     try:
-        return _dispatcher(function, cache=True)
+        return _dispatcher(plan.function, cache=True, **plan.options)
     finally:
         numba.config.CACHE_DIR = before
 
@@ -165,7 +186,10 @@ def _cache_folder() -> Path | None:
 def _digest() -> str:
     """What compiled code depends on, in 16 characters."""
     binding: Any = llvmlite.binding
-    machine = (binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten())
+    machine = (
+        numba.config.CPU_NAME or binding.get_host_cpu_name(),
+        numba.config.CPU_FEATURES or binding.get_host_cpu_features().flatten(),
+    )
     versions = (platform.python_version(), numba.__version__, llvmlite.__version__)
     sources = sorted(path for pattern in SOURCES for path in Path(__file__).parent.glob(pattern))
     digest = hashlib.sha256("\n".join((*machine, *versions)).encode())

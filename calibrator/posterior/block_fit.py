@@ -261,6 +261,9 @@ def weigh_nodes(
     start = rows.level[1] + 0.5 * (fitted * LOG_2PI - cholesky(rows.A, room.fitted, fitted, room.L)) - math.log(number)
     least = _follow_pivots(rows, fitted, held, room)
     log_density = -math.log(2.0 * (nodes.high - nodes.low))
+    if not nodes.logarithmic:
+        for i in range(fitted):
+            start += math.log(unit[room.fitted[i]])
     has_variances = False
     for q in range(number):
         misfit = least
@@ -274,7 +277,8 @@ def weigh_nodes(
             room.right[i] = room.x[i]
             for j in range(held):
                 room.right[i] -= room.lever[i, j] * nodes.values[held, q, j]
-            value += room.right[i] if nodes.logarithmic else math.log(unit[room.fitted[i]])
+            if nodes.logarithmic:
+                value += room.right[i]
         if not value + fitted * log_density >= floor:
             out[q] = -np.inf
             continue

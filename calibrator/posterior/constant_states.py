@@ -64,7 +64,7 @@ def sharpest(law: Law, evidence: Evidence, j: int, room: Room) -> None:
     rows = law.constant_design.shape[0]
     log_determinant = _invert(evidence.constant_covariance[j], rows, room.scratch, room.precision[0])
     room.sharp.level[1] = -0.5 * (rows * LOG_2PI + log_determinant)
-    normal_form(law.constant_design, room.precision[0], room.rows, room.sharp.A, room.sharp.b)
+    normal_form(law.constant_design, room.precision[0], room.rows, room.product, room.sharp.A, room.sharp.b)
 
 
 @inner
@@ -114,9 +114,9 @@ def take_pattern(law: Law, evidence: Evidence, j: int, pattern: int, room: Room)
                 total += room.spread[r, p] * room.turned[s, p]
             whole[r, s] = whole[s, r] = total
     log_determinant = _invert(whole, rows, room.scratch, room.precision[pattern])
-    room.pattern_level[pattern, 0] = normal_form(
-        law.constant_design, room.precision[pattern], room.rows, room.patterns[pattern], room.pattern_b[pattern]
-    )
+    A, b = room.patterns[pattern], room.pattern_b[pattern]
+    misfit = normal_form(law.constant_design, room.precision[pattern], room.rows, room.product, A, b)
+    room.pattern_level[pattern, 0] = misfit
     room.pattern_level[pattern, 1] = -0.5 * (rows * LOG_2PI + log_determinant)
     room.pattern_known[pattern] = True
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, qmc
 
-from calibrator.compiled import compiled, inner
+from calibrator.compiled import in_place, inner
 from calibrator.drive import Array
 from calibrator.posterior.slab import NEVER
 from calibrator.posterior.small_matrices import normal_mass
@@ -79,7 +79,7 @@ def _normal_points(dimensions: int) -> Array:
     return np.asarray(norm.ppf(qmc.Sobol(dimensions, scramble=True, rng=0).random(POINTS_PER_STATE)))
 
 
-@compiled
+@in_place
 def _cover(weight: Array, mean: Array, sd: Array, least: Array, normal: Array, covered: Array) -> None:
     """``covered`` (N, C) becomes the weight near each of the first states; 0 where it cannot be the largest."""
     for j in range(len(weight)):
@@ -169,7 +169,7 @@ def harm_probability(states: States, drift: Array, offset: Array, *, mean: Array
     return np.where(changed, np.minimum(harm + dropped, 1.0), 0.0)
 
 
-@compiled
+@in_place
 def _sum_harm(
     weight: Array, mean: Array, sd: Array, estimate: Array, moments: Array, steps: Array, harm: Array
 ) -> None:

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from calibrator.compiled import compiled, inlined
+from calibrator.compiled import in_place, inlined
 from calibrator.posterior.block_fit import Normal, fit_node
 from calibrator.posterior.constant_states import (
     bits_of,
@@ -35,7 +35,7 @@ UNTOLD = 1e-5
 """Weight that is left when the parameters of no more states are worked out. [1]"""
 
 
-@compiled
+@in_place
 def enumerate_vehicles(law: Law, evidence: Evidence, room: Room, found: Found) -> None:
     """Find the states of all vehicles.
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.compiled import compiled, inner
+from calibrator.compiled import in_place, inner
 from calibrator.drive import Array
 from calibrator.evidence.rows import FleetRows
 from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
@@ -254,7 +254,7 @@ def _next_slab(parameters: Array, sd: Array, weight: Array, slab: Slab) -> Slab:
     return Slab(max(slab.low - margin, WIDEST.low), min(slab.high + margin, WIDEST.high))
 
 
-@compiled
+@in_place
 def _log_evidence(others: Array, parameters: Array, sd: Array, low: float, high: float) -> float:
     """Logarithm of the evidence of N vehicles under a slab.
 

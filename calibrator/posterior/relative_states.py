@@ -25,9 +25,10 @@ def weigh_relative(law: Law, evidence: Evidence, j: int, room: Room) -> int:
     normal = room.normal
     rows = evidence.relative.shape[1]
     normal.level[0] = normal_form(
-        law.relative_design, evidence.relative_precision[j], evidence.relative[j], normal.A, normal.b
+        law.relative_design, evidence.relative_precision[j], evidence.relative[j], room.product, normal.A, normal.b
     )
     normal.level[1] = -0.5 * (rows * LOG_2PI + evidence.relative_log_determinant[j])
+    _told_turn(law, evidence, j, room)
     best = -np.inf
     room.relative_log[:] = -np.inf
     for s in range(len(law.relative_size)):
@@ -46,6 +47,20 @@ def weigh_relative(law: Law, evidence: Evidence, j: int, room: Room) -> int:
             kept += 1
     sort_falling(room.relative_log, room.order, kept, room.order_work)
     return min(kept, law.most_relative)
+
+
+@inlined
+def _told_turn(law: Law, evidence: Evidence, j: int, room: Room) -> None:
+    """How the constant rows change with the relative parameters through what the relative rows tell of their errors."""
+    K, rows_r, rows_c = law.branches, evidence.relative.shape[1], evidence.constant.shape[1]
+    for r in range(rows_c):
+        for p in range(K + 1):
+            room.told_turn[r, p] = 0.0
+            for i in range(rows_r):
+                room.told_turn[r, p] += evidence.carry[j, r, i] * law.relative_design[i, p]
+            if r <= K:
+                for i in range(2 * K - 1):
+                    room.told_turn[r, p] -= evidence.lever[j, r, i] * law.relative_design[i, p]
 
 
 @inner
@@ -77,9 +92,7 @@ def take_relative(law: Law, evidence: Evidence, j: int, state: int, room: Room) 
             total -= evidence.carry[j, r, i] * room.residual[i]
         room.rows[r] = total
         for p in range(K + 1):
-            room.turn[r, p] = 0.0
-            for i in range(rows_r):
-                room.turn[r, p] += evidence.carry[j, r, i] * law.relative_design[i, p]
+            room.turn[r, p] = room.told_turn[r, p]
     if evidence.turning:
         _turn(law, evidence, j, room)
     return float(room.relative_log[state] - law.best_share[s] - log_change)
@@ -94,8 +107,6 @@ def _turn(law: Law, evidence: Evidence, j: int, room: Room) -> None:
             lever = evidence.lever[j, r, i]
             if lever != 0.0:
                 room.rows[r] += lever * room.residual[i]
-                for p in range(K + 1):
-                    room.turn[r, p] -= lever * law.relative_design[i, p]
     for k in range(K):
         true = (1.0 + room.parameters[0]) * evidence.model[j, k]
         room.rows[k] += true * math.expm1(min(room.residual[k], MOST_TURN))

@@ -106,24 +106,29 @@ def variances(L: Array, count: int, work: Array, out: Array) -> None:
 
 
 @inner
-def normal_form(X: Array, R: Array, y: Array, A: Array, b: Array) -> float:
-    """A becomes X^T R X and b becomes X^T R y, R the precision; y^T R y."""
+def normal_form(X: Array, R: Array, y: Array, work: Array, A: Array, b: Array) -> float:
+    """A becomes X^T R X and b becomes X^T R y, R the precision; y^T R y. ``work`` has at least the shape of X."""
     rows, P = X.shape
-    c = 0.0
-    b[:P] = 0.0
-    A[:P, :P] = 0.0
-    for r in range(rows):
-        weighted = 0.0
+    for q in range(P):
+        for r in range(rows):
+            work[r, q] = 0.0
         for s in range(rows):
-            weighted += R[r, s] * y[s]
-        c += y[r] * weighted
-        for p in range(P):
-            if X[r, p] != 0.0:
-                b[p] += X[r, p] * weighted
-                for s in range(rows):
-                    if R[r, s] != 0.0:
-                        for q in range(P):
-                            A[p, q] += X[r, p] * R[r, s] * X[s, q]
+            if X[s, q] != 0.0:
+                for r in range(rows):
+                    work[r, q] += R[r, s] * X[s, q]
+        b[q] = 0.0
+        for r in range(rows):
+            b[q] += work[r, q] * y[r]
+        for p in range(q + 1):
+            total = 0.0
+            for r in range(rows):
+                if X[r, p] != 0.0:
+                    total += X[r, p] * work[r, q]
+            A[p, q] = A[q, p] = total
+    c = 0.0
+    for r in range(rows):
+        for s in range(rows):
+            c += y[r] * R[r, s] * y[s]
     return c
 
 

@@ -87,6 +87,7 @@ class Found(NamedTuple):
 class Room(NamedTuple):
     """Intermediate results of one vehicle; patterns are those of drifts that scale hardware offsets.
 
+    ``told_turn`` is the derivative of the constant rows by the relative parameters as far as it is that of all states.
     ``kept`` (1,) counts the states on the list ``top``; ``best`` is the largest logarithm so far, and the sum of all
     states over the best one.
     """
@@ -103,7 +104,9 @@ class Room(NamedTuple):
     parameters: Array
     scale: Array
     residual: Array
+    product: Array
     rows: Array
+    told_turn: Array
     turn: Array
     turned: Array
     spread: Array
@@ -225,7 +228,9 @@ def room_of(law: Law) -> Room:
         parameters=np.zeros(n),
         scale=np.zeros(P),
         residual=np.zeros(3 * K - 1),
+        product=np.zeros((max(3 * K - 1, rows), max(n, P))),
         rows=np.zeros(rows),
+        told_turn=np.zeros((rows, n)),
         turn=np.zeros((rows, n)),
         turned=np.zeros((rows, n)),
         spread=np.zeros((rows, n)),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from calibrator.compiled import compiled
+from calibrator.compiled import in_place
 from calibrator.drive import Array
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, constant_design, relative_design
 from calibrator.posterior.block_fit import (
@@ -38,7 +38,7 @@ class Fit:
     covariance: Array
 
 
-@compiled
+@in_place
 def weigh(
     rows: Normal,
     active: NDArray[np.int64],
@@ -52,12 +52,12 @@ def weigh(
     return weigh_nodes(rows, active, len(active), pivots, nodes, unit, floor, room, out)
 
 
-@compiled
+@in_place
 def find_pivots(A: Array, active: NDArray[np.int64], spacing: Array, room: Scratch) -> int:
     return open_directions(A, active, len(active), spacing, room)
 
 
-@compiled
+@in_place
 def fit_at_node(
     rows: Normal,
     active: NDArray[np.int64],
