@@ -203,6 +203,18 @@ def _follow_pivots(rows: Normal, fitted: int, held: int, room: Scratch) -> float
 
 
 @inlined
+def _more_misfit(values: Array, held: int, room: Scratch) -> float:
+    """What the misfit grows by if the pivots take these values."""
+    more = 0.0
+    for i in range(held):
+        across = 2.0 * room.node[i]
+        for j in range(held):
+            across += room.C[i, j] * values[j]
+        more += values[i] * across
+    return more
+
+
+@inlined
 def _least_misfit(rows: Normal, active: Places, count: int, room: Scratch) -> float:
     """Misfit of the rows if all active parameters, pivots too, take whatever value suits them: none is smaller."""
     for i in range(count):
@@ -216,7 +228,7 @@ def _least_misfit(rows: Normal, active: Places, count: int, room: Scratch) -> fl
     return float(rows.level[0]) - quadratic(room.L, room.right, count, room.z)
 
 
-@inlined
+@inner
 def weigh_nodes(
     rows: Normal,
     active: Places,
@@ -266,13 +278,7 @@ def weigh_nodes(
             start += math.log(unit[room.fitted[i]])
     has_variances = False
     for q in range(number):
-        misfit = least
-        for i in range(held):
-            across = 2.0 * room.node[i]
-            for j in range(held):
-                across += room.C[i, j] * nodes.values[held, q, j]
-            misfit += nodes.values[held, q, i] * across
-        value = start - 0.5 * misfit
+        value = start - 0.5 * (least + _more_misfit(nodes.values[held, q], held, room))
         for i in range(fitted):
             room.right[i] = room.x[i]
             for j in range(held):

@@ -18,7 +18,7 @@ from calibrator.posterior.relative_states import take_relative
 from calibrator.posterior.small_matrices import LOG_2PI, cholesky, inverse, normal_form, sort_falling
 from calibrator.posterior.workspace import BEAM, Evidence, Law, Room
 
-__all__ = ["bits_of", "grown", "pattern_of", "sharpest", "take_pattern", "take_turn", "weigh_constants"]
+__all__ = ["bit_count", "bits_of", "grown", "pattern_of", "sharpest", "take_pattern", "take_turn", "weigh_constants"]
 
 Places = NDArray[np.int64]
 DROPPED = 15.0
@@ -28,7 +28,8 @@ GROWING = 3.0
 
 
 @inlined
-def _bit_count(bits: int) -> int:
+def bit_count(bits: int) -> int:
+    """How many bits are set."""
     count = 0
     while bits:
         bits &= bits - 1
@@ -139,8 +140,8 @@ def weigh_constants(law: Law, evidence: Evidence, j: int, number: int, supports:
             continue
         hardware, sensors, drifting = _counts(law, s)
         for bits in supports:
-            in_hardware = _bit_count(bits & hardware_bits)
-            log_prior = law.log_prior[hardware + in_hardware, sensors + _bit_count(bits) - in_hardware]
+            in_hardware = bit_count(bits & hardware_bits)
+            log_prior = law.log_prior[hardware + in_hardware, sensors + bit_count(bits) - in_hardware]
             base = log_relative + log_prior
             if base == -np.inf or base + room.sharp.level[1] < best - DROPPED:
                 continue
@@ -195,7 +196,7 @@ def grown(law: Law, size: int, room: Room) -> int:
     for i in range(kept):
         place = room.top_order[i]
         bits = room.top[place, 1]
-        if _bit_count(bits) != size or bits == last:
+        if bit_count(bits) != size or bits == last:
             continue
         if beam == 0 and room.top_log[place] < best - GROWING:
             return 0

@@ -13,8 +13,10 @@ import math
 import numpy as np
 
 from calibrator.compiled import in_place, inlined
+from calibrator.drive import Array
 from calibrator.posterior.block_fit import Normal, fit_node
 from calibrator.posterior.constant_states import (
+    bit_count,
     bits_of,
     grown,
     pattern_of,
@@ -97,9 +99,8 @@ def _write_state(law: Law, evidence: Evidence, j: int, room: Room, entry: int, f
 
     The rows were divided by the 1 + d of the state, whatever moves it: the offsets stay.
     """
-    K = law.branches
+    K, P = law.branches, law.constant_design.shape[1]
     bits, q = room.top[entry, 1], room.top[entry, 2]
-    rows, P = law.constant_design.shape
     drifting = 0
     for k in range(K):
         if room.theta[1 + k] != 0.0:
@@ -108,36 +109,38 @@ def _write_state(law: Law, evidence: Evidence, j: int, room: Room, entry: int, f
     take_pattern(law, evidence, j, pattern, room)
     take_turn(law, evidence, pattern, room)
     normal = Normal(room.patterns[pattern], room.pattern_b[pattern], room.pattern_level[pattern])
-    count = bits_of(bits, room.active)
-    theta, C, precision = room.constant_theta, room.constant_covariance, room.precision[pattern]
-    fit_node(normal, room.active, count, room.seen[bits], law.constant, q, room.scratch, theta, C)
+    count, pivots = bits_of(bits, room.active), room.seen[bits]
+    theta, C = room.constant_theta, room.constant_covariance
+    fit_node(normal, room.active, count, pivots, law.constant, q, room.scratch, theta, C)
     for p in range(P):
         found.constant[j, place, p] = theta[p] * room.scale[p]
         found.constant_sd[j, place, p] = math.sqrt(C[p, p]) * room.scale[p]
-    fitted = 0
-    for i in range(count):
-        if not (room.seen[bits] >> i) & 1:
-            fitted += 1
-    for r in range(rows):
+    for r in range(len(room.left)):
         room.left[r] = room.rows[r]
         for p in range(P):
             room.left[r] -= law.constant_design[r, p] * theta[p]
+    fitted = count - bit_count(pivots)
     for p in range(K + 1):
-        # What the constant rows say of this parameter: the residual through the gain, and as much less variance.
-        moved, told = 0.0, 0.0
-        for r in range(rows):
-            total = 0.0
-            for t in range(rows):
-                total += precision[r, t] * room.spread[t, p]
-            room.weighted[r] = total
-            moved -= total * room.left[r]
-            told += total * room.spread[r, p]
-        for i in range(fitted):
-            total = 0.0
-            for r in range(rows):
-                total += law.constant_design[r, room.scratch.fitted[i]] * room.weighted[r]
-            room.projected[i] = total
-        told -= quadratic(room.scratch.L, room.projected, fitted, room.scratch.z)
+        moved, told = _told_by_constants(law, room, room.precision[pattern], p, fitted)
         factor = (1.0 + room.parameters[p]) * math.exp(min(max(moved, -MOST_MOVED), MOST_MOVED))
         found.relative[j, place, p] = factor - 1.0
         found.relative_sd[j, place, p] = math.sqrt(max(room.covariance[p, p] - told, 0.0)) * factor
+
+
+@inlined
+def _told_by_constants(law: Law, room: Room, precision: Array, p: int, fitted: int) -> tuple[float, float]:
+    """By how much what is left of the constant rows moves a relative parameter, and the variance that it takes away."""
+    moved, told, rows = 0.0, 0.0, len(room.left)
+    for r in range(rows):
+        total = 0.0
+        for t in range(rows):
+            total += precision[r, t] * room.spread[t, p]
+        room.weighted[r] = total
+        moved -= total * room.left[r]
+        told += total * room.spread[r, p]
+    for i in range(fitted):
+        total = 0.0
+        for r in range(rows):
+            total += law.constant_design[r, room.scratch.fitted[i]] * room.weighted[r]
+        room.projected[i] = total
+    return moved, told - quadratic(room.scratch.L, room.projected, fitted, room.scratch.z)

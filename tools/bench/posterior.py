@@ -29,10 +29,10 @@ __all__ = ["rows"]
 
 VEHICLES = {2: 300, 3: 300, 4: 150, 5: 32, 6: 16, 8: 8}
 """Vehicles of a fleet by number of branches."""
-QUICK_VEHICLES = 8
-SOLVED, QUICK_SOLVED = 40, 4
+QUICK_VEHICLES = 4
+SOLVED, QUICK_SOLVED = 40, 2
 """Vehicles that the peer solves."""
-FLEET, QUICK_FLEET = 1000, 50
+FLEET, QUICK_FLEET = 1000, 20
 """Vehicles of the fleet that is estimated as a whole."""
 WITH_PEER, ALONE = (2, 4), (3, 5, 6, 8)
 """Numbers of branches that are measured beside the peer, and those that are not."""
