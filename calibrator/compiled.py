@@ -1,65 +1,207 @@
 """Compilation of numerical loops: what is written as plain Python runs as machine code.
 
-A function so marked may use numbers, arrays, tuples and other such functions only. It is compiled when it is first
-called, which takes some ten seconds for all; the result is kept in the user's cache folder, one folder per state of the
-source: a compiled function holds those that it calls, wherever they stand.
+A function so marked may use numbers, arrays, tuples and other such functions only. If it makes no new array, and writes
+its results into those that it is given, numba need not count references to arrays at every call, which takes several
+times as long as the arithmetic of small matrices.
+
+Compilation of the estimator takes about half a minute. The result is kept in the user's cache folder, one folder per
+state of source, Python, numba and processor. Of several processes that need it at once one compiles, and others wait.
 """
 
+import fcntl
 import hashlib
 import os
-from collections.abc import Callable
+import pickle
+import platform
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar, cast
 
-import numba
+import llvmlite.binding
+import numba as _numba
 
-__all__ = ["compiled", "inlined", "inner"]
+__all__ = ["compiled", "in_place", "inlined", "inner"]
+
+numba: Any = _numba  # its type hints leave out options and the compilation for given types
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
+_Parameters = ParamSpec("_Parameters")
+_Result = TypeVar("_Result")
 CACHE_VARIABLE = "CALIBRATOR_CACHE"
 """Environment variable that names another folder than the user's cache folder."""
+SOURCES = (
+    "compiled.py",
+    "score.py",
+    "drives/charge.py",
+    "drives/delay_fit.py",
+    "evidence/rows.py",
+    "evidence/summary.py",
+    "identification/filter_bank.py",
+    "posterior/*.py",
+)
+"""Files of this package whose functions or constants are compiled."""
+KEPT = 4
+"""Folders of compiled code that are kept, the last ones used: of other versions or installations."""
+PREFIX = "compiled-"
+"""Of the names of these folders: nothing else is removed."""
 
-COMPILED = ("posterior", "evidence", "identification")
-"""Folders of this package with compiled functions."""
+
+class compiled(Generic[_Parameters, _Result]):  # noqa: N801 (a decorator)
+    """Compile a function that Python calls, when it is first called; division by zero gives infinity, as in arrays."""
+
+    makes_arrays = True
+    takes_long = False
+
+    def __init__(self, function: Callable[_Parameters, _Result]) -> None:
+        self._function = function
+        self._ready: Callable[_Parameters, _Result] | None = None
+
+    def __call__(self, *args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
+        """Call it."""
+        if self._ready is None:
+            self._ready = self._compile(tuple(numba.typeof(value) for value in args))
+        return self._ready(*args, **kwargs)
+
+    def _compile(self, types: tuple[Any, ...]) -> Callable[_Parameters, _Result]:
+        """Machine code for arguments of these types, from the cache if it is there."""
+        if numba.config.DISABLE_JIT:  # to debug what is compiled
+            return self._function
+        plan, folder = _Plan(self._function, types, {"_nrt": self.makes_arrays}), _cache_folder()
+        if folder is None:
+            if self.takes_long:
+                _say(f"in every run, as its cache cannot be written; {CACHE_VARIABLE} can name another folder")
+            return cast("Callable[_Parameters, _Result]", _without_cache(plan))
+        with _alone(folder):
+            os.utime(folder)
+            if not any(folder.rglob(f"*.{self._function.__qualname__}-*.nbc")):
+                _forget_others(folder)
+                if self.takes_long:
+                    _say("once")
+            return cast("Callable[_Parameters, _Result]", _from_cache(plan, folder))
 
 
-def compiled(function: _Function) -> _Function:
-    """Compile a function; division by zero gives infinity, as in arrays."""
-    return _compile(function, no_cfunc_wrapper=True)
+class in_place(compiled[_Parameters, _Result]):  # noqa: N801 (a decorator)
+    """The same for the estimator: a function that makes no array, and whose compilation the user is told of."""
+
+    makes_arrays = False
+    takes_long = True
 
 
 def inner(function: _Function) -> _Function:
-    """Compile a function that other compiled functions alone call."""
-    return _compile(function, no_cfunc_wrapper=True, no_cpython_wrapper=True)
+    """Compile a function that compiled functions alone call, and that makes no array."""
+    return cast("_Function", _dispatcher(function, no_cpython_wrapper=True, _nrt=False))
 
 
 def inlined(function: _Function) -> _Function:
-    """Compile a function into its callers: for those that are called so often that handing over arguments counts."""
-    return _compile(function, no_cfunc_wrapper=True, no_cpython_wrapper=True, forceinline=True)
+    """Compile a function into its callers: for those with few callers, as each layer of calls is compiled anew."""
+    return cast("_Function", _dispatcher(function, no_cpython_wrapper=True, inline="always"))
 
 
-def _compile(function: _Function, **options: Any) -> _Function:
-    config: Any = numba.config
-    before = config.CACHE_DIR
-    config.CACHE_DIR = _CACHE or before
+def _dispatcher(function: Callable[..., object], **options: Any) -> Any:
+    # _nrt: numba's run time, which makes arrays and counts references to them.
+    return numba.njit(error_model="numpy", no_cfunc_wrapper=True, **options)(function)
+
+
+class _Plan(NamedTuple):
+    """What is to be compiled, for arguments of which types, and how."""
+
+    function: Callable[..., object]
+    types: tuple[Any, ...]
+    options: dict[str, Any]
+
+
+def _from_cache(plan: _Plan, folder: Path) -> Any:
+    """Machine code from the folder, or compiled and written there, or only compiled if that cannot be done."""
+    dispatcher = _cached_dispatcher(plan, folder)
     try:
-        return cast("_Function", numba.njit(cache=bool(_CACHE), error_model="numpy", **options)(function))
+        dispatcher.compile(plan.types)
+    except (OSError, EOFError, pickle.UnpicklingError):
+        if not dispatcher.signatures:  # what is there cannot be read: the machine went down as it was written, say
+            _clear(folder)
+            return _without_cache(plan)
+    return dispatcher
+
+
+def _without_cache(plan: _Plan) -> Any:
+    dispatcher = _dispatcher(plan.function, **plan.options)
+    dispatcher.compile(plan.types)
+    return dispatcher
+
+
+def _cached_dispatcher(plan: _Plan, folder: Path) -> Any:
+    before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
+    try:
+        return _dispatcher(plan.function, cache=True, **plan.options)
     finally:
-        config.CACHE_DIR = before
+        numba.config.CACHE_DIR = before
 
 
-def _cache_folder() -> str:
-    """Folder of compiled code of this source, made if missing; empty if it cannot be made."""
-    package = Path(__file__).parent
-    sources = [Path(__file__), *(path for name in COMPILED for path in sorted((package / name).glob("*.py")))]
-    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
-    usual = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "calibrator"
-    folder = Path(os.environ.get(CACHE_VARIABLE) or usual) / digest
+@cache
+def _say(when: str) -> None:
+    """Tell the user what takes time; once per process."""
+    print(f"calibrator: compiling the estimator (about half a minute, {when})", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """While no other process does this with the same folder."""
+    with (folder / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        except OSError:  # a file system without locks: each process compiles for itself
+            yield
+            return
+        yield
+
+
+def _clear(folder: Path) -> None:
+    """Remove what is in a folder of compiled code, but for its lock."""
+    for entry in folder.iterdir():
+        if entry.is_dir():
+            shutil.rmtree(entry, ignore_errors=True)
+
+
+def _forget_others(folder: Path) -> None:
+    """Remove the folders of compiled code that were not used for longest."""
+
+    def last_use(other: Path) -> float:
+        try:
+            return other.stat().st_mtime
+        except OSError:  # another process removed it
+            return 0.0
+
+    others = sorted(folder.parent.glob(f"{PREFIX}*"), key=last_use, reverse=True)
+    for other in others[KEPT:]:
+        shutil.rmtree(other, ignore_errors=True)
+
+
+@cache
+def _cache_folder() -> Path | None:
+    """Folder of compiled code of this source, Python, numba and processor, made if missing; None if it cannot be."""
     try:
+        usual = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "calibrator"
+        folder = Path(os.environ.get(CACHE_VARIABLE) or usual) / f"{PREFIX}{_digest()}"
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return ""
-    return str(folder) if os.access(folder, os.W_OK) else ""
+        (folder / "lock").touch()
+    except (OSError, RuntimeError):  # no home folder, or none that can be written
+        return None
+    return folder if os.access(folder, os.W_OK) else None
 
 
-_CACHE = _cache_folder()
+def _digest() -> str:
+    """What compiled code depends on, in 16 characters."""
+    binding: Any = llvmlite.binding
+    machine = (
+        numba.config.CPU_NAME or binding.get_host_cpu_name(),
+        numba.config.CPU_FEATURES or binding.get_host_cpu_features().flatten(),
+    )
+    versions = (platform.python_version(), numba.__version__, llvmlite.__version__)
+    sources = sorted(path for pattern in SOURCES for path in Path(__file__).parent.glob(pattern))
+    digest = hashlib.sha256("\n".join((*machine, *versions)).encode())
+    for source in sources:
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]

@@ -26,12 +26,20 @@ from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.faults import Index
 
-__all__ = ["UNKNOWN_VARIANCE", "FleetRows", "LineMeans", "constant_design", "relative_design", "with_load_spread"]
+__all__ = [
+    "MOST_TURN",
+    "UNKNOWN_VARIANCE",
+    "FleetRows",
+    "LineMeans",
+    "constant_design",
+    "relative_design",
+    "with_load_spread",
+]
 
 UNKNOWN_VARIANCE = 100.0
 """Of a row that says nothing: ten times full scale, or a factor of 20 000. [1]"""
 MOST_TURN = 3.0
-"""Largest logarithm by which a ratio can be off."""
+"""Largest logarithm by which a ratio can be off. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.compiled import compiled, inlined
+from calibrator.compiled import inlined, inner
 from calibrator.drive import Array
 from calibrator.posterior.slab import Slab
 from calibrator.posterior.small_matrices import (
@@ -127,7 +127,7 @@ def scratch_of(size: int) -> Scratch:
     return Scratch(*places, *vectors, *matrices)
 
 
-@compiled
+@inner
 def open_directions(A: Array, active: Places, count: int, spacing: Array, room: Scratch) -> int:
     """Which of the active parameters are pivots, as bits: the first that is open, until none is.
 
@@ -203,6 +203,18 @@ def _follow_pivots(rows: Normal, fitted: int, held: int, room: Scratch) -> float
 
 
 @inlined
+def _more_misfit(values: Array, held: int, room: Scratch) -> float:
+    """What the misfit grows by if the pivots take these values."""
+    more = 0.0
+    for i in range(held):
+        across = 2.0 * room.node[i]
+        for j in range(held):
+            across += room.C[i, j] * values[j]
+        more += values[i] * across
+    return more
+
+
+@inlined
 def _least_misfit(rows: Normal, active: Places, count: int, room: Scratch) -> float:
     """Misfit of the rows if all active parameters, pivots too, take whatever value suits them: none is smaller."""
     for i in range(count):
@@ -216,7 +228,7 @@ def _least_misfit(rows: Normal, active: Places, count: int, room: Scratch) -> fl
     return float(rows.level[0]) - quadratic(room.L, room.right, count, room.z)
 
 
-@inlined
+@inner
 def weigh_nodes(
     rows: Normal,
     active: Places,
@@ -261,20 +273,18 @@ def weigh_nodes(
     start = rows.level[1] + 0.5 * (fitted * LOG_2PI - cholesky(rows.A, room.fitted, fitted, room.L)) - math.log(number)
     least = _follow_pivots(rows, fitted, held, room)
     log_density = -math.log(2.0 * (nodes.high - nodes.low))
+    if not nodes.logarithmic:
+        for i in range(fitted):
+            start += math.log(unit[room.fitted[i]])
     has_variances = False
     for q in range(number):
-        misfit = least
-        for i in range(held):
-            across = 2.0 * room.node[i]
-            for j in range(held):
-                across += room.C[i, j] * nodes.values[held, q, j]
-            misfit += nodes.values[held, q, i] * across
-        value = start - 0.5 * misfit
+        value = start - 0.5 * (least + _more_misfit(nodes.values[held, q], held, room))
         for i in range(fitted):
             room.right[i] = room.x[i]
             for j in range(held):
                 room.right[i] -= room.lever[i, j] * nodes.values[held, q, j]
-            value += room.right[i] if nodes.logarithmic else math.log(unit[room.fitted[i]])
+            if nodes.logarithmic:
+                value += room.right[i]
         if not value + fitted * log_density >= floor:
             out[q] = -np.inf
             continue
@@ -289,7 +299,7 @@ def weigh_nodes(
     return int(number)
 
 
-@compiled
+@inner
 def fit_node(
     rows: Normal,
     active: Places,
@@ -321,7 +331,8 @@ def fit_node(
         theta[room.pivots[p]] = nodes.values[held, q, p]
     for p in range(held):
         variance = nodes.sd[held, q, p] ** 2
-        room.right[:fitted] = -room.lever[:fitted, p]
+        for i in range(fitted):
+            room.right[i] = -room.lever[i, p]
         for i in range(fitted):
             for j in range(fitted):
                 covariance[room.fitted[i], room.fitted[j]] += variance * room.right[i] * room.right[j]

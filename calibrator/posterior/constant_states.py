@@ -18,7 +18,7 @@ from calibrator.posterior.relative_states import take_relative
 from calibrator.posterior.small_matrices import LOG_2PI, cholesky, inverse, normal_form, sort_falling
 from calibrator.posterior.workspace import BEAM, Evidence, Law, Room
 
-__all__ = ["bits_of", "grown", "pattern_of", "sharpest", "take_pattern", "take_turn", "weigh_constants"]
+__all__ = ["bit_count", "bits_of", "grown", "pattern_of", "sharpest", "take_pattern", "take_turn", "weigh_constants"]
 
 Places = NDArray[np.int64]
 DROPPED = 15.0
@@ -28,7 +28,8 @@ GROWING = 3.0
 
 
 @inlined
-def _bit_count(bits: int) -> int:
+def bit_count(bits: int) -> int:
+    """How many bits are set."""
     count = 0
     while bits:
         bits &= bits - 1
@@ -58,13 +59,13 @@ def pattern_of(bits: int, branches: int, drifting: int) -> int:
     return hardware & ~(bits >> (branches - 1)) & drifting
 
 
-@inner
+@inlined
 def sharpest(law: Law, evidence: Evidence, j: int, room: Room) -> None:
     """Information of the constant rows if the relative parameters were known: it says which directions are open."""
     rows = law.constant_design.shape[0]
     log_determinant = _invert(evidence.constant_covariance[j], rows, room.scratch, room.precision[0])
     room.sharp.level[1] = -0.5 * (rows * LOG_2PI + log_determinant)
-    normal_form(law.constant_design, room.precision[0], room.rows, room.sharp.A, room.sharp.b)
+    normal_form(law.constant_design, room.precision[0], room.rows, room.product, room.sharp.A, room.sharp.b)
 
 
 @inner
@@ -84,7 +85,9 @@ def take_turn(law: Law, evidence: Evidence, pattern: int, room: Room) -> None:
     ``room.spread`` becomes the same times the covariance of the relative parameters.
     """
     K, n = law.branches, law.branches + 1
-    room.turned[:] = room.turn
+    for r in range(len(room.rows)):
+        for p in range(n):
+            room.turned[r, p] = room.turn[r, p]
     for k in range(K):
         if (pattern >> k) & 1:
             room.turned[k, 1 + k] -= room.rows[k]
@@ -112,23 +115,18 @@ def take_pattern(law: Law, evidence: Evidence, j: int, pattern: int, room: Room)
                 total += room.spread[r, p] * room.turned[s, p]
             whole[r, s] = whole[s, r] = total
     log_determinant = _invert(whole, rows, room.scratch, room.precision[pattern])
-    room.pattern_level[pattern, 0] = normal_form(
-        law.constant_design, room.precision[pattern], room.rows, room.patterns[pattern], room.pattern_b[pattern]
-    )
+    A, b = room.patterns[pattern], room.pattern_b[pattern]
+    misfit = normal_form(law.constant_design, room.precision[pattern], room.rows, room.product, A, b)
+    room.pattern_level[pattern, 0] = misfit
     room.pattern_level[pattern, 1] = -0.5 * (rows * LOG_2PI + log_determinant)
     room.pattern_known[pattern] = True
 
 
-@inner
-def weigh_constants(
-    law: Law, evidence: Evidence, j: int, number: int, supports: Places, room: Room, so_far: tuple[int, float, float]
-) -> tuple[int, float, float]:
-    """Take all relative states with these constant supports.
-
-    Number of states on the list, the best logarithm, and the sum of all states over the best one.
-    """
+@inlined
+def weigh_constants(law: Law, evidence: Evidence, j: int, number: int, supports: Places, room: Room) -> None:
+    """Take all relative states with these constant supports, on top of what was found so far."""
     K, Q = law.branches, room.weights.shape[0]
-    kept, best, total = so_far
+    best, total = room.best[0], room.best[1]
     hardware_bits = (1 << (K - 1)) - 1
     for bits in supports:
         room.visited[bits] = True
@@ -142,8 +140,8 @@ def weigh_constants(
             continue
         hardware, sensors, drifting = _counts(law, s)
         for bits in supports:
-            in_hardware = _bit_count(bits & hardware_bits)
-            log_prior = law.log_prior[hardware + in_hardware, sensors + _bit_count(bits) - in_hardware]
+            in_hardware = bit_count(bits & hardware_bits)
+            log_prior = law.log_prior[hardware + in_hardware, sensors + bit_count(bits) - in_hardware]
             base = log_relative + log_prior
             if base == -np.inf or base + room.sharp.level[1] < best - DROPPED:
                 continue
@@ -160,8 +158,8 @@ def weigh_constants(
                     best = value
                 if value >= best - DROPPED:
                     total += math.exp(value - best)
-                    kept = _keep(room, kept, value, m, bits, q)
-    return kept, best, total
+                    _keep(room, value, m, bits, q)
+    room.best[0], room.best[1] = best, total
 
 
 @inlined
@@ -187,17 +185,18 @@ def _weigh_support(law: Law, room: Room, bits: int, pattern: int, floor: float) 
     return weigh_nodes(normal, room.active, count, pivots, law.constant, room.scale, floor, room.scratch, room.weights)
 
 
-@inner
-def grown(law: Law, size: int, kept: int, best: float, room: Room) -> int:
+@inlined
+def grown(law: Law, size: int, room: Room) -> int:
     """Write down constant supports with one parameter more than the best ones of this size; how many they are."""
+    kept, best = room.kept[0], room.best[0]
     for i in range(kept):
         room.top_order[i] = i
-    sort_falling(room.top_log, room.top_order, kept)
+    sort_falling(room.top_log, room.top_order, kept, room.order_work)
     beam, wanted, last = 0, 0, -1
     for i in range(kept):
         place = room.top_order[i]
         bits = room.top[place, 1]
-        if _bit_count(bits) != size or bits == last:
+        if bit_count(bits) != size or bits == last:
             continue
         if beam == 0 and room.top_log[place] < best - GROWING:
             return 0
@@ -214,19 +213,18 @@ def grown(law: Law, size: int, kept: int, best: float, room: Room) -> int:
     return wanted
 
 
-@inner
-def _keep(room: Room, kept: int, value: float, m: int, bits: int, q: int) -> int:
-    """Put a state on the list of the best ones; the length of the list."""
-    if kept < len(room.top_log):
-        place = kept
-        kept += 1
+@inlined
+def _keep(room: Room, value: float, m: int, bits: int, q: int) -> None:
+    """Put a state on the list of the best ones."""
+    place = room.kept[0]
+    if place < len(room.top_log):
+        room.kept[0] += 1
     else:
         place = 0
-        for i in range(1, kept):
+        for i in range(1, len(room.top_log)):
             if room.top_log[i] < room.top_log[place]:
                 place = i
         if room.top_log[place] >= value:
-            return kept
+            return
     room.top_log[place] = value
     room.top[place, 0], room.top[place, 1], room.top[place, 2] = m, bits, q
-    return kept

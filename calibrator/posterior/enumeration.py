@@ -12,9 +12,11 @@ import math
 
 import numpy as np
 
-from calibrator.compiled import compiled, inner
+from calibrator.compiled import in_place, inlined
+from calibrator.drive import Array
 from calibrator.posterior.block_fit import Normal, fit_node
 from calibrator.posterior.constant_states import (
+    bit_count,
     bits_of,
     grown,
     pattern_of,
@@ -35,7 +37,7 @@ UNTOLD = 1e-5
 """Weight that is left when the parameters of no more states are worked out. [1]"""
 
 
-@compiled
+@in_place
 def enumerate_vehicles(law: Law, evidence: Evidence, room: Room, found: Found) -> None:
     """Find the states of all vehicles.
 
@@ -49,61 +51,56 @@ def enumerate_vehicles(law: Law, evidence: Evidence, room: Room, found: Found) -
         Becomes the result.
     """
     for j in range(len(evidence.relative)):
-        _enumerate_vehicle(law, evidence, j, room, found)
+        number = weigh_relative(law, evidence, j, room)
+        sharpest(law, evidence, j, room)
+        room.seen[:] = -1
+        room.visited[:] = False
+        room.kept[0], room.best[0], room.best[1] = 0, -np.inf, 0.0
+        supports, size = law.constant_bits, law.grown
+        while len(supports):
+            weigh_constants(law, evidence, j, number, supports, room)
+            wanted = grown(law, size, room) if size else 0
+            supports = room.wanted[:wanted]
+            size += 1
+        found.log_total[j] = room.best[0] + math.log(room.best[1])
+        found.number[j] = _write_states(law, evidence, j, room, found)
 
 
-@inner
-def _enumerate_vehicle(law: Law, evidence: Evidence, j: int, room: Room, found: Found) -> None:
-    number = weigh_relative(law, evidence, j, room)
-    sharpest(law, evidence, j, room)
-    room.seen[:] = -1
-    room.visited[:] = False
-    kept, best, total = weigh_constants(law, evidence, j, number, law.constant_bits, room, (0, -np.inf, 0.0))
-    size = law.grown
-    while size:
-        wanted = grown(law, size, kept, best, room)
-        if not wanted:
-            break
-        kept, best, total = weigh_constants(law, evidence, j, number, room.wanted[:wanted], room, (kept, best, total))
-        size += 1
-    found.log_total[j] = best + math.log(total)
-    found.number[j] = _write_states(law, evidence, j, room, kept, found)
-
-
-@inner
-def _write_states(law: Law, evidence: Evidence, j: int, room: Room, kept: int, found: Found) -> int:
+@inlined
+def _write_states(law: Law, evidence: Evidence, j: int, room: Room, found: Found) -> int:
     """Work out the parameters of the best states until next to no weight is left; how many they are."""
+    kept = room.kept[0]
     for i in range(kept):
         room.top_order[i] = i
-    sort_falling(room.top_log, room.top_order, kept)
+    sort_falling(room.top_log, room.top_order, kept, room.order_work)
     left, written = 1.0, 0
     while written < kept and left > UNTOLD:
         left -= math.exp(room.top_log[room.top_order[written]] - found.log_total[j])
         found.log_weight[j, written] = room.top_log[room.top_order[written]]
         written += 1
     # One relative state after the other, as each is worked out anew.
-    for m in range(len(room.order)):
-        taken = False
-        for i in range(written):
-            place = room.top_order[i]
-            if room.top[place, 0] == m:
-                if not taken:
-                    take_relative(law, evidence, j, room.order[m], room)
-                    room.pattern_known[:] = False
-                    taken = True
-                _write_state(law, evidence, j, room, place, found, i)
+    for i in range(written):
+        m = room.top[room.top_order[i], 0]
+        if m < 0:
+            continue
+        take_relative(law, evidence, j, room.order[m], room)
+        room.pattern_known[:] = False
+        for place in range(i, written):
+            entry = room.top_order[place]
+            if room.top[entry, 0] == m:
+                _write_state(law, evidence, j, room, entry, found, place)
+                room.top[entry, 0] = -1
     return written
 
 
-@inner
+@inlined
 def _write_state(law: Law, evidence: Evidence, j: int, room: Room, entry: int, found: Found, place: int) -> None:
     """Parameters of one state: constant ones, and relative ones as these move them.
 
     The rows were divided by the 1 + d of the state, whatever moves it: the offsets stay.
     """
-    K = law.branches
+    K, P = law.branches, law.constant_design.shape[1]
     bits, q = room.top[entry, 1], room.top[entry, 2]
-    rows, P = law.constant_design.shape
     drifting = 0
     for k in range(K):
         if room.theta[1 + k] != 0.0:
@@ -112,36 +109,38 @@ def _write_state(law: Law, evidence: Evidence, j: int, room: Room, entry: int, f
     take_pattern(law, evidence, j, pattern, room)
     take_turn(law, evidence, pattern, room)
     normal = Normal(room.patterns[pattern], room.pattern_b[pattern], room.pattern_level[pattern])
-    count = bits_of(bits, room.active)
-    theta, C, precision = room.constant_theta, room.constant_covariance, room.precision[pattern]
-    fit_node(normal, room.active, count, room.seen[bits], law.constant, q, room.scratch, theta, C)
+    count, pivots = bits_of(bits, room.active), room.seen[bits]
+    theta, C = room.constant_theta, room.constant_covariance
+    fit_node(normal, room.active, count, pivots, law.constant, q, room.scratch, theta, C)
     for p in range(P):
         found.constant[j, place, p] = theta[p] * room.scale[p]
         found.constant_sd[j, place, p] = math.sqrt(C[p, p]) * room.scale[p]
-    fitted = 0
-    for i in range(count):
-        if not (room.seen[bits] >> i) & 1:
-            fitted += 1
-    for r in range(rows):
+    for r in range(len(room.left)):
         room.left[r] = room.rows[r]
         for p in range(P):
             room.left[r] -= law.constant_design[r, p] * theta[p]
+    fitted = count - bit_count(pivots)
     for p in range(K + 1):
-        # What the constant rows say of this parameter: the residual through the gain, and as much less variance.
-        moved, told = 0.0, 0.0
-        for r in range(rows):
-            total = 0.0
-            for t in range(rows):
-                total += precision[r, t] * room.spread[t, p]
-            room.weighted[r] = total
-            moved -= total * room.left[r]
-            told += total * room.spread[r, p]
-        for i in range(fitted):
-            total = 0.0
-            for r in range(rows):
-                total += law.constant_design[r, room.scratch.fitted[i]] * room.weighted[r]
-            room.projected[i] = total
-        told -= quadratic(room.scratch.L, room.projected, fitted, room.scratch.z)
+        moved, told = _told_by_constants(law, room, room.precision[pattern], p, fitted)
         factor = (1.0 + room.parameters[p]) * math.exp(min(max(moved, -MOST_MOVED), MOST_MOVED))
         found.relative[j, place, p] = factor - 1.0
         found.relative_sd[j, place, p] = math.sqrt(max(room.covariance[p, p] - told, 0.0)) * factor
+
+
+@inlined
+def _told_by_constants(law: Law, room: Room, precision: Array, p: int, fitted: int) -> tuple[float, float]:
+    """By how much what is left of the constant rows moves a relative parameter, and the variance that it takes away."""
+    moved, told, rows = 0.0, 0.0, len(room.left)
+    for r in range(rows):
+        total = 0.0
+        for t in range(rows):
+            total += precision[r, t] * room.spread[t, p]
+        room.weighted[r] = total
+        moved -= total * room.left[r]
+        told += total * room.spread[r, p]
+    for i in range(fitted):
+        total = 0.0
+        for r in range(rows):
+            total += law.constant_design[r, room.scratch.fitted[i]] * room.weighted[r]
+        room.projected[i] = total
+    return moved, told - quadratic(room.scratch.L, room.projected, fitted, room.scratch.z)

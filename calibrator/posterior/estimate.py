@@ -1,12 +1,12 @@
 """The default estimator: from the evidence of a fleet to the posterior of each vehicle."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
+from calibrator.evidence.block_regression import products
 from calibrator.evidence.rows import FleetRows
 from calibrator.faults import Faults, Index
 from calibrator.posterior.decision import best_estimate, harm_probability
@@ -207,8 +207,7 @@ def estimate_vehicles(rows: FleetRows, moments: Moments, law: FleetLaw, *, full_
     if not full_scale_a > 0.0:
         raise FleetError(f"full scale must be positive, not {full_scale_a:g} A")
     states = mean_states([enumerate_states(rows, each.prior, each.spread) for each in law.drawn])
-    vehicles = [_of_vehicle(states, j, law, moments=moments, full_scale_a=full_scale_a) for j in range(len(rows))]
-    return _joined(vehicles, rows, states, law.hyperparameters, full_scale_a)
+    return _decided(states, rows, law, moments=moments, full_scale_a=full_scale_a)
 
 
 def _require_fit(rows: FleetRows, moments: Moments) -> None:
@@ -223,61 +222,57 @@ def _require_fit(rows: FleetRows, moments: Moments) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Vehicle:
-    state: int
-    confidence: float
-    variance: Array
-    harm: Array
-
-
-def _of_vehicle(states: States, j: int, law: FleetLaw, *, moments: Moments, full_scale_a: float) -> _Vehicle:
-    prior = law.hyperparameters.prior
-    state, confidence = best_estimate(states, j, least=(prior.relative.low, prior.constant.low))
-    drift, offset = states.drift[j, state], states.offset[j, state]
-    distance = np.concatenate([states.drift[j] - drift, states.offset[j] - offset], axis=1)
-    sd = np.concatenate([states.relative_sd[j, :, 1:], states.constant_sd[j, :, states.branches - 1 :]], axis=1)
-    variance = np.asarray(states.weight[j] @ (distance**2 + sd**2))
-    mean, mean_square = _true_moments(moments, law, j, drift=drift, offset_a=offset * full_scale_a)
-    mean, mean_square = mean / full_scale_a, mean_square / full_scale_a**2
-    harm = harm_probability(states, j, drift, offset, mean=mean, mean_square=mean_square)
-    return _Vehicle(state, confidence, variance, harm)
-
-
-def _true_moments(moments: Moments, law: FleetLaw, j: int, *, drift: Array, offset_a: Array) -> tuple[Array, Array]:
-    """Moments of the true currents on the vehicle's own drives and on the fleet's usual one, each of shape (2, K)."""
-    mean, square = moments.mean_a[j], moments.mean_square_a2[j]
+def _true_moments(moments: Moments, law: FleetLaw, *, drift: Array, offset_a: Array) -> tuple[Array, Array]:
+    """Moments of the true currents on each vehicle's own drives and on the fleet's usual one, both (N, 2, K)."""
+    mean, square = moments.mean_a, moments.mean_square_a2
     own_mean = (mean - offset_a) / (1.0 + drift)
     own_square = np.maximum((square - 2.0 * offset_a * mean + offset_a**2) / (1.0 + drift) ** 2, own_mean**2)
-    return np.stack([own_mean, law.usual_mean_a]), np.stack([own_square, law.usual_mean_square_a2])
+    usual = (law.usual_mean_a, law.usual_mean_square_a2)
+    usual_mean, usual_square = (np.broadcast_to(values, mean.shape) for values in usual)
+    return np.stack([own_mean, usual_mean], axis=1), np.stack([own_square, usual_square], axis=1)
 
 
-def _joined(
-    vehicles: Sequence[_Vehicle], rows: FleetRows, states: States, hyperparameters: Hyperparameters, full_scale_a: float
+def _decided(
+    states: States, rows: FleetRows, law: FleetLaw, *, moments: Moments, full_scale_a: float
 ) -> FleetPosterior:
-    K, N = states.branches, len(vehicles)
-    chosen = (np.arange(N), [vehicle.state for vehicle in vehicles])
+    """Estimate of each vehicle, and what the posterior says of it."""
+    K, prior = states.branches, law.hyperparameters.prior
+    state, confidence = best_estimate(states, least=(prior.relative.low, prior.constant.low))
+    chosen = (np.arange(len(states)), state)
+    drift, offset = states.drift[chosen], states.offset[chosen]
+    mean_a, square_a2 = _true_moments(moments, law, drift=drift, offset_a=offset * full_scale_a)
+    mean, square = mean_a / full_scale_a, square_a2 / full_scale_a**2
     free = states.constant[chosen][:, : K - 1] * full_scale_a
-    sd = np.sqrt([vehicle.variance for vehicle in vehicles])
     faulty = (states.drift != 0.0) | (states.offset != 0.0)
     return FleetPosterior(
         faults=Faults(
             hardware_drift=states.relative[chosen][:, 0],
             hardware_offset_a=np.column_stack([free, -free.sum(axis=1)]),
-            drift=states.drift[chosen],
-            offset_a=states.offset[chosen] * full_scale_a,
+            drift=drift,
+            offset_a=offset * full_scale_a,
         ),
-        confidence=np.array([vehicle.confidence for vehicle in vehicles]),
-        drift_sd=sd[:, :K],
-        offset_sd_a=sd[:, K:] * full_scale_a,
-        sensor_fault=np.einsum("ns,nsk->nk", states.weight, faulty),
+        confidence=confidence,
+        drift_sd=_distance_rms(states.weight, states.drift, states.relative_sd[:, :, 1:], drift),
+        offset_sd_a=_distance_rms(states.weight, states.offset, states.constant_sd[:, :, K - 1 :], offset)
+        * full_scale_a,
+        sensor_fault=_expected(states.weight, faulty),
         hardware_fault=np.sum(states.weight * states.hardware, axis=1),
-        harm=np.stack([vehicle.harm for vehicle in vehicles]),
+        harm=harm_probability(states, drift, offset, mean=mean, mean_square=square),
         identifiable=_identifiable(rows),
-        hyperparameters=hyperparameters,
+        hyperparameters=law.hyperparameters,
         states=states,
         order=tuple(range(K)),
     )
+
+
+def _distance_rms(weight: Array, mean: Array, sd: Array, estimate: Array) -> Array:
+    """Root mean square of the posterior's distance from the estimate (N, K)."""
+    return np.asarray(np.sqrt(_expected(weight, (mean - estimate[:, None]) ** 2 + sd**2)))
+
+
+def _expected(weight: Array, values: Array | Mask) -> Array:
+    """Mean over the states, shape (N, K) of (N, S) and (N, S, K)."""
+    return products(np.swapaxes(values, 1, 2), weight)
 
 
 def _identifiable(rows: FleetRows) -> Mask:

@@ -9,13 +9,14 @@ The likelihood has several maxima (a cluster of faulty vehicles can stand for th
 several starts and the highest is taken.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
+from calibrator.compiled import in_place, inner
 from calibrator.drive import Array
 from calibrator.evidence.rows import FleetRows
 from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
@@ -27,6 +28,7 @@ from calibrator.posterior.model_spread import (
     next_spread,
 )
 from calibrator.posterior.slab import WIDEST, Slab
+from calibrator.posterior.small_matrices import log_mass
 from calibrator.posterior.states import States, enumerate_states
 from calibrator.random_streams import Purpose, random_stream
 
@@ -234,18 +236,15 @@ def _next_slab(parameters: Array, sd: Array, weight: Array, slab: Slab) -> Slab:
     Both are then moved outwards by what the extremes of so many draws of a uniform distribution fall short of its ends.
     """
     parameters, sd, weight = parameters[:, :USED_STATES], sd[:, :USED_STATES], weight[:, :USED_STATES]
-    told = parameters != 0.0
     faults = _faults(parameters, weight)
     if faults < 1.0:
         return slab
-    before = np.where(told, slab.log_mass(parameters, sd), 0.0).sum(axis=2)
+    before = np.where(parameters != 0.0, slab.log_mass(parameters, sd), 0.0).sum(axis=2)
     others = np.log(np.maximum(weight, np.finfo(float).tiny)) - before
+    parameters, sd = np.ascontiguousarray(parameters), np.ascontiguousarray(sd)
 
     def log_evidence(candidate: Slab) -> float:
-        mass = np.logaddexp(candidate.log_mass(parameters[told], sd[told]), LOG_LEAST_DENSITY)
-        after = np.zeros(parameters.shape)
-        after[told] = mass
-        return float(np.sum(logsumexp(others + after.sum(axis=2), axis=1)))
+        return _log_evidence(others, parameters, sd, candidate.low, candidate.high)
 
     for coarse in (True, False):
         lows, highs = (LOWS, HIGHS) if coarse else (slab.low * FINE, slab.high * FINE)
@@ -253,3 +252,32 @@ def _next_slab(parameters: Array, sd: Array, weight: Array, slab: Slab) -> Slab:
         slab = max([slab, *(Slab(slab.low, float(x)) for x in highs if x > 1.4 * slab.low)], key=log_evidence)
     margin = (slab.high - slab.low) / (faults + 1.0)
     return Slab(max(slab.low - margin, WIDEST.low), min(slab.high + margin, WIDEST.high))
+
+
+@in_place
+def _log_evidence(others: Array, parameters: Array, sd: Array, low: float, high: float) -> float:
+    """Logarithm of the evidence of N vehicles under a slab.
+
+    ``others`` (N, S) is what the states owe to all else, ``parameters`` and ``sd`` (N, S, P) are zero where not active.
+    """
+    total = 0.0
+    for j in range(len(others)):
+        best, sum_ = -np.inf, 0.0
+        for s in range(others.shape[1]):
+            value = others[j, s]
+            for p in range(parameters.shape[2]):
+                if parameters[j, s, p] != 0.0:
+                    value += _log_density(parameters[j, s, p], sd[j, s, p], low, high)
+            if value > best:
+                best, sum_ = value, sum_ * math.exp(best - value) + 1.0
+            else:
+                sum_ += math.exp(value - best)
+        total += best + math.log(sum_)
+    return total
+
+
+@inner
+def _log_density(mean: float, sd: float, low: float, high: float) -> float:
+    """Of one parameter under the slab; not below the least one."""
+    mass = log_mass(mean, sd, low, high)
+    return max(mass, LOG_LEAST_DENSITY) + math.log1p(math.exp(-abs(mass - LOG_LEAST_DENSITY)))

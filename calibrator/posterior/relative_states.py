@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from calibrator.compiled import inner
+from calibrator.compiled import inlined, inner
+from calibrator.evidence.rows import MOST_TURN
 from calibrator.posterior.block_fit import fit_node, open_directions, weigh_nodes
 from calibrator.posterior.small_matrices import LOG_2PI, normal_form, sort_falling
 from calibrator.posterior.workspace import Evidence, Law, Room
@@ -13,22 +14,21 @@ __all__ = ["take_relative", "weigh_relative"]
 
 POSSIBLE_DRIFT = (-0.9, 9.0)
 """Beyond it the scale between measured and true currents vanishes or explodes. [1]"""
-MOST_TURN = 3.0
-"""Largest logarithm by which a ratio can be off."""
 NEGLIGIBLE = 25.0
 """Relative states so far below the best (logarithm) are dropped: constant rows hardly ever make that good. [1]"""
 
 
-@inner
+@inlined
 def weigh_relative(law: Law, evidence: Evidence, j: int, room: Room) -> int:
     """Write down the logarithms of all relative states and their order; how many go on."""
     Q = room.weights.shape[0]
     normal = room.normal
     rows = evidence.relative.shape[1]
     normal.level[0] = normal_form(
-        law.relative_design, evidence.relative_precision[j], evidence.relative[j], normal.A, normal.b
+        law.relative_design, evidence.relative_precision[j], evidence.relative[j], room.product, normal.A, normal.b
     )
     normal.level[1] = -0.5 * (rows * LOG_2PI + evidence.relative_log_determinant[j])
+    _told_turn(law, evidence, j, room)
     best = -np.inf
     room.relative_log[:] = -np.inf
     for s in range(len(law.relative_size)):
@@ -45,8 +45,22 @@ def weigh_relative(law: Law, evidence: Evidence, j: int, room: Room) -> int:
         if room.relative_log[state] >= best - NEGLIGIBLE:
             room.order[kept] = state
             kept += 1
-    sort_falling(room.relative_log, room.order, kept)
+    sort_falling(room.relative_log, room.order, kept, room.order_work)
     return min(kept, law.most_relative)
+
+
+@inlined
+def _told_turn(law: Law, evidence: Evidence, j: int, room: Room) -> None:
+    """How the constant rows change with the relative parameters through what the relative rows tell of their errors."""
+    K, rows_r, rows_c = law.branches, evidence.relative.shape[1], evidence.constant.shape[1]
+    for r in range(rows_c):
+        for p in range(K + 1):
+            room.told_turn[r, p] = 0.0
+            for i in range(rows_r):
+                room.told_turn[r, p] += evidence.carry[j, r, i] * law.relative_design[i, p]
+            if r <= K:
+                for i in range(2 * K - 1):
+                    room.told_turn[r, p] -= evidence.lever[j, r, i] * law.relative_design[i, p]
 
 
 @inner
@@ -78,15 +92,13 @@ def take_relative(law: Law, evidence: Evidence, j: int, state: int, room: Room) 
             total -= evidence.carry[j, r, i] * room.residual[i]
         room.rows[r] = total
         for p in range(K + 1):
-            room.turn[r, p] = 0.0
-            for i in range(rows_r):
-                room.turn[r, p] += evidence.carry[j, r, i] * law.relative_design[i, p]
+            room.turn[r, p] = room.told_turn[r, p]
     if evidence.turning:
         _turn(law, evidence, j, room)
     return float(room.relative_log[state] - law.best_share[s] - log_change)
 
 
-@inner
+@inlined
 def _turn(law: Law, evidence: Evidence, j: int, room: Room) -> None:
     """What turning about the means adds to the constant rows and their derivative, as :class:`LineMeans` tells."""
     K = law.branches
@@ -95,8 +107,6 @@ def _turn(law: Law, evidence: Evidence, j: int, room: Room) -> None:
             lever = evidence.lever[j, r, i]
             if lever != 0.0:
                 room.rows[r] += lever * room.residual[i]
-                for p in range(K + 1):
-                    room.turn[r, p] -= lever * law.relative_design[i, p]
     for k in range(K):
         true = (1.0 + room.parameters[0]) * evidence.model[j, k]
         room.rows[k] += true * math.expm1(min(room.residual[k], MOST_TURN))

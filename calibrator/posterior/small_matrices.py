@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.compiled import compiled, inner
+from calibrator.compiled import inner
 from calibrator.drive import Array
 from calibrator.posterior.slab import LEAST_DEVIATION, NEVER
 
@@ -22,16 +22,18 @@ __all__ = [
 ]
 
 LOG_2PI = float(np.log(2.0 * np.pi))
-TINY_PIVOT = 1e-300
+TINY_PIVOT = 1e-150
 """Instead of a pivot that rounding made negative."""
+SMALL, LARGE = 1e-150, 1e150
+"""Between these a product of pivots is still a number after one more; beyond them its logarithm is taken first."""
 _ROOT_HALF = math.sqrt(0.5)
 _LEAST_MASS = float(np.finfo(float).tiny)
 
 
-@compiled
+@inner
 def cholesky(A: Array, active: NDArray[np.int64], count: int, L: Array) -> float:
     """Factor the rows and columns ``active[:count]`` of A into L L^T, in place; the logarithm of their determinant."""
-    log_determinant = 0.0
+    log_determinant, product = 0.0, 1.0
     for i in range(count):
         row = active[i]
         for j in range(i + 1):
@@ -41,13 +43,16 @@ def cholesky(A: Array, active: NDArray[np.int64], count: int, L: Array) -> float
             if i == j:
                 total = max(total, TINY_PIVOT)
                 L[i, i] = math.sqrt(total)
-                log_determinant += math.log(total)
+                if not SMALL < product < LARGE:
+                    log_determinant += math.log(product)
+                    product = 1.0
+                product *= total
             else:
                 L[i, j] = total / L[j, j]
-    return log_determinant
+    return log_determinant + math.log(product)
 
 
-@compiled
+@inner
 def quadratic(L: Array, b: Array, count: int, z: Array) -> float:
     """b^T (L L^T)^-1 b; z becomes L^-1 b."""
     squared = 0.0
@@ -60,7 +65,7 @@ def quadratic(L: Array, b: Array, count: int, z: Array) -> float:
     return squared
 
 
-@compiled
+@inner
 def solution(L: Array, z: Array, count: int, x: Array) -> None:
     """X becomes L^-T z, the solution of L L^T x = b if z is L^-1 b."""
     for i in range(count - 1, -1, -1):
@@ -70,7 +75,7 @@ def solution(L: Array, z: Array, count: int, x: Array) -> None:
         x[i] = total / L[i, i]
 
 
-@compiled
+@inner
 def inverse(L: Array, count: int, work: Array, C: Array) -> None:
     """C becomes (L L^T)^-1; ``work`` is of the same shape."""
     for j in range(count):
@@ -87,7 +92,7 @@ def inverse(L: Array, count: int, work: Array, C: Array) -> None:
             C[i, j] = C[j, i] = total
 
 
-@compiled
+@inner
 def variances(L: Array, count: int, work: Array, out: Array) -> None:
     """``out`` becomes the diagonal of (L L^T)^-1."""
     for j in range(count):
@@ -100,32 +105,36 @@ def variances(L: Array, count: int, work: Array, out: Array) -> None:
             out[j] += work[i, j] * work[i, j]
 
 
-@compiled
-def normal_form(X: Array, R: Array, y: Array, A: Array, b: Array) -> float:
-    """A becomes X^T R X and b becomes X^T R y, R the precision; y^T R y."""
+@inner
+def normal_form(X: Array, R: Array, y: Array, work: Array, A: Array, b: Array) -> float:
+    """A becomes X^T R X and b becomes X^T R y, R the precision; y^T R y. ``work`` has at least the shape of X."""
     rows, P = X.shape
-    c = 0.0
-    b[:P] = 0.0
-    A[:P, :P] = 0.0
-    for r in range(rows):
-        weighted = 0.0
+    for q in range(P):
+        for r in range(rows):
+            work[r, q] = 0.0
         for s in range(rows):
-            weighted += R[r, s] * y[s]
-        c += y[r] * weighted
-        for p in range(P):
-            if X[r, p] != 0.0:
-                b[p] += X[r, p] * weighted
-                for s in range(rows):
-                    if R[r, s] != 0.0:
-                        for q in range(P):
-                            A[p, q] += X[r, p] * R[r, s] * X[s, q]
+            if X[s, q] != 0.0:
+                for r in range(rows):
+                    work[r, q] += R[r, s] * X[s, q]
+        b[q] = 0.0
+        for r in range(rows):
+            b[q] += work[r, q] * y[r]
+        for p in range(q + 1):
+            total = 0.0
+            for r in range(rows):
+                if X[r, p] != 0.0:
+                    total += X[r, p] * work[r, q]
+            A[p, q] = A[q, p] = total
+    c = 0.0
+    for r in range(rows):
+        for s in range(rows):
+            c += y[r] * R[r, s] * y[s]
     return c
 
 
-@compiled
-def sort_falling(values: Array, order: NDArray[np.int64], count: int) -> None:
-    """Put the first so many positions in order of falling values; equal ones keep theirs."""
-    work = np.empty(count, np.int64)
+@inner
+def sort_falling(values: Array, order: NDArray[np.int64], count: int, work: NDArray[np.int64]) -> None:
+    """Put the first so many positions in order of falling values; equal ones keep theirs; ``work`` is as long."""
     width = 1
     while width < count:
         for begin in range(0, count, 2 * width):
@@ -151,10 +160,12 @@ def normal_mass(low: float, high: float) -> float:
     return 0.5 * (math.erfc(-high * _ROOT_HALF) - math.erfc(-low * _ROOT_HALF))
 
 
-@compiled
+@inner
 def log_mass(mean: float, sd: float, low: float, high: float) -> float:
     """As :meth:`calibrator.posterior.slab.Slab.log_mass`, of one value."""
     spread, magnitude = max(sd, LEAST_DEVIATION), abs(mean)
+    if low + NEVER * spread < magnitude < high - NEVER * spread:
+        return -math.log(2.0 * (high - low))
     mass = normal_mass((low - magnitude) / spread, (high - magnitude) / spread)
     if spread * NEVER > low + magnitude:
         mass += normal_mass((low + magnitude) / spread, (high + magnitude) / spread)

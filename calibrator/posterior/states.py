@@ -2,10 +2,10 @@
 
 A state is a support, and a node where the rows leave directions of it open. Up to :data:`EXACT_BRANCHES` branches all
 supports are looked at. With more branches the sum over supports is approximate. All relative supports are looked at,
-and of their states the best go on (:data:`calibrator.posterior.joint_evidence.MOST_RELATIVE`). With each of these go
+and of their states the best go on (:data:`calibrator.posterior.workspace.MOST_RELATIVE`). With each of these go
 the constant supports without hardware offsets, and those of at most
 :data:`calibrator.posterior.supports.MOST_CONSTANT` parameters. Where one of the latter size is a likely explanation,
-the best ones of its size (:data:`BEAM`) are grown by one parameter, and so on.
+the best ones of its size (:data:`calibrator.posterior.workspace.BEAM`) are grown by one parameter, and so on.
 """
 
 from collections.abc import Sequence

@@ -85,7 +85,12 @@ class Found(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Intermediate results of one vehicle; patterns are those of drifts that scale hardware offsets."""
+    """Intermediate results of one vehicle; patterns are those of drifts that scale hardware offsets.
+
+    ``told_turn`` is the derivative of the constant rows by the relative parameters as far as it is that of all states.
+    ``kept`` (1,) counts the states on the list ``top``; ``best`` is the largest logarithm so far, and the sum of all
+    states over the best one.
+    """
 
     scratch: Scratch
     active: Places
@@ -93,12 +98,15 @@ class Room(NamedTuple):
     weights: Array
     relative_log: Array
     order: Places
+    order_work: Places
     theta: Array
     covariance: Array
     parameters: Array
     scale: Array
     residual: Array
+    product: Array
     rows: Array
+    told_turn: Array
     turn: Array
     turned: Array
     spread: Array
@@ -117,6 +125,8 @@ class Room(NamedTuple):
     left: Array
     weighted: Array
     projected: Array
+    kept: Places
+    best: Array
     top: Places
     top_log: Array
     top_order: Places
@@ -212,12 +222,15 @@ def room_of(law: Law) -> Room:
         weights=np.zeros(Q),
         relative_log=np.zeros(S * Q),
         order=np.zeros(S * Q, np.int64),
+        order_work=np.zeros(max(S * Q, MOST_STATES), np.int64),
         theta=np.zeros(n),
         covariance=np.zeros((n, n)),
         parameters=np.zeros(n),
         scale=np.zeros(P),
         residual=np.zeros(3 * K - 1),
+        product=np.zeros((max(3 * K - 1, rows), max(n, P))),
         rows=np.zeros(rows),
+        told_turn=np.zeros((rows, n)),
         turn=np.zeros((rows, n)),
         turned=np.zeros((rows, n)),
         spread=np.zeros((rows, n)),
@@ -236,6 +249,8 @@ def room_of(law: Law) -> Room:
         left=np.zeros(rows),
         weighted=np.zeros(rows),
         projected=np.zeros(rows),
+        kept=np.zeros(1, np.int64),
+        best=np.zeros(2),
         top=np.zeros((MOST_STATES, 3), np.int64),
         top_log=np.zeros(MOST_STATES),
         top_order=np.zeros(MOST_STATES, np.int64),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from calibrator.compiled import compiled
+from calibrator.compiled import in_place
 from calibrator.drive import Array
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, constant_design, relative_design
 from calibrator.posterior.block_fit import (
@@ -38,7 +38,7 @@ class Fit:
     covariance: Array
 
 
-@compiled
+@in_place
 def weigh(
     rows: Normal,
     active: NDArray[np.int64],
@@ -50,6 +50,25 @@ def weigh(
     out: Array,
 ) -> int:
     return weigh_nodes(rows, active, len(active), pivots, nodes, unit, floor, room, out)
+
+
+@in_place
+def find_pivots(A: Array, active: NDArray[np.int64], spacing: Array, room: Scratch) -> int:
+    return open_directions(A, active, len(active), spacing, room)
+
+
+@in_place
+def fit_at_node(
+    rows: Normal,
+    active: NDArray[np.int64],
+    pivots: int,
+    nodes: SlabNodes,
+    q: int,
+    room: Scratch,
+    theta: Array,
+    C: Array,
+) -> None:
+    fit_node(rows, active, len(active), pivots, nodes, q, room, theta, C)
 
 
 def fitted(
@@ -71,11 +90,11 @@ def fitted(
     rows = Normal(design.T @ precision @ design, design.T @ precision @ y, np.array([y @ precision @ y, density]))
     room, out, places = scratch_of(max(design.shape)), np.zeros(nodes.values.shape[1]), np.array(active, np.int64)
     information = design.T @ np.linalg.inv(R if sharp is None else sharp) @ design
-    pivots = open_directions(information, places, len(places), nodes.spacing, room)
+    pivots = find_pivots(information, places, nodes.spacing, room)
     count = weigh(rows, places, pivots, nodes, unit, floor, room, out)
     theta, C = np.zeros((count, P)), np.zeros((count, P, P))
     for q in range(count):
-        fit_node(rows, places, len(places), pivots, nodes, q, room, theta[q], C[q])
+        fit_at_node(rows, places, pivots, nodes, q, room, theta[q], C[q])
     return Fit(out[:count], np.expm1(theta) if scale is None else theta * unit, C)
 
 
