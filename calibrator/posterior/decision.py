@@ -164,7 +164,8 @@ def harm_probability(states: States, drift: Array, offset: Array, *, mean: Array
     harm = np.zeros(drift.shape)
     estimate, moments = np.stack([drift, offset], axis=2), np.stack([mean, mean_square], axis=3)
     _sum_harm(*_spread_states(states), estimate, moments, _STEPS, harm)
-    dropped = np.maximum(1.0 - states.weight.sum(axis=1), 0.0)[:, None]
+    kept = np.cumsum(states.weight, axis=1)[:, -1]  # one after the other: states of weight zero change no digit
+    dropped = np.maximum(1.0 - kept, 0.0)[:, None]
     changed = (drift != 0.0) | (offset != 0.0)
     return np.where(changed, np.minimum(harm + dropped, 1.0), 0.0)
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
-from calibrator.evidence.block_regression import products
 from calibrator.evidence.rows import FleetRows
 from calibrator.faults import Faults, Index
 from calibrator.posterior.decision import best_estimate, harm_probability
@@ -256,7 +255,7 @@ def _decided(
         offset_sd_a=_distance_rms(states.weight, states.offset, states.constant_sd[:, :, K - 1 :], offset)
         * full_scale_a,
         sensor_fault=_expected(states.weight, faulty),
-        hardware_fault=np.sum(states.weight * states.hardware, axis=1),
+        hardware_fault=_expected(states.weight, states.hardware[:, :, None])[:, 0],
         harm=harm_probability(states, drift, offset, mean=mean, mean_square=square),
         identifiable=_identifiable(rows),
         hyperparameters=law.hyperparameters,
@@ -271,8 +270,11 @@ def _distance_rms(weight: Array, mean: Array, sd: Array, estimate: Array) -> Arr
 
 
 def _expected(weight: Array, values: Array | Mask) -> Array:
-    """Mean over the states, shape (N, K) of (N, S) and (N, S, K)."""
-    return products(np.swapaxes(values, 1, 2), weight)
+    """Mean over the states, shape (N, K) of (N, S) and (N, S, K).
+
+    One state after the other: those with which others of the fleet are filled up, of weight zero, change no digit.
+    """
+    return np.asarray(np.cumsum(weight[:, :, None] * values, axis=1)[:, -1])
 
 
 def _identifiable(rows: FleetRows) -> Mask:

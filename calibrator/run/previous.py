@@ -12,12 +12,14 @@ from calibrator.options import Method
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.results import PARTS, chunk_parameters, read_run
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import VehicleParameters, decode_parameters, read_parameters
+from ecu_node.parameters import BranchParameters, VehicleParameters, decode_parameters, read_parameters
 
 __all__ = ["PreviousResult", "moved_sensors", "require_previous"]
 
 SURE = 4.0
-"""Standard deviations from which on a sensor has moved. [1]"""
+"""Standard deviations within which two values are one. [1]"""
+LEAST_PROBABILITY = 1e-3
+"""Of the explanations near the earlier faults: below, a sensor has moved. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,18 +72,16 @@ def require_previous(folder: Path, database: VehicleDatabase, branches: Sequence
 
 
 def moved_sensors(
-    before: VehicleParameters, now: FleetPosterior, j: int, branches: Sequence[str], *, full_scale_a: float
+    before: VehicleParameters, now: FleetPosterior, branches: Sequence[str], *, full_scale_a: float
 ) -> dict[str, str]:
-    """Sensors whose faults differ from earlier ones by more than both are unsure.
+    """Sensors that have moved: the earlier faults of a vehicle are none of the explanations of its new drives.
 
     Parameters
     ----------
     before : VehicleParameters
-        Earlier parameters of a vehicle.
+        Earlier parameters of the vehicle.
     now : FleetPosterior
-        From drives that came since, and from these alone.
-    j : int
-        Position of the vehicle in it.
+        Of the vehicle, from drives that came since and from these alone.
     branches : sequence of str
         Names of the K branches.
     full_scale_a : float
@@ -90,21 +90,24 @@ def moved_sensors(
     Returns
     -------
     dict of str to str
-        What has moved from where to where, by branch.
+        What has moved from where to where, by branch; nothing if the earlier faults still explain the vehicle.
     """
-    found: dict[str, str] = {}
-    for k, name in enumerate(branches):
-        old = before.branches[name]
-        if not (old.identifiable and now.identifiable[j, k]) or old.drift_sd is None or old.offset_sd_a is None:
-            continue
-        drift, offset_a = float(now.faults.drift[j, k]), float(now.faults.offset_a[j, k])
-        doubt = np.sqrt(old.drift_sd**2 + now.drift_sd[j, k] ** 2 + TRUSTED_DRIFT_SD**2)
-        doubt_a = np.sqrt(old.offset_sd_a**2 + now.offset_sd_a[j, k] ** 2 + (TRUSTED_OFFSET_SD * full_scale_a) ** 2)
-        texts = []
-        if abs(drift - old.drift) > SURE * doubt:
-            texts.append(f"drift {old.drift:+.2%} -> {drift:+.2%}")
-        if abs(offset_a - old.offset_a) > SURE * doubt_a:
-            texts.append(f"offset {old.offset_a:+.2f} A -> {offset_a:+.2f} A")
-        if texts:
-            found[name] = ", ".join(texts)
-    return found
+    old = [before.branches[branches[k]] for k in now.order]
+    scale = np.repeat([1.0, full_scale_a], len(old))
+    value = np.array([*(item.drift for item in old), *(item.offset_a for item in old)]) / scale
+    sd = np.array([*(item.drift_sd or 0.0 for item in old), *(item.offset_sd_a or 0.0 for item in old)]) / scale
+    accuracy = np.repeat([TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD], len(old))
+    states, K = now.states, len(old)
+    found = np.concatenate([states.drift[0], states.offset[0]], axis=1)
+    found_sd = np.concatenate([states.relative_sd[0][:, 1:], states.constant_sd[0][:, K - 1 :]], axis=1)
+    apart = np.abs(found - value) / np.sqrt(found_sd**2 + sd**2 + accuracy**2)
+    if states.weight[0] @ (apart <= SURE).all(axis=1) >= LEAST_PROBABILITY:
+        return {}
+    best = apart[int(np.argmax(states.weight[0]))]
+    moved = [branches[now.order[int(place) % K]] for place in np.flatnonzero(best > SURE)]
+    return {name: _change(before.branches[name], now, branches.index(name)) for name in dict.fromkeys(moved)}
+
+
+def _change(old: BranchParameters, now: FleetPosterior, k: int) -> str:
+    drift, offset_a = now.faults.drift[0, k], now.faults.offset_a[0, k]
+    return f"drift {old.drift:+.2%} -> {drift:+.2%}, offset {old.offset_a:+.2f} A -> {offset_a:+.2f} A"

@@ -100,7 +100,7 @@ def _what_holds(
     except _BAD_VEHICLE:
         return everything
     scale_a = task.identity.database.layout.full_scale_a
-    moved = moved_sensors(before, posterior, 0, task.branches, full_scale_a=scale_a)
+    moved = moved_sensors(before, posterior, task.branches, full_scale_a=scale_a)
     found.moved |= {(before.vehicle, branch): text for branch, text in moved.items()}
     return recent if moved else everything
 

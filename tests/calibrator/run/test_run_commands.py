@@ -129,16 +129,16 @@ def test_since_an_earlier_result_only_those_who_drove_are_calibrated(
 ) -> None:
     shutil.copytree(store.url, tmp_path / "store")
     grown = SummaryStore(storage=type(store.storage)(url=str(tmp_path / "store")), identity=store.identity)
-    bucket = grown.bucket_of("V007")
+    bucket = grown.bucket_of("V009")
     records = grown.read(bucket)
-    (new,) = summaries_of(faults_of_vehicle(7, drift=0.08), Conditions(model_error_a=0.5), seed=5)
-    grown.write(bucket, {**records, "V007": [*records["V007"], record_of("V007", new, ("d2",))]})
+    (new,) = summaries_of(faults_of_vehicle(9, drift=0.08), Conditions(model_error_a=0.5), seed=5)
+    grown.write(bucket, {**records, "V009": [*records["V009"], record_of("V009", new, ("d2",))]})
     run = calibrate(grown.url, tmp_path / "out", "--since", result, "--workers", 1)
     assert run.returncode == 0, run.stderr
     assert "moved since the earlier result:" in run.stdout
-    assert "V007: battery drift" in run.stdout
+    assert "V009: battery drift" in run.stdout
     before, after = contents(result / "params"), contents(tmp_path / "out" / "params")
-    assert [name for name in before if before[name] != after[name]] == ["V007.json"]
+    assert [name for name in before if before[name] != after[name]] == ["V009.json"]
 
 
 def test_since_what_is_no_result_is_refused(store: SummaryStore, tmp_path: Path) -> None:

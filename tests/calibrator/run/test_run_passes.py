@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -50,8 +50,8 @@ def texts(chunk: ChunkResult) -> dict[str, bytes]:
     return dict(chunk_parameters(chunk.parameters))
 
 
-def rows(chunk: ChunkResult) -> list[dict[str, object]]:
-    found: list[dict[str, object]] = pq.read_table(pa.BufferReader(chunk.rows)).to_pylist()
+def rows(chunk: ChunkResult) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = pq.read_table(pa.BufferReader(chunk.rows)).to_pylist()
     return found
 
 
@@ -75,7 +75,8 @@ def test_what_is_found_for_a_vehicle_does_not_depend_on_those_beside_it(
     assert len(together) >= 5
     for name, items in records.items():
         alone = rewritten(store, tmp_path, bucket, {name: items})
-        assert texts(calibrate_bucket(bucket, store=alone, task=task)) == {name: together[name]}
+        (found,) = texts(calibrate_bucket(bucket, store=alone, task=task)).values()
+        assert found.decode().splitlines() == together[name].decode().splitlines()
 
 
 def test_a_vehicle_that_cannot_be_estimated_does_not_stop_the_others(
@@ -166,9 +167,7 @@ def test_a_sensor_that_moved_is_told_and_calibrated_from_the_new_drives(
 ) -> None:
     bucket = fullest(store)
     records: dict[str, Sequence[Record]] = dict(store.read(bucket))
-    battery = random_faults(VEHICLES)
-    sound = (battery.drift[:, 0] == 0.0) & (battery.offset_a[:, 0] == 0.0)
-    name = min(name for name in records if sound[int(name[1:])])
+    name = min(name for name in records if int(name[1:]) % 3 == 0)
     previous = previous_of(tmp_path / "r", calibrate_bucket(bucket, store=store, task=task), bucket)
     faults = faults_of_vehicle(int(name[1:]), **changes)
     (new,) = summaries_of(faults, Conditions(model_error_a=0.5), seed=77)
@@ -185,7 +184,7 @@ def test_a_sensor_that_moved_is_told_and_calibrated_from_the_new_drives(
     assert list(moved) == ["battery"]
     assert text in moved["battery"]
     (battery,) = [row for row in rows(chunk) if row["vehicle"] == name and row["branch"] == "battery"]
-    assert battery["drift"] == pytest.approx(faults.drift[0, 0], abs=0.01)
-    assert battery["offset_a"] == pytest.approx(faults.offset_a[0, 0], abs=1.0)
+    for name_of, truth in (("drift", faults.drift), ("offset_a", faults.offset_a)):
+        sd = battery["drift_sd" if name_of == "drift" else "offset_sd_a"]
+        assert abs(battery[name_of] - truth[0, 0]) <= 4.0 * sd
     assert b'"d1"' not in texts(chunk)[name]
-    assert np.isfinite(float(str(battery["drift_sd"])))

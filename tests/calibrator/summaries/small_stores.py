@@ -29,7 +29,8 @@ CONDITIONS = Conditions(model_error_a=0.5)
 
 
 def random_faults(vehicles: int, seed: int = 0) -> Faults:
-    return draw_faults(
+    """One fault in most vehicles; every third has none."""
+    drawn = draw_faults(
         np.random.default_rng(seed),
         vehicles=vehicles,
         branches=len(BRANCHES),
@@ -38,9 +39,17 @@ def random_faults(vehicles: int, seed: int = 0) -> Faults:
         full_scale_a=400.0,
         balanced=True,
     )
+    faulty = np.arange(vehicles) % 3 != 0
+    return Faults(
+        hardware_drift=drawn.hardware_drift * faulty,
+        hardware_offset_a=drawn.hardware_offset_a * faulty[:, None],
+        drift=drawn.drift * faulty[:, None],
+        offset_a=drawn.offset_a * faulty[:, None],
+    )
 
 
-def record_of(name: str, summary: DriveSummary, drives: Sequence[str] = ("d1",)) -> Record:
+def record_of(name: str, summary: DriveSummary, drives: Sequence[str] = ("d1",), *, shown_a: float = np.nan) -> Record:
+    """A record; the motor showed so many amperes with open contactors."""
     K = len(BRANCHES)
     found = VehicleSummary(
         vehicle=name,
@@ -52,7 +61,7 @@ def record_of(name: str, summary: DriveSummary, drives: Sequence[str] = ("d1",))
             sd_s=np.array([0.0, 0.001]),
             known=np.ones(K, bool),
         ),
-        zero_current=ZeroCurrent(offset_a=np.array([np.nan, 1.5]), sd_a=np.array([np.nan, 0.1])),
+        zero_current=ZeroCurrent(offset_a=np.array([np.nan, shown_a]), sd_a=np.array([np.nan, 0.0 * shown_a + 0.1])),
         recorded=frozenset({"speed", "torque"}),
     )
     return Record(vehicle=name, drives=tuple(drives), sources=("1-2",) * len(drives), found=found)

@@ -76,7 +76,7 @@ def test_the_bucket_of_a_vehicle_depends_on_its_name_alone() -> None:
 
 def test_records_of_a_vehicle_add_up(store: SummaryStore) -> None:
     parts = [summary_of(900, seed) for seed in (1, 2)]
-    both = joined_records([record_of("V1", part, (f"d{k}",)) for k, part in enumerate(parts)])
+    both = joined_records([record_of("V1", part, (f"d{k}",), shown_a=1.5) for k, part in enumerate(parts)])
     assert both.drives == ("d0", "d1")
     np.testing.assert_allclose(both.summary.total, parts[0].total + parts[1].total)
     assert len(both.summary.moments) == len(parts[0].moments) + len(parts[1].moments)
