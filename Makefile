@@ -6,7 +6,7 @@ DRIVES ?= builtin
 OUT ?= build/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types schema constraints clean
+.PHONY: help setup demo test bench bench-quick lint types schema constraints clean
 
 help:                    ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -26,6 +26,12 @@ demo: setup              ## a fleet, its calibration, and the Kirchhoff sum befo
 test: setup              ## all tests; those of SocketCAN on a kernel that has it
 	$(BIN)/python -m pytest
 	tools/with_vcan --or-skip $(BIN)/python -m pytest tests/vcan
+
+bench: setup             ## how long each step takes, beside its peers; also build/bench.json (an hour)
+	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all
+
+bench-quick: setup       ## the same at small sizes, within five minutes
+	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all --quick
 
 lint: setup              ## ruff, formatting included
 	$(BIN)/ruff check .

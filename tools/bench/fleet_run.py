@@ -1,0 +1,206 @@
+"""Whole calibrations from summaries on disk: time and memory over the size of the fleet, and going on after a kill.
+
+Every run is the command that a user types, watched from outside: its processes' memory, and when its chunks appear.
+"""
+
+import argparse
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bench.row import Row
+from bench.synthetic_store import LAYOUT, make_store
+
+__all__ = ["rows"]
+
+FLEETS = (1_000, 10_000, 100_000)
+QUICK_FLEETS = (500, 1_000, 2_000)
+KILLED_FLEET, KILLS = 2_000, 20
+QUICK_KILLS = 3
+WORKERS = 2
+WATCH_EVERY_S = 0.05
+MEBIBYTE = 1024.0**2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Watched:
+    """What was seen of one run.
+
+    Attributes
+    ----------
+    whole_s : float
+        From start to end. [s]
+    steady_s : float
+        From when half of the chunks are there to the last one: all workers have started by then. [s]
+    share : float
+        Of the chunks that came within that time. [1]
+    peak_bytes : float
+        Largest sum of the resident memory of its processes. [byte]
+    """
+
+    whole_s: float
+    steady_s: float
+    share: float
+    peak_bytes: float
+
+
+def rows(*, quick: bool) -> list[Row]:
+    """Measure.
+
+    Parameters
+    ----------
+    quick : bool
+        Small fleets, few kills.
+
+    Returns
+    -------
+    list of Row
+        Per fleet size the time per vehicle once the reference is known, that of the whole run, and the peak memory, each against
+        the smallest fleet; and how many of the killed runs gave the same result.
+    """
+    found: list[Row] = []
+    first: tuple[float, float] | None = None
+    with tempfile.TemporaryDirectory(prefix="bench-") as name:
+        for vehicles in QUICK_FLEETS if quick else FLEETS:
+            seen, per_vehicle_s = measure(Path(name), vehicles)
+            first = first or (per_vehicle_s, seen.peak_bytes)
+            peer = None if first == (per_vehicle_s, seen.peak_bytes) else "the smallest fleet"
+            label = f"{vehicles} vehicles from summaries"
+            found += [
+                Row(
+                    name=f"{label}, per vehicle once the reference is known",
+                    value=1e3 * per_vehicle_s,
+                    unit="ms",
+                    peer=peer,
+                    ratio=first[0] / per_vehicle_s if peer else None,
+                ),
+                Row(name=f"{label}, whole run", value=seen.whole_s, unit="s"),
+                Row(
+                    name=f"{label}, peak memory of all processes",
+                    value=seen.peak_bytes / MEBIBYTE,
+                    unit="MiB",
+                    peer=peer,
+                    ratio=first[1] / seen.peak_bytes if peer else None,
+                ),
+            ]
+        kills = QUICK_KILLS if quick else KILLS
+        same = killed_runs(Path(name), kills)
+    return [
+        *found,
+        Row(name=f"runs killed at random moments with the identical result, of {kills}", value=same, unit="1"),
+    ]
+
+
+def measure(folder: Path, vehicles: int) -> tuple[Watched, float]:
+    """Run once; what was seen, and the time per vehicle once all workers are at it. [s]"""
+    store, out = folder / f"store-{vehicles}", folder / f"result-{vehicles}"
+    make_store(store, vehicles=vehicles, workers=WORKERS)
+    seen = watch(store, out)
+    shutil.rmtree(store)
+    shutil.rmtree(out)
+    return seen, seen.steady_s / (seen.share * vehicles)
+
+
+def watch(store: Path, out: Path) -> Watched:
+    """Calibrate, and look at it from outside."""
+    chunks = out.with_name(f".{out.name}.unfinished") / "chunks"
+    total = len(list((store / "buckets").iterdir()))
+    start = time.monotonic()
+    seen: list[tuple[float, int]] = []
+    peak = 0.0
+    with subprocess.Popen(_command(store, out), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
+        while run.poll() is None:
+            peak = max(peak, _resident_bytes(run.pid))
+            if not seen or seen[-1][1] < total:
+                done = len(list(chunks.glob("*.rows.parquet")))
+                if done and (not seen or done > seen[-1][1]):
+                    seen.append((time.monotonic(), done))
+            time.sleep(WATCH_EVERY_S)
+        whole_s = time.monotonic() - start
+        assert run.stderr is not None
+        errors = run.stderr.read().decode()
+    if run.returncode:
+        raise RuntimeError(errors)
+    (first_s, first), (last_s, last) = next(item for item in seen if 2 * item[1] >= total), seen[-1]
+    return Watched(whole_s=whole_s, steady_s=last_s - first_s, share=(last - first) / total, peak_bytes=peak)
+
+
+def _command(store: Path, out: Path) -> list[str]:
+    options = ["--layout", str(LAYOUT), "--out", str(out), "--workers", str(WORKERS)]
+    return [sys.executable, "-m", "calibrator", "calibrate", str(store), *options]
+
+
+def _resident_bytes(process: int) -> float:
+    """Resident memory of a process and all that descend from it; what processes share is counted in each. [byte]"""
+    parents: dict[int, int] = {}
+    resident: dict[int, float] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            try:
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+                pages = int((entry / "statm").read_text().split()[1])
+            except (OSError, IndexError):
+                continue
+            parents[int(entry.name)], resident[int(entry.name)] = int(fields[1]), pages * os.sysconf("SC_PAGE_SIZE")
+    family = {process}
+    while more := {child for child, parent in parents.items() if parent in family} - family:
+        family |= more
+    return sum(resident.get(member, 0.0) for member in family)
+
+
+def killed_runs(folder: Path, kills: int) -> int:
+    """Kill runs at random moments, finish each with a second one, and count the results that are identical."""
+    store = folder / "store-killed"
+    make_store(store, vehicles=KILLED_FLEET, workers=WORKERS)
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": "1700000000"}
+    start = time.monotonic()
+    subprocess.run(_command(store, folder / "whole"), check=True, capture_output=True, env=environment)
+    whole_s = time.monotonic() - start
+    expected, chance = _contents(folder / "whole"), random.Random(0)  # noqa: S311 (moments, no secrets)
+    same = 0
+    for number in range(kills):
+        out = folder / f"killed-{number}"
+        with subprocess.Popen(
+            _command(store, out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment, process_group=0
+        ) as run:
+            try:
+                run.wait(chance.uniform(0.0, whole_s))
+            except subprocess.TimeoutExpired:
+                os.killpg(run.pid, signal.SIGKILL)
+        if not out.exists():
+            subprocess.run(_command(store, out), check=True, capture_output=True, env=environment)
+        same += _contents(out) == expected
+        shutil.rmtree(out)
+    return same
+
+
+def _contents(result: Path) -> dict[str, bytes]:
+    files: Sequence[Path] = [path for path in sorted(result.rglob("*")) if path.is_file()]
+    return {str(path.relative_to(result)): path.read_bytes() for path in files}
+
+
+def main() -> None:
+    """Calibrate one fleet of a given size and print what was seen."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--vehicles", type=int, default=1_000_000)
+    parser.add_argument("--folder", type=Path, help="where store and result are put, and stay; else a temporary one")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="bench-") as name:
+        folder = arguments.folder or Path(name)
+        store = folder / f"store-{arguments.vehicles}"
+        if not store.exists():
+            make_store(store, vehicles=arguments.vehicles, workers=WORKERS)
+        seen = watch(store, folder / f"result-{arguments.vehicles}")
+    print(f"{arguments.vehicles} vehicles: {seen.whole_s:.0f} s, {seen.peak_bytes / MEBIBYTE:.0f} MiB")
+
+
+if __name__ == "__main__":
+    main()
