@@ -315,6 +315,24 @@ def calibrate(
 
 
 @app.command()
+def params(
+    result: Annotated[Path, typer.Argument(help="Folder that 'calibrator calibrate' wrote.")],
+    vehicles: Annotated[list[str], typer.Argument(help="Vehicles.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for VEHICLE.json; files of that name are replaced.")],
+) -> None:
+    """Write the parameter files of some vehicles, of a fleet too large for a file each in one folder."""
+    with importing():
+        from calibrator.results import parameters_of
+
+    texts = {vehicle: parameters_of(result, vehicle) for vehicle in vehicles}
+    require_possible_folder(out)
+    out.mkdir(parents=True, exist_ok=True)
+    for vehicle, text in texts.items():
+        write_atomically(out / f"{vehicle}.json", text)
+    _print_report("\n".join(str(out / f"{vehicle}.json") for vehicle in texts))
+
+
+@app.command()
 def score(
     result: Annotated[Path, typer.Argument(help="Folder that 'calibrator calibrate' wrote.")],
     truth: Annotated[Path, typer.Option("--truth", help="truth.json that 'calibrator simulate' wrote.")],

@@ -26,7 +26,7 @@ from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.fleet import FindModels
 from calibrator.published.fleet import calibrate_fleet_published
 from calibrator.report.calibration import MOST_NAMED, CalibrationReport, report_of
-from calibrator.results import RunRecord, encode_chunk, join_rows, left_out_of, write_parameter_files, write_run
+from calibrator.results import PARTS, RunRecord, encode_chunk, join_rows, left_out_of, write_parameter_files, write_run
 from calibrator.run.in_order import Workers
 from calibrator.run.posterior_run import calibrate_store
 from calibrator.run.previous import PreviousResult, require_previous
@@ -252,7 +252,7 @@ def _calibrate_store(
 ) -> CalibrationReport:
     """Calibrate from summaries; those that were read here become part of the result."""
     if since is not None:
-        require_previous(since, database, store.identity.branches)
+        require_previous(since, database, store.identity)
     plan = _plan(store, database, settings, since)
     identity = _identity(fleet, database, settings, created=unfinished.begin(plan, _now()))
     run = calibrate_store(
@@ -266,7 +266,14 @@ def _calibrate_store(
     )
     own = unfinished.summaries if unfinished.summaries.exists() else None
     return _finish(
-        unfinished, fleet, identity, settings, details=run.learnt.details, notices=run.learnt.notices, summaries=own
+        unfinished,
+        fleet,
+        identity,
+        settings,
+        details=run.learnt.details,
+        notices=run.learnt.notices,
+        summaries=own,
+        buckets=store.identity.buckets,
     )
 
 
@@ -322,6 +329,7 @@ def _finish(
     details: Mapping[str, object],
     notices: Sequence[str],
     summaries: Path | None = None,
+    buckets: int = 0,
 ) -> CalibrationReport:
     """Put the chunks together."""
     chunks, folder = unfinished.chunks, unfinished.result()
@@ -348,6 +356,7 @@ def _finish(
         created=identity.created,
         details=dict(details),
         vehicles=vehicles,
+        buckets=buckets if where == PARTS else 0,
         left_out=left_out,
         notices=[*fleet.notices, *notices],
     )

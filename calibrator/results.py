@@ -21,6 +21,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from calibrator.errors import FleetError
+from calibrator.summaries.buckets import bucket_of
 from ecu_node.parameters import VehicleParameters, encode_parameters, write_atomically
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "encode_chunk",
     "join_rows",
     "left_out_of",
+    "parameters_of",
     "read_results",
     "read_run",
     "write_parameter_files",
@@ -92,7 +94,10 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     details: dict[str, Any]
     """What the method tells of its run: unity drive and simulation SNR, or reference, delays and hyper-parameters."""
     vehicles: int
+    buckets: int = 0
+    """Files that the parameters of a large fleet are spread over, see :func:`parameters_of`; 0: one per vehicle."""
     left_out: dict[str, str]
+    """Why vehicles have no parameters; of many the first ones."""
     notices: list[str]
 
 
@@ -189,6 +194,41 @@ def join_rows(folder: Path, parts: Sequence[Path]) -> int:
         rows.sort(key=lambda row: (row["verdict"] == LEFT_OUT, row["vehicle"]))  # stable: branches keep their order
         path.write_bytes(_parquet(rows, SCHEMA))
     return calibrated
+
+
+def parameters_of(result: Path, vehicle: str) -> bytes:
+    """Text of the parameter file of one vehicle.
+
+    Parameters
+    ----------
+    result : Path
+        Folder of a result.
+    vehicle : str
+        Name.
+
+    Returns
+    -------
+    bytes
+        JSON, as the node reads it.
+
+    Raises
+    ------
+    FleetError
+        If it is no result, or there are no parameters of this vehicle in it.
+    """
+    buckets = read_run(result).buckets
+    if buckets:
+        part = result / PARTS / f"{bucket_of(vehicle, buckets):05d}.parquet"
+        texts = dict(chunk_parameters(part.read_bytes())) if part.exists() else {}
+        if vehicle in texts:
+            return texts[vehicle]
+    else:
+        path = result / "params" / f"{vehicle}.json"
+        if path.parent.is_dir() and path.name in {entry.name for entry in path.parent.iterdir()}:
+            return path.read_bytes()
+    raise FleetError(
+        f"{result}: no parameters of a vehicle {vehicle!r}; results.parquet says who was left out, and why"
+    )
 
 
 def left_out_of(folder: Path, *, most: int) -> dict[str, str]:

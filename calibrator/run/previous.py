@@ -11,6 +11,7 @@ from calibrator.evidence.readings import TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD
 from calibrator.options import Method
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.results import PARTS, chunk_parameters, read_run
+from calibrator.summaries.identity import StoreIdentity
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters, VehicleParameters, decode_parameters, read_parameters
 
@@ -44,7 +45,7 @@ class PreviousResult:
         return {name: read_parameters(path) for name, path in paths.items() if path.exists()}
 
 
-def require_previous(folder: Path, database: VehicleDatabase, branches: Sequence[str]) -> None:
+def require_previous(folder: Path, database: VehicleDatabase, store: StoreIdentity) -> None:
     """Refuse an earlier result that a run cannot go on from.
 
     Parameters
@@ -53,8 +54,8 @@ def require_previous(folder: Path, database: VehicleDatabase, branches: Sequence
         Where it is.
     database : VehicleDatabase
         Of the run that goes on from it.
-    branches : sequence of str
-        Of the fleet.
+    store : StoreIdentity
+        Of the store of summaries.
 
     Raises
     ------
@@ -64,10 +65,15 @@ def require_previous(folder: Path, database: VehicleDatabase, branches: Sequence
     run = read_run(folder)
     if run.method != Method.POSTERIOR.value:
         raise FleetError(f"{folder}: a result of the method {run.method}; --since goes on from one of the posterior")
-    if run.layout != database.layout.name or run.branches != list(branches):
+    if run.layout != database.layout.name or run.branches != list(store.branches):
         raise FleetError(
             f"{folder}: a result of layout {run.layout} with branches {', '.join(run.branches)}; this fleet is of "
-            f"layout {database.layout.name} with {', '.join(branches)}: calibrate it without --since"
+            f"layout {database.layout.name} with {', '.join(store.branches)}: calibrate it without --since"
+        )
+    if run.buckets not in {0, store.buckets}:
+        raise FleetError(
+            f"{folder}: made from a store of {run.buckets} buckets, and this one has {store.buckets}; give the same "
+            f"store, with the new drives added, or calibrate without --since"
         )
 
 

@@ -5,38 +5,17 @@ moderate number of files of moderate size, a vehicle is found without an index, 
 the fleet. A bucket is written whole or not at all.
 """
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from calibrator.storage import Storage
+from calibrator.summaries.buckets import bucket_of
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.record import Outline, Record
 from calibrator.summaries.table import decode_outlines, decode_records, encode_records
 
-__all__ = ["SummaryStore", "bucket_of"]
-
-_HASH_BYTES = 8
-
-
-def bucket_of(vehicle: str, buckets: int) -> int:
-    """Bucket of a vehicle: the same on every machine, and independent of the other vehicles.
-
-    Parameters
-    ----------
-    vehicle : str
-        Name.
-    buckets : int
-        Number of buckets of the store.
-
-    Returns
-    -------
-    int
-        From 0 to buckets - 1.
-    """
-    digest = hashlib.blake2b(vehicle.encode(), digest_size=_HASH_BYTES).digest()
-    return int.from_bytes(digest, "big") % buckets
+__all__ = ["SummaryStore"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -63,8 +63,8 @@ def rows(*, quick: bool) -> list[Row]:
     Returns
     -------
     list of Row
-        Per fleet size the time per vehicle once the reference is known, that of the whole run, and the peak memory, each against
-        the smallest fleet; and how many of the killed runs gave the same result.
+        Per fleet size the time per vehicle once the reference is known, that of the whole run, and the peak memory,
+        against those of the smallest fleet; and how many of the killed runs gave the same result.
     """
     found: list[Row] = []
     first: tuple[float, float] | None = None

@@ -11,9 +11,10 @@ import pytest
 from calibrator.errors import DriveError, FleetError
 from calibrator.evidence.summary import DriveSummary
 from calibrator.storage import Storage, StorageError, open_storage
+from calibrator.summaries.buckets import bucket_of
 from calibrator.summaries.identity import SCHEMA_VERSION, read_identity, write_identity
 from calibrator.summaries.record import Record, joined_records
-from calibrator.summaries.store import SummaryStore, bucket_of
+from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.table import MOST_BLOCKS
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.evidence.simulated_drives import Conditions, no_faults, summaries_of
