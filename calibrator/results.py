@@ -224,7 +224,7 @@ def parameters_of(result: Path, vehicle: str) -> bytes:
             return texts[vehicle]
     else:
         path = result / "params" / f"{vehicle}.json"
-        if path.parent.is_dir() and path.name in {entry.name for entry in path.parent.iterdir()}:
+        if path.parent.is_dir() and f"{vehicle}.json" in {entry.name for entry in path.parent.iterdir()}:
             return path.read_bytes()
     raise FleetError(
         f"{result}: no parameters of a vehicle {vehicle!r}; results.parquet says who was left out, and why"
