@@ -1,6 +1,7 @@
 """Read all vehicles of a fleet in parallel; one bad vehicle never stops the fleet."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from functools import partial
 from typing import TypeVar
 
@@ -96,8 +97,8 @@ def read_each(
     sources = ((read, fleet.vehicles[name]) for name, read in readers.items())
     found: dict[str, Vehicle] = {}
     errors: dict[str, str] = {}
-    with progress_bar("read drives", len(readers), "vehicles") as progress:
-        outcomes = read_in_processes(read_one, sources, workers=workers, limit_s=limit_s)
+    reading = read_in_processes(read_one, sources, workers=workers, limit_s=limit_s)
+    with progress_bar("read drives", len(readers), "vehicles") as progress, closing(reading) as outcomes:
         for done, (name, outcome) in enumerate(zip(readers, outcomes, strict=True), start=1):
             if isinstance(outcome, Unread):
                 errors[name] = outcome.reason

@@ -1,6 +1,7 @@
 """CAN logs of one or many vehicles into a drive store. One bad log never stops the others."""
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -88,8 +89,8 @@ def import_logs(
     drives: list[ImportedDrive] = []
     already_there: list[str] = []
     read = partial(_import_one, database=database, store=store)
-    runs = read_in_processes(read, found.logs, workers=workers, limit_s=limit_s)
-    with progress_bar("import", len(found.logs), "logs") as progress:
+    reading = read_in_processes(read, found.logs, workers=workers, limit_s=limit_s)
+    with progress_bar("import", len(found.logs), "logs") as progress, closing(reading) as runs:
         for done, (log, outcome) in enumerate(zip(found.logs, runs, strict=True), start=1):
             if isinstance(outcome, ImportedDrive):
                 drives.append(outcome)

@@ -4,6 +4,7 @@ The store is its own checkpoint: buckets that are there are not made again, and 
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 
@@ -134,10 +135,10 @@ def add_drives(
         _remove_others(store, fleet)
     problems: dict[str, str] = {}
     vehicles = drives = seen = 0
+    entries = (new.entries for bucket, names in by_bucket.items() for new in _new(store, fleet, bucket, names))
     summarise = partial(_summarise, store=store.identity, database=database)
-    with progress_bar("summarise drives", len(fleet.vehicles), "vehicles") as progress:
-        entries = (new.entries for bucket, names in by_bucket.items() for new in _new(store, fleet, bucket, names))
-        results = read_in_processes(summarise, entries, workers=workers, limit_s=time_limit_s)
+    reading = read_in_processes(summarise, entries, workers=workers, limit_s=time_limit_s)
+    with progress_bar("summarise drives", len(fleet.vehicles), "vehicles") as progress, closing(reading) as results:
         for bucket, names in by_bucket.items():
             new = _new(store, fleet, bucket, names)
             records = store.read(bucket) if new else {}

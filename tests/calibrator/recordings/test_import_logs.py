@@ -92,10 +92,11 @@ def write_endless_log(path: Path) -> None:
     path.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)
 
 
-def kill_first_reader() -> None:
-    while not multiprocessing.active_children():
+def kill_first_reader(others: set[int | None]) -> None:
+    """Kill the first worker that was not there before."""
+    while not (new := {child.pid for child in multiprocessing.active_children()} - others):
         time.sleep(0.01)
-    os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
+    os.kill(new.pop() or 0, signal.SIGKILL)
 
 
 def test_a_log_that_takes_too_long_costs_itself_only(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
@@ -111,7 +112,8 @@ def test_a_log_that_takes_too_long_costs_itself_only(fleet: Path, tmp_path: Path
 def test_a_log_whose_reader_is_killed_costs_itself_only(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     endless = tmp_path / "logs" / "V000" / "endless.log.gz"
     write_endless_log(endless)
-    killer = threading.Thread(target=kill_first_reader)
+    others = {child.pid for child in multiprocessing.active_children()}
+    killer = threading.Thread(target=kill_first_reader, args=[others])
     killer.start()
     report = imported([endless, fleet / "logs"], tmp_path / "store", database)
     killer.join()
