@@ -26,6 +26,7 @@ from calibrator.command_options import (
     MagnitudeOption,
     MinutesOption,
     NoiseOption,
+    PartOption,
     PolesOption,
     QuickOption,
     ReadingsOption,
@@ -46,6 +47,7 @@ from calibrator.command_options import (
     VehiclesOption,
     WorkersOption,
     named_vehicles,
+    numbered_part,
     require_heeded_options,
     require_one_bank,
     require_own_options,
@@ -195,6 +197,7 @@ def summarise(
     out: Annotated[str, typer.Option("--out", help="Store of summaries, path or URL; drives are added to one.")],
     branches: BranchesOption = None,
     bank: BankOption = None,
+    part: PartOption = "1/1",
     workers: WorkersOption = 2,
     time_limit: TimeLimitOption = TIME_LIMIT_S,
     json: JsonOption = False,
@@ -212,6 +215,7 @@ def summarise(
         bank=read_bank(bank) if bank is not None else None,
         workers=workers,
         time_limit_s=time_limit,
+        part=numbered_part(part),
     )
     _print_report(report.as_json() if json else report.as_text())
 

@@ -30,6 +30,7 @@ __all__ = [
     "MagnitudeOption",
     "MinutesOption",
     "NoiseOption",
+    "PartOption",
     "PolesOption",
     "QuickOption",
     "ReadingsOption",
@@ -51,6 +52,7 @@ __all__ = [
     "WorkersOption",
     "named_vehicles",
     "number_option",
+    "numbered_part",
     "require_heeded_options",
     "require_one_bank",
     "require_own_options",
@@ -73,6 +75,7 @@ MAX_VEHICLES = 100_000
 MAX_CURRENTS = 16
 MAX_SEED = 2**32 - 1
 MAX_WORKERS = 256
+MAX_PARTS = 1024
 MAX_TIME_LIMIT_S = 86_400.0
 """A day. [s]"""
 MAX_MINUTES = 240.0
@@ -151,6 +154,13 @@ def _branches(value: str | None) -> str | None:
     return None if value is None else ",".join(names)
 
 
+def _part(value: str) -> str:
+    number, slash, count = value.partition("/")
+    if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count) <= MAX_PARTS):
+        raise typer.BadParameter(f"{value}: expected I/N with 1 <= I <= N <= {MAX_PARTS}, such as 3/8")
+    return value
+
+
 LayoutOption = Annotated[Path, typer.Option("--layout", help="Layout (TOML) that says what the signals mean.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 WorkersOption = Annotated[int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Number of processes.")]
@@ -170,6 +180,12 @@ BranchesOption = Annotated[
 ]
 DrivesOption = Annotated[str, typer.Option("--drives", help="Drive store with the trips to drive, or 'builtin'.")]
 SymmetricOption = Annotated[bool, typer.Option("--symmetric", help="The fleet's mean is the ideal vehicle (22).")]
+PartOption = Annotated[
+    str,
+    typer.Option(
+        "--part", metavar="I/N", callback=_part, help="Part I of N of the vehicles, where N machines share the work."
+    ),
+]
 SinceOption = Annotated[
     Path | None,
     typer.Option("--since", help="Earlier result: vehicles without new drives keep its parameters (posterior)."),
@@ -280,6 +296,12 @@ def require_one_bank(bank: Path | None, poles: str | None) -> None:
     """
     if bank is not None and poles is not None:
         raise typer.BadParameter("a bank has its own poles; give --bank or --poles", param_hint="--poles")
+
+
+def numbered_part(value: str) -> tuple[int, int]:
+    """Number and count of ``I/N``."""
+    number, _, count = value.partition("/")
+    return int(number), int(count)
 
 
 def require_own_options(context: typer.Context, method: Method) -> None:

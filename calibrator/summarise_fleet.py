@@ -49,6 +49,7 @@ def summarise_fleet(
     bank: FilterBank | None = None,
     workers: int,
     time_limit_s: float = TIME_LIMIT_S,
+    part: tuple[int, int] = (1, 1),
 ) -> SummariseReport:
     """Summarise the drives of a fleet that a store does not have yet.
 
@@ -68,6 +69,8 @@ def summarise_fleet(
         Number of processes.
     time_limit_s : float
         Longest time for the drives of one vehicle. [s]
+    part : tuple of int
+        Number and count: which part of the vehicles, where several machines share the work.
 
     Returns
     -------
@@ -82,7 +85,7 @@ def summarise_fleet(
     source = without_copies(find_fleet(fleet))
     equipment = probe_equipment(source, database, branches, limit_s=time_limit_s)
     store = open_store(open_storage(out), equipment, database, source, bank=bank)
-    added = add_drives(store, source, database, workers=workers, time_limit_s=time_limit_s)
+    added = add_drives(store, source, database, workers=workers, time_limit_s=time_limit_s, part=part)
     return SummariseReport(
         store=out,
         vehicles=added.vehicles,

@@ -33,10 +33,12 @@ def write(store: Path, vehicle: str, name: str, database: VehicleDatabase, *, sc
     )
 
 
-def add(drives: Path, out: Path, database: VehicleDatabase, *, exactly: bool = False) -> tuple[Added, SummaryStore]:
+def add(
+    drives: Path, out: Path, database: VehicleDatabase, *, exactly: bool = False, part: tuple[int, int] = (1, 1)
+) -> tuple[Added, SummaryStore]:
     fleet = find_fleet(drives)
     store = open_store(open_storage(out), EQUIPMENT, database, fleet)
-    return add_drives(store, fleet, database, workers=1, exactly=exactly), store
+    return add_drives(store, fleet, database, workers=1, exactly=exactly, part=part), store
 
 
 def drives_in(store: SummaryStore) -> dict[str, list[tuple[str, ...]]]:
@@ -122,3 +124,16 @@ def test_drives_of_other_branches_cannot_be_added(tmp_path: Path, database: Vehi
         FleetError, match="cannot be added to this store: branches battery, motor against battery, dcdc"
     ):
         open_store(open_storage(out), other, database, find_fleet(drives))
+
+
+def test_parts_of_the_work_add_up(tmp_path: Path, database: VehicleDatabase) -> None:
+    drives = tmp_path / "drives"
+    for number in range(6):
+        write(drives, f"V{number}", "a", database)
+    added = [add(drives, tmp_path / "parts", database, part=(number, 3))[0].vehicles for number in (1, 2, 3)]
+    assert sum(added) == 6
+    assert max(added) < 6
+    _, whole = add(drives, tmp_path / "whole", database)
+    assert drives_in(SummaryStore(storage=open_storage(tmp_path / "parts"), identity=whole.identity)) == drives_in(
+        whole
+    )
