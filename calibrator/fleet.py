@@ -23,10 +23,19 @@ from calibrator.errors import FleetError
 from calibrator.folders import require_new_folder
 from calibrator.options import Method
 from calibrator.parameter_files import RunIdentity
+from calibrator.posterior.bench import read_bench
 from calibrator.posterior.fleet import FindModels
 from calibrator.published.fleet import calibrate_fleet_published
 from calibrator.report.calibration import MOST_NAMED, CalibrationReport, report_of
-from calibrator.results import PARTS, RunRecord, encode_chunk, join_rows, left_out_of, write_parameter_files, write_run
+from calibrator.results import (
+    RunRecord,
+    encode_chunk,
+    join_rows,
+    left_out_of,
+    read_run,
+    write_parameter_files,
+    write_run,
+)
 from calibrator.run.in_order import Workers
 from calibrator.run.posterior_run import calibrate_store
 from calibrator.run.previous import PreviousResult, require_previous
@@ -41,9 +50,6 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.layout import file_digest
 
 __all__ = ["calibrate_fleet"]
-
-LAST_CHUNK = 99_999
-"""Number of the chunk of those of which there is no summary."""
 
 
 def calibrate_fleet(
@@ -85,8 +91,11 @@ def calibrate_fleet(
         If the fleet as a whole cannot be calibrated.
     """
     require_new_folder(out)
+    _require_consistent(settings, since)
     storage = open_storage(place)
     stored = read_identity(storage, database)
+    if stored is None and not storage.is_local:
+        raise FleetError(f"{storage.url}: no store of summaries there; make one with 'calibrator summarise --out'")
     if stored is not None:
         _require_drives_unneeded(settings, storage.url)
         store = SummaryStore(storage=storage, identity=stored)
@@ -99,6 +108,14 @@ def calibrate_fleet(
         if settings.method is Method.PUBLISHED:
             return _calibrate_published(unfinished, fleet, database, settings, workers=workers)
         store = _summaries_of(unfinished, fleet, database, settings, since)
+        if since is None:  # a slip is told before the drives are read
+            read_bench(
+                settings,
+                fleet.vehicles.keys(),
+                store.identity.branches,
+                left_out=fleet.left_out,
+                full_scale_a=database.layout.full_scale_a,
+            )
         add_drives(
             store,
             fleet,
@@ -156,6 +173,18 @@ class _Fleet:
         )
 
 
+def _require_consistent(settings: CalibrationSettings, since: Path | None) -> None:
+    """Refuse settings that contradict each other."""
+    both = settings.hold_out & settings.trusted
+    if both:
+        raise FleetError(
+            f"vehicle {', '.join(sorted(both))} is both held out and trusted: the reference would be learnt from it"
+        )
+    for option, wanted in (("--branches", settings.branches is not None), ("--sensor-models", settings.sensor_models)):
+        if wanted and since is not None:
+            raise FleetError(f"{option} and --since exclude each other: the earlier result has decided on that")
+
+
 def _require_drives_unneeded(settings: CalibrationSettings, where: str) -> None:
     """Refuse what summaries do not tell."""
     needs = {
@@ -179,11 +208,6 @@ def _find_drives(path: Path, settings: CalibrationSettings, *, everyone: bool) -
         if unknown:
             reasons = [f"; {name}: {fleet.left_out[name]}" for name in unknown if name in fleet.left_out]
             raise FleetError(f"{path}: no vehicle {', '.join(unknown)} to {what}{''.join(reasons)}")
-    both = settings.hold_out & settings.trusted
-    if both:
-        raise FleetError(
-            f"vehicle {', '.join(sorted(both))} is both held out and trusted: the reference would be learnt from it"
-        )
     return fleet
 
 
@@ -197,14 +221,14 @@ def _summaries_of(
     """Store of the summaries read so far; one that was begun with other branches or another layout is begun anew."""
     folder = unfinished.summaries
     storage = open_storage(folder)
+    if since is not None and not (since / folder.name).is_dir():
+        read_run(since)
+        raise FleetError(
+            f"{since}: holds no summaries; add the new drives to the store it was made from, with 'calibrator "
+            f"summarise', and give that store"
+        )
+    unfinished.summaries_since(since)
     if since is not None:
-        if not (since / folder.name).is_dir():
-            raise FleetError(
-                f"{since}: holds no summaries; add the new drives to the store it was made from with 'calibrator "
-                f"summarise', and give that store"
-            )
-        if read_identity(storage) is None:
-            shutil.copytree(since / folder.name, folder, dirs_exist_ok=True)
         identity = read_identity(storage, database)
         assert identity is not None
         return SummaryStore(storage=storage, identity=identity)
@@ -262,7 +286,7 @@ def _calibrate_store(
         unfinished.chunks,
         workers=workers,
         find_models=find_models,
-        previous=None if since is None else PreviousResult(folder=since),
+        previous=None if since is None else PreviousResult(folder=since.absolute()),
     )
     own = unfinished.summaries if unfinished.summaries.exists() else None
     return _finish(
@@ -298,6 +322,8 @@ def _calibrate_published(
 def _now() -> str:
     """The time, ISO 8601; that of SOURCE_DATE_EPOCH, if it is set, makes results alike to the bit."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
+    if epoch is not None and not epoch.isdecimal():
+        raise FleetError(f"SOURCE_DATE_EPOCH is {epoch!r}; expected seconds since 1970, or leave it unset")
     now = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
     return now.isoformat(timespec="seconds")
 
@@ -334,16 +360,14 @@ def _finish(
     """Put the chunks together."""
     chunks, folder = unfinished.chunks, unfinished.result()
     numbers = chunks.numbers()
-    if fleet.left_out:
-        chunks.put(LAST_CHUNK, encode_chunk([], fleet.left_out))
-    vehicles = join_rows(folder, [chunks.rows(number) for number in chunks.numbers()])
-    left_out = left_out_of(folder, most=MOST_NAMED)
+    vehicles = join_rows(folder, [chunks.rows(number) for number in numbers], fleet.left_out)
+    left_out, left_out_count = left_out_of(folder, most=MOST_NAMED)
     if not vehicles:
         why = next(iter(left_out.values()), "there is none")
         raise FleetError(f"{fleet.name}: no vehicle can be calibrated; the first: {why}")
     where = write_parameter_files(folder, {n: chunks.parameters(n) for n in numbers}, vehicles=vehicles)
     if summaries is not None:
-        shutil.copytree(summaries, folder / summaries.name)
+        shutil.copytree(summaries, folder / summaries.name, ignore=shutil.ignore_patterns(".*"))
     run = RunRecord(
         tool=identity.tool,
         method=identity.method.value,
@@ -356,8 +380,11 @@ def _finish(
         created=identity.created,
         details=dict(details),
         vehicles=vehicles,
-        buckets=buckets if where == PARTS else 0,
+        buckets=buckets,
         left_out=left_out,
+        left_out_count=left_out_count,
+        layout_sha256=identity.database.layout.digest,
+        dbc_sha256=identity.database.digest,
         notices=[*fleet.notices, *notices],
     )
     write_run(folder, run)

@@ -1,8 +1,8 @@
 """Result of a calibration: parameter files, ``RESULT/results.parquet`` and ``RESULT/run.json``.
 
 ``results.parquet`` has one row per vehicle and branch; a vehicle that was left out has one row without branch.
-Parameter files are ``RESULT/params/VEHICLE.json`` for up to :data:`MOST_FILES` vehicles. Of a larger fleet they are the
-rows of ``RESULT/parameters/NNNNN.parquet``, by the bucket of the vehicle: a folder of a million files is no use.
+Parameter files are rows of ``RESULT/parameters/NNNNN.parquet``, by the bucket of the vehicle, and for up to
+:data:`MOST_FILES` vehicles also ``RESULT/params/VEHICLE.json``: a folder of a million files is no use.
 
 A fleet is calibrated in chunks. Each chunk gives a :class:`ChunkResult`; what a result says of the fleet as a whole is
 computed from them.
@@ -10,7 +10,7 @@ computed from them.
 
 import io
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,17 +22,20 @@ import pyarrow.parquet as pq
 
 from calibrator.errors import FleetError
 from calibrator.summaries.buckets import bucket_of
+from ecu_node.errors import ParameterError
 from ecu_node.parameters import VehicleParameters, encode_parameters, write_atomically
 
 __all__ = [
     "LEFT_OUT",
+    "PARTS",
     "ChunkResult",
     "RunRecord",
-    "chunk_parameters",
+    "Written",
     "encode_chunk",
     "join_rows",
     "left_out_of",
     "parameters_of",
+    "read_part",
     "read_results",
     "read_run",
     "write_parameter_files",
@@ -44,9 +47,15 @@ LEFT_OUT = "left out"
 
 MOST_FILES = 10_000
 """Vehicles whose parameters are files of their own in one folder."""
-PARTS = "parameters"
+MOST_SORTED = 100_000
+"""Rows of results that are put in the order of the vehicles."""
+PARTS, FILES = "parameters", "params"
 PARAMETERS_SCHEMA = pa.schema(
-    [pa.field("vehicle", pa.string(), nullable=False), pa.field("parameters", pa.string(), nullable=False)]
+    [
+        pa.field("vehicle", pa.string(), nullable=False),
+        pa.field("drives", pa.string(), nullable=False, metadata={"meaning": "digest of the drives' files"}),
+        pa.field("parameters", pa.string(), nullable=False, metadata={"meaning": "text of the parameter file"}),
+    ]
 )
 
 SCHEMA = pa.schema(
@@ -95,9 +104,12 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """What the method tells of its run: unity drive and simulation SNR, or reference, delays and hyper-parameters."""
     vehicles: int
     buckets: int = 0
-    """Files that the parameters of a large fleet are spread over, see :func:`parameters_of`; 0: one per vehicle."""
+    """Files that the parameters are spread over by the hash of the vehicle; 0: all are in the first."""
     left_out: dict[str, str]
     """Why vehicles have no parameters; of many the first ones."""
+    left_out_count: int = 0
+    layout_sha256: str = ""
+    dbc_sha256: str = ""
     notices: list[str]
 
 
@@ -110,49 +122,72 @@ class ChunkResult:
     rows : bytes
         Their part of ``results.parquet``.
     parameters : bytes
-        Parquet with the columns ``vehicle`` and ``parameters``, the text of the parameter file.
+        Parquet with the texts of their parameter files, see :data:`PARAMETERS_SCHEMA`.
     """
 
     rows: bytes
     parameters: bytes
 
 
+@dataclass(frozen=True, kw_only=True)
+class Written:
+    """Parameters of one vehicle as they were written.
+
+    Attributes
+    ----------
+    drives : str
+        Digest of the drives' files; empty if it is not known.
+    text : bytes
+        Of the parameter file.
+    """
+
+    drives: str
+    text: bytes
+
+
 def encode_chunk(
     parameters: Sequence[VehicleParameters],
     left_out: Mapping[str, str],
+    *,
     moved: Mapping[tuple[str, str], str] | None = None,
+    drives: Mapping[str, str] | None = None,
 ) -> ChunkResult:
     """Write down what a chunk gave.
 
     Parameters
     ----------
     parameters : sequence of VehicleParameters
-        One per calibrated vehicle.
+        One per calibrated vehicle; one whose parameters cannot be written is left out.
     left_out : mapping of str to str
         Why the other vehicles have none.
     moved : mapping of (str, str) to str, or None
         What has moved since an earlier result, by vehicle and branch.
+    drives : mapping of str to str, or None
+        Digest of the drives' files by vehicle.
 
     Returns
     -------
     ChunkResult
         In the order of the vehicles' names.
-
-    Raises
-    ------
-    ParameterError
-        If a number is not finite.
     """
-    ordered = sorted(parameters, key=lambda item: item.vehicle)
-    rows = [row for item in ordered for row in _rows(item)]
-    for row in rows:
-        row["moved"] = (moved or {}).get((row["vehicle"], row["branch"]))
-    rows += [{"vehicle": vehicle, "verdict": LEFT_OUT, "reason": left_out[vehicle]} for vehicle in sorted(left_out)]
-    texts = [
-        {"vehicle": item.vehicle, "parameters": encode_parameters(item, f"parameters of {item.vehicle}").decode()}
-        for item in ordered
-    ]
+    rows: list[dict[str, Any]] = []
+    texts: list[dict[str, Any]] = []
+    reasons = dict(left_out)
+    for item in sorted(parameters, key=lambda item: item.vehicle):
+        try:
+            text = encode_parameters(item, f"parameters of {item.vehicle}").decode()
+        except ParameterError as error:
+            reasons[item.vehicle] = f"{error}; look at its recordings"
+            continue
+        texts.append({"vehicle": item.vehicle, "drives": (drives or {}).get(item.vehicle, ""), "parameters": text})
+        rows += [{**row, "moved": (moved or {}).get((item.vehicle, row["branch"]))} for row in _rows(item)]
+    rows += left_out_rows(reasons)
     return ChunkResult(rows=_parquet(rows, SCHEMA), parameters=_parquet(texts, PARAMETERS_SCHEMA))
+
+
+def left_out_rows(left_out: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Rows of vehicles that have no parameters."""
+    return [{"vehicle": vehicle, "verdict": LEFT_OUT, "reason": left_out[vehicle]} for vehicle in sorted(left_out)]
 
 
 def _parquet(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes:
@@ -161,14 +196,25 @@ def _parquet(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes:
     return buffer.getvalue()
 
 
-def chunk_parameters(content: bytes) -> Iterator[tuple[str, bytes]]:
-    """Vehicles and texts of their parameter files, from the parameters of a :class:`ChunkResult`."""
-    table = pq.read_table(io.BytesIO(content), schema=PARAMETERS_SCHEMA, use_threads=False)
-    for row in table.to_pylist():
-        yield row["vehicle"], row["parameters"].encode()
+def read_part(path: Path) -> dict[str, Written]:
+    """Parameters of a chunk by vehicle, from a file of a result; none if there is no such file.
+
+    Raises
+    ------
+    FleetError
+        If the file is damaged.
+    """
+    try:
+        rows = pq.ParquetFile(path).read(use_threads=False).to_pylist()
+        return {row["vehicle"]: Written(drives=row["drives"], text=row["parameters"].encode()) for row in rows}
+    except FileNotFoundError:
+        return {}
+    except (pa.ArrowException, OSError, KeyError) as error:
+        reason = str(error).partition("\n")[0][:120]
+        raise FleetError(f"{path}: damaged part of a result: {reason}; calibrate again") from None
 
 
-def join_rows(folder: Path, parts: Sequence[Path]) -> int:
+def join_rows(folder: Path, parts: Sequence[Path], left_out: Mapping[str, str]) -> int:
     """Join the rows of all chunks to ``results.parquet``; of up to :data:`MOST_FILES` vehicles in order of their names.
 
     Parameters
@@ -177,23 +223,59 @@ def join_rows(folder: Path, parts: Sequence[Path]) -> int:
         Of the result; it must exist.
     parts : sequence of Path
         Files with the rows of each chunk.
+    left_out : mapping of str to str
+        Vehicles, or files of unclear vehicle, that are in no chunk, and why.
 
     Returns
     -------
     int
         Number of vehicles that have parameters.
     """
-    path, calibrated = folder / "results.parquet", 0
+    path, calibrated, rows, others = folder / "results.parquet", 0, 0, dict(left_out)
     with pq.ParquetWriter(path, SCHEMA, compression="zstd") as writer:
         for part in parts:
             table = pq.read_table(part, schema=SCHEMA, use_threads=False)
+            vehicles = pc.unique(table["vehicle"]).to_pylist()
             calibrated += len(pc.unique(table.filter(pc.field("branch").is_valid())["vehicle"]))
+            rows += table.num_rows
+            for name in others.keys() & set(vehicles):
+                del others[name]
             writer.write_table(table)
-    if calibrated <= MOST_FILES:
-        rows = pq.read_table(path, schema=SCHEMA).to_pylist()
-        rows.sort(key=lambda row: (row["verdict"] == LEFT_OUT, row["vehicle"]))  # stable: branches keep their order
-        path.write_bytes(_parquet(rows, SCHEMA))
+        writer.write_table(pa.Table.from_pylist(left_out_rows(others), schema=SCHEMA))
+    if rows <= MOST_SORTED:
+        found = pq.read_table(path, schema=SCHEMA).to_pylist()
+        found.sort(key=lambda row: (row["verdict"] == LEFT_OUT, row["vehicle"]))  # stable: branches keep their order
+        path.write_bytes(_parquet(found, SCHEMA))
     return calibrated
+
+
+def write_parameter_files(folder: Path, parts: Mapping[int, Path], *, vehicles: int) -> str:
+    """Write the parameter files of a result.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the result; it must exist.
+    parts : mapping of int to Path
+        Files with the parameters of each chunk, by its number.
+    vehicles : int
+        How many there are in all.
+
+    Returns
+    -------
+    str
+        Where they are for the user, within the folder.
+    """
+    (folder / PARTS).mkdir()
+    for number, part in parts.items():
+        shutil.copyfile(part, folder / PARTS / f"{number:05d}.parquet")
+    if vehicles > MOST_FILES:
+        return PARTS
+    (folder / FILES).mkdir()
+    for part in parts.values():
+        for vehicle, written in read_part(part).items():
+            write_atomically(folder / FILES / f"{vehicle}.json", written.text)
+    return FILES
 
 
 def parameters_of(result: Path, vehicle: str) -> bytes:
@@ -216,55 +298,27 @@ def parameters_of(result: Path, vehicle: str) -> bytes:
     FleetError
         If it is no result, or there are no parameters of this vehicle in it.
     """
-    buckets = read_run(result).buckets
-    if buckets:
-        part = result / PARTS / f"{bucket_of(vehicle, buckets):05d}.parquet"
-        texts = dict(chunk_parameters(part.read_bytes())) if part.exists() else {}
-        if vehicle in texts:
-            return texts[vehicle]
-    else:
-        path = result / "params" / f"{vehicle}.json"
-        if path.parent.is_dir() and f"{vehicle}.json" in {entry.name for entry in path.parent.iterdir()}:
-            return path.read_bytes()
-    raise FleetError(
-        f"{result}: no parameters of a vehicle {vehicle!r}; results.parquet says who was left out, and why"
-    )
+    run = read_run(result)
+    number = bucket_of(vehicle, run.buckets) if run.buckets else 0
+    found = read_part(result / PARTS / f"{number:05d}.parquet")
+    if vehicle not in found:
+        raise FleetError(
+            f"{result}: no parameters of a vehicle {vehicle!r}; results.parquet says who was left out, and why"
+        )
+    return found[vehicle].text
 
 
-def left_out_of(folder: Path, *, most: int) -> dict[str, str]:
-    """Vehicles of ``results.parquet`` that have no parameters, and why; so many at most are named."""
-    rows = pq.read_table(folder / "results.parquet", columns=["vehicle", "branch", "reason"])
-    rows = rows.filter(pc.field("branch").is_null()).slice(0, most)
-    return dict(zip(rows["vehicle"].to_pylist(), rows["reason"].to_pylist(), strict=True))
-
-
-def write_parameter_files(folder: Path, parts: Mapping[int, Path], *, vehicles: int) -> str:
-    """Write the parameter files of a result.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the result; it must exist.
-    parts : mapping of int to Path
-        Files with the parameters of each chunk, by its number.
-    vehicles : int
-        How many there are in all.
-
-    Returns
-    -------
-    str
-        Where they are, within the folder.
-    """
-    if vehicles > MOST_FILES:
-        (folder / PARTS).mkdir()
-        for number, part in parts.items():
-            shutil.copyfile(part, folder / PARTS / f"{number:05d}.parquet")
-        return PARTS
-    (folder / "params").mkdir()
-    for part in parts.values():
-        for vehicle, text in chunk_parameters(part.read_bytes()):
-            write_atomically(folder / "params" / f"{vehicle}.json", text)
-    return "params"
+def left_out_of(folder: Path, *, most: int) -> tuple[dict[str, str], int]:
+    """Vehicles of ``results.parquet`` that have no parameters, and why, so many at most; and how many there are."""
+    found: dict[str, str] = {}
+    count = 0
+    file = pq.ParquetFile(folder / "results.parquet")
+    for batch in file.iter_batches(columns=["vehicle", "branch", "reason"]):
+        rows = batch.filter(pc.is_null(batch["branch"])).select(["vehicle", "reason"])
+        count += rows.num_rows
+        for row in rows.slice(0, max(most - len(found), 0)).to_pylist():
+            found[row["vehicle"]] = row["reason"]
+    return found, count
 
 
 def write_run(folder: Path, run: RunRecord) -> None:

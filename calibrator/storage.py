@@ -9,6 +9,9 @@ from ecu_node.parameters import write_atomically
 
 __all__ = ["Storage", "StorageError", "open_storage"]
 
+OBJECT_STORAGE = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "memory"})
+"""Kinds of storage in which a file appears only when it is complete."""
+
 
 class StorageError(UserError):
     """A folder or object storage cannot be read or written."""
@@ -37,22 +40,26 @@ class Storage:
 
     def names(self) -> list[str]:
         """Return the names of the files in it, sorted; none if there is no such folder. Hidden ones do not count."""
+        return sorted(self._list())
+
+    def _list(self) -> dict[str, dict[str, Any]]:
+        """What the storage tells of each file, by name."""
         filesystem, root = self._filesystem()
         try:
-            found = filesystem.ls(root, detail=False)
+            found = filesystem.ls(root, detail=True)
         except (FileNotFoundError, NotADirectoryError):
-            return []
+            return {}
         except Exception as error:  # noqa: BLE001 (each kind of storage has its own)
             raise self._failed("", "read", error) from None
-        names = [str(path).rstrip("/").rpartition("/")[2] for path in found]
-        return sorted(name for name in names if not name.startswith("."))
+        named = {str(about["name"]).rstrip("/").rpartition("/")[2]: about for about in found}
+        return {name: about for name, about in named.items() if not name.startswith(".")}
 
     def versions(self) -> dict[str, str]:
         """What tells whether a file was changed, by name: size, and time of change or tag where the storage has one."""
-        filesystem, root = self._filesystem()
-        found = {name: filesystem.info(f"{root}/{name}") for name in self.names()}
         marks = ("size", "mtime", "LastModified", "ETag", "etag", "created")
-        return {name: "-".join(str(about[mark]) for mark in marks if mark in about) for name, about in found.items()}
+        return {
+            name: "-".join(str(about[mark]) for mark in marks if mark in about) for name, about in self._list().items()
+        }
 
     def read(self, name: str) -> bytes:
         """Return the content of a file.
@@ -96,10 +103,14 @@ class Storage:
             if self.is_local:
                 Path(self.url).mkdir(parents=True, exist_ok=True)
                 write_atomically(Path(self.url) / name, content)
-            else:  # objects appear only when they are complete
-                filesystem, root = self._filesystem()
-                filesystem.makedirs(root, exist_ok=True)
+                return
+            filesystem, root = self._filesystem()
+            filesystem.makedirs(root, exist_ok=True)
+            if self.url.partition("://")[0] in OBJECT_STORAGE:
                 filesystem.pipe_file(f"{root}/{name}", content)
+            else:
+                filesystem.pipe_file(f"{root}/.{name}", content)
+                filesystem.mv(f"{root}/.{name}", f"{root}/{name}")
         except Exception as error:  # noqa: BLE001
             raise self._failed(name, "write", error) from None
 
@@ -120,6 +131,6 @@ class Storage:
 
 
 def open_storage(place: str | Path) -> Storage:
-    """Storage at a path or URL; a ``file://`` URL is a path."""
-    text = str(place)
-    return Storage(url=text.removeprefix("file://") or "/")
+    """Storage at a path or URL; a ``file://`` URL is a path, and paths become absolute: others may work elsewhere."""
+    text = str(place).removeprefix("file://")
+    return Storage(url=text if "://" in text else str(Path(text).absolute()))

@@ -159,6 +159,10 @@ class UnfitError(ParameterError):
         super().__init__(text)
         self.reason = reason
 
+    def __reduce__(self) -> tuple[type["UnfitError"], tuple[Reason, str]]:
+        """Let it travel between processes."""
+        return type(self), (self.reason, str(self))
+
 
 def read_parameters(path: Path) -> VehicleParameters:
     """Read a parameter file and check it against the schema.

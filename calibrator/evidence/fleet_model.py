@@ -10,11 +10,12 @@ drive (2), every vehicle is compared on its own drive, so that what its drive do
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
-from calibrator.drive import Array
+from calibrator.drive import Array, Mask
 from calibrator.evidence.block_regression import VehicleRegressions, products, regress_vehicles
 from calibrator.evidence.fleet_moments import FleetMoments
 from calibrator.posterior.cluster import densest_clusters
@@ -29,6 +30,8 @@ SLOPE_SD = 0.4
 """Prior deviation of a slope from 1: a branch that hardly moves counts as faultless. [1]"""
 LEAST_SD = 1e-5
 """Of slopes and intercepts where a model fits exactly. [1], [A]"""
+MOST_VARIATION = 100.0
+"""Deviation of an input over the fleet's median deviation from which on a vehicle does not tell the read-outs. [1]"""
 TINY_A2 = 1e-12
 """Of a fleet that stands still. [A^2]"""
 
@@ -137,6 +140,8 @@ def _fit_read_out(means: Array, slopes: Array) -> Array:
     K = slopes.shape[1]
     M = means.shape[1] - 1 - K
     centred = means - means[:, :, -1:] * means[:, -1:, :]
+    centred = centred[usual := _usual_inputs(np.diagonal(centred, axis1=1, axis2=2)[:, :M])]
+    slopes = slopes[usual]
     read_out = np.zeros((M + 1, K))
     for k in range(K):
         gram = np.einsum("n,npq->pq", slopes[:, k] ** 2, centred[:, :M, :M])
@@ -145,3 +150,12 @@ def _fit_read_out(means: Array, slopes: Array) -> Array:
         normalised = gram / np.outer(scale, scale) + RIDGE * np.eye(M)
         read_out[:M, k] = np.linalg.solve(normalised, right / scale) / scale
     return read_out
+
+
+def _usual_inputs(variance: Array) -> Mask:
+    """Vehicles none of whose inputs (N, M) varies far more than in the rest of the fleet: it has another unit there."""
+    varying = np.where(variance > 0.0, variance, np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # an input that varies in no vehicle has no median
+        usual = np.nanmedian(varying, axis=0)
+    return np.asarray(~(variance > MOST_VARIATION**2 * usual).any(axis=1))

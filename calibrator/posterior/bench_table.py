@@ -16,7 +16,7 @@ from calibrator.errors import FleetError
 from calibrator.evidence.readings import Readings
 from calibrator.posterior.slab import WIDEST
 
-__all__ = ["BenchReadings", "read_bench_readings", "readings_of"]
+__all__ = ["BenchReadings", "read_bench_readings", "readings_of", "vehicles_named"]
 
 KEYS = ("vehicle", "branch")
 PAIRS = (("drift", "drift_sd"), ("offset_a", "offset_sd_a"))
@@ -86,6 +86,16 @@ def read_bench_readings(
     if not found:
         raise FleetError(f"{path}: no reading below the header; leave --readings out if there is none")
     return found
+
+
+def vehicles_named(path: Path) -> set[str]:
+    """Vehicles that stand in a table, as far as it can be read: what is wrong with it is told when it is read."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        rows = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
+        return {str(row.get("vehicle") or "").strip() for row in rows}
+    except (OSError, UnicodeDecodeError, csv.Error):
+        return set()
 
 
 def _check_header(header: Sequence[str], path: Path) -> None:

@@ -85,6 +85,8 @@ def _cover(weight: Array, mean: Array, sd: Array, least: Array, normal: Array, c
     for j in range(len(weight)):
         best = 0.0
         for c in range(covered.shape[1]):
+            if weight[j, c] == 0.0:
+                continue
             possible = 0.0
             for s in range(weight.shape[1]):
                 if weight[j, s] > 0.0 and _surely_near(mean[j], sd[j], s, c, least) != 0:

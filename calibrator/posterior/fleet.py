@@ -187,38 +187,16 @@ def learn_fleet(
     learning = np.array(require_learning(names, settings, {}))
     trusted = np.array([name in settings.trusted for name in names])
     layout = identity.database.layout
-    learn = partial(
-        _learn,
-        learning=learning,
-        trusted=trusted,
-        learner=partial(
-            learn_reference, full_scale_a=layout.full_scale_a, branches=branches, load=layout.unmeasured_load
-        ),
-    )
-    summaries = [vehicle.summary for vehicle in vehicles]
-    readings, doubts = merge_readings(vehicles, {}, branches)
-    reference, believed = learn(summaries, readings)
-    if bench:
-        checked = np.array([any(name == vehicle for vehicle, _ in bench) for name in names])
-        posterior = estimate_summaries(
-            [part for part, use in zip(summaries, checked, strict=True) if use],
-            reference,
-            readings=readings.take(checked),
-            believed=believed[checked],
-        )
-        checked_names = [name for name, use in zip(names, checked, strict=True) if use]
-        wrong = contradicted_readings(posterior, bench, checked_names, branches, layout.full_scale_a)
-        bench = {sensor: values for sensor, values in bench.items() if sensor not in wrong}
-        readings, doubts = merge_readings(vehicles, bench, branches)
-        doubts += wrong.values()
-        reference, believed = learn(summaries, readings)
+    learner = partial(learn_reference, full_scale_a=layout.full_scale_a, branches=branches, load=layout.unmeasured_load)
+    learn = partial(_learn, learning=learning, trusted=trusted, learner=learner)
+    reference, believed, readings = _with_readings(vehicles, bench, branches, learn, full_scale_a=layout.full_scale_a)
     findings = all_linear(vehicles)
     if find_models is not None:
-        zero_a = estimate_summaries(summaries, reference, readings=readings, believed=believed).faults.offset_a
-        findings = find_models(vehicles, zero_a, learning, believed)
+        summaries = [vehicle.summary for vehicle in vehicles]
+        linear = estimate_summaries(summaries, reference, readings=readings.told, believed=believed)
+        findings = find_models(vehicles, linear.faults.offset_a, learning, believed)
     if findings.not_linear.any():
-        reference, believed = learn(findings.summaries, readings)
-    told = findings.not_linear.any(axis=1) | findings.undecided.any(axis=1)
+        reference, believed = learn(findings.summaries, readings.told)
     learners = [name for name, use in zip(names, learning, strict=True) if use]
     return Learnt(
         task=FleetTask(
@@ -226,20 +204,70 @@ def learn_fleet(
             identity=identity,
             branches=branches,
             harm_limit=settings.harm_limit,
-            bench=bench,
+            bench=readings.bench,
             believed=frozenset(name for name, use in zip(names, believed, strict=True) if use),
             fleet_size=fleet_size,
-            not_linear={names[j]: (findings.choices[j], findings.summaries[j]) for j in np.flatnonzero(told).tolist()},
+            not_linear=_not_linear(names, findings),
         ),
         notices=(
             *reference.health.warnings,
             *trust_notices(learners, trusted[learning], reference.health),
-            *doubts,
+            *readings.notices,
             *window_notices(vehicles, believed, branches, layout.full_scale_a),
             *finding_notices(names, findings, branches),
         ),
         details=_details(reference, branches),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Readings:
+    """Direct readings: those that are used, of which bench readings, and what is to be said."""
+
+    told: Readings
+    bench: BenchReadings
+    notices: Sequence[str]
+
+
+def _with_readings(
+    vehicles: Sequence[VehicleSummary],
+    bench: BenchReadings,
+    branches: tuple[str, ...],
+    learn: Callable[[Sequence[DriveSummary], Readings], tuple[FleetReference, Mask]],
+    *,
+    full_scale_a: float,
+) -> tuple[FleetReference, Mask, _Readings]:
+    """Reference of linear sensors with the readings that the drives do not contradict."""
+    summaries, names = [vehicle.summary for vehicle in vehicles], [vehicle.vehicle for vehicle in vehicles]
+    told, notices = merge_readings(vehicles, {}, branches)
+    reference, believed = learn(summaries, told)
+    if not bench:
+        return reference, believed, _Readings(told=told, bench={}, notices=notices)
+    named = {vehicle for vehicle, _ in bench}
+    checked = np.array([name in named for name in names])
+    wrong: Mapping[tuple[str, str], str] = {}
+    if checked.any():
+        posterior = estimate_summaries(
+            [summaries[j] for j in np.flatnonzero(checked).tolist()],
+            reference,
+            readings=told.take(checked),
+            believed=believed[checked],
+        )
+        wrong = contradicted_readings(
+            posterior, bench, [name for name in names if name in named], branches, full_scale_a
+        )
+    used = {sensor: values for sensor, values in bench.items() if sensor not in wrong}
+    told, notices = merge_readings(vehicles, used, branches)
+    reference, believed = learn(summaries, told)
+    return reference, believed, _Readings(told=told, bench=used, notices=[*notices, *wrong.values()])
+
+
+def _not_linear(
+    names: Sequence[str], findings: SensorFindings
+) -> dict[str, tuple[Sequence[SensorModelChoice], DriveSummary]]:
+    """Models and linear parts of the vehicles that have sensors that are not linear, or may have."""
+    told = findings.not_linear.any(axis=1) | findings.undecided.any(axis=1)
+    return {names[j]: (findings.choices[j], findings.summaries[j]) for j in np.flatnonzero(told).tolist()}
 
 
 def _learn(

@@ -1,7 +1,9 @@
 """What a calibration found, in short: counted from the rows of its result."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from calibrator.drive import Array
 from calibrator.posterior.verdict import CONFIDENT
 from calibrator.report.text import dumps, left_out_text, reasons_text, table
 from calibrator.results import RunRecord
@@ -49,10 +52,14 @@ class CalibrationReport:
     """Vehicles of which branches are corrected, and which."""
     hardware_suspected: Mapping[str, str]
     """Vehicles that are thought to differ from their fleet, and how probable that is."""
+    hardware_count: int
+    """How many there are."""
     held_back: Mapping[str, int]
     """Branches in which a fault was found that is not applied, by reason."""
     moved: Mapping[str, str]
     """Vehicles with sensors that have moved since an earlier result, and how."""
+    moved_count: int
+    """How many there are."""
     junction_rms_measured_a: float
     """Median over vehicles. [A]"""
     junction_rms_deployed_a: float
@@ -69,8 +76,8 @@ class CalibrationReport:
         rows = [
             ("vehicles calibrated", f"{run.vehicles}"),
             *((f"  {verdict}", f"{count}") for verdict, count in self.verdicts.items()),
-            ("  hardware fault suspected", f"{len(self.hardware_suspected)}"),
-            ("vehicles left out", f"{len(run.left_out)}"),
+            ("  hardware fault suspected", f"{self.hardware_count}"),
+            ("vehicles left out", f"{run.left_out_count}"),
             *((f"faults held back, {reason}", f"{count}") for reason, count in self.held_back.items()),
             ("junction sum RMS, median, measured [A]", f"{self.junction_rms_measured_a:.2f}"),
             ("junction sum RMS, median, deployed [A]", f"{self.junction_rms_deployed_a:.2f}"),
@@ -108,55 +115,89 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
     CalibrationReport
         At most :data:`MOST_NAMED` vehicles of a kind are named.
     """
-    rows = pq.read_table(result / "results.parquet", columns=list(_COLUMNS))
-    rows = rows.filter(pc.field("branch").is_valid())
-    vehicles = rows.filter(pc.field("branch") == run.branches[0])
-    applied = rows.group_by("vehicle", use_threads=False).aggregate([("applied", "any")])["applied_any"]
-    measured_a = vehicles["junction_rms_measured_a"].to_numpy()
-    deployed_a = np.where(applied.to_numpy(), vehicles["junction_rms_corrected_a"].to_numpy(), measured_a)
+    tally = _Tally()
+    for batch in pq.ParquetFile(result / "results.parquet").iter_batches(columns=list(_COLUMNS)):
+        rows = pa.Table.from_batches([batch])
+        tally.add(rows.filter(pc.field("branch").is_valid()), run.branches)
     return CalibrationReport(
         result=str(shown),
         parameters=parameters,
         run=run,
-        verdicts=_counts(vehicles["verdict"]),
-        undecided=_named(vehicles.filter(pc.field("verdict") == "cannot tell"), "reason"),
-        corrected=_corrections(rows.filter((pc.field("verdict") == "corrected") & pc.field("applied"))),
-        hardware_suspected={
-            name: "" if probability is None else f"probability {probability:.1f}"
-            for name, probability in _named(vehicles.filter(pc.field("hardware_fault")), "hardware_probability").items()
-        },
-        held_back=_counts(rows["held_back"].drop_null()),
-        moved=_moved(rows.filter(pc.field("moved").is_valid())),
-        junction_rms_measured_a=float(np.median(measured_a)),
-        junction_rms_deployed_a=float(np.median(deployed_a)),
+        verdicts=dict(tally.verdicts),
+        undecided=tally.undecided,
+        corrected=tally.corrected,
+        hardware_suspected=tally.hardware,
+        hardware_count=tally.hardware_count,
+        held_back=dict(tally.held_back),
+        moved=tally.moved,
+        moved_count=tally.moved_count,
+        junction_rms_measured_a=float(np.median(np.concatenate(tally.measured_a))),
+        junction_rms_deployed_a=float(np.median(np.concatenate(tally.deployed_a))),
     )
+
+
+@dataclass(kw_only=True)
+class _Tally:
+    """Counts over the rows, a few vehicles at a time; a vehicle's rows stand together, one per branch."""
+
+    verdicts: Counter[str] = field(default_factory=Counter)
+    held_back: Counter[str] = field(default_factory=Counter)
+    undecided: dict[str, str] = field(default_factory=dict)
+    corrected: dict[str, str] = field(default_factory=dict)
+    hardware: dict[str, str] = field(default_factory=dict)
+    moved: dict[str, str] = field(default_factory=dict)
+    hardware_count: int = 0
+    moved_count: int = 0
+    measured_a: list[Array] = field(default_factory=list)
+    deployed_a: list[Array] = field(default_factory=list)
+    rest: pa.Table | None = None
+
+    def add(self, rows: pa.Table, branches: Sequence[str]) -> None:
+        """Count rows; those of a vehicle whose others are still to come wait."""
+        rows = rows if self.rest is None else pa.concat_tables([self.rest, rows])
+        whole = rows.num_rows - rows.num_rows % len(branches)
+        self.rest, rows = rows.slice(whole), rows.slice(0, whole)
+        vehicles = rows.filter(pc.field("branch") == branches[0])
+        applied = rows["applied"].to_numpy().reshape(-1, len(branches)).any(axis=1)
+        measured_a = vehicles["junction_rms_measured_a"].to_numpy()
+        self.measured_a.append(measured_a)
+        self.deployed_a.append(np.where(applied, vehicles["junction_rms_corrected_a"].to_numpy(), measured_a))
+        self.verdicts.update(_counts(vehicles["verdict"]))
+        self.held_back.update(_counts(rows["held_back"].drop_null()))
+        _name(
+            self.undecided, vehicles.filter(pc.field("verdict") == "cannot tell"), lambda rows: rows[0]["reason"] or ""
+        )
+        suspected = vehicles.filter(pc.field("hardware_fault"))
+        self.hardware_count += suspected.num_rows
+        _name(self.hardware, suspected, lambda rows: _probability(rows[0]["hardware_probability"]))
+        moved = rows.filter(pc.field("moved").is_valid())
+        self.moved_count += len(pc.unique(moved["vehicle"]))
+        _name(self.moved, moved, lambda rows: "; ".join(f"{row['branch']} {row['moved']}" for row in rows))
+        corrected = rows.filter((pc.field("verdict") == "corrected") & pc.field("applied"))
+        _name(self.corrected, corrected, _corrections)
+
+
+def _name(found: dict[str, str], rows: pa.Table, text: Callable[[list[dict[str, Any]]], str]) -> None:
+    """Name vehicles with what their rows say, until there are enough."""
+    if len(found) >= MOST_NAMED or not rows.num_rows:
+        return
+    for name, group in groupby(rows.to_pylist(), key=lambda row: str(row["vehicle"])):
+        if len(found) == MOST_NAMED:
+            return
+        found[name] = text(list(group))
+
+
+def _corrections(rows: list[dict[str, Any]]) -> str:
+    """Which branches of a vehicle are corrected, and a low confidence."""
+    return ", ".join(row["branch"] for row in rows) + _doubt(rows[0]["confidence"])
+
+
+def _probability(value: float | None) -> str:
+    return "" if value is None else f"probability {value:.1f}"
 
 
 def _counts(values: pa.ChunkedArray) -> dict[str, int]:
     return {item["values"]: item["counts"] for item in pc.value_counts(values).to_pylist()}
-
-
-def _named(rows: pa.Table, column: str) -> dict[str, Any]:
-    some = rows.slice(0, MOST_NAMED)
-    return dict(zip(some["vehicle"].to_pylist(), some[column].to_pylist(), strict=True))
-
-
-def _moved(rows: pa.Table) -> dict[str, str]:
-    """Which branches of vehicles have moved, and how."""
-    found: dict[str, list[str]] = {}
-    for row in rows.select(["vehicle", "branch", "moved"]).slice(0, MOST_NAMED).to_pylist():
-        found.setdefault(row["vehicle"], []).append(f"{row['branch']} {row['moved']}")
-    return {name: "; ".join(texts) for name, texts in found.items()}
-
-
-def _corrections(rows: pa.Table) -> dict[str, str]:
-    """Which branches of vehicles are corrected, and a low confidence."""
-    found: dict[str, list[str]] = {}
-    confidence: dict[str, float | None] = {}
-    for row in rows.select(["vehicle", "branch", "confidence"]).slice(0, MOST_NAMED).to_pylist():
-        found.setdefault(row["vehicle"], []).append(row["branch"])
-        confidence[row["vehicle"]] = row["confidence"]
-    return {name: ", ".join(branches) + _doubt(confidence[name]) for name, branches in found.items()}
 
 
 def _doubt(confidence: float | None) -> str:

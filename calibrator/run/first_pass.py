@@ -4,42 +4,43 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from calibrator.calibration_settings import CalibrationSettings, require_learning
+from calibrator.errors import DriveError
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.report.progress import progress_bar
 from calibrator.run.in_order import Workers
-from calibrator.summaries.record import joined_records
+from calibrator.summaries.record import Outline, joined_records
 from calibrator.summaries.store import SummaryStore
 
-__all__ = ["MOST_LEARNT", "Census", "read_sample", "take_census"]
+__all__ = ["MOST_LEARNT", "Census", "named_outlines", "read_sample", "take_census"]
 
 MOST_LEARNT = 2000
 """Vehicles that the reference is learnt from. With so many its centre is known to a fortieth of what faultless vehicles
 differ by, so more would not tell any vehicle's faults better. [1]"""
 
 
+MOST_REASONS = 20
+"""Reasons that are kept for messages."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Census:
-    """Who there is in a store.
+    """Who there is in a store: numbers only, as a fleet has millions of names.
 
     Attributes
     ----------
-    usable : mapping of int to tuple of str
-        Names of the vehicles that can be calibrated, by bucket.
-    left_out : mapping of str to str
-        Why the others cannot.
+    usable : mapping of int to int
+        How many vehicles can be calibrated, by bucket; of all buckets.
+    reasons : mapping of str to str
+        Why others cannot; the first few.
     """
 
-    usable: Mapping[int, tuple[str, ...]]
-    left_out: Mapping[str, str]
+    usable: Mapping[int, int]
+    reasons: Mapping[str, str]
 
     @property
     def size(self) -> int:
         """Number of vehicles that can be calibrated."""
-        return sum(map(len, self.usable.values()))
-
-    def holds(self, vehicle: str, bucket: int) -> bool:
-        """Whether a vehicle, in its bucket, can be calibrated."""
-        return vehicle in self.usable.get(bucket, ())
+        return sum(self.usable.values())
 
 
 def take_census(store: SummaryStore, workers: Workers) -> Census:
@@ -63,14 +64,25 @@ def take_census(store: SummaryStore, workers: Workers) -> Census:
         If a bucket cannot be read.
     """
     buckets = store.buckets()
-    usable: dict[int, tuple[str, ...]] = {}
-    left_out: dict[str, str] = {}
+    usable: dict[int, int] = {}
+    reasons: dict[str, str] = {}
     with progress_bar("look at vehicles", len(buckets), "chunks") as progress:
         for done, (bucket, outlines) in enumerate(zip(buckets, workers.map(store.outlines, buckets), strict=True), 1):
-            usable[bucket] = tuple(item.vehicle for item in outlines if not item.problem)
-            left_out |= {item.vehicle: item.problem for item in outlines if item.problem}
+            usable[bucket] = sum(not item.problem for item in outlines)
+            for item in outlines:
+                if item.problem and len(reasons) < MOST_REASONS:
+                    reasons[item.vehicle] = item.problem
             progress(done)
-    return Census(usable=usable, left_out=left_out)
+    return Census(usable=usable, reasons=reasons)
+
+
+def named_outlines(store: SummaryStore, census: Census, names: Collection[str]) -> dict[str, Outline]:
+    """What there is of some vehicles, by name; those that are not in the store are not."""
+    found: dict[str, Outline] = {}
+    for bucket, wanted in store.by_bucket(names).items():
+        if bucket in census.usable:
+            found |= {item.vehicle: item for item in store.outlines(bucket) if item.vehicle in wanted}
+    return found
 
 
 def read_sample(
@@ -102,19 +114,19 @@ def read_sample(
         If there are too few to learn from.
     """
     wanted = settings.trusted | frozenset(checked)
-    usable = [name for names in census.usable.values() for name in names]
-    require_learning(usable, settings, census.left_out)
     apart = {store.bucket_of(name) for name in wanted}
     found: list[VehicleSummary] = []
     learners = 0
-    for bucket, names in census.usable.items():
-        full = learners >= MOST_LEARNT and not everyone
-        if full and bucket not in apart:
+    for bucket in census.usable:
+        if learners >= MOST_LEARNT and not everyone and bucket not in apart:
             continue
-        records = store.read(bucket)
-        for name in names:
+        for name, records in store.read(bucket).items():
             learns = name not in settings.hold_out
             if name in wanted or everyone or (learns and learners < MOST_LEARNT):
-                found.append(joined_records(records[name]))
+                try:
+                    found.append(joined_records(records))
+                except DriveError:  # left out, with the reason, in the second pass
+                    continue
                 learners += learns
+    require_learning([item.vehicle for item in found], settings, census.reasons)
     return found

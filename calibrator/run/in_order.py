@@ -6,6 +6,7 @@ Nothing of a result depends on where or beside what it was computed; so it is th
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -22,7 +23,7 @@ _Result = TypeVar("_Result")
 
 AHEAD_PER_WORKER = 3
 """Items that are given to a cluster before it is the turn of their results: enough that no worker waits. [1]"""
-TIMEOUT_S = 30.0
+TIMEOUT_S = 10.0
 """Within which a scheduler must answer. [s]"""
 
 
@@ -77,13 +78,20 @@ class Workers:
 
 def _alone(function: Callable[[Any], Any], item: Any) -> Any:
     """One thread: the processes share the cores, and sums do not depend on how many there are."""
-    with threadpool_limits(1):
-        return function(item)
+    _one_thread()
+    return function(item)
+
+
+@cache
+def _one_thread() -> threadpool_limits:
+    """Limit this process for good: the limit is the process's, and other threads of it may compute as well."""
+    return threadpool_limits(1)
 
 
 def _on_cluster(scheduler: str, function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
     try:
-        from distributed import Client  # noqa: PLC0415 (an extra)
+        from distributed import CancelledError, Client, KilledWorker  # noqa: PLC0415 (an extra)
+        from distributed.comm.core import CommClosedError  # noqa: PLC0415
     except ImportError:
         raise FleetError("--scheduler needs Dask: pip install 'hv-current-correction[cluster]'") from None
     try:
@@ -91,11 +99,27 @@ def _on_cluster(scheduler: str, function: Callable[[_Item], _Result], items: Ite
     except (OSError, ValueError) as error:
         raise FleetError(f"{scheduler}: no Dask scheduler answers: {error}; start one with 'dask scheduler'") from None
     with client:
-        shared = client.scatter(function, broadcast=False, hash=False)
+        try:
+            client.wait_for_workers(1, timeout=TIMEOUT_S)
+        except TimeoutError:
+            raise FleetError(f"{scheduler}: the scheduler has no worker; start some with 'dask worker'") from None
+        try:
+            yield from _in_turn(client, function, items)
+        except (KilledWorker, CancelledError, CommClosedError) as error:
+            reason = str(error).partition("\n")[0]
+            raise FleetError(
+                f"{scheduler}: the cluster gave up: {reason}; look at its workers; the same command, run again, goes on"
+            ) from None
+
+
+def _in_turn(client: Any, function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
+    """Results in the order of the items; as many are given out ahead as the workers there are now need."""
+    waiting, futures = iter(items), deque[Any]()
+    while True:
         ahead = AHEAD_PER_WORKER * max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
-        waiting = iter(items)
-        futures = deque(client.submit(_alone, shared, item, pure=False) for item in islice(waiting, ahead))
-        while futures:
-            result = futures.popleft().result()
-            futures.extend(client.submit(_alone, shared, item, pure=False) for item in islice(waiting, 1))
-            yield result
+        more = islice(waiting, max(ahead - len(futures), 0))
+        futures.extend(client.submit(_alone, function, item, pure=False) for item in more)
+        if not futures:
+            return
+        result: _Result = futures.popleft().result()
+        yield result

@@ -9,9 +9,10 @@ from calibrator.calibration_settings import CalibrationSettings
 from calibrator.errors import FleetError
 from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.bench import read_bench
+from calibrator.posterior.bench_table import vehicles_named
 from calibrator.posterior.fleet import FindModels, Learnt, learn_fleet
 from calibrator.report.progress import progress_bar
-from calibrator.run.first_pass import Census, read_sample, take_census
+from calibrator.run.first_pass import Census, named_outlines, read_sample, take_census
 from calibrator.run.in_order import Workers
 from calibrator.run.previous import PreviousResult
 from calibrator.run.second_pass import calibrate_bucket
@@ -76,18 +77,20 @@ def calibrate_store(
     UserError
         If the fleet as a whole cannot be calibrated.
     """
-    census = take_census(store, workers)
+    versions, census = store.versions(), take_census(store, workers)
     _require_known(settings, store, census)
     learnt = _learn(store, census, settings, identity, find_models)
-    todo = [bucket for bucket in store.buckets() if not chunks.done(bucket)]
+    todo = [bucket for bucket in census.usable if not chunks.done(bucket)]
     calibrate = partial(calibrate_bucket, store=store, task=learnt.task, previous=previous)
-    before = sum(len(names) for bucket, names in census.usable.items() if bucket not in set(todo))
+    seen = census.size - sum(census.usable[bucket] for bucket in todo)
     with progress_bar("calibrate", census.size, "vehicles") as progress:
-        progress(before)
+        progress(seen)
         for bucket, result in zip(todo, workers.map(calibrate, todo), strict=True):
             chunks.put(bucket, result)
-            before += len(census.usable[bucket])
-            progress(before)
+            seen += census.usable[bucket]
+            progress(seen)
+    if store.versions() != versions:
+        raise FleetError(f"{store.url}: the summaries were changed during the run; run the same command again")
     return PosteriorRun(census=census, learnt=learnt)
 
 
@@ -99,12 +102,15 @@ def _learn(
     find_models: FindModels | None,
 ) -> Learnt:
     """The reference, in one thread, so that it is the same wherever it is learnt."""
-    branches, usable = store.identity.branches, {name for names in census.usable.values() for name in names}
+    branches = store.identity.branches
+    named = set() if settings.readings is None else vehicles_named(settings.readings)
+    there = named_outlines(store, census, named)
+    some = [item.vehicle for bucket in list(census.usable)[:1] for item in store.outlines(bucket)]
     bench = read_bench(
         settings,
-        usable,
+        {name for name, item in there.items() if not item.problem} | set(some) - there.keys(),
         branches,
-        left_out=census.left_out,
+        left_out={name: item.problem for name, item in there.items() if item.problem},
         full_scale_a=identity.database.layout.full_scale_a,
     )
     checked = {vehicle for vehicle, _ in bench}
@@ -122,9 +128,9 @@ def _learn(
 
 def _require_known(settings: CalibrationSettings, store: SummaryStore, census: Census) -> None:
     """Refuse names of vehicles that there are not."""
+    there = named_outlines(store, census, settings.hold_out | settings.trusted)
     for names, what in ((settings.hold_out, "hold out"), (settings.trusted, "trust")):
-        usable = {name for name in names if census.holds(name, store.bucket_of(name))}
-        unknown = sorted(names - usable - (census.left_out.keys() if what == "hold out" else set()))
-        if unknown:
-            reasons = [f"; {name}: {census.left_out[name]}" for name in unknown if name in census.left_out]
-            raise FleetError(f"{store.url}: no usable vehicle {', '.join(unknown)} to {what}{''.join(reasons)}")
+        missing = [name for name in sorted(names) if name not in there or (there[name].problem and what == "trust")]
+        if missing:
+            reasons = [f"; {name}: {there[name].problem}" for name in missing if name in there]
+            raise FleetError(f"{store.url}: no usable vehicle {', '.join(missing)} to {what}{''.join(reasons)}")

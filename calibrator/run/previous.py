@@ -10,10 +10,10 @@ from calibrator.errors import FleetError
 from calibrator.evidence.readings import TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD
 from calibrator.options import Method
 from calibrator.posterior.estimate import FleetPosterior
-from calibrator.results import PARTS, chunk_parameters, read_run
+from calibrator.results import PARTS, Written, read_part, read_run
 from calibrator.summaries.identity import StoreIdentity
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import BranchParameters, VehicleParameters, decode_parameters, read_parameters
+from ecu_node.parameters import BranchParameters, VehicleParameters
 
 __all__ = ["PreviousResult", "moved_sensors", "require_previous"]
 
@@ -35,14 +35,11 @@ class PreviousResult:
 
     folder: Path
 
-    def parameters(self, bucket: int, vehicles: Sequence[str]) -> dict[str, VehicleParameters]:
-        """Parameters of those of some vehicles of one bucket that have any."""
-        part = self.folder / PARTS / f"{bucket:05d}.parquet"
-        if (self.folder / PARTS).is_dir():
-            texts = dict(chunk_parameters(part.read_bytes())) if part.exists() else {}
-            return {name: decode_parameters(texts[name], f"{part}: {name}") for name in vehicles if name in texts}
-        paths = {name: self.folder / "params" / f"{name}.json" for name in vehicles}
-        return {name: read_parameters(path) for name, path in paths.items() if path.exists()}
+    def written(self, bucket: int) -> dict[str, Written]:
+        """Parameters of the vehicles of a bucket, by name; raises FleetError if they cannot be read."""
+        if not (self.folder / PARTS).is_dir():
+            raise FleetError(f"{self.folder / PARTS}: the earlier result cannot be reached from here")
+        return read_part(self.folder / PARTS / f"{bucket:05d}.parquet")
 
 
 def require_previous(folder: Path, database: VehicleDatabase, store: StoreIdentity) -> None:
@@ -65,12 +62,17 @@ def require_previous(folder: Path, database: VehicleDatabase, store: StoreIdenti
     run = read_run(folder)
     if run.method != Method.POSTERIOR.value:
         raise FleetError(f"{folder}: a result of the method {run.method}; --since goes on from one of the posterior")
-    if run.layout != database.layout.name or run.branches != list(store.branches):
+    if run.branches != list(store.branches):
         raise FleetError(
-            f"{folder}: a result of layout {run.layout} with branches {', '.join(run.branches)}; this fleet is of "
-            f"layout {database.layout.name} with {', '.join(store.branches)}: calibrate it without --since"
+            f"{folder}: a result with branches {', '.join(run.branches)}; this fleet has {', '.join(store.branches)}: "
+            f"calibrate it without --since"
         )
-    if run.buckets not in {0, store.buckets}:
+    if (run.layout_sha256, run.dbc_sha256) != (database.layout.digest, database.digest):
+        raise FleetError(
+            f"{folder}: made with another version of layout or DBC than {database.layout.path}; the node would not "
+            f"accept its parameters: calibrate without --since"
+        )
+    if run.buckets != store.buckets:
         raise FleetError(
             f"{folder}: made from a store of {run.buckets} buckets, and this one has {store.buckets}; give the same "
             f"store, with the new drives added, or calibrate without --since"

@@ -7,23 +7,27 @@ from all of them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from calibrator.errors import DriveError
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.posterior.fleet import FleetTask
-from calibrator.results import ChunkResult, encode_chunk
+from calibrator.results import ChunkResult, Written, encode_chunk
 from calibrator.run.previous import PreviousResult, moved_sensors
-from calibrator.summaries.record import Record, joined_records
+from calibrator.summaries.record import Record, drives_digest, joined_records
 from calibrator.summaries.store import SummaryStore
 from ecu_node.errors import UserError
-from ecu_node.parameters import VehicleParameters
+from ecu_node.parameters import VehicleParameters, decode_parameters
 
 __all__ = ["calibrate_bucket"]
 
-_BAD_VEHICLE = (UserError, np.linalg.LinAlgError, ArithmeticError, ValueError)
+_BAD_VEHICLE = (UserError, np.linalg.LinAlgError, ArithmeticError, LookupError, ValueError)
 """What numbers that make no sense may raise."""
+SILENT: dict[str, Any] = {"over": "ignore", "invalid": "ignore", "divide": "ignore"}
+"""What comes of such numbers is not finite, which is refused; no warning is needed."""
+NOT_THERE = "it is not in this store; its earlier parameters are in the earlier result"
 
 
 @dataclass(kw_only=True)
@@ -57,52 +61,63 @@ def calibrate_bucket(
         Parameters, and who was left out and why.
     """
     records, found = store.read(bucket), _Found()
-    before = previous.parameters(bucket, list(records)) if previous is not None else {}
+    before = previous.written(bucket) if previous is not None else {}
+    digests = {name: drives_digest(items) for name, items in records.items()}
     todo: list[VehicleSummary] = []
     for name, items in records.items():
-        known, new = _known_and_new(items, before.get(name))
-        if known and not any(record.found for record in new):
-            found.parameters.append(before[name])
+        earlier = _earlier(name, before.get(name))
+        if earlier is not None and before[name].drives == digests[name]:
+            found.parameters.append(earlier)
             continue
         try:
-            todo.append(_what_holds(known, new, before[name], task, found) if known else joined_records(new))
+            todo.append(_what_holds(items, earlier, task, found))
         except DriveError as error:
             found.left_out[name] = str(error)
+    found.left_out |= dict.fromkeys(before.keys() - records.keys(), NOT_THERE)
     _calibrate(todo, task, found)
-    return encode_chunk(found.parameters, found.left_out, found.moved)
+    return encode_chunk(found.parameters, found.left_out, moved=found.moved, drives=digests)
 
 
-def _known_and_new(
-    records: Sequence[Record], before: VehicleParameters | None
-) -> tuple[Sequence[Record], Sequence[Record]]:
-    """Records that the earlier parameters were found from, and those that came since.
-
-    Records stand in the order in which they came. Those before the first known one are of a time before a sensor moved.
-    """
-    drives = set() if before is None else set(before.provenance.drives)
-    known = [place for place, record in enumerate(records) if drives & set(record.drives)]
-    if not known:
-        return [], records
-    return records[known[0] : known[-1] + 1], records[known[-1] + 1 :]
+def _earlier(name: str, written: Written | None) -> VehicleParameters | None:
+    return None if written is None else decode_parameters(written.text, f"earlier parameters of {name}")
 
 
 def _what_holds(
-    known: Sequence[Record], new: Sequence[Record], before: VehicleParameters, task: FleetTask, found: _Found
+    records: Sequence[Record], earlier: VehicleParameters | None, task: FleetTask, found: _Found
 ) -> VehicleSummary:
-    """Summary of all drives of a vehicle, or of the new ones alone if they show that a sensor has moved."""
-    everything = joined_records([*known, *new])
+    """Summary of all drives of a vehicle, or of the new ones alone if they show that a sensor has moved.
+
+    Records stand in the order in which they came. Those before the first one that the earlier parameters were found
+    from are of a time before a sensor moved.
+    """
+    drives = set() if earlier is None else set(earlier.provenance.drives)
+    known = [place for place, record in enumerate(records) if record.drives and set(record.drives) <= drives]
+    if earlier is None or not known:
+        return joined_records(records)
+    everything = joined_records(records[known[0] :])
+    moved = _moved_since(records[known[-1] + 1 :], earlier, task)
+    if moved is None:
+        return everything
+    recent, changes = moved
+    found.moved |= {(earlier.vehicle, branch): text for branch, text in changes.items()}
+    return recent
+
+
+def _moved_since(
+    new: Sequence[Record], earlier: VehicleParameters, task: FleetTask
+) -> tuple[VehicleSummary, dict[str, str]] | None:
+    """New drives alone, and what they show to have moved; None if nothing has, or they do not tell."""
+    if not any(record.found for record in new):
+        return None
     try:
         recent = joined_records(new)
-    except DriveError:
-        return everything
-    try:
-        posterior = task.estimate([recent])
+        with np.errstate(**SILENT):
+            posterior = task.estimate([recent])
     except _BAD_VEHICLE:
-        return everything
+        return None
     scale_a = task.identity.database.layout.full_scale_a
-    moved = moved_sensors(before, posterior, task.branches, full_scale_a=scale_a)
-    found.moved |= {(before.vehicle, branch): text for branch, text in moved.items()}
-    return recent if moved else everything
+    changes = moved_sensors(earlier, posterior, task.branches, full_scale_a=scale_a)
+    return (recent, changes) if changes else None
 
 
 def _calibrate(vehicles: Sequence[VehicleSummary], task: FleetTask, found: _Found) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from calibrator.errors import FleetError
 from calibrator.results import ChunkResult
+from ecu_node.layout import file_digest
 from ecu_node.parameters import write_atomically
 
 __all__ = ["Chunks", "Unfinished", "unfinished_run"]
@@ -36,7 +37,7 @@ class Chunks:
 
     def done(self, number: int) -> bool:
         """Whether a chunk is there."""
-        return self.rows(number).exists()
+        return self.rows(number).exists() and self.parameters(number).exists()
 
     def put(self, number: int, result: ChunkResult) -> None:
         """Keep a chunk; it counts from when its rows are there, which are written last."""
@@ -84,6 +85,22 @@ class Unfinished:
         """What was computed."""
         return Chunks(folder=self.folder / CHUNKS)
 
+    def summaries_since(self, earlier: Path | None) -> None:
+        """Begin the store of summaries with those of an earlier result, unless this was done before, or with none."""
+        marker, mark = self.folder / "since", "" if earlier is None else _mark(earlier)
+        there = marker.read_text() if marker.exists() else ""
+        if there == mark and (earlier is None or self.summaries.exists()):
+            return
+        marker.unlink(missing_ok=True)
+        shutil.rmtree(self.summaries, ignore_errors=True)
+        if earlier is None:
+            return
+        copy = self.folder / "summaries.copy"
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(earlier / SUMMARIES, copy, ignore=shutil.ignore_patterns(".*"))
+        copy.rename(self.summaries)
+        write_atomically(marker, mark.encode())
+
     def begin(self, plan: str | None, note: str) -> str:
         """Keep the chunks that are there if they were computed by the same plan, else remove them.
 
@@ -103,6 +120,7 @@ class Unfinished:
         before, _, noted = path.read_text().partition("\n") if path.exists() else ("", "", "")
         if plan is not None and before == plan:
             return noted
+        path.unlink(missing_ok=True)  # first, so that no other plan is ever taken for that of the chunks
         shutil.rmtree(self.folder / CHUNKS, ignore_errors=True)
         (self.folder / CHUNKS).mkdir()
         write_atomically(path, f"{plan or ''}\n{note}".encode())
@@ -166,6 +184,10 @@ def unfinished_run(out: Path) -> Iterator[Unfinished]:
     finally:
         os.close(lock)
         _remove_if_empty(folder)
+
+
+def _mark(result: Path) -> str:
+    return f"{result.absolute()} {file_digest(result / 'run.json')}"
 
 
 def _remove_if_empty(folder: Path) -> None:

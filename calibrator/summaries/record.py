@@ -1,5 +1,6 @@
 """One record of a store: what one reading of a vehicle's drives gave. Records of a vehicle add up."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -16,7 +17,10 @@ from calibrator.evidence.readings import weighted_mean
 from calibrator.evidence.vehicle_summary import LEAST_DURATION_S, VehicleSummary
 from calibrator.evidence.zero_current import ZeroCurrent
 
-__all__ = ["Outline", "Record", "joined_records", "outline_of", "source_version"]
+__all__ = ["Outline", "Record", "drives_digest", "joined_records", "outline_of", "source_version"]
+
+MOST_MOMENT, MOST_VARIANCE_A2 = 1e30, 1e10
+"""Far beyond what any vehicle's recordings give: sums of products in any unit, variance of a current [A^2]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +65,14 @@ class Outline:
     vehicle: str
     drives: tuple[str, ...]
     problem: str
+
+
+def drives_digest(records: Sequence[Record]) -> str:
+    """Digest of the drives of a vehicle that can be used, as they are: another one if any was added or changed."""
+    known = sorted(
+        pair for record in records if record.found for pair in zip(record.drives, record.sources, strict=True)
+    )
+    return hashlib.blake2b(repr(known).encode(), digest_size=16).hexdigest()
 
 
 def source_version(path: Path) -> str:
@@ -114,8 +126,8 @@ def joined_records(records: Sequence[Record]) -> VehicleSummary:
     found = usable[0] if len(usable) == 1 else _added(usable)
     if problem := _too_short(found.summary.duration_s, found.drives):
         raise DriveError(problem)
-    if not np.isfinite(found.summary.moments).all():
-        raise DriveError("its summary holds numbers that are not finite; summarise its drives again")
+    if not np.abs(found.summary.moments).max() < MOST_MOMENT or found.summary.variance_a2.max() > MOST_VARIANCE_A2:
+        raise DriveError("its summary holds impossible numbers; look at its recordings, and summarise them again")
     return found
 
 

@@ -5,8 +5,11 @@ moderate number of files of moderate size, a vehicle is found without an index, 
 the fleet. A bucket is written whole or not at all.
 """
 
+import fcntl
+import os
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from calibrator.storage import Storage
@@ -91,6 +94,19 @@ class SummaryStore:
         """
         rows = [record for vehicle in sorted(records) for record in records[vehicle]]
         self._files.write(_file(bucket), encode_records(rows, self.identity))
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """While no other process of this machine does the same; other storage than folders has no locks."""
+        if not self.storage.is_local:
+            yield
+            return
+        handle = os.open(self.storage.url, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(handle)
 
     @property
     def _files(self) -> Storage:

@@ -3,11 +3,13 @@
 The store is its own checkpoint: buckets that are there are not made again, and what a killed run has left is whole.
 """
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calibrator.drive import DriveFile
@@ -93,7 +95,8 @@ def open_store(
     )
     if identity is None:
         write_identity(storage, wanted)
-        return SummaryStore(storage=storage, identity=wanted)
+        identity = read_identity(storage, database)  # another process may have made the store just now
+        assert identity is not None
     if difference := identity.difference(wanted):
         raise FleetError(f"{storage.url}: these drives cannot be added to this store: {difference}; use another store")
     return SummaryStore(storage=storage, identity=identity)
@@ -137,28 +140,109 @@ def add_drives(
     by_bucket = {b: names for b, names in store.by_bucket(fleet.vehicles).items() if b % count == number - 1}
     if exactly:
         _remove_others(store, fleet)
-    problems: dict[str, str] = {}
-    vehicles = drives = seen = 0
-    total = sum(map(len, by_bucket.values()))
-    entries = (new.entries for bucket, names in by_bucket.items() for new in _new(store, fleet, bucket, names))
+    waiting: deque[_Work] = deque()
+    entries = _entries(store, fleet, by_bucket, waiting, retry=not exactly)
     summarise = partial(_summarise, store=store.identity, database=database)
     reading = read_in_processes(summarise, entries, workers=workers, limit_s=time_limit_s)
+    total, seen, done = sum(map(len, by_bucket.values())), 0, _Done()
     with progress_bar("summarise drives", total, "vehicles") as progress, closing(reading) as results:
-        for bucket, names in by_bucket.items():
-            new = _new(store, fleet, bucket, names)
-            records = store.read(bucket) if new else {}
-            for vehicle, outcome in zip(new, results, strict=False):
-                record = _record(vehicle.entries, outcome)
-                records[vehicle.name] = [*vehicle.kept, record]
-                vehicles, drives = vehicles + 1, drives + len(vehicle.entries)
-                if record.problem:
-                    problems[vehicle.name] = record.problem
-                progress(seen + vehicles)
-            if new:
-                store.write(bucket, records)
-            seen += len(names) - len(new)
-            progress(seen + vehicles)
-    return Added(vehicles=vehicles, drives=drives, problems=problems)
+        for outcome in results:
+            while not waiting[0].new:
+                seen += waiting.popleft().vehicles
+            work = waiting[0]
+            work.records.append(_record(work.new[len(work.records)].entries, outcome))
+            progress(seen + len(work.records))
+            if len(work.records) == len(work.new):
+                _keep(store, work, done)
+                seen += waiting.popleft().vehicles
+        progress(total)
+    return Added(vehicles=done.vehicles, drives=done.drives, problems=done.problems)
+
+
+@dataclass(kw_only=True)
+class _Done:
+    """What has been read so far."""
+
+    vehicles: int = 0
+    drives: int = 0
+    problems: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _New:
+    """Drives of a vehicle to be read, and which version of each drive there is."""
+
+    entries: tuple[DriveFile, ...]
+    versions: Mapping[str, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Work:
+    """What is to be read for a bucket, and the records that there are of it, in the same order."""
+
+    bucket: int
+    vehicles: int
+    new: Sequence[_New]
+    records: list[Record] = field(default_factory=list)
+
+
+def _entries(
+    store: SummaryStore,
+    fleet: FleetSource,
+    by_bucket: Mapping[int, Sequence[str]],
+    waiting: "deque[_Work]",
+    *,
+    retry: bool,
+) -> Iterator[tuple[DriveFile, ...]]:
+    """Drives to read, vehicle by vehicle; ``waiting`` gets what they belong to."""
+    for bucket, names in by_bucket.items():
+        work = _Work(bucket=bucket, vehicles=len(names), new=_new(store.read(bucket), fleet, names, retry=retry))
+        waiting.append(work)
+        yield from (item.entries for item in work.new)
+
+
+def _new(
+    records: Mapping[str, Sequence[Record]], fleet: FleetSource, names: Sequence[str], *, retry: bool
+) -> list[_New]:
+    """Vehicles of a bucket that have drives which no record holds as they are now.
+
+    A record is made anew with all its drives if one of them was changed; what could not be used is tried again if it
+    was changed, or if that is asked for.
+    """
+    found = []
+    for name in names:
+        versions = {entry.name: source_version(entry.path) for entry in fleet.vehicles[name]}
+        kept = [item for item in records.get(name, []) if _stays(item, versions) and not (retry and item.problem)]
+        there = {drive for record in kept for drive in record.drives}
+        entries = tuple(entry for entry in fleet.vehicles[name] if entry.name not in there)
+        if entries:
+            found.append(_New(entries=entries, versions=versions))
+    return found
+
+
+def _stays(record: Record, versions: Mapping[str, str]) -> bool:
+    """Whether a record is still right, or cannot be made anew as not all of its drives are given."""
+    known = zip(record.drives, record.sources, strict=True)
+    return not versions.keys() >= set(record.drives) or all(versions[drive] == source for drive, source in known)
+
+
+def _keep(store: SummaryStore, work: _Work, done: _Done) -> None:
+    """Put the records of a bucket into the store, beside what others have put there meanwhile."""
+    with store.locked():
+        records = store.read(work.bucket)
+        for item, record in zip(work.new, work.records, strict=True):
+            drives = set(record.drives)
+            others = [
+                old
+                for old in records.get(record.vehicle, [])
+                if _stays(old, item.versions) and not drives & set(old.drives)
+            ]
+            records[record.vehicle] = [*others, record]
+            done.vehicles += 1
+            done.drives += len(record.drives)
+            if record.problem:
+                done.problems[record.vehicle] = record.problem
+        store.write(work.bucket, records)
 
 
 def _remove_others(store: SummaryStore, fleet: FleetSource) -> None:
@@ -177,54 +261,27 @@ def _is_of(record: Record, fleet: FleetSource) -> bool:
     return all(versions.get(drive) == source for drive, source in known)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _New:
-    """Drives of a vehicle to be read, and its records that stay."""
-
-    name: str
-    entries: tuple[DriveFile, ...]
-    kept: tuple[Record, ...]
-
-
-def _new(store: SummaryStore, fleet: FleetSource, bucket: int, names: Sequence[str]) -> list[_New]:
-    """Vehicles of a bucket that have drives which no record holds as they are now.
-
-    A record is made anew with all its drives if one of them was changed, and what could not be used is tried again.
-    """
-    records, found = store.read(bucket), []
-    for name in names:
-        versions = {entry.name: source_version(entry.path) for entry in fleet.vehicles[name]}
-        kept = tuple(record for record in records.get(name, []) if _stays(record, versions))
-        there = {drive for record in kept for drive in record.drives}
-        entries = tuple(entry for entry in fleet.vehicles[name] if entry.name not in there)
-        if entries:
-            found.append(_New(name=name, entries=entries, kept=kept))
-    return found
-
-
-def _stays(record: Record, versions: Mapping[str, str]) -> bool:
-    """Whether a record is still right, or cannot be made anew as not all of its drives are given."""
-    if record.problem:
-        return False
-    known = zip(record.drives, record.sources, strict=True)
-    return not versions.keys() >= set(record.drives) or all(versions[drive] == source for drive, source in known)
-
-
 def _record(entries: Sequence[DriveFile], outcome: "Record | Unread") -> Record:
     return _unusable(entries, outcome.reason) if isinstance(outcome, Unread) else outcome
 
 
 def _summarise(entries: tuple[DriveFile, ...], *, store: StoreIdentity, database: VehicleDatabase) -> Record:
     """Record of some drives of one vehicle. One thread: the processes share the cores."""
+    sources = _sources(entries)
     with threadpool_limits(1):
         try:
-            sources = tuple(source_version(entry.path) for entry in entries)
             found = read_vehicle_summary(entries, store.equipment, database, bank=store.bank)
         except UserError as error:
             return _unusable(entries, str(error))
+        except (np.linalg.LinAlgError, ArithmeticError, LookupError, ValueError) as error:
+            return _unusable(entries, f"its drives cannot be summarised: {error}; look at its recordings")
     return Record(vehicle=found.vehicle, drives=found.drives, sources=sources, found=found)
+
+
+def _sources(entries: Sequence[DriveFile]) -> tuple[str, ...]:
+    return tuple(source_version(entry.path) for entry in entries)
 
 
 def _unusable(entries: Sequence[DriveFile], problem: str) -> Record:
     drives = tuple(entry.name for entry in entries)
-    return Record(vehicle=entries[0].vehicle, drives=drives, sources=("",) * len(drives), found=None, problem=problem)
+    return Record(vehicle=entries[0].vehicle, drives=drives, sources=_sources(entries), found=None, problem=problem)

@@ -65,7 +65,9 @@ def result(request: pytest.FixtureRequest, tmp_path: Path, database: VehicleData
     folder = tmp_path / "result"
     folder.mkdir()
     where = write_parameter_files(folder, parts, vehicles=request.param)
-    write_run(folder, replace(RUN, buckets=BUCKETS if where == PARTS else 0))
+    assert where == ("params" if request.param == 2 else PARTS)
+    assert (folder / "params").exists() == (where == "params")
+    write_run(folder, replace(RUN, buckets=BUCKETS))
     return folder
 
 

@@ -114,3 +114,13 @@ def test_one_vehicle_is_its_own_fleet() -> None:
     a, b = slopes_of(summaries, model_of(summaries))
     np.testing.assert_allclose(a, 1.0, atol=1e-3)
     np.testing.assert_allclose(b, 0.0, atol=0.1)
+
+
+def test_a_vehicle_with_an_input_in_another_unit_does_not_bend_the_model() -> None:
+    summaries = list(summaries_of(no_faults(20, K), seed=4))
+    scale = np.ones(summaries[0].moments.shape[1])
+    scale[0] = 1000.0
+    odd = replace(summaries[3], moments=summaries[3].moments * np.outer(scale, scale))
+    assert (
+        largest_error(model_of([*summaries[:3], odd, *summaries[4:]])) < 1.5 * largest_error(model_of(summaries)) + 1e-3
+    )

@@ -1,5 +1,6 @@
 """Whole runs as a user types them: killed and gone on with, with any number of workers, on a cluster, from a result."""
 
+import dataclasses
 import os
 import shutil
 import signal
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from calibrator.results import read_results, read_run
+from calibrator.run.unfinished import unfinished_run
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.evidence.simulated_drives import Conditions, summaries_of
@@ -93,13 +95,8 @@ def test_other_settings_do_not_go_on_from_what_was_computed(store: SummaryStore,
 
 
 def test_a_second_run_to_the_same_place_is_refused(store: SummaryStore, tmp_path: Path) -> None:
-    line = command("calibrate", store.url, "--layout", LAYOUT, "--out", tmp_path / "out", "--workers", 1)
-    with subprocess.Popen(line, stderr=subprocess.PIPE, env=ENVIRONMENT) as first:
-        until = time.monotonic() + 120.0
-        while not (tmp_path / ".out.unfinished" / "plan").exists() and time.monotonic() < until:
-            time.sleep(0.01)
+    with unfinished_run(tmp_path / "out"):
         second = calibrate(store.url, tmp_path / "out", "--workers", 1)
-        first.kill()
     assert second.returncode == 1
     assert "another run is writing this result; wait for it or choose another --out" in second.stderr
 
@@ -112,6 +109,7 @@ def test_a_second_run_to_the_same_place_is_refused(store: SummaryStore, tmp_path
         (("--branches", "battery,motor"), "a store of summaries, and --branches needs the drives"),
         (("--trusted", "V777"), "no usable vehicle V777 to trust"),
         (("--hold-out", "V777"), "no usable vehicle V777 to hold out"),
+        (("--hold-out", "V003", "--trusted", "V003"), "vehicle V003 is both held out and trusted"),
         (("--scheduler", "tcp://127.0.0.1:9"), "tcp://127.0.0.1:9: no Dask scheduler answers"),
     ],
 )
@@ -139,6 +137,26 @@ def test_since_an_earlier_result_only_those_who_drove_are_calibrated(
     assert "V009: battery drift" in run.stdout
     before, after = contents(result / "params"), contents(tmp_path / "out" / "params")
     assert [name for name in before if before[name] != after[name]] == ["V009.json"]
+
+
+def test_a_vehicle_that_cannot_be_used_stops_neither_pass(
+    store: SummaryStore, database: VehicleDatabase, tmp_path: Path
+) -> None:
+    shutil.copytree(store.url, tmp_path / "store")
+    other = SummaryStore(storage=type(store.storage)(url=str(tmp_path / "store")), identity=store.identity)
+    bucket = other.bucket_of("V012")
+    records = other.read(bucket)
+    found = records["V012"][0].found
+    assert found is not None
+    huge = dataclasses.replace(found.summary, moments=1e200 * found.summary.moments)
+    spoilt = dataclasses.replace(records["V012"][0], found=dataclasses.replace(found, summary=huge))
+    other.write(bucket, {**records, "V012": [spoilt]})
+    run = calibrate(other.url, tmp_path / "out", "--workers", 2)
+    assert run.returncode == 0, run.stderr
+    assert read_run(tmp_path / "out").left_out == {
+        "V012": "its summary holds impossible numbers; look at its recordings, and summarise them again"
+    }
+    assert read_run(tmp_path / "out").vehicles == VEHICLES - 1
 
 
 def test_since_what_is_no_result_is_refused(store: SummaryStore, tmp_path: Path) -> None:

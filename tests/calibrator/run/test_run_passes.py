@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -15,7 +16,7 @@ from calibrator.faults import Faults
 from calibrator.options import Method
 from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.fleet import FleetTask, learn_fleet
-from calibrator.results import ChunkResult, chunk_parameters
+from calibrator.results import ChunkResult
 from calibrator.run.first_pass import read_sample, take_census
 from calibrator.run.in_order import Workers
 from calibrator.run.previous import PreviousResult
@@ -47,7 +48,8 @@ def task(store: SummaryStore, database: VehicleDatabase) -> FleetTask:
 
 
 def texts(chunk: ChunkResult) -> dict[str, bytes]:
-    return dict(chunk_parameters(chunk.parameters))
+    table = pq.read_table(pa.BufferReader(chunk.parameters)).to_pylist()
+    return {row["vehicle"]: row["parameters"].encode() for row in table}
 
 
 def rows(chunk: ChunkResult) -> list[dict[str, Any]]:
@@ -91,9 +93,43 @@ def test_a_vehicle_that_cannot_be_estimated_does_not_stop_the_others(
     huge = replace(found.summary, moments=found.summary.moments * 1e200)
     spoilt = {**records, bad: [replace(records[bad][0], found=replace(found, summary=huge))]}
     chunk = calibrate_bucket(bucket, store=rewritten(store, tmp_path, bucket, spoilt), task=task)
+    assert texts(chunk) == {name: expected[name] for name in others}
+    (left_out,) = [row for row in rows(chunk) if row["branch"] is None]
+    assert (left_out["vehicle"], left_out["reason"][:37]) == (bad, "its summary holds impossible numbers;")
+
+
+def test_a_vehicle_whose_evidence_cannot_be_used_does_not_stop_the_others(
+    store: SummaryStore, task: FleetTask, tmp_path: Path
+) -> None:
+    bucket = fullest(store)
+    records = store.read(bucket)
+    expected = texts(calibrate_bucket(bucket, store=store, task=task))
+    bad, *others = records
+    found = records[bad][0].found
+    assert found is not None
+    huge = replace(found.summary, noise_a2=np.full_like(found.summary.noise_a2, np.nan))
+    spoilt = {**records, bad: [replace(records[bad][0], found=replace(found, summary=huge))]}
+    chunk = calibrate_bucket(bucket, store=rewritten(store, tmp_path, bucket, spoilt), task=task)
     assert {name: text for name, text in texts(chunk).items() if name != bad} == {
         name: expected[name] for name in others
     }
+    (left_out,) = [row for row in rows(chunk) if row["branch"] is None]
+    assert left_out["vehicle"] == bad
+    assert left_out["reason"].startswith("its evidence cannot be used: ")
+
+
+def test_a_vehicle_with_impossible_numbers_is_not_learnt_from(store: SummaryStore, tmp_path: Path) -> None:
+    bucket = fullest(store)
+    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
+    bad = min(records)
+    found = records[bad][0].found
+    assert found is not None
+    moments = found.summary.moments.copy()
+    moments[2, 1, 1] = np.inf
+    records[bad] = [replace(records[bad][0], found=replace(found, summary=replace(found.summary, moments=moments)))]
+    other = rewritten(store, tmp_path, bucket, records)
+    sample = read_sample(other, take_census(other, ONE), CalibrationSettings(), (), everyone=False)
+    assert {item.vehicle for item in sample} == records.keys() - {bad}
 
 
 def test_a_vehicle_without_usable_drives_is_left_out_with_its_reason(
@@ -105,7 +141,8 @@ def test_a_vehicle_without_usable_drives_is_left_out_with_its_reason(
     other = rewritten(store, tmp_path, bucket, records)
     (left_out,) = [row for row in rows(calibrate_bucket(bucket, store=other, task=task)) if row["branch"] is None]
     assert (left_out["vehicle"], left_out["verdict"], left_out["reason"]) == ("V999", "left out", "drive x: cut")
-    assert take_census(other, ONE).left_out == {"V999": "drive x: cut"}
+    census = take_census(other, ONE)
+    assert (census.size, census.reasons) == (len(records) - 1, {"V999": "drive x: cut"})
 
 
 def test_the_sample_is_the_whole_of_a_small_fleet_less_those_held_out(store: SummaryStore) -> None:
@@ -123,7 +160,7 @@ def test_the_sample_of_a_large_fleet_is_of_fixed_size_and_holds_those_that_were_
 ) -> None:
     monkeypatch.setattr("calibrator.run.first_pass.MOST_LEARNT", 10)
     census = take_census(store, ONE)
-    last = census.usable[max(census.usable)][-1]
+    last = list(store.read(max(census.usable)))[-1]
     settings = CalibrationSettings(trusted=frozenset({last}))
     sample = [item.vehicle for item in read_sample(store, census, settings, (), everyone=False)]
     assert last in sample
@@ -149,6 +186,47 @@ def faults_of_vehicle(j: int, **changes: float) -> Faults:
     drift[0, 0] += changes.get("drift", 0.0)
     offset_a[0, 0] += changes.get("offset_a", 0.0)
     return replace(faults, drift=drift, offset_a=offset_a)
+
+
+def test_a_drive_that_was_changed_is_heeded_though_its_name_is_known(
+    store: SummaryStore, task: FleetTask, tmp_path: Path
+) -> None:
+    bucket = fullest(store)
+    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
+    previous = previous_of(tmp_path / "r", calibrate_bucket(bucket, store=store, task=task), bucket)
+    name = min(name for name in records if int(name[1:]) % 3 == 0)
+    (changed,) = summaries_of(faults_of_vehicle(int(name[1:]), drift=0.08), Conditions(model_error_a=0.5), seed=7)
+    records[name] = [replace(record_of(name, changed), sources=("3-4",))]
+    other = rewritten(store, tmp_path / "s", bucket, records)
+    chunk = calibrate_bucket(bucket, store=other, task=task, previous=previous)
+    (battery,) = [row for row in rows(chunk) if row["vehicle"] == name and row["branch"] == "battery"]
+    assert battery["drift"] == pytest.approx(0.08, abs=0.005)
+
+
+def test_an_earlier_vehicle_that_the_store_lacks_is_told(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
+    bucket = fullest(store)
+    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
+    previous = previous_of(tmp_path / "r", calibrate_bucket(bucket, store=store, task=task), bucket)
+    name = max(records)
+    del records[name]
+    other = rewritten(store, tmp_path / "s", bucket, records)
+    (left_out,) = [
+        row
+        for row in rows(calibrate_bucket(bucket, store=other, task=task, previous=previous))
+        if row["branch"] is None
+    ]
+    assert (left_out["vehicle"], left_out["reason"][:23]) == (name, "it is not in this store")
+
+
+def test_an_earlier_result_that_cannot_be_reached_is_refused(
+    store: SummaryStore, task: FleetTask, tmp_path: Path
+) -> None:
+    with pytest.raises(FleetError, match="the earlier result cannot be reached from here"):
+        calibrate_bucket(fullest(store), store=store, task=task, previous=PreviousResult(folder=tmp_path))
+    (tmp_path / "parameters").mkdir()
+    (tmp_path / "parameters" / f"{fullest(store):05d}.parquet").write_bytes(b"nonsense")
+    with pytest.raises(FleetError, match="damaged part of a result"):
+        calibrate_bucket(fullest(store), store=store, task=task, previous=PreviousResult(folder=tmp_path))
 
 
 def test_vehicles_that_have_not_driven_since_keep_their_parameters(

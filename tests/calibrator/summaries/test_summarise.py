@@ -1,5 +1,6 @@
 """Drives into a store: each is read once, changes are noticed, bad ones are tried again."""
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +103,54 @@ def test_a_bad_drive_costs_its_vehicle_and_is_tried_again(tmp_path: Path, databa
     again, store = add(drives, out, database)
     assert (again.vehicles, again.problems) == (1, {})
     assert drives_in(store) == {"V1": [("a",)], "V2": [("a",)]}
+
+
+def test_going_on_does_not_try_again_what_could_not_be_used(tmp_path: Path, database: VehicleDatabase) -> None:
+    drives, out = tmp_path / "drives", tmp_path / "summaries"
+    for vehicle in ("V1", "V2"):
+        write(drives, vehicle, "a", database)
+    path = drives / "drives" / "V1" / "a.parquet"
+    path.write_bytes(path.read_bytes()[:1000])
+    _, store = add(drives, out, database, exactly=True)
+    before = store.versions()
+    again, store = add(drives, out, database, exactly=True)
+    assert (again.vehicles, store.versions()) == (0, before)
+    write(drives, "V1", "a", database)
+    mended, _ = add(drives, out, database, exactly=True)
+    assert (mended.vehicles, mended.problems) == (1, {})
+
+
+def test_drives_that_change_while_they_are_read_stay_with_their_vehicle(
+    tmp_path: Path, database: VehicleDatabase
+) -> None:
+    drives, out = tmp_path / "drives", tmp_path / "summaries"
+    for number in range(6):
+        write(drives, f"V{number}", "a", database)
+    add(drives, out, database)
+    for number in (1, 3):
+        write(drives, f"V{number}", "b", database)
+    fleet = find_fleet(drives)
+    store = open_store(open_storage(out), EQUIPMENT, database, fleet)
+    stop = threading.Event()
+
+    def touch() -> None:
+        while not stop.wait(0.01):
+            for number in (0, 2, 4):
+                (drives / "drives" / f"V{number}" / "a.parquet").touch()
+
+    toucher = threading.Thread(target=touch)
+    toucher.start()
+    add_drives(store, fleet, database, workers=1)
+    stop.set()
+    toucher.join()
+    found = {
+        name: (bucket, {record.vehicle for record in records}, {d for record in records for d in record.drives})
+        for bucket in store.buckets()
+        for name, records in store.read(bucket).items()
+    }
+    for number in range(6):
+        name, expected = f"V{number}", {"a", "b"} if number in {1, 3} else {"a"}
+        assert found[name] == (store.bucket_of(name), {name}, expected)
 
 
 def test_a_store_that_is_to_hold_these_drives_alone_loses_the_others(tmp_path: Path, database: VehicleDatabase) -> None:
