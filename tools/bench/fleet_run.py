@@ -22,9 +22,9 @@ from bench.synthetic_store import LAYOUT, make_store
 __all__ = ["rows"]
 
 FLEETS = (1_000, 10_000, 100_000)
-QUICK_FLEETS = (500, 1_000, 2_000)
+QUICK_FLEETS = (500, 1_000)
 KILLED_FLEET, KILLS = 2_000, 20
-QUICK_KILLS = 3
+QUICK_KILLED_FLEET, QUICK_KILLS = 500, 2
 WORKERS = 2
 WATCH_EVERY_S = 0.05
 MEBIBYTE = 1024.0**2
@@ -91,8 +91,8 @@ def rows(*, quick: bool) -> list[Row]:
                     ratio=first[1] / seen.peak_bytes if peer else None,
                 ),
             ]
-        kills = QUICK_KILLS if quick else KILLS
-        same = killed_runs(Path(name), kills)
+        vehicles, kills = (QUICK_KILLED_FLEET, QUICK_KILLS) if quick else (KILLED_FLEET, KILLS)
+        same = killed_runs(Path(name), vehicles, kills)
     return [
         *found,
         Row(name=f"runs killed at random moments with the identical result, of {kills}", value=same, unit="1"),
@@ -156,10 +156,10 @@ def _resident_bytes(process: int) -> float:
     return sum(resident.get(member, 0.0) for member in family)
 
 
-def killed_runs(folder: Path, kills: int) -> int:
+def killed_runs(folder: Path, vehicles: int, kills: int) -> int:
     """Kill runs at random moments, finish each with a second one, and count the results that are identical."""
     store = folder / "store-killed"
-    make_store(store, vehicles=KILLED_FLEET, workers=WORKERS)
+    make_store(store, vehicles=vehicles, workers=WORKERS)
     environment = {**os.environ, "SOURCE_DATE_EPOCH": "1700000000"}
     start = time.monotonic()
     subprocess.run(_command(store, folder / "whole"), check=True, capture_output=True, env=environment)

@@ -32,12 +32,18 @@ from ecu_node.layout import read_layout
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 TRIPS = 64
-DURATION_S = 360.0
+MINUTES = 6.0
 MAGNITUDE = (0.05, 0.25)
 
 
 def make_store(
-    folder: Path, *, vehicles: int, branches: int = 2, sparsity: float = 80.0, workers: int = 2
+    folder: Path,
+    *,
+    vehicles: int,
+    branches: int = 2,
+    sparsity: float = 80.0,
+    minutes: float = MINUTES,
+    workers: int = 2,
 ) -> SummaryStore:
     """Write a store of so many vehicles with known kinds of faults.
 
@@ -49,6 +55,8 @@ def make_store(
         N and K.
     sparsity : float
         Of the faults, 5 to 25 %, as in the paper. [%]
+    minutes : float
+        Least length of each vehicle's trip. [min]
     workers : int
         Number of processes.
 
@@ -58,7 +66,7 @@ def make_store(
         The store.
     """
     database = read_database(read_layout(LAYOUT))
-    trips, equipment = _trips(database, branches)
+    trips, equipment = _trips(database, branches, minutes)
     identity = store_identity(equipment, database, vehicles=vehicles, fleet="synthetic", fleet_ids=frozenset())
     store = SummaryStore(storage=open_storage(folder), identity=identity)
     write_identity(store.storage, identity)
@@ -72,10 +80,10 @@ def make_store(
     return store
 
 
-def _trips(database: VehicleDatabase, branches: int) -> tuple[list[DriveSummary], Equipment]:
+def _trips(database: VehicleDatabase, branches: int, minutes: float) -> tuple[list[DriveSummary], Equipment]:
     """Summaries of trips of the vehicle without faults."""
     layout = database.layout
-    fleet = builtin_fleet(database, trips=TRIPS, duration_s=DURATION_S)
+    fleet = builtin_fleet(database, trips=TRIPS, duration_s=60.0 * minutes)
     trips = fleet.with_branches(branches)
     case = RecordedCase(branches=branches, sparsity=100.0, magnitude=MAGNITUDE)
     inputs = layout.fleet_inputs or layout.model_inputs
@@ -155,9 +163,16 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--vehicles", type=int, default=1000)
     parser.add_argument("--currents", type=int, default=2)
+    parser.add_argument("--minutes", type=float, default=MINUTES)
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
-    make_store(arguments.folder, vehicles=arguments.vehicles, branches=arguments.currents, workers=arguments.workers)
+    make_store(
+        arguments.folder,
+        vehicles=arguments.vehicles,
+        branches=arguments.currents,
+        minutes=arguments.minutes,
+        workers=arguments.workers,
+    )
 
 
 if __name__ == "__main__":
