@@ -19,7 +19,7 @@ from pathlib import Path
 from bench.row import Row
 from bench.synthetic_store import LAYOUT, make_store
 
-__all__ = ["rows"]
+__all__ = ["killed_runs", "resident_bytes", "rows"]
 
 FLEETS = (1_000, 10_000, 100_000)
 QUICK_FLEETS = (500, 1_000)
@@ -118,7 +118,7 @@ def watch(store: Path, out: Path) -> Watched:
     peak = 0.0
     with subprocess.Popen(_command(store, out), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
         while run.poll() is None:
-            peak = max(peak, _resident_bytes(run.pid))
+            peak = max(peak, resident_bytes(run.pid))
             if not seen or seen[-1][1] < total:
                 done = len(list(chunks.glob("*.rows.parquet")))
                 if done and (not seen or done > seen[-1][1]):
@@ -138,7 +138,7 @@ def _command(store: Path, out: Path) -> list[str]:
     return [sys.executable, "-m", "calibrator", "calibrate", str(store), *options]
 
 
-def _resident_bytes(process: int) -> float:
+def resident_bytes(process: int) -> float:
     """Resident memory of a process and all that descend from it; what processes share is counted in each. [byte]"""
     parents: dict[int, int] = {}
     resident: dict[int, float] = {}
