@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from bench.all import GROUPS, table_of, write
-from bench.fleet_run import killed_runs, resident_bytes
+from bench.fleet_run import resident_bytes
 from bench.row import Row
 
 ROWS = [
@@ -48,7 +48,3 @@ def test_memory_is_that_of_the_process_and_its_children() -> None:
         together = resident_bytes(os.getpid())
         child.kill()
     assert together > alone + 200_000_000
-
-
-def test_a_killed_run_gives_the_result_of_one_that_was_not(tmp_path: Path) -> None:
-    assert killed_runs(tmp_path, 60, 1) == 1

@@ -19,7 +19,7 @@ from pathlib import Path
 from bench.row import Row
 from bench.synthetic_store import LAYOUT, make_store
 
-__all__ = ["killed_runs", "resident_bytes", "rows"]
+__all__ = ["resident_bytes", "rows"]
 
 FLEETS = (1_000, 10_000, 100_000)
 QUICK_FLEETS = (500, 1_000)
