@@ -12,7 +12,7 @@ from ecu_node.interrupts import INTERRUPTED, ending_at_interrupt
 
 __all__ = ["INTERRUPTED", "MESSAGE", "importing", "in_processes"]
 
-MESSAGE = "calibrator: interrupted; nothing unfinished was kept"
+MESSAGE = "calibrator: interrupted; the same command, run again, goes on with what it had read or computed"
 
 
 def importing() -> AbstractContextManager[None]:

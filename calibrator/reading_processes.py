@@ -27,6 +27,8 @@ TIME_LIMIT_S = 600.0
 """A day's log is read in seconds; what takes so long never ends, or would hold up a fleet. [s]"""
 START_S = 120.0
 """Time for a worker to start on a busy machine, which does not count as reading. [s]"""
+LOOK_UP_S = 1.0
+"""Time after which a Ctrl-C is heeded that a library has swallowed as it was interrupted. [s]"""
 AHEAD_PER_WORKER = 4
 """Files read before it is the turn of their results: others go on while one takes long, and few wait in memory."""
 PRELOADED = ["can", "cantools", "numba", "numpy", "pyarrow.parquet", "threadpoolctl"]
@@ -77,7 +79,11 @@ def read_in_processes(
         What `read` returns, in the order of the sources, or why it did not return. What it raises is raised here, when
         it is the turn of its source.
     """
-    with tempfile.TemporaryDirectory(prefix="calibrator-") as folder, _crew(read, folder, workers, limit_s) as crew:
+    with (
+        _noticed_interrupts() as noticed,
+        tempfile.TemporaryDirectory(prefix="calibrator-") as folder,
+        _crew(read, folder, workers, limit_s) as crew,
+    ):
         waiting = enumerate(sources)
         done: dict[int, _Content | Unread | _Raised] = {}
         turn = taken = 0
@@ -95,6 +101,8 @@ def read_in_processes(
                 turn += 1
             else:
                 done |= crew.collect()
+                if noticed():
+                    raise KeyboardInterrupt
 
 
 @dataclass(kw_only=True)
@@ -125,7 +133,7 @@ class _Crew(Generic[_Source, _Content]):
     def collect(self) -> "dict[int, _Content | Unread | _Raised]":
         """Wait for what happens next; results by the number of their source, none if one was begun."""
         patience_s = min(worker.deadline_s for worker in self.busy.values()) - time.monotonic()
-        heard = set(wait(list(self.busy), max(patience_s, 0.0)))
+        heard = set(wait(list(self.busy), min(max(patience_s, 0.0), LOOK_UP_S)))
         now_s = time.monotonic()
         late = [w for pipe, w in self.busy.items() if pipe not in heard and w.deadline_s <= now_s]
         results = self._messages([worker for pipe, worker in self.busy.items() if pipe in heard])
@@ -209,6 +217,25 @@ def _crew(read: Callable[[Any], Any], folder: str, size: int, limit_s: float) ->
     finally:
         for worker in [*crew.idle, *crew.busy.values()]:
             worker.end()
+
+
+@contextmanager
+def _noticed_interrupts() -> Iterator[Callable[[], bool]]:
+    """Tell whether SIGINT came within the block, also if its KeyboardInterrupt never got here."""
+    before, came = signal.getsignal(signal.SIGINT), threading.Event()
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield came.is_set
+        return
+
+    def notice(number: int, frame: Any) -> Any:
+        came.set()
+        return before(number, frame)
+
+    signal.signal(signal.SIGINT, notice)
+    try:
+        yield came.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
