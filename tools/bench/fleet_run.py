@@ -26,7 +26,8 @@ QUICK_FLEETS = (500, 1_000)
 KILLED_FLEET, KILLS = 2_000, 20
 QUICK_KILLED_FLEET, QUICK_KILLS = 500, 2
 WORKERS = 2
-WATCH_EVERY_S = 0.05
+WATCH_EVERY_S, WATCHED_SHARE = 0.02, 0.05
+"""Least time between two looks at a run, and the largest share of the time that is spent on them. [s], [1]"""
 MEBIBYTE = 1024.0**2
 
 
@@ -118,12 +119,13 @@ def watch(store: Path, out: Path) -> Watched:
     peak = 0.0
     with subprocess.Popen(_command(store, out), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
         while run.poll() is None:
+            look_s = time.monotonic()
             peak = max(peak, resident_bytes(run.pid))
             if not seen or seen[-1][1] < total:
                 done = len(list(chunks.glob("*.rows.parquet")))
                 if done and (not seen or done > seen[-1][1]):
                     seen.append((time.monotonic(), done))
-            time.sleep(WATCH_EVERY_S)
+            time.sleep(max(WATCH_EVERY_S, (time.monotonic() - look_s) / WATCHED_SHARE))
         whole_s = time.monotonic() - start
         assert run.stderr is not None
         errors = run.stderr.read().decode()
