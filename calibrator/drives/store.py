@@ -28,6 +28,7 @@ __all__ = [
     "drive_digest",
     "drive_outline",
     "has_drive",
+    "is_plain_name",
     "iterate_drives",
     "list_drives",
     "read_drive_file",
@@ -51,6 +52,11 @@ _SCHEMA = pa.schema(
 )
 
 
+def is_plain_name(name: str) -> bool:
+    """Whether a vehicle or drive may have this name, see :func:`require_plain_name`."""
+    return _PLAIN_NAME.fullmatch(name) is not None and not name.endswith((" ", "."))
+
+
 def require_plain_name(name: str, what: str) -> None:
     """Refuse a vehicle or drive name that cannot be a file name everywhere.
 
@@ -64,13 +70,13 @@ def require_plain_name(name: str, what: str) -> None:
     Raises
     ------
     DriveError
-        If the name is empty, longer than 64 characters, starts with a dot or a blank, or has characters other than
-        letters, digits and ``_ . + @ -`` and blanks.
+        If the name is empty, longer than 64 characters, has other characters than A to Z, a to z, 0 to 9, ``_ . + @ -``
+        and blanks, does not start with a letter, a digit or ``_``, or ends with a dot or a blank.
     """
-    if _PLAIN_NAME.fullmatch(name) is None or name.endswith((" ", ".")):
+    if not is_plain_name(name):
         raise DriveError(
-            f"{what} {name[:80]!r} cannot be used; expected 1 to 64 letters, digits, blanks or _ . + @ -, "
-            f"not starting with a dot; rename it"
+            f"{what} {name[:80]!r} cannot be used; expected 1 to 64 letters A to Z, digits, blanks or _ . + @ -, "
+            f"not starting with a dash, dot, +, @ or blank, not ending with a dot or blank; rename it"
         )
 
 

@@ -1,6 +1,7 @@
 """One record of a store: what one reading of a vehicle's drives gave. Records of a vehicle add up."""
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -12,13 +13,28 @@ import numpy as np
 
 from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
+from calibrator.drives.store import require_plain_name
 from calibrator.errors import DriveError
 from calibrator.evidence.readings import weighted_mean
 from calibrator.evidence.vehicle_summary import LEAST_DURATION_S, VehicleSummary
 from calibrator.evidence.zero_current import ZeroCurrent
 
-__all__ = ["Outline", "Record", "drives_digest", "joined_records", "outline_of", "source_version"]
+__all__ = [
+    "IMPOSSIBLE",
+    "MOST_MOMENT",
+    "MOST_VARIANCE_A2",
+    "Outline",
+    "Record",
+    "drives_digest",
+    "joined_records",
+    "name_problem",
+    "outline_of",
+    "source_version",
+    "stored_problem",
+]
 
+IMPOSSIBLE = "its summary holds impossible numbers; look at its recordings, and summarise them again"
+"""Why a vehicle is left out."""
 MOST_MOMENT, MOST_VARIANCE_A2 = 1e30, 1e10
 """Far beyond what any vehicle's recordings give: sums of products in any unit, variance of a current [A^2]."""
 
@@ -39,6 +55,8 @@ class Record:
         What they tell; None if they cannot be used.
     problem : str
         Why not; empty if they can.
+    damaged: bool
+        Whether they could be used, but what is stored of them makes no sense: their vehicle is left out.
     """
 
     vehicle: str
@@ -46,6 +64,7 @@ class Record:
     sources: tuple[str, ...]
     found: VehicleSummary | None
     problem: str = ""
+    damaged: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,14 +103,34 @@ def source_version(path: Path) -> str:
     return f"{status.st_size}-{status.st_mtime_ns}"
 
 
+def name_problem(vehicle: str) -> str:
+    """Why a vehicle of this name cannot be used, as its parameter file is named after it; empty if it can."""
+    try:
+        require_plain_name(vehicle, "vehicle")
+    except DriveError as error:
+        return str(error)
+    return ""
+
+
+def stored_problem(text: str) -> str:
+    """The problem of a record as one line, whatever is stored."""
+    return " ".join(text.split()) or "no reason is stored; summarise its drives again"
+
+
 def outline_of(vehicle: str, rows: Sequence[Mapping[str, Any]]) -> Outline:
     """Outline of a vehicle from the rows of its records, without their moments."""
     usable = [row for row in rows if row["problem"] is None]
-    drives = tuple(name for row in usable for name in row["drives"])
-    problem = "" if usable else str(rows[-1]["problem"])
-    return Outline(
-        vehicle=vehicle, drives=drives, problem=problem or _too_short(sum(row["duration_s"] for row in usable), drives)
-    )
+    drives = tuple(name for row in usable for name in row["drives"] or ())
+    return Outline(vehicle=vehicle, drives=drives, problem=name_problem(vehicle) or _problem_of(rows, usable, drives))
+
+
+def _problem_of(rows: Sequence[Mapping[str, Any]], usable: Sequence[Mapping[str, Any]], drives: Sequence[str]) -> str:
+    if not usable:
+        return stored_problem(rows[-1]["problem"])
+    durations_s = [row["duration_s"] for row in usable]
+    if not all(value is not None and math.isfinite(value) and value > 0.0 for value in durations_s):
+        return IMPOSSIBLE
+    return _too_short(sum(durations_s), drives)
 
 
 def _too_short(duration_s: float, drives: Sequence[str]) -> str:
@@ -118,8 +157,11 @@ def joined_records(records: Sequence[Record]) -> VehicleSummary:
     Raises
     ------
     DriveError
-        If none can be used, or they are too short together.
+        If none can be used, one is damaged, or they are too short together.
     """
+    for record in records:
+        if record.damaged:
+            raise DriveError(record.problem)
     usable = [record.found for record in records if record.found is not None]
     if not usable:
         raise DriveError(records[-1].problem)
@@ -127,7 +169,7 @@ def joined_records(records: Sequence[Record]) -> VehicleSummary:
     if problem := _too_short(found.summary.duration_s, found.drives):
         raise DriveError(problem)
     if not np.abs(found.summary.moments).max() < MOST_MOMENT or found.summary.variance_a2.max() > MOST_VARIANCE_A2:
-        raise DriveError("its summary holds impossible numbers; look at its recordings, and summarise them again")
+        raise DriveError(IMPOSSIBLE)
     return found
 
 

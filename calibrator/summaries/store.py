@@ -7,11 +7,14 @@ the fleet. A bucket is written whole or not at all.
 
 import fcntl
 import os
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from calibrator.drives.store import is_plain_name
+from calibrator.errors import FleetError
 from calibrator.storage import Storage
 from calibrator.summaries.buckets import bucket_of
 from calibrator.summaries.identity import StoreIdentity
@@ -19,6 +22,8 @@ from calibrator.summaries.record import Outline, Record
 from calibrator.summaries.table import decode_outlines, decode_records, encode_records
 
 __all__ = ["SummaryStore"]
+
+_BUCKET = re.compile(r"[0-9]{5}\.parquet")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +51,22 @@ class SummaryStore:
         return bucket_of(vehicle, self.identity.buckets)
 
     def buckets(self) -> list[int]:
-        """Buckets in which there are vehicles, in order."""
-        stems = (name.partition(".")[0] for name in self._files.names())
-        return sorted(int(stem) for stem in stems if stem.isdecimal())
+        """Buckets in which there are vehicles, in order.
+
+        Raises
+        ------
+        FleetError
+            If there is a file that would not be read, though it looks like one with vehicles.
+        """
+        names = [name for name in self._files.names() if name.endswith(".parquet")]
+        count = self.identity.buckets
+        for name in names:
+            if not (_BUCKET.fullmatch(name) and int(name[:5]) < count):
+                raise FleetError(
+                    f"{self._files.url}/{name}: no bucket of this store, whose buckets are {_file(0)} to "
+                    f"{_file(count - 1)}; remove it"
+                )
+        return [int(name[:5]) for name in names]
 
     def versions(self) -> dict[str, str]:
         """What tells whether a bucket was changed, by file."""
@@ -77,12 +95,25 @@ class SummaryStore:
         found: dict[str, list[Record]] = {}
         for record in records:
             found.setdefault(record.vehicle, []).append(record)
+        self._require_in(bucket, found)
         return found
 
     def outlines(self, bucket: int) -> list[Outline]:
         """What there is of each vehicle of a bucket; raises as :meth:`read`."""
         content = self._files.read(_file(bucket))
-        return decode_outlines(content, f"{self._files.url}/{_file(bucket)}")
+        outlines = decode_outlines(content, f"{self._files.url}/{_file(bucket)}")
+        self._require_in(bucket, [item.vehicle for item in outlines])
+        return outlines
+
+    def _require_in(self, bucket: int, vehicles: Iterable[str]) -> None:
+        """Refuse a bucket with vehicles of another; those whose names no vehicle may have are left out anyway."""
+        for name in vehicles:
+            right = self.bucket_of(name)
+            if right != bucket and is_plain_name(name):
+                raise FleetError(
+                    f"{self._files.url}/{_file(bucket)}: vehicle {name} belongs into {_file(right)}; this file was "
+                    f"renamed or copied: remove it and summarise again"
+                )
 
     def write(self, bucket: int, records: Mapping[str, Sequence[Record]]) -> None:
         """Replace a bucket, whole or not at all.

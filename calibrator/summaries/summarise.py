@@ -212,7 +212,8 @@ def _new(
     found = []
     for name in names:
         versions = {entry.name: source_version(entry.path) for entry in fleet.vehicles[name]}
-        kept = [item for item in records.get(name, []) if _stays(item, versions) and not (retry and item.problem)]
+        stored = records.get(name, [])
+        kept = [item for item in stored if _stays(item, versions) and not (item.damaged or (retry and item.problem))]
         there = {drive for record in kept for drive in record.drives}
         entries = tuple(entry for entry in fleet.vehicles[name] if entry.name not in there)
         if entries:

@@ -6,13 +6,13 @@ does not grow with the hours that it is driven between two summaries.
 """
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import groupby
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from calibrator.drive import Array
@@ -22,7 +22,8 @@ from calibrator.evidence.summary import DriveSummary
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.evidence.zero_current import ZeroCurrent
 from calibrator.summaries.identity import StoreIdentity
-from calibrator.summaries.record import Outline, Record, outline_of
+from calibrator.summaries.record import Outline, Record, name_problem, outline_of, stored_problem
+from calibrator.summaries.row_checks import row_problem
 
 __all__ = ["MOST_BLOCKS", "SCHEMA", "decode_outlines", "decode_records", "encode_records"]
 
@@ -93,18 +94,14 @@ def decode_records(content: bytes, identity: StoreIdentity, where: str) -> list[
     Returns
     -------
     list of Record
-        In the order of the file.
+        In the order of the file. One whose numbers make no sense, or are too few or too many, is damaged.
 
     Raises
     ------
     FleetError
         If the file is cut or no such file.
     """
-    try:
-        return list(_records(_table(content), identity))
-    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
-        reason = str(error).partition("\n")[0][:120]
-        raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again") from None
+    return list(_records(_table(content, where), identity))
 
 
 def decode_outlines(content: bytes, where: str) -> list[Outline]:
@@ -127,20 +124,26 @@ def decode_outlines(content: bytes, where: str) -> list[Outline]:
     FleetError
         If the file is cut or no such file.
     """
-    try:
-        rows = _table(content, ["vehicle", "drives", "problem", "duration_s"]).to_pylist()
-    except (pa.ArrowException, OSError, ValueError) as error:
-        reason = str(error).partition("\n")[0][:120]
-        raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again") from None
-    return [outline_of(name, list(group)) for name, group in groupby(rows, key=lambda row: str(row["vehicle"]))]
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for row in _table(content, where, ["vehicle", "drives", "problem", "duration_s"]).to_pylist():
+        rows.setdefault(row["vehicle"] or "", []).append(row)
+    return [outline_of(name, group) for name, group in rows.items()]
 
 
-def _table(content: bytes, columns: list[str] | None = None) -> pa.Table:
+def _table(content: bytes, where: str, columns: list[str] | None = None) -> pa.Table:
     """Some columns of a file; without the detour over data sets, which takes twice as long for many row groups."""
-    file = pq.ParquetFile(pa.BufferReader(content), pre_buffer=False)
-    if not file.schema_arrow.equals(SCHEMA):
-        raise ValueError("its columns are not those of summaries")
-    return file.read(columns=columns, use_threads=False)
+    try:
+        file = pq.ParquetFile(pa.BufferReader(content), pre_buffer=False)
+        fits = file.schema_arrow.equals(SCHEMA)
+        table = file.read(columns=columns, use_threads=False) if fits else None
+        if table is not None:
+            table.validate(full=True)
+    except (pa.ArrowException, OSError):
+        table, fits = None, True
+    if table is None:
+        reason = "it is cut, or no Parquet file" if fits else "its columns are not those of summaries"
+        raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again")
+    return table
 
 
 def _row(record: Record, identity: StoreIdentity) -> dict[str, Any]:
@@ -181,33 +184,64 @@ def _shortened(summary: DriveSummary) -> DriveSummary:
 
 
 def _records(table: pa.Table, identity: StoreIdentity) -> Iterable[Record]:
-    columns = {name: table.column(name).combine_chunks() for name in SCHEMA.names}
-    small = table.drop_columns(["moments", "noise_a2"]).to_pylist()
-    M, K = identity.bank.width, len(identity.branches)
-    p = M + K + 1
-    triangles = columns["moments"].values.to_numpy().reshape(-1, p * (p + 1) // 2)
+    rows = table.drop_columns(["moments", "noise_a2"]).to_pylist()
+    for row, summary in zip(rows, _summaries(table, identity), strict=True):
+        name = row["vehicle"] or ""
+        drives, sources = _drives(row)
+        record = Record(vehicle=name, drives=drives, sources=sources, found=None)
+        if row["problem"] is not None:
+            yield replace(record, problem=stored_problem(row["problem"]))
+        elif problem := name_problem(name) or row_problem(row, summary, identity.branches):
+            yield replace(record, problem=problem, damaged=True)
+        else:
+            assert summary is not None
+            yield replace(record, found=_vehicle(row, summary, identity.branches))
+
+
+def _drives(row: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Drives of a row, and their versions; these are unknown where they do not fit the drives."""
+    drives, sources = (tuple(name or "" for name in row[column] or ()) for column in ("drives", "sources"))
+    return drives, sources if len(sources) == len(drives) else ("",) * len(drives)
+
+
+def _summaries(table: pa.Table, identity: StoreIdentity) -> list[DriveSummary | None]:
+    """Summary of each record; None where it is not there, or not of a whole number of blocks."""
+    K = len(identity.branches)
+    p = identity.bank.width + K + 1
+    values, triangle = _lengths(table, "noise_a2"), p * (p + 1) // 2
+    blocks = values // K
+    whole = (blocks > 0) & (values == K * blocks) & (_lengths(table, "moments") == triangle * blocks)
+    bank = identity.bank.identity
+    kept = table.select(["moments", "noise_a2"]).filter(pa.array(whole))
+    triangles, noise = _numbers(kept, "moments").reshape(-1, triangle), _numbers(kept, "noise_a2").reshape(-1, K)
     moments, upper = np.empty((len(triangles), p, p)), np.triu_indices(p)
     moments[:, upper[0], upper[1]] = moments[:, upper[1], upper[0]] = triangles
-    noise = columns["noise_a2"].values.to_numpy().reshape(-1, K)
-    stops = columns["noise_a2"].offsets.to_numpy() // K
-    for row, start, stop in zip(small, stops[:-1].tolist(), stops[1:].tolist(), strict=True):
-        found = None
-        if row["problem"] is None:
-            summary = DriveSummary(
-                moments=moments[start:stop],
-                noise_a2=noise[start:stop],
-                branches=K,
-                period_s=identity.bank.period_s,
-                bank=identity.bank.identity,
-            )
-            found = _vehicle(row, summary, identity.branches)
-        yield Record(
-            vehicle=row["vehicle"],
-            drives=tuple(row["drives"]),
-            sources=tuple(row["sources"]),
-            found=found,
-            problem=row["problem"] or "",
+    blocks = blocks * whole
+    stops = np.cumsum(blocks)
+    return [
+        DriveSummary(
+            moments=moments[start:stop],
+            noise_a2=noise[start:stop],
+            branches=K,
+            period_s=identity.bank.period_s,
+            bank=bank,
         )
+        if start < stop
+        else None
+        for start, stop in zip((stops - blocks).tolist(), stops.tolist(), strict=True)
+    ]
+
+
+def _lengths(table: pa.Table, name: str) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
+    """Number of values in each row of a column of lists; 0 where there is no list."""
+    counts = pc.fill_null(pc.list_value_length(table.column(name)), 0)
+    return np.asarray(counts.to_numpy(), np.int64)
+
+
+def _numbers(table: pa.Table, name: str) -> Array:
+    """All values of a column of lists; NaN where there is none."""
+    lists = table.column(name).combine_chunks()
+    return np.asarray(lists.flatten().to_numpy(zero_copy_only=False), np.float64)
 
 
 def _vehicle(row: dict[str, Any], summary: DriveSummary, branches: tuple[str, ...]) -> VehicleSummary:

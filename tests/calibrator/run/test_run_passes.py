@@ -12,6 +12,7 @@ import pytest
 
 from calibrator.calibration_settings import CalibrationSettings
 from calibrator.errors import FleetError
+from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.faults import Faults
 from calibrator.options import Method
 from calibrator.parameter_files import RunIdentity
@@ -99,23 +100,44 @@ def test_a_vehicle_that_cannot_be_estimated_does_not_stop_the_others(
 
 
 def test_a_vehicle_whose_evidence_cannot_be_used_does_not_stop_the_others(
-    store: SummaryStore, task: FleetTask, tmp_path: Path
+    store: SummaryStore, task: FleetTask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bucket = fullest(store)
-    records = store.read(bucket)
     expected = texts(calibrate_bucket(bucket, store=store, task=task))
-    bad, *others = records
-    found = records[bad][0].found
-    assert found is not None
-    huge = replace(found.summary, noise_a2=np.full_like(found.summary.noise_a2, np.nan))
-    spoilt = {**records, bad: [replace(records[bad][0], found=replace(found, summary=huge))]}
-    chunk = calibrate_bucket(bucket, store=rewritten(store, tmp_path, bucket, spoilt), task=task)
+    bad, *others = expected
+    calibrate = FleetTask.calibrate
+
+    def refusing(task: FleetTask, vehicles: Sequence[VehicleSummary]) -> Any:
+        if bad in {vehicle.vehicle for vehicle in vehicles}:
+            raise FleetError("evidence is not finite")
+        return calibrate(task, vehicles)
+
+    monkeypatch.setattr(FleetTask, "calibrate", refusing)
+    chunk = calibrate_bucket(bucket, store=store, task=task)
     assert {name: text for name, text in texts(chunk).items() if name != bad} == {
         name: expected[name] for name in others
     }
     (left_out,) = [row for row in rows(chunk) if row["branch"] is None]
     assert left_out["vehicle"] == bad
-    assert left_out["reason"].startswith("its evidence cannot be used: ")
+    assert left_out["reason"].startswith("its evidence cannot be used: evidence is not finite; ")
+
+
+@pytest.mark.parametrize("noise_a2", [np.nan, -1.0, np.inf])
+def test_a_vehicle_with_impossible_noise_stops_neither_pass(
+    store: SummaryStore, task: FleetTask, tmp_path: Path, noise_a2: float
+) -> None:
+    bucket = fullest(store)
+    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
+    bad = min(records)
+    found = records[bad][0].found
+    assert found is not None
+    summary = replace(found.summary, noise_a2=np.full_like(found.summary.noise_a2, noise_a2))
+    records[bad] = [replace(records[bad][0], found=replace(found, summary=summary))]
+    other = rewritten(store, tmp_path, bucket, records)
+    sample = read_sample(other, take_census(other, ONE), CalibrationSettings(), (), everyone=False)
+    assert {item.vehicle for item in sample} == records.keys() - {bad}
+    (left_out,) = [row for row in rows(calibrate_bucket(bucket, store=other, task=task)) if row["branch"] is None]
+    assert (left_out["vehicle"], left_out["reason"][:37]) == (bad, "its summary holds impossible numbers;")
 
 
 def test_a_vehicle_with_impossible_numbers_is_not_learnt_from(store: SummaryStore, tmp_path: Path) -> None:
@@ -137,12 +159,13 @@ def test_a_vehicle_without_usable_drives_is_left_out_with_its_reason(
 ) -> None:
     bucket = fullest(store)
     records: dict[str, Sequence[Record]] = dict(store.read(bucket))
-    records["V999"] = [Record(vehicle="V999", drives=("x",), sources=("",), found=None, problem="drive x: cut")]
+    bad = next(name for name in (f"V9{j:02d}" for j in range(100)) if store.bucket_of(name) == bucket)
+    records[bad] = [Record(vehicle=bad, drives=("x",), sources=("",), found=None, problem="drive x:\ncut")]
     other = rewritten(store, tmp_path, bucket, records)
     (left_out,) = [row for row in rows(calibrate_bucket(bucket, store=other, task=task)) if row["branch"] is None]
-    assert (left_out["vehicle"], left_out["verdict"], left_out["reason"]) == ("V999", "left out", "drive x: cut")
+    assert (left_out["vehicle"], left_out["verdict"], left_out["reason"]) == (bad, "left out", "drive x: cut")
     census = take_census(other, ONE)
-    assert (census.size, census.reasons) == (len(records) - 1, {"V999": "drive x: cut"})
+    assert (census.size, census.reasons) == (len(records) - 1, {bad: "drive x: cut"})
 
 
 def test_the_sample_is_the_whole_of_a_small_fleet_less_those_held_out(store: SummaryStore) -> None:

@@ -1,9 +1,15 @@
 """Summaries on disk: nothing is lost, records add up, and nothing that does not fit gets in."""
 
+import math
+import re
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import duckdb
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -14,7 +20,7 @@ from calibrator.summaries.buckets import bucket_of
 from calibrator.summaries.identity import SCHEMA_VERSION, read_identity, write_identity
 from calibrator.summaries.record import Record, joined_records
 from calibrator.summaries.store import SummaryStore
-from calibrator.summaries.table import MOST_BLOCKS
+from calibrator.summaries.table import MOST_BLOCKS, SCHEMA
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.evidence.simulated_drives import Conditions, no_faults, summaries_of
 from tests.calibrator.summaries.small_stores import identity_of, random_faults, record_of, small_store
@@ -86,8 +92,9 @@ def test_records_of_a_vehicle_add_up(store: SummaryStore) -> None:
 def test_a_long_drive_is_shortened_and_its_sums_stay(tmp_path: Path, database: VehicleDatabase) -> None:
     long = summary_of(30 * (MOST_BLOCKS + 40))
     store = SummaryStore(storage=open_storage(tmp_path), identity=identity_of(database, 1))
-    store.write(3, {"V1": [record_of("V1", long)]})
-    (record,) = store.read(3)["V1"]
+    bucket = store.bucket_of("V1")
+    store.write(bucket, {"V1": [record_of("V1", long)]})
+    (record,) = store.read(bucket)["V1"]
     assert record.found is not None
     kept = record.found.summary
     assert len(kept.moments) <= MOST_BLOCKS < len(long.moments)
@@ -125,6 +132,104 @@ def test_a_damaged_bucket_is_named(tmp_path: Path, database: VehicleDatabase, da
         store.read(int(path.stem))
     with pytest.raises(FleetError, match="damaged file of summaries"):
         store.outlines(int(path.stem))
+
+
+def spoil(store: SummaryStore, bucket: int, changes: Mapping[str, Any]) -> str:
+    """Change columns of the first vehicle of a bucket, as another tool would; its name."""
+    path = Path(store.url) / "buckets" / f"{bucket:05d}.parquet"
+    rows = pq.read_table(path).to_pylist()
+    name = str(rows[0]["vehicle"])
+    rows[0] |= changes
+    pq.write_table(pa.Table.from_pylist(rows, schema=SCHEMA), path, row_group_size=1)
+    return name
+
+
+def fullest(store: SummaryStore) -> int:
+    return max(store.buckets(), key=lambda bucket: len(store.outlines(bucket)))
+
+
+@pytest.fixture
+def own_store(store: SummaryStore, tmp_path: Path) -> SummaryStore:
+    shutil.copytree(store.url, tmp_path / "store")
+    return SummaryStore(storage=open_storage(tmp_path / "store"), identity=store.identity)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"moments": None}, "its summary is damaged: moments and noise_a2 do not fit the other columns; summarise"),
+        ({"moments": [1.0] * 29}, "its summary is damaged: moments and noise_a2"),
+        ({"noise_a2": []}, "its summary is damaged: moments and noise_a2"),
+        ({"noise_a2": [math.nan] * 120}, "its summary holds impossible numbers"),
+        ({"noise_a2": [None] * 120}, "its summary holds impossible numbers"),
+        ({"moments": [-1.0] * 60 * 21}, "its summary holds impossible numbers"),
+        ({"duration_s": None}, "its summary is damaged: duration_s"),
+        ({"duration_s": math.inf}, "its summary holds impossible numbers"),
+        ({"delay_reference": "bogus"}, "its summary is damaged: delay_reference"),
+        ({"delay_s": [0.1]}, "its summary is damaged: delay_s"),
+        ({"delay_s": [0.1, math.nan]}, "its summary holds impossible numbers"),
+        ({"delay_sd_s": [0.1, -0.1]}, "its summary holds impossible numbers"),
+        ({"zero_sd_a": None}, "its summary is damaged: zero_sd_a"),
+        ({"zero_offset_a": [1.0, 1.0], "zero_sd_a": [0.0, 0.1]}, "its summary holds impossible numbers"),
+        ({"zero_offset_a": [1.0, math.nan], "zero_sd_a": [0.1, 0.1]}, "its summary holds impossible numbers"),
+        ({"recorded": None}, "its summary is damaged: recorded"),
+        ({"sources": []}, "its summary is damaged: sources"),
+    ],
+)
+def test_a_vehicle_whose_row_makes_no_sense_is_left_out_and_the_others_stay_as_they_are(
+    store: SummaryStore, own_store: SummaryStore, changes: dict[str, Any], reason: str
+) -> None:
+    bucket = fullest(store)
+    bad = spoil(own_store, bucket, changes)
+    before, after = store.read(bucket), own_store.read(bucket)
+    with pytest.raises(DriveError, match=reason):
+        joined_records(after[bad])
+    for name in before.keys() - {bad}:
+        first, second = (joined_records(records[name]).summary for records in (before, after))
+        np.testing.assert_array_equal(second.moments, first.moments)
+        np.testing.assert_array_equal(second.noise_a2, first.noise_a2)
+    assert len(own_store.outlines(bucket)) == len(before)
+
+
+def test_a_damaged_record_is_not_made_up_for_by_another_of_its_vehicle() -> None:
+    damaged = Record(vehicle="V1", drives=("x",), sources=("",), found=None, problem="damaged", damaged=True)
+    with pytest.raises(DriveError, match="damaged"):
+        joined_records([damaged, record_of("V1", summary_of(600))])
+
+
+@pytest.mark.parametrize("name", ["../../evil", "", "-V1", "Vä"])
+def test_a_vehicle_whose_name_cannot_be_used_is_left_out_with_it(own_store: SummaryStore, name: str) -> None:
+    bucket = fullest(own_store)
+    spoil(own_store, bucket, {"vehicle": name})
+    expected = rf"vehicle {re.escape(repr(name))} cannot be used; .* not starting with a dash, dot"
+    with pytest.raises(DriveError, match=expected):
+        joined_records(own_store.read(bucket)[name])
+    (outline,) = [item for item in own_store.outlines(bucket) if item.vehicle == name]
+    assert re.match(expected, outline.problem)
+
+
+def test_a_problem_is_told_in_one_line(own_store: SummaryStore) -> None:
+    bucket = fullest(own_store)
+    name = spoil(own_store, bucket, {"problem": "cut\n  there\n"})
+    assert own_store.read(bucket)[name][0].problem == "cut there"
+    assert [item.problem for item in own_store.outlines(bucket) if item.vehicle == name] == ["cut there"]
+
+
+def test_a_bucket_that_is_the_copy_of_another_is_refused(own_store: SummaryStore) -> None:
+    first, second = own_store.buckets()[:2]
+    folder = Path(own_store.url) / "buckets"
+    shutil.copy(folder / f"{first:05d}.parquet", folder / f"{second:05d}.parquet")
+    for read in (own_store.read, own_store.outlines):
+        with pytest.raises(FleetError, match=rf"{second:05d}\.parquet: vehicle V\d+ belongs into {first:05d}\.parquet"):
+            read(second)
+
+
+@pytest.mark.parametrize("name", ["99999.parquet", "00016.parquet", "3.parquet", "00003 (copy).parquet"])
+def test_a_file_that_is_no_bucket_of_the_store_is_refused(own_store: SummaryStore, name: str) -> None:
+    folder = Path(own_store.url) / "buckets"
+    shutil.copy(next(folder.iterdir()), folder / name)
+    with pytest.raises(FleetError, match=rf"{re.escape(name)}: no bucket of this store, whose buckets are 00000"):
+        own_store.buckets()
 
 
 def test_a_bucket_that_is_not_there_is_empty(store: SummaryStore) -> None:
