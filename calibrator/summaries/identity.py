@@ -3,11 +3,12 @@
 import msgspec
 
 from calibrator.drives.fleet_source import Equipment
-from calibrator.errors import FleetError
+from calibrator.errors import DriveError, FleetError
 from calibrator.evidence.summary import BLOCK_S
 from calibrator.identification.filter_bank import FilterBank
 from calibrator.storage import Storage
 from ecu_node.database import VehicleDatabase
+from ecu_node.layout import Layout
 
 __all__ = ["SCHEMA_VERSION", "StoreIdentity", "read_identity", "store_identity", "write_identity"]
 
@@ -151,7 +152,7 @@ def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> 
     Raises
     ------
     FleetError
-        If the store is of another version, layout or DBC.
+        If the store is of another version, layout or DBC, or has numbers or names that none can have.
     """
     content, where = storage.read_if_there(FILE), f"{storage.url}/{FILE}"
     if content is None:
@@ -164,10 +165,18 @@ def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> 
                 f"{where}: schema version {version!r}, expected {SCHEMA_VERSION}; summarise the drives again"
             )
         identity = msgspec.convert(raw, StoreIdentity)
-    except (msgspec.DecodeError, msgspec.ValidationError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise FleetError(f"{where}: not a store of summaries: {error}; summarise the drives again") from None
+    except DriveError as error:
+        raise FleetError(f"{where}: {error}; summarise the drives again") from None
     if database is not None:
         _require_made_with(identity, database, where)
+        _require_known_names(identity, database.layout, where)
+    if not FEWEST_BUCKETS <= identity.buckets <= MOST_BUCKETS:
+        raise FleetError(
+            f"{where}: {identity.buckets} buckets, expected {FEWEST_BUCKETS} to {MOST_BUCKETS}; summarise the drives "
+            f"again, into another store"
+        )
     return identity
 
 
@@ -182,4 +191,24 @@ def _require_made_with(identity: StoreIdentity, database: VehicleDatabase, where
     if identity.block_s != BLOCK_S:
         raise FleetError(
             f"{where}: blocks of {identity.block_s:g} s, expected {BLOCK_S:g} s; summarise the drives again"
+        )
+
+
+def _require_known_names(identity: StoreIdentity, layout: Layout, where: str) -> None:
+    """Refuse branches and inputs that the layout does not have, too few of them, or one twice."""
+    inputs = {item.name for item in (*layout.input, *layout.derived)}
+    for what, names, known, fewest in (
+        ("branches", identity.branches, set(layout.branch_names), 2),
+        ("inputs", identity.inputs, inputs, 1),
+        ("fleet_inputs", identity.fleet_inputs, inputs, 0),
+    ):
+        if len(names) < fewest or len(set(names)) < len(names) or not known.issuperset(names):
+            raise FleetError(
+                f"{where}: {what} {', '.join(names) or 'none'}; expected {fewest} or more different ones of "
+                f"{', '.join(sorted(known))}; summarise the drives again, into another store"
+            )
+    if identity.bank.input_names != identity.fleet_inputs:
+        raise FleetError(
+            f"{where}: a filter bank of {', '.join(identity.bank.input_names) or 'no input'}; expected one of the "
+            f"fleet_inputs, {', '.join(identity.fleet_inputs)}; summarise the drives again, into another store"
         )

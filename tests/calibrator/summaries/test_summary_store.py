@@ -263,9 +263,18 @@ def test_a_store_of_another_layout_version_or_content_is_refused(tmp_path: Path,
         (('"block_s": 30.0', '"block_s": 60.0'), "blocks of 60 s, expected 30 s"),
         (("{", "[", 1), "not a store of summaries"),
         (('"branches"', '"branchs"'), "not a store of summaries"),
+        (("{", 2000 * "[", 1), "not a store of summaries"),
+        (('"buckets": 16', '"buckets": 0'), "0 buckets, expected 16 to 32768"),
+        (('"buckets": 16', '"buckets": 40000'), "40000 buckets, expected 16 to 32768"),
+        (('    "motor"', '    "steam"'), "branches battery, steam; expected 2 or more different ones of auxiliary, "),
+        (('    "motor"', '    "battery"'), "branches battery, battery; expected 2 or more different ones of"),
+        (('    "torque"', '    "magic"', 1), "fleet_inputs speed, magic, voltage; expected 0 or more different ones of"),
+        (('"input_names": [\n      "speed"', '"input_names": [\n      "torque2"'), "a filter bank of torque2, torque"),
+        (('"period_s": 1.0', '"period_s": 0.0'), "filter bank: period 0.0 s; expected a positive number; summarise"),
     ):
         path.write_text(text.replace(*change))
-        with pytest.raises(FleetError, match=message):
+        assert path.read_text() != text
+        with pytest.raises(FleetError, match=rf"^{path}: .*{message}"):
             read_identity(storage, database)
 
 
