@@ -9,6 +9,7 @@ from calibrator.artificial.truth import FleetTruth
 from calibrator.errors import FleetError
 from calibrator.options import Classifier, Method
 from calibrator.reading_processes import TIME_LIMIT_S
+from calibrator.report.text import counted, few_reasons
 from ecu_node.layout import file_digest
 from ecu_node.parameters import VehicleParameters
 
@@ -118,13 +119,22 @@ class FleetOutcome:
     details: Mapping[str, Any]
 
 
-def require_learning(names: Sequence[str], settings: CalibrationSettings, left_out: Mapping[str, str]) -> list[bool]:
-    """Which vehicles the fleet learns from; FleetError if they are too few."""
+def require_learning(
+    names: Sequence[str],
+    settings: CalibrationSettings,
+    left_out: Mapping[str, str],
+    *,
+    left_out_count: int | None = None,
+) -> list[bool]:
+    """Which vehicles the fleet learns from; FleetError if they are too few.
+
+    ``left_out`` says why others cannot be used; of many the first ones, ``left_out_count`` being how many there are.
+    """
     learning = [name not in settings.hold_out for name in names]
     if sum(learning) < LEAST_VEHICLES:
-        reasons = "".join(f"; {name}: {reason}" for name, reason in left_out.items())
+        reasons = few_reasons(left_out, count=left_out_count)
         raise FleetError(
-            f"{sum(learning)} usable vehicle to learn from, at least {LEAST_VEHICLES} are needed, "
+            f"{counted(sum(learning), 'usable vehicle')} to learn from, at least {LEAST_VEHICLES} are needed, "
             f"as every vehicle is compared with its fleet (tools/compare_kirchhoff.py shows the sum of one){reasons}"
         )
     return learning

@@ -19,6 +19,8 @@ from calibrator.command_options import (
     DrivesOption,
     ExperimentDrivesOption,
     ExperimentLayoutOption,
+    FleetArgument,
+    FleetOrSummariesArgument,
     HarmLimitOption,
     HoldOutOption,
     JsonOption,
@@ -37,6 +39,7 @@ from calibrator.command_options import (
     SensorModelsOption,
     SinceOption,
     SparsityOption,
+    StoreOption,
     SymmetricOption,
     TimeLimitOption,
     TrustedOption,
@@ -53,7 +56,7 @@ from calibrator.command_options import (
     require_own_options,
     require_truth_where_used,
 )
-from calibrator.errors import LogError
+from calibrator.errors import ContradictionError, LogError
 from calibrator.folders import require_new_folder, require_possible_file, require_possible_folder
 from calibrator.interrupts import importing
 from calibrator.options import Classifier, ExperimentName, Method
@@ -96,7 +99,7 @@ def main() -> int:
             raise
         text = str(error) if isinstance(error, UserError) else f"{error.filename or 'file'}: {error.strerror or error}"
         print(f"calibrator: {text}", file=sys.stderr)
-        return 1
+        return 2 if isinstance(error, ContradictionError) else 1
     return 0
 
 
@@ -192,9 +195,9 @@ def simulate(
 
 @app.command()
 def summarise(
-    fleet: Annotated[Path, typer.Argument(help="Drive store, or folder with a folder of logs per vehicle.")],
+    fleet: FleetArgument,
     layout: LayoutOption,
-    out: Annotated[str, typer.Option("--out", help="Store of summaries, path or URL; drives are added to one.")],
+    out: StoreOption,
     branches: BranchesOption = None,
     bank: BankOption = None,
     part: PartOption = "1/1",
@@ -222,7 +225,7 @@ def summarise(
 
 @app.command()
 def identify(
-    fleet: Annotated[Path, typer.Argument(help="Drive store, or folder with a folder of logs per vehicle.")],
+    fleet: FleetArgument,
     layout: LayoutOption,
     bank: BankOption = None,
     poles: PolesOption = None,
@@ -258,9 +261,7 @@ def identify(
 @app.command()
 def calibrate(
     context: typer.Context,
-    fleet: Annotated[
-        str, typer.Argument(help="Drive store, folder with a folder of logs per vehicle, or summaries (path or URL).")
-    ],
+    fleet: FleetOrSummariesArgument,
     layout: LayoutOption,
     out: Annotated[Path, typer.Option("--out", help="Folder of the result, new or empty.")],
     method: Annotated[Method, typer.Option("--method", help="Estimator.")] = Method.POSTERIOR,

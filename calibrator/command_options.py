@@ -4,6 +4,7 @@ Upper bounds are far beyond what a vehicle has; they catch slips of units before
 """
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +24,8 @@ __all__ = [
     "DrivesOption",
     "ExperimentDrivesOption",
     "ExperimentLayoutOption",
+    "FleetArgument",
+    "FleetOrSummariesArgument",
     "HarmLimitOption",
     "HoldOutOption",
     "JsonOption",
@@ -41,6 +44,7 @@ __all__ = [
     "SensorModelsOption",
     "SinceOption",
     "SparsityOption",
+    "StoreOption",
     "SymmetricOption",
     "TimeLimitOption",
     "TrustedOption",
@@ -70,6 +74,8 @@ RECORDED_OPTIONS = ("drives", "layout")
 """What only experiments on recorded trips heed."""
 RUN_OPTIONS = (*RECORDED_OPTIONS, "quick", "repetitions", "seed", "workers")
 """What only experiments that run something heed."""
+SCHEDULER = re.compile(r"(tcp|tls)://([^\s/?#@:\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})")
+MAX_PORT = 65_535
 MAX_REPETITIONS = 1000
 MAX_VEHICLES = 100_000
 MAX_CURRENTS = 16
@@ -154,6 +160,28 @@ def _branches(value: str | None) -> str | None:
     return None if value is None else ",".join(names)
 
 
+def _scheduler(value: str | None) -> str | None:
+    if value is None:
+        return None
+    found = SCHEDULER.fullmatch(value)
+    if found is None or not 1 <= int(found["port"]) <= MAX_PORT:
+        raise typer.BadParameter(
+            f"{value!r}: expected the address of a Dask scheduler, tcp://HOST:PORT or tls://HOST:PORT, port 1 to "
+            f"{MAX_PORT}"
+        )
+    return value
+
+
+def _named(value: str) -> str:
+    if not value.strip():
+        raise typer.BadParameter("an empty name; give the path of a folder, '.' for this one")
+    return value
+
+
+def _named_path(value: str) -> Path:
+    return Path(_named(value))
+
+
 def _part(value: str) -> str:
     number, slash, count = value.partition("/")
     if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count) <= MAX_PARTS):
@@ -161,12 +189,29 @@ def _part(value: str) -> str:
     return value
 
 
+FleetArgument = Annotated[
+    Path,
+    typer.Argument(parser=_named_path, help="Drive store, or folder with a folder of logs per vehicle."),
+]
+FleetOrSummariesArgument = Annotated[
+    str,
+    typer.Argument(
+        callback=_named,
+        help="Drive store, folder with a folder of logs per vehicle, or summaries (path or URL).",
+    ),
+]
+StoreOption = Annotated[
+    str,
+    typer.Option("--out", callback=_named, help="Store of summaries, path or URL; drives are added to one."),
+]
 LayoutOption = Annotated[Path, typer.Option("--layout", help="Layout (TOML) that says what the signals mean.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 WorkersOption = Annotated[int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Number of processes.")]
 SchedulerOption = Annotated[
     str | None,
-    typer.Option("--scheduler", metavar="URL", help="Dask scheduler, tcp://HOST:PORT, instead of processes."),
+    typer.Option(
+        "--scheduler", metavar="URL", callback=_scheduler, help="Dask scheduler, tcp://HOST:PORT, instead of processes."
+    ),
 ]
 TimeLimitOption = Annotated[
     float,

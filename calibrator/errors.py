@@ -2,7 +2,7 @@
 
 from ecu_node.errors import UserError
 
-__all__ = ["DriveError", "FleetError", "LogError"]
+__all__ = ["ContradictionError", "DriveError", "FleetError", "LogError"]
 
 
 class LogError(UserError):
@@ -15,3 +15,7 @@ class DriveError(UserError):
 
 class FleetError(UserError):
     """A fleet cannot be calibrated (too small, contradictory, wrong folder)."""
+
+
+class ContradictionError(UserError):
+    """Options contradict each other: wrong use, whatever is in the files."""

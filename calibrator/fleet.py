@@ -18,8 +18,15 @@ import msgspec
 
 from calibrator.calibration_settings import CalibrationSettings
 from calibrator.drives.copies import without_copies
-from calibrator.drives.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment
-from calibrator.errors import FleetError
+from calibrator.drives.fleet_source import (
+    LOGS_FOLDER,
+    STORE_FOLDER,
+    Equipment,
+    FleetSource,
+    find_fleet,
+    probe_equipment,
+)
+from calibrator.errors import ContradictionError, FleetError
 from calibrator.folders import require_new_folder
 from calibrator.options import Method
 from calibrator.parameter_files import RunIdentity
@@ -27,6 +34,7 @@ from calibrator.posterior.bench import read_bench
 from calibrator.posterior.fleet import FindModels
 from calibrator.published.fleet import calibrate_fleet_published
 from calibrator.report.calibration import MOST_NAMED, CalibrationReport, report_of
+from calibrator.report.text import few, few_reasons
 from calibrator.results import (
     RunRecord,
     encode_chunk,
@@ -41,7 +49,7 @@ from calibrator.run.posterior_run import calibrate_store
 from calibrator.run.previous import PreviousResult, require_previous
 from calibrator.run.unfinished import Unfinished, unfinished_run
 from calibrator.sensor_models.fleet import SensorFindings, find_sensor_models
-from calibrator.storage import open_storage
+from calibrator.storage import Storage, open_storage
 from calibrator.summaries.identity import read_identity
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.summarise import add_drives, open_store
@@ -90,13 +98,15 @@ def calibrate_fleet(
     UserError
         If the fleet as a whole cannot be calibrated.
     """
-    require_new_folder(out)
     _require_consistent(settings, since)
+    require_new_folder(out)
     storage = open_storage(place)
+    _require_folder(storage, place)
     stored = read_identity(storage, database)
     if stored is None and not storage.is_local:
         raise FleetError(f"{storage.url}: no store of summaries there; make one with 'calibrator summarise --out'")
     if stored is not None:
+        _require_summaries_alone(storage)
         _require_drives_unneeded(settings, storage.url)
         store = SummaryStore(storage=storage, identity=stored)
         with unfinished_run(out) as unfinished:
@@ -177,12 +187,33 @@ def _require_consistent(settings: CalibrationSettings, since: Path | None) -> No
     """Refuse settings that contradict each other."""
     both = settings.hold_out & settings.trusted
     if both:
-        raise FleetError(
-            f"vehicle {', '.join(sorted(both))} is both held out and trusted: the reference would be learnt from it"
+        raise ContradictionError(
+            f"vehicle {few(sorted(both))} is both held out and trusted: the reference would be learnt from it"
         )
     for option, wanted in (("--branches", settings.branches is not None), ("--sensor-models", settings.sensor_models)):
         if wanted and since is not None:
-            raise FleetError(f"{option} and --since exclude each other: the earlier result has decided on that")
+            raise ContradictionError(f"{option} and --since exclude each other: the earlier result has decided on that")
+
+
+def _require_folder(storage: Storage, place: str | Path) -> None:
+    """Refuse a place that cannot be a fleet; of a URL its storage tells."""
+    if storage.is_local and not Path(storage.url).is_dir():
+        if Path(storage.url).exists():
+            raise FleetError(
+                f"{place}: is a file; give a store of drives or of summaries, or a folder with one folder of logs per "
+                f"vehicle"
+            )
+        raise FleetError(f"{place}: no such folder, store of drives or store of summaries")
+
+
+def _require_summaries_alone(storage: Storage) -> None:
+    """Refuse a store of summaries in which there are drives as well: which are meant, nobody can tell."""
+    drives = [name for name in (STORE_FOLDER, LOGS_FOLDER) if storage.is_local and (Path(storage.url) / name).is_dir()]
+    if drives:
+        raise FleetError(
+            f"{storage.url}: holds drives ({few(drives)}) and summaries (summaries.json); move one of them elsewhere, "
+            f"and give the folder of the other"
+        )
 
 
 def _require_drives_unneeded(settings: CalibrationSettings, where: str) -> None:
@@ -201,13 +232,12 @@ def _find_drives(path: Path, settings: CalibrationSettings, *, everyone: bool) -
     """Drives of a fleet; if they are everyone's, vehicles that the settings name must be among them."""
     fleet = without_copies(find_fleet(path))
     if not fleet.vehicles:
-        why = "; ".join(f"{name}: {reason}" for name, reason in fleet.left_out.items())
-        raise FleetError(f"{path}: no drive that is one vehicle's alone; {why}")
+        raise FleetError(f"{path}: no drive that is one vehicle's alone{few_reasons(fleet.left_out)}")
     for names, what in ((settings.hold_out, "hold out"), (settings.trusted, "trust")):
         unknown = sorted(names - fleet.vehicles.keys()) if everyone else []
         if unknown:
-            reasons = [f"; {name}: {fleet.left_out[name]}" for name in unknown if name in fleet.left_out]
-            raise FleetError(f"{path}: no vehicle {', '.join(unknown)} to {what}{''.join(reasons)}")
+            reasons = few_reasons({name: fleet.left_out[name] for name in unknown if name in fleet.left_out})
+            raise FleetError(f"{path}: no vehicle {few(unknown)} to {what}{reasons}")
     return fleet
 
 

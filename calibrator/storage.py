@@ -1,5 +1,6 @@
 """Files of a local folder or of object storage (a URL that fsspec knows), each written whole or not at all."""
 
+import errno
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -7,10 +8,11 @@ from typing import Any
 from ecu_node.errors import UserError
 from ecu_node.parameters import write_atomically
 
-__all__ = ["Storage", "StorageError", "open_storage"]
+__all__ = ["DISK_FULL", "Storage", "StorageError", "open_storage"]
 
 OBJECT_STORAGE = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "memory"})
-"""Kinds of storage in which a file appears only when it is complete."""
+"""Kinds of storage in which a file appears only when it is complete, and which need no folders."""
+DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 class StorageError(UserError):
@@ -34,6 +36,11 @@ class Storage:
         """Whether it is a folder of this machine."""
         return "://" not in self.url
 
+    @property
+    def lasts(self) -> bool:
+        """Whether what is written stays when this process ends."""
+        return not self.url.startswith("memory://")
+
     def folder(self, name: str) -> "Storage":
         """Return a folder in this one; it is made when something is written."""
         return Storage(url=f"{self.url.rstrip('/')}/{name}")
@@ -46,6 +53,7 @@ class Storage:
         """What the storage tells of each file, by name."""
         filesystem, root = self._filesystem()
         try:
+            filesystem.invalidate_cache(root)  # others write there as well
             found = filesystem.ls(root, detail=True)
         except (FileNotFoundError, NotADirectoryError):
             return {}
@@ -105,10 +113,10 @@ class Storage:
                 write_atomically(Path(self.url) / name, content)
                 return
             filesystem, root = self._filesystem()
-            filesystem.makedirs(root, exist_ok=True)
-            if self.url.partition("://")[0] in OBJECT_STORAGE:
+            if self.url.partition("://")[0] in OBJECT_STORAGE:  # a folder made there might be a new bucket, of a slip
                 filesystem.pipe_file(f"{root}/{name}", content)
             else:
+                filesystem.makedirs(root, exist_ok=True)
                 filesystem.pipe_file(f"{root}/.{name}", content)
                 filesystem.mv(f"{root}/.{name}", f"{root}/{name}")
         except Exception as error:  # noqa: BLE001
@@ -127,10 +135,22 @@ class Storage:
 
     def _failed(self, name: str, what: str, error: Exception) -> StorageError:
         reason = getattr(error, "strerror", None) or str(error).partition("\n")[0] or type(error).__name__
-        return StorageError(f"{self.url}{name and '/'}{name}: cannot {what} it: {reason}")
+        remedy = "; make room, and run the same command again to go on, or choose another place"
+        full = getattr(error, "errno", None) in DISK_FULL
+        return StorageError(f"{self.url}{name and '/'}{name}: cannot {what} it: {reason}{remedy if full else ''}")
 
 
 def open_storage(place: str | Path) -> Storage:
-    """Storage at a path or URL; a ``file://`` URL is a path, and paths become absolute: others may work elsewhere."""
+    """Storage at a path or URL; a ``file://`` URL is a path, and paths become absolute: others may work elsewhere.
+
+    Raises
+    ------
+    StorageError
+        If nothing is named, which would be the folder that one happens to be in.
+    """
     text = str(place).removeprefix("file://")
+    if not text.strip() or text.endswith("://"):
+        raise StorageError(
+            f"{str(place)!r}: names no place; give the path of a folder or a URL such as s3://BUCKET/NAME"
+        )
     return Storage(url=text if "://" in text else str(Path(text).absolute()))

@@ -8,9 +8,9 @@ from calibrator.drives.copies import without_copies
 from calibrator.drives.fleet_source import find_fleet, probe_equipment
 from calibrator.identification.filter_bank import FilterBank
 from calibrator.reading_processes import TIME_LIMIT_S
-from calibrator.report.text import dumps, left_out_text
+from calibrator.report.text import counted, dumps, left_out_text
 from calibrator.storage import open_storage
-from calibrator.summaries.summarise import add_drives, open_store
+from calibrator.summaries.summarise import add_drives, open_store, require_store_or_nothing
 from ecu_node.database import VehicleDatabase
 
 __all__ = ["SummariseReport", "summarise_fleet"]
@@ -35,7 +35,7 @@ class SummariseReport:
         parts = [
             "\n".join(f"notice: {notice}" for notice in self.notices),
             left_out_text(self.left_out),
-            f"{self.drives} drives of {self.vehicles} vehicles summarised in {self.store}",
+            f"{counted(self.drives, 'drive')} of {counted(self.vehicles, 'vehicle')} summarised in {self.store}",
         ]
         return "\n\n".join(part for part in parts if part)
 
@@ -82,9 +82,11 @@ def summarise_fleet(
     UserError
         If the drives do not fit the store, or it cannot be written.
     """
+    storage = open_storage(out)
+    require_store_or_nothing(storage)
     source = without_copies(find_fleet(fleet))
     equipment = probe_equipment(source, database, branches, limit_s=time_limit_s)
-    store = open_store(open_storage(out), equipment, database, source, bank=bank)
+    store = open_store(storage, equipment, database, source, bank=bank)
     added = add_drives(store, source, database, workers=workers, time_limit_s=time_limit_s, part=part)
     return SummariseReport(
         store=out,

@@ -16,11 +16,20 @@ from calibrator.errors import FleetError
 from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
 from calibrator.recordings.readers import read_drive
 from calibrator.recordings.sources import find_logs
+from calibrator.report.text import few_reasons
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout
 
-__all__ = ["Equipment", "FleetSource", "find_fleet", "load_drive", "probe_equipment"]
+__all__ = [
+    "LOGS_FOLDER",
+    "STORE_FOLDER",
+    "Equipment",
+    "FleetSource",
+    "find_fleet",
+    "load_drive",
+    "probe_equipment",
+]
 
 STORE_FOLDER, LOGS_FOLDER = "drives", "logs"
 PROBED_VEHICLES = 7
@@ -89,7 +98,8 @@ def find_fleet(path: Path) -> FleetSource:
         If there is no drive at all.
     """
     if not path.is_dir():
-        raise FleetError(f"{path}: no such folder; give a drive store or a folder with one folder of logs per vehicle")
+        what = "is a file" if path.is_file() else "no such folder"
+        raise FleetError(f"{path}: {what}; give a drive store or a folder with one folder of logs per vehicle")
     left_out: dict[str, str] = {}
     folder = path
     if (path / STORE_FOLDER).is_dir():
@@ -100,8 +110,7 @@ def find_fleet(path: Path) -> FleetSource:
         entries = list(found.logs)
         left_out = {f"problem {k + 1}": str(problem) for k, problem in enumerate(found.problems)}
     if not entries:
-        reasons = "".join(f"; {reason}" for reason in left_out.values())
-        raise FleetError(f"{path}: no drive in it{reasons}")
+        raise FleetError(f"{path}: no drive in it{few_reasons(left_out)}")
     entries.sort(key=lambda entry: (entry.vehicle, entry.name))
     vehicles = {vehicle: tuple(group) for vehicle, group in groupby(entries, key=lambda entry: entry.vehicle)}
     return FleetSource(path=path, vehicles=vehicles, left_out=left_out, fleet_ids=read_fleet_ids(folder))
@@ -170,6 +179,11 @@ def probe_equipment(
         )
     seen = Counter(name for drive in drives for name in drive.branches)
     found = [name for name in layout.branch_names if 2 * seen[name] > len(drives)]
+    if branches is not None and len(branches) < 2:
+        raise FleetError(
+            f"--branches {','.join(branches)}: a junction has two branches or more; name all that are measured, or "
+            f"leave --branches out"
+        )
     chosen = _distinct(branches, layout) if branches is not None else tuple(found)
     available = {name for drive in drives for name in drive.inputs}
     inputs, missing_inputs = choose_inputs(layout, available)

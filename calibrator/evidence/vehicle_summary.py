@@ -13,6 +13,7 @@ from calibrator.errors import DriveError
 from calibrator.evidence.summary import DriveSummary, summarise
 from calibrator.evidence.zero_current import ZeroCurrent, zero_current_offsets
 from calibrator.identification.filter_bank import FilterBank
+from calibrator.report.text import counted
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
@@ -133,7 +134,8 @@ def _aligned(entries: Sequence[DriveFile], equipment: Equipment, database: Vehic
     duration_s = layout.period_s * sum(int(part.valid.sum()) for part in samples)
     if duration_s < LEAST_DURATION_S:
         raise DriveError(
-            f"{duration_s:.1f} s of usable data in {len(entries)} drives; at least {LEAST_DURATION_S:.0f} s are needed"
+            f"{duration_s:.1f} s of usable data in {counted(len(entries), 'drive')}; at least "
+            f"{LEAST_DURATION_S:.0f} s are needed"
         )
     return _AlignedDrives(drives=drives, delays=delays, samples=samples)
 

@@ -5,10 +5,12 @@ from typing import Any
 
 import msgspec
 
-__all__ = ["dumps", "left_out_text", "reasons_text", "table", "told_once"]
+__all__ = ["counted", "dumps", "few", "few_reasons", "left_out_text", "reasons_text", "table", "told_once"]
 
 MOST_NAMES = 6
 """Names told on one line: half a line of a terminal."""
+MOST_REASONS = 5
+"""Vehicles whose reasons are told in one message."""
 
 
 def dumps(value: Any) -> str:
@@ -44,7 +46,7 @@ def told_once(texts: Iterable[tuple[str, str]]) -> list[str]:
     names: dict[str, list[str]] = {}
     for name, text in texts:
         names.setdefault(text, []).append(name)
-    return [f"{_few(found)}: {text}" for text, found in names.items()]
+    return [f"{few(found)}: {text}" for text, found in names.items()]
 
 
 def reasons_text(title: str, reasons: Mapping[str, str], most: int = 10) -> str:
@@ -61,7 +63,33 @@ def left_out_text(left_out: Mapping[str, str]) -> str:
     return "\n".join(["left out:", *(f"  {line}" for line in told_once(left_out.items()))]) if left_out else ""
 
 
-def _few(names: Sequence[str]) -> str:
+def few(names: Sequence[str]) -> str:
+    """Names with commas: the first few of many, and how many more there are."""
     if len(names) <= MOST_NAMES:
         return ", ".join(names)
     return f"{', '.join(names[:MOST_NAMES])} and {len(names) - MOST_NAMES} more"
+
+
+def few_reasons(reasons: Mapping[str, str], *, count: int | None = None) -> str:
+    """Why vehicles cannot be used, to be added to a message.
+
+    Parameters
+    ----------
+    reasons : mapping of str to str
+        Why, by vehicle; of many perhaps the first ones.
+    count : int or None
+        How many vehicles there are in all; None: those that are given.
+
+    Returns
+    -------
+    str
+        ``"; NAME: why"`` for each of the first :data:`MOST_REASONS`, and how many more there are; empty for none.
+    """
+    told = "".join(f"; {name}: {why}" for name, why in list(reasons.items())[:MOST_REASONS])
+    more = (len(reasons) if count is None else count) - MOST_REASONS
+    return f"{told}; and {more} more" if more > 0 else told
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things: ``1 drive``, ``2 drives``."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"

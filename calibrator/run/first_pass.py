@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from calibrator.calibration_settings import CalibrationSettings, require_learning
-from calibrator.errors import DriveError
+from calibrator.errors import DriveError, FleetError
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.report.progress import progress_bar
 from calibrator.run.in_order import Workers
@@ -32,10 +32,13 @@ class Census:
         How many vehicles can be calibrated, by bucket; of all buckets.
     reasons : mapping of str to str
         Why others cannot; the first few.
+    left_out : int
+        How many others there are.
     """
 
     usable: Mapping[int, int]
     reasons: Mapping[str, str]
+    left_out: int
 
     @property
     def size(self) -> int:
@@ -61,19 +64,23 @@ def take_census(store: SummaryStore, workers: Workers) -> Census:
     Raises
     ------
     UserError
-        If a bucket cannot be read.
+        If a bucket cannot be read, or there is no vehicle.
     """
     buckets = store.buckets()
     usable: dict[int, int] = {}
     reasons: dict[str, str] = {}
+    seen = 0
     with progress_bar("look at vehicles", len(buckets), "chunks") as progress:
         for done, (bucket, outlines) in enumerate(zip(buckets, workers.map(store.outlines, buckets), strict=True), 1):
+            seen += len(outlines)
             usable[bucket] = sum(not item.problem for item in outlines)
             for item in outlines:
                 if item.problem and len(reasons) < MOST_REASONS:
                     reasons[item.vehicle] = item.problem
             progress(done)
-    return Census(usable=usable, reasons=reasons)
+    if not seen:
+        raise FleetError(f"{store.url}: the store of summaries is empty; add drives with 'calibrator summarise'")
+    return Census(usable=usable, reasons=reasons, left_out=seen - sum(usable.values()))
 
 
 def named_outlines(store: SummaryStore, census: Census, names: Collection[str]) -> dict[str, Outline]:
@@ -128,5 +135,5 @@ def read_sample(
                 except DriveError:  # left out, with the reason, in the second pass
                     continue
                 learners += learns
-    require_learning([item.vehicle for item in found], settings, census.reasons)
+    require_learning([item.vehicle for item in found], settings, census.reasons, left_out_count=census.left_out)
     return found

@@ -12,6 +12,7 @@ from calibrator.posterior.bench import read_bench
 from calibrator.posterior.bench_table import vehicles_named
 from calibrator.posterior.fleet import FindModels, Learnt, learn_fleet
 from calibrator.report.progress import progress_bar
+from calibrator.report.text import few, few_reasons
 from calibrator.run.first_pass import Census, named_outlines, read_sample, take_census
 from calibrator.run.in_order import Workers
 from calibrator.run.previous import PreviousResult
@@ -78,7 +79,7 @@ def calibrate_store(
         If the fleet as a whole cannot be calibrated.
     """
     versions, census = store.versions(), take_census(store, workers)
-    _require_known(settings, store, census)
+    _require_known(settings, store, census, fleet=identity.fleet)
     learnt = _learn(store, census, settings, identity, find_models)
     todo = [bucket for bucket in census.usable if not chunks.done(bucket)]
     calibrate = partial(calibrate_bucket, store=store, task=learnt.task, previous=previous)
@@ -126,11 +127,11 @@ def _learn(
         )
 
 
-def _require_known(settings: CalibrationSettings, store: SummaryStore, census: Census) -> None:
+def _require_known(settings: CalibrationSettings, store: SummaryStore, census: Census, *, fleet: str) -> None:
     """Refuse names of vehicles that there are not."""
     there = named_outlines(store, census, settings.hold_out | settings.trusted)
     for names, what in ((settings.hold_out, "hold out"), (settings.trusted, "trust")):
         missing = [name for name in sorted(names) if name not in there or (there[name].problem and what == "trust")]
         if missing:
-            reasons = [f"; {name}: {there[name].problem}" for name in missing if name in there]
-            raise FleetError(f"{store.url}: no usable vehicle {', '.join(missing)} to {what}{''.join(reasons)}")
+            reasons = few_reasons({name: there[name].problem for name in missing if name in there})
+            raise FleetError(f"fleet {fleet}: no usable vehicle {few(missing)} to {what}{reasons}")

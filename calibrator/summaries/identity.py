@@ -196,7 +196,7 @@ def _require_made_with(identity: StoreIdentity, database: VehicleDatabase, where
 
 def _require_known_names(identity: StoreIdentity, layout: Layout, where: str) -> None:
     """Refuse branches and inputs that the layout does not have, too few of them, or one twice."""
-    inputs = {item.name for item in (*layout.input, *layout.derived)}
+    inputs = {item.name for item in layout.input} | {item.name for item in layout.derived}
     for what, names, known, fewest in (
         ("branches", identity.branches, set(layout.branch_names), 2),
         ("inputs", identity.inputs, inputs, 1),

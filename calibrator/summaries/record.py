@@ -18,6 +18,7 @@ from calibrator.errors import DriveError
 from calibrator.evidence.readings import weighted_mean
 from calibrator.evidence.vehicle_summary import LEAST_DURATION_S, VehicleSummary
 from calibrator.evidence.zero_current import ZeroCurrent
+from calibrator.report.text import counted
 
 __all__ = [
     "IMPOSSIBLE",
@@ -137,7 +138,8 @@ def _too_short(duration_s: float, drives: Sequence[str]) -> str:
     """Why so much data cannot be used; empty if it can."""
     if duration_s >= LEAST_DURATION_S:
         return ""
-    return f"{duration_s:.1f} s of usable data in {len(drives)} drives; at least {LEAST_DURATION_S:.0f} s are needed"
+    found = f"{duration_s:.1f} s of usable data in {counted(len(drives), 'drive')}"
+    return f"{found}; at least {LEAST_DURATION_S:.0f} s are needed"
 
 
 def joined_records(records: Sequence[Record]) -> VehicleSummary:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -19,6 +20,7 @@ from calibrator.evidence.vehicle_summary import read_vehicle_summary
 from calibrator.identification.filter_bank import FilterBank
 from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
 from calibrator.report.progress import progress_bar
+from calibrator.report.text import few
 from calibrator.storage import Storage
 from calibrator.summaries.identity import StoreIdentity, read_identity, store_identity, write_identity
 from calibrator.summaries.record import Record, source_version
@@ -26,7 +28,7 @@ from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 
-__all__ = ["Added", "add_drives", "open_store"]
+__all__ = ["Added", "add_drives", "open_store", "require_store_or_nothing"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +48,27 @@ class Added:
     vehicles: int
     drives: int
     problems: Mapping[str, str]
+
+
+def require_store_or_nothing(storage: Storage) -> None:
+    """Refuse a place for summaries, before any drive is read, that is not empty and no store of them.
+
+    Raises
+    ------
+    FleetError
+        If it is another folder, a file, or one that does not last.
+    """
+    if storage.is_local and Path(storage.url).is_file():
+        raise FleetError(f"{storage.url}: is a file; name a folder for the summaries, or a URL")
+    if not storage.lasts:
+        raise FleetError(
+            f"{storage.url}: is gone when the command ends; name a folder for the summaries, or another URL"
+        )
+    there = storage.names()  # before its identity: another machine may make the store just now
+    if there and read_identity(storage) is None:
+        raise FleetError(
+            f"{storage.url}: no store of summaries, and not empty: {few(there)}; choose an empty or new folder"
+        )
 
 
 def open_store(

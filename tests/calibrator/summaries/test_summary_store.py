@@ -1,5 +1,6 @@
 """Summaries on disk: nothing is lost, records add up, and nothing that does not fit gets in."""
 
+import errno
 import math
 import re
 import shutil
@@ -104,7 +105,7 @@ def test_a_long_drive_is_shortened_and_its_sums_stay(tmp_path: Path, database: V
 
 def test_drives_too_short_by_themselves_count_together() -> None:
     parts = [record_of("V1", summary_of(90, seed), (f"d{seed}",)) for seed in (1, 2)]
-    with pytest.raises(DriveError, match=r"90\.0 s of usable data in 1 drives; at least 120 s are needed"):
+    with pytest.raises(DriveError, match=r"90\.0 s of usable data in 1 drive; at least 120 s are needed"):
         joined_records(parts[:1])
     assert joined_records(parts).summary.duration_s == 180.0
 
@@ -245,6 +246,32 @@ def test_object_storage_holds_the_same(database: VehicleDatabase) -> None:
     assert set(store.versions()) == {f"{bucket:05d}.parquet" for bucket in store.buckets()}
 
 
+def test_no_place_is_refused() -> None:
+    for place in ("", " ", "file://", "s3://"):
+        with pytest.raises(StorageError, match=f"^{place!r}: names no place; give the path of a folder or a URL"):
+            open_storage(place)
+
+
+def test_a_full_disk_is_told_with_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("calibrator.storage.write_atomically", full)
+    expected = rf"^{tmp_path}/x: cannot write it: No space left on device; make room, and run the same command again"
+    with pytest.raises(StorageError, match=expected):
+        open_storage(tmp_path).write("x", b"")
+
+
+def test_object_storage_is_looked_at_anew_and_gets_no_new_bucket_by_a_slip(monkeypatch: pytest.MonkeyPatch) -> None:
+    storage, calls = open_storage("memory://fleet/two"), []
+    kind = type(storage._filesystem()[0])
+    monkeypatch.setattr(kind, "invalidate_cache", lambda *_: calls.append("looked"))
+    monkeypatch.setattr(kind, "makedirs", lambda *_, **__: calls.append("made"))
+    storage.write("x", b"1")
+    assert storage.names() == ["x"]
+    assert calls == ["looked"]
+
+
 def test_storage_of_an_unknown_kind_is_refused_in_one_line() -> None:
     with pytest.raises(StorageError, match=r"^nokind://x: no way to reach this kind of storage: "):
         open_storage("nokind://x").names()
@@ -268,7 +295,10 @@ def test_a_store_of_another_layout_version_or_content_is_refused(tmp_path: Path,
         (('"buckets": 16', '"buckets": 40000'), "40000 buckets, expected 16 to 32768"),
         (('    "motor"', '    "steam"'), "branches battery, steam; expected 2 or more different ones of auxiliary, "),
         (('    "motor"', '    "battery"'), "branches battery, battery; expected 2 or more different ones of"),
-        (('    "torque"', '    "magic"', 1), "fleet_inputs speed, magic, voltage; expected 0 or more different ones of"),
+        (
+            ('    "torque"', '    "magic"', 1),
+            "fleet_inputs speed, magic, voltage; expected 0 or more different ones of",
+        ),
         (('"input_names": [\n      "speed"', '"input_names": [\n      "torque2"'), "a filter bank of torque2, torque"),
         (('"period_s": 1.0', '"period_s": 0.0'), "filter bank: period 0.0 s; expected a positive number; summarise"),
     ):
