@@ -302,10 +302,20 @@ def parameters_of(result: Path, vehicle: str) -> bytes:
     number = bucket_of(vehicle, run.buckets) if run.buckets else 0
     found = read_part(result / PARTS / f"{number:05d}.parquet")
     if vehicle not in found:
-        raise FleetError(
-            f"{result}: no parameters of a vehicle {vehicle!r}; results.parquet says who was left out, and why"
-        )
+        why = _left_out_reason(result / "results.parquet", vehicle)
+        if why is None:
+            raise FleetError(f"{result}: no vehicle {vehicle!r} in it; results.parquet names all that are")
+        raise FleetError(f"{result}: no parameters of vehicle {vehicle!r}, it was left out: {why}")
     return found[vehicle].text
+
+
+def _left_out_reason(path: Path, vehicle: str) -> str | None:
+    """Why a vehicle has no parameters; None if nothing is said of it."""
+    try:
+        rows = pq.read_table(path, columns=["reason"], filters=[("vehicle", "==", vehicle)]).to_pylist()
+    except (pa.ArrowException, OSError):
+        return None
+    return str(rows[0]["reason"]) if rows else None
 
 
 def left_out_of(folder: Path, *, most: int) -> tuple[dict[str, str], int]:

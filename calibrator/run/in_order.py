@@ -3,8 +3,10 @@
 Nothing of a result depends on where or beside what it was computed; so it is the same for any number of workers.
 """
 
+import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
@@ -25,6 +27,8 @@ AHEAD_PER_WORKER = 3
 """Items that are given to a cluster before it is the turn of their results: enough that no worker waits. [1]"""
 TIMEOUT_S = 10.0
 """Within which a scheduler must answer. [s]"""
+TALKATIVE = ("distributed", "distributed.client", "tornado.application", "asyncio")
+"""Loggers that print tracebacks of what is told in one line here."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,22 +98,45 @@ def _on_cluster(scheduler: str, function: Callable[[_Item], _Result], items: Ite
         from distributed.comm.core import CommClosedError  # noqa: PLC0415
     except ImportError:
         raise FleetError("--scheduler needs Dask: pip install 'hv-current-correction[cluster]'") from None
-    try:
-        client = Client(scheduler, timeout=TIMEOUT_S, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise FleetError(f"{scheduler}: no Dask scheduler answers: {error}; start one with 'dask scheduler'") from None
-    with client:
+    with _silenced(TALKATIVE):
         try:
-            client.wait_for_workers(1, timeout=TIMEOUT_S)
-        except TimeoutError:
-            raise FleetError(f"{scheduler}: the scheduler has no worker; start some with 'dask worker'") from None
-        try:
-            yield from _in_turn(client, function, items)
-        except (KilledWorker, CancelledError, CommClosedError) as error:
+            client = Client(scheduler, timeout=TIMEOUT_S, set_as_default=False)
+        except (OSError, ValueError) as error:
             reason = str(error).partition("\n")[0]
             raise FleetError(
-                f"{scheduler}: the cluster gave up: {reason}; look at its workers; the same command, run again, goes on"
+                f"{scheduler}: no Dask scheduler answers: {reason}; start one with 'dask scheduler'"
             ) from None
+        with client:
+            try:
+                client.wait_for_workers(1, timeout=TIMEOUT_S)
+            except TimeoutError:
+                raise FleetError(f"{scheduler}: the scheduler has no worker; start some with 'dask worker'") from None
+            try:
+                yield from _in_turn(client, function, items)
+            except KilledWorker:
+                raise FleetError(
+                    f"{scheduler}: workers of the cluster died again and again, as by a lack of memory; look at their "
+                    f"logs; the same command, run again, goes on where it stopped"
+                ) from None
+            except (CancelledError, CommClosedError):
+                raise FleetError(
+                    f"{scheduler}: the scheduler is gone; start it and its workers again; the same command, run again, "
+                    f"goes on where it stopped"
+                ) from None
+
+
+@contextmanager
+def _silenced(names: Iterable[str]) -> Iterator[None]:
+    """While the block runs, some loggers say nothing."""
+    loggers = [logging.getLogger(name) for name in names]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def _in_turn(client: Any, function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:

@@ -38,7 +38,10 @@ class PreviousResult:
     def written(self, bucket: int) -> dict[str, Written]:
         """Parameters of the vehicles of a bucket, by name; raises FleetError if they cannot be read."""
         if not (self.folder / PARTS).is_dir():
-            raise FleetError(f"{self.folder / PARTS}: the earlier result cannot be reached from here")
+            raise FleetError(
+                f"{self.folder / PARTS}: the earlier result cannot be reached from here; put it where every worker "
+                f"reaches it by this path"
+            )
         return read_part(self.folder / PARTS / f"{bucket:05d}.parquet")
 
 
@@ -66,6 +69,11 @@ def require_previous(folder: Path, database: VehicleDatabase, store: StoreIdenti
         raise FleetError(
             f"{folder}: a result with branches {', '.join(run.branches)}; this fleet has {', '.join(store.branches)}: "
             f"calibrate it without --since"
+        )
+    if not (folder / PARTS).is_dir():
+        raise FleetError(
+            f"{folder / PARTS}: no such folder; expected the parameters of the earlier result: give the whole folder "
+            f"that 'calibrator calibrate' wrote, or calibrate without --since"
         )
     if (run.layout_sha256, run.dbc_sha256) != (database.layout.digest, database.digest):
         raise FleetError(

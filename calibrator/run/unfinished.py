@@ -15,6 +15,7 @@ from pathlib import Path
 
 from calibrator.errors import FleetError
 from calibrator.results import ChunkResult
+from calibrator.storage import DISK_FULL
 from ecu_node.layout import file_digest
 from ecu_node.parameters import write_atomically
 
@@ -87,7 +88,7 @@ class Unfinished:
 
     def summaries_since(self, earlier: Path | None) -> None:
         """Begin the store of summaries with those of an earlier result, unless this was done before, or with none."""
-        marker, mark = self.folder / "since", "" if earlier is None else _mark(earlier)
+        marker, mark = self._since, "" if earlier is None else _mark(earlier)
         there = marker.read_text() if marker.exists() else ""
         if there == mark and (earlier is None or self.summaries.exists()):
             return
@@ -100,6 +101,19 @@ class Unfinished:
         shutil.copytree(earlier / SUMMARIES, copy, ignore=shutil.ignore_patterns(".*"))
         copy.rename(self.summaries)
         write_atomically(marker, mark.encode())
+
+    def worth_keeping(self) -> bool:
+        """Whether anything was computed: a chunk, or summaries of drives besides those of an earlier result."""
+        if self.chunks.numbers():
+            return True
+        copied = self._since.stat().st_mtime_ns if self._since.exists() else 0
+        buckets = self.summaries.glob("buckets/[0-9]*.parquet")
+        return any(path.stat().st_mtime_ns >= copied for path in buckets)
+
+    @property
+    def _since(self) -> Path:
+        """Which earlier result's summaries were copied; written after them."""
+        return self.folder / "since"
 
     def begin(self, plan: str | None, note: str) -> str:
         """Keep the chunks that are there if they were computed by the same plan, else remove them.
@@ -180,19 +194,33 @@ def unfinished_run(out: Path) -> Iterator[Unfinished]:
             raise FleetError(
                 f"{out}: another run is writing this result; wait for it or choose another --out"
             ) from None
-        yield Unfinished(folder=folder, out=out, shown=shown)
+        unfinished = Unfinished(folder=folder, out=out, shown=shown)
+        try:
+            with _disk_full_told(unfinished):
+                yield unfinished
+        finally:
+            if not unfinished.worth_keeping():
+                shutil.rmtree(folder, ignore_errors=True)
     finally:
         os.close(lock)
-        _remove_if_empty(folder)
+
+
+@contextmanager
+def _disk_full_told(unfinished: Unfinished) -> Iterator[None]:
+    """Say where there is no room, and what to do; libraries leave out the name of the file."""
+    try:
+        yield
+    except OSError as error:
+        where, reason = error.filename or unfinished.folder, os.strerror(error.errno or 0)
+        if isinstance(error, shutil.Error):  # of a folder that was copied: the first of its files that was not
+            (_, where, reason), *_ = error.args[0]
+        elif error.errno not in DISK_FULL:
+            raise
+        raise FleetError(
+            f"{where}: cannot write it: {reason}; make room, and run the same command again to go on, or choose "
+            f"another --out"
+        ) from None
 
 
 def _mark(result: Path) -> str:
     return f"{result.absolute()} {file_digest(result / 'run.json')}"
-
-
-def _remove_if_empty(folder: Path) -> None:
-    """A run that failed before it did anything leaves nothing."""
-    try:
-        folder.rmdir()
-    except OSError:
-        return

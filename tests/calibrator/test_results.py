@@ -10,6 +10,7 @@ from calibrator.results import (
     PARTS,
     RunRecord,
     encode_chunk,
+    join_rows,
     parameters_of,
     read_results,
     read_run,
@@ -79,8 +80,15 @@ def test_the_parameter_file_of_a_vehicle_is_found_however_many_there_are(result:
 
 @pytest.mark.parametrize("name", ["v3", "../params/v1", ""])
 def test_a_vehicle_that_has_no_parameters_is_named(result: Path, name: str) -> None:
-    with pytest.raises(FleetError, match=rf"no parameters of a vehicle '{name}'; results\.parquet says who was left"):
+    with pytest.raises(FleetError, match=rf"no vehicle '{name}' in it; results\.parquet names all that are"):
         parameters_of(result, name)
+
+
+def test_a_vehicle_that_was_left_out_is_told_with_its_reason(result: Path, tmp_path: Path) -> None:
+    (tmp_path / "part").write_bytes(encode_chunk([], {"v3": "too short"}).rows)
+    join_rows(result, [tmp_path / "part"], {})
+    with pytest.raises(FleetError, match=r"no parameters of vehicle 'v3', it was left out: too short"):
+        parameters_of(result, "v3")
 
 
 def test_parameter_files_are_written_by_the_command(

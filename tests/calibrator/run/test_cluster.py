@@ -32,7 +32,7 @@ def store(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -
 
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[tuple[str, list["subprocess.Popen[bytes]"]]]:
-    """Address of a scheduler, and its two workers."""
+    """Address of a scheduler; its two workers, and itself."""
     file = tmp_path / "scheduler.json"
     environment = {**ENVIRONMENT, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     common = ["--scheduler-file", str(file)]
@@ -45,13 +45,35 @@ def cluster(tmp_path: Path) -> Iterator[tuple[str, list["subprocess.Popen[bytes]
             stack.callback(process.kill)
             return process
 
-        start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-jupyter", *common)
+        scheduler = start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-jupyter", *common)
         until = time.monotonic() + 60.0
         while not file.exists() and time.monotonic() < until:
             time.sleep(0.05)
         workers = [start("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard", *common) for _ in range(2)]
         address = next(line for line in file.read_text().split('"') if line.startswith("tcp://"))
-        yield address, workers
+        yield address, [*workers, scheduler]
+
+
+def test_a_scheduler_that_is_killed_is_told_in_one_line_and_the_run_goes_on(
+    store: SummaryStore, cluster: tuple[str, list["subprocess.Popen[bytes]"]], tmp_path: Path
+) -> None:
+    address, (_, _, scheduler) = cluster
+    line = command("calibrate", store.url, "--layout", LAYOUT, "--out", tmp_path / "out", "--scheduler", address)
+    chunks = tmp_path / ".out.unfinished" / "chunks"
+    with subprocess.Popen(line, stderr=subprocess.PIPE, stdout=subprocess.PIPE, env=ENVIRONMENT) as run:
+        until = time.monotonic() + 300.0
+        while not list(chunks.glob("*.rows.parquet")) and run.poll() is None and time.monotonic() < until:
+            time.sleep(0.005)
+        scheduler.send_signal(signal.SIGKILL)
+        _, errors = run.communicate(timeout=300)
+    *progress, last = errors.decode().replace("\r", "\n").splitlines()
+    assert run.returncode == 1
+    assert last == (
+        f"calibrator: {address}: the scheduler is gone; start it and its workers again; the same command, run again, "
+        f"goes on where it stopped"
+    )
+    assert all("chunks" in text or "vehicles" in text or not text.strip() for text in progress)
+    assert list(chunks.glob("*.rows.parquet"))
 
 
 def test_a_cluster_that_loses_a_worker_gives_the_same_result(
@@ -59,7 +81,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_result(
 ) -> None:
     here = calibrate(store.url, tmp_path / "here", "--workers", 2)
     assert here.returncode == 0, here.stderr
-    address, workers = cluster
+    address, (*workers, _) = cluster
     line = command("calibrate", store.url, "--layout", LAYOUT, "--out", tmp_path / "there", "--scheduler", address)
     chunks = tmp_path / ".there.unfinished" / "chunks"
     with subprocess.Popen(line, stderr=subprocess.PIPE, stdout=subprocess.PIPE, env=ENVIRONMENT) as run:

@@ -1,16 +1,19 @@
 """Whole runs as a user types them: killed and gone on with, with any number of workers, on a cluster, from a result."""
 
 import dataclasses
+import errno
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from calibrator.errors import FleetError
 from calibrator.results import read_results, read_run
 from calibrator.run.unfinished import unfinished_run
 from calibrator.summaries.store import SummaryStore
@@ -102,24 +105,35 @@ def test_a_second_run_to_the_same_place_is_refused(store: SummaryStore, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "code", "message"),
     [
-        (("--method", "published"), "a store of summaries, and --method published needs the drives"),
-        (("--sensor-models",), "a store of summaries, and --sensor-models needs the drives"),
-        (("--branches", "battery,motor"), "a store of summaries, and --branches needs the drives"),
-        (("--trusted", "V777"), "no usable vehicle V777 to trust"),
-        (("--hold-out", "V777"), "no usable vehicle V777 to hold out"),
-        (("--hold-out", "V003", "--trusted", "V003"), "vehicle V003 is both held out and trusted"),
-        (("--scheduler", "tcp://127.0.0.1:9"), "tcp://127.0.0.1:9: no Dask scheduler answers"),
+        (("--method", "published"), 1, "a store of summaries, and --method published needs the drives"),
+        (("--sensor-models",), 1, "a store of summaries, and --sensor-models needs the drives"),
+        (("--branches", "battery,motor"), 1, "a store of summaries, and --branches needs the drives"),
+        (("--trusted", "V777"), 1, "fleet small: no usable vehicle V777 to trust"),
+        (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
+        (
+            ("--trusted", ",".join(f"V{number}" for number in range(700, 710))),
+            1,
+            "V700, V701, V702, V703, V704, V705 and 4 more to trust",
+        ),
+        (("--hold-out", "V003", "--trusted", "V003"), 2, "vehicle V003 is both held out and trusted"),
+        (("--since", "earlier", "--branches", "battery,motor"), 2, "--branches and --since exclude each other"),
+        (("--since", "earlier", "--sensor-models"), 2, "--sensor-models and --since exclude each other"),
+        (("--scheduler", "tcp://127.0.0.1:9"), 1, "tcp://127.0.0.1:9: no Dask scheduler answers"),
+        (("--scheduler", ""), 2, "'': expected the address of a Dask scheduler, tcp://HOST:PORT or tls://HOST:PORT"),
+        (("--scheduler", "http://127.0.0.1:9"), 2, "'http://127.0.0.1:9': expected the address of a Dask scheduler"),
+        (("--scheduler", "tcp://127.0.0.1:99999"), 2, "port 1 to 65535"),
     ],
 )
 def test_what_summaries_do_not_tell_is_refused_in_one_line(
-    store: SummaryStore, tmp_path: Path, options: tuple[str, ...], message: str
+    store: SummaryStore, tmp_path: Path, options: tuple[str, ...], code: int, message: str
 ) -> None:
     run = calibrate(store.url, tmp_path / "out", *options)
-    assert run.returncode == 1
+    assert run.returncode == code
     assert message in run.stderr.splitlines()[-1]
     assert "Traceback" not in run.stderr
+    assert list(tmp_path.iterdir()) == [], "nothing was computed, so nothing is left"
 
 
 def test_since_an_earlier_result_only_those_who_drove_are_calibrated(
@@ -157,6 +171,86 @@ def test_a_vehicle_that_cannot_be_used_stops_neither_pass(
         "V012": "its summary holds impossible numbers; look at its recordings, and summarise them again"
     }
     assert read_run(tmp_path / "out").vehicles == VEHICLES - 1
+
+
+def test_since_a_result_without_its_parameters_is_refused(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+    shutil.copytree(result, tmp_path / "earlier")
+    shutil.rmtree(tmp_path / "earlier" / "parameters")
+    run = calibrate(store.url, tmp_path / "out", "--since", tmp_path / "earlier")
+    assert run.returncode == 1
+    assert "earlier/parameters: no such folder; expected the parameters of the earlier result: give" in run.stderr
+    assert not (tmp_path / ".out.unfinished").exists()
+
+
+def test_a_place_that_is_no_fleet_is_told_in_words(store: SummaryStore, tmp_path: Path) -> None:
+    shutil.copytree(store.url, tmp_path / "both")
+    (tmp_path / "both" / "drives").mkdir()
+    shutil.copytree(store.url, tmp_path / "empty", ignore=shutil.ignore_patterns("*.parquet"))
+    (tmp_path / "file").touch()
+    for place, code, message in (
+        ("nothing", 1, "nothing: no such folder, store of drives or store of summaries"),
+        ("file", 1, "file: is a file; give a store of drives or of summaries, or a folder with one folder of logs"),
+        ("both", 1, "both: holds drives (drives) and summaries (summaries.json); move one of them elsewhere"),
+        ("empty", 1, "empty: the store of summaries is empty; add drives with 'calibrator summarise'"),
+    ):
+        run = calibrate(str(tmp_path / place), tmp_path / "out")
+        assert (run.returncode, message in run.stderr.splitlines()[-1]) == (code, True), run.stderr
+        assert not (tmp_path / ".out.unfinished").exists()
+    for place, code, message in (("", 2, "an empty name; give the path"), ("file://", 1, "'file://': names no place")):
+        run = calibrate(place, tmp_path / "out")
+        assert (run.returncode, message in run.stderr.splitlines()[-1]) == (code, True), run.stderr
+
+
+def test_drives_are_not_summarised_into_a_folder_that_holds_something_else(result: Path, tmp_path: Path) -> None:
+    (tmp_path / "fleet").mkdir()
+    for out, code, message in (
+        (result, 1, "no store of summaries, and not empty: parameters, params, results.parquet, run.json; choose"),
+        (result / "run.json", 1, "run.json: is a file; name a folder"),
+        ("memory://m", 1, "memory://m: is gone when the command ends"),
+        ("", 2, "an empty name; give the path of a folder"),
+    ):
+        line = command("summarise", tmp_path / "fleet", "--layout", LAYOUT, "--out", out)
+        run = subprocess.run(line, capture_output=True, text=True, check=False, timeout=120, env=ENVIRONMENT)
+        assert (run.returncode, message in run.stderr.splitlines()[-1]) == (code, True), run.stderr
+    run = subprocess.run(
+        command("summarise", "", "--layout", LAYOUT, "--out", "x"), capture_output=True, text=True, check=False
+    )
+    assert (run.returncode, "an empty name" in run.stderr) == (2, True)
+
+
+def test_what_was_computed_is_kept_and_else_nothing(store: SummaryStore, tmp_path: Path) -> None:
+    out, folder = tmp_path / "out", tmp_path / ".out.unfinished"
+    for name, kept in (("chunks/00003.rows.parquet", True), ("summaries/buckets/00003.parquet", True), ("plan", False)):
+        with suppress(FleetError), unfinished_run(out):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).touch()
+            raise FleetError("a slip")
+        assert folder.exists() == kept
+        shutil.rmtree(folder, ignore_errors=True)
+    (tmp_path / "earlier").mkdir()
+    (tmp_path / "earlier" / "run.json").touch()
+    shutil.copytree(store.url, tmp_path / "earlier" / "summaries")
+    for new in (False, True):
+        with suppress(FleetError), unfinished_run(out) as unfinished:
+            unfinished.summaries_since(tmp_path / "earlier")
+            if new:
+                (unfinished.summaries / "buckets" / "00003.parquet").touch()
+            raise FleetError("a slip")
+        assert folder.exists() == new, "copies of earlier summaries are nothing new"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.ENOSPC, "Error writing bytes to file. Detail: [errno 28] No space left on device"),
+        shutil.Error([("a", "b", "[Errno 28] No space left on device: 'b'")]),
+    ],
+)
+def test_a_full_disk_is_told_with_what_to_do(tmp_path: Path, error: OSError) -> None:
+    where = "b" if isinstance(error, shutil.Error) else rf"{tmp_path}/\.out\.unfinished"
+    message = rf"^{where}: cannot write it: .*No space left on device.*; make room, and run the same command again"
+    with pytest.raises(FleetError, match=message), unfinished_run(tmp_path / "out"):
+        raise error
 
 
 def test_since_what_is_no_result_is_refused(store: SummaryStore, tmp_path: Path) -> None:
