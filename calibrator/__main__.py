@@ -7,13 +7,14 @@ import os
 import signal
 import sys
 
-from calibrator.interrupts import INTERRUPTED, MESSAGE, importing
+from calibrator.interrupts import INTERRUPTED, MESSAGE, ending_at_sigterm, importing
 
 __all__ = ["main"]
 
 
 def main() -> None:
-    """Run the command line; exit code 0 done, 1 failed, 2 wrong use, 130 interrupted."""
+    """Run the command line; exit code 0 done, 1 failed, 2 wrong use, 130 interrupted, 143 ended by SIGTERM."""
+    ending_at_sigterm()
     try:
         code = _run()
         sys.stdout.flush()

@@ -1,18 +1,45 @@
 """Ctrl-C at the two times when KeyboardInterrupt does not do: while libraries are imported, and in worker processes.
 
 Libraries swallow exceptions of their own imports, or turn them into others; workers would each print a traceback.
+SIGTERM ends the program at once, as a kill does, with a line.
 """
 
+import os
 import signal
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
+from types import FrameType
 from typing import Any
 
 from ecu_node.interrupts import INTERRUPTED, ending_at_interrupt
 
-__all__ = ["INTERRUPTED", "MESSAGE", "importing", "in_processes"]
+__all__ = [
+    "INTERRUPTED",
+    "MESSAGE",
+    "TERMINATED",
+    "TERMINATED_MESSAGE",
+    "ending_at_sigterm",
+    "importing",
+    "in_processes",
+]
 
-MESSAGE = "calibrator: interrupted; the same command, run again, goes on with what it had read or computed"
+TERMINATED = 143
+"""Exit code that shells give to a program ended by SIGTERM."""
+_GOES_ON = "the same command, run again, goes on with what it had read or computed"
+MESSAGE = f"calibrator: interrupted; {_GOES_ON}"
+TERMINATED_MESSAGE = f"calibrator: ended by SIGTERM; {_GOES_ON}"
+
+
+def ending_at_sigterm() -> None:
+    """From now on SIGTERM ends the program with one line and :data:`TERMINATED`, unless that is handled already."""
+
+    def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+        os.write(sys.stderr.fileno(), f"{TERMINATED_MESSAGE}\n".encode())
+        os._exit(TERMINATED)
+
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, end)
 
 
 def importing() -> AbstractContextManager[None]:

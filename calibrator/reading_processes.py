@@ -262,13 +262,11 @@ def _work(pipe: Connection, read: Callable[[Any], Any], folder: str) -> None:
     os.setsid()  # a group of its own, so that it can be killed with what it starts
     tempfile.tempdir = folder
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    while True:
-        try:
+    with suppress(EOFError, ConnectionError):  # the parent is gone, or wants no more
+        while True:
             source = pipe.recv()
-        except EOFError:
-            return
-        pipe.send(_Begun())
-        _send(pipe, _outcome(read, source))
+            pipe.send(_Begun())
+            _send(pipe, _outcome(read, source))
 
 
 def _outcome(read: Callable[[Any], Any], source: Any) -> object:

@@ -17,6 +17,7 @@ from calibrator.drives.fleet_source import Equipment, load_drive
 from calibrator.errors import DriveError
 from calibrator.identification.identify import identify
 from calibrator.identification.state_space import StateSpaceModel, simulation_snr_db
+from calibrator.report.text import counted
 from ecu_node.database import VehicleDatabase
 
 __all__ = ["LEAD_IN_S", "VehicleModel", "identify_vehicle", "read_vehicle_model"]
@@ -132,7 +133,8 @@ def identify_vehicle(
     duration_s = period_s * sum(int(drive.valid.sum()) for drive in drives)
     if duration_s < LEAST_DURATION_S:
         raise DriveError(
-            f"{duration_s:.1f} s of usable data in {len(drives)} drives; at least {LEAST_DURATION_S:.0f} s are needed"
+            f"{duration_s:.1f} s of usable data in {counted(len(drives), 'drive')}; at least {LEAST_DURATION_S:.0f} s "
+            f"are needed"
         )
     inputs, currents, training, held_out = _joined(drives, int(GAP_S / period_s))
     valid = training | held_out

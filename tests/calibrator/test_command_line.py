@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from calibrator.cli import app, main
 from calibrator.command_options import RECORDED_EXPERIMENTS
 from calibrator.experiments.runner import EXPERIMENTS, Recorded
-from calibrator.interrupts import INTERRUPTED, MESSAGE
+from calibrator.interrupts import INTERRUPTED, MESSAGE, TERMINATED, TERMINATED_MESSAGE
 
 ROOT = Path(__file__).parents[2]
 LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
@@ -260,7 +260,10 @@ def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(delay_s: 
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.5, 2.0])
-def test_ctrl_c_while_logs_are_read_ends_readers_too_in_one_line(delay_s: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_sigterm_while_logs_are_read_end_readers_too_in_one_line(
+    how: signal.Signals, delay_s: float, tmp_path: Path
+) -> None:
     log, temporary = tmp_path / "V1" / "endless.log.gz", tmp_path / "temporary"
     log.parent.mkdir()
     temporary.mkdir()
@@ -276,8 +279,11 @@ def test_ctrl_c_while_logs_are_read_ends_readers_too_in_one_line(delay_s: float,
             assert process.poll() is None
             time.sleep(0.01)
         time.sleep(delay_s)
-        os.killpg(process.pid, signal.SIGINT)
+        process.send_signal(how) if how is signal.SIGTERM else os.killpg(process.pid, how)
         _, errors = process.communicate(timeout=60)  # also waits for all that have its stderr
+    if how is signal.SIGTERM:
+        assert (process.returncode, errors) == (TERMINATED, f"{TERMINATED_MESSAGE}\n")
+        return
     assert (process.returncode, errors) == (INTERRUPTED, f"{MESSAGE}\n")
     assert not list(temporary.iterdir())
 

@@ -90,7 +90,7 @@ def test_drive_that_is_good_only_at_its_start_has_held_out_data(database: Vehicl
 
 
 def test_three_seconds_are_too_little(database: VehicleDatabase, tmp_path: Path) -> None:
-    with pytest.raises(DriveError, match=r"of usable data in 1 drives; at least 60 s are needed"):
+    with pytest.raises(DriveError, match=r"of usable data in 1 drive; at least 60 s are needed"):
         model_of(database, tmp_path, drive("a", 30))
 
 
