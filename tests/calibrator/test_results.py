@@ -98,7 +98,7 @@ def test_parameter_files_are_written_by_the_command(
     assert capsys.readouterr().out.splitlines() == [str(tmp_path / "out" / f"{name}.json") for name in ("v1", "v2")]
     assert read_parameters(tmp_path / "out" / "v2.json").branches["motor"].offset_a == 1.0
     assert run_command(["params", str(result), "v1", "v9", "--out", str(tmp_path / "none")]) == 1
-    assert "no parameters of a vehicle 'v9'" in capsys.readouterr().err
+    assert "no vehicle 'v9' in it" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
 
 
