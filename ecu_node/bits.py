@@ -2,20 +2,37 @@
 
 The bytes that a signal touches are one integer of its own byte order; the signal is ``length`` bits of it, ``shift``
 bits above the least significant one. A whole frame is never decoded, so bits that no signal of the DBC covers survive.
+A multiplexed signal is in a frame only if the multiplexers above it have one of its codes.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
-from cantools.database.can import Signal
+from cantools.database.can import Message, Signal
 
 from ecu_node.errors import DatabaseError
 
-__all__ = ["BitPlace", "bit_place"]
+__all__ = ["BitPlace", "Multiplexer", "Order", "PlacedSignal", "WordField", "bit_place", "multiplexers"]
 
 _BITS_PER_BYTE = 8
 _LONGEST = 64
 """No CAN signal of integers is longer. [bit]"""
+
+
+Order = Literal["little", "big"]
+"""Byte order."""
+
+
+class WordField(NamedTuple):
+    """A signal in a whole payload of one length, read as one integer of the signal's byte order.
+
+    ``raw = ((word >> shift & ones) ^ sign) - sign``.
+    """
+
+    shift: int
+    ones: int
+    sign: int
+    """The sign bit of a two's complement; 0 if the signal has none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +55,7 @@ class BitPlace:
 
     first: int
     end: int
-    order: Literal["little", "big"]
+    order: Order
     shift: int
     length: int
     signed: bool
@@ -59,6 +76,16 @@ class BitPlace:
         field = ((1 << self.length) - 1) << self.shift
         placed = bytes(self.first) + field.to_bytes(self.end - self.first, self.order)
         return int.from_bytes(placed, "little")
+
+    def in_word(self, payload_bytes: int) -> WordField | None:
+        """The signal in payloads of some length [byte]; None if they are too short to hold it."""
+        if payload_bytes < self.end:
+            return None
+        ones = (1 << self.length) - 1
+        below = self.first if self.order == "little" else payload_bytes - self.end
+        shift = self.shift + _BITS_PER_BYTE * below
+        sign = 1 << (self.length - 1) if self.signed else 0
+        return WordField(shift, ones, sign)
 
     def extract(self, payload: bytes | bytearray) -> int | None:
         """Read the raw integer.
@@ -116,7 +143,7 @@ def bit_place(signal: Signal) -> BitPlace:
     Parameters
     ----------
     signal : Signal
-        An integer signal that is in every frame of its message.
+        An integer signal; where it is multiplexed, see :func:`multiplexers`.
 
     Returns
     -------
@@ -126,12 +153,10 @@ def bit_place(signal: Signal) -> BitPlace:
     Raises
     ------
     DatabaseError
-        If the signal is a floating-point number, multiplexed, or wider than 64 bits.
+        If the signal is a floating-point number or wider than 64 bits.
     """
     if signal.is_float:
         raise DatabaseError(f"signal {signal.name} is a floating-point number; the node corrects integer signals only")
-    if signal.multiplexer_ids is not None:
-        raise DatabaseError(f"signal {signal.name} is multiplexed; the node corrects signals of every frame only")
     if not 1 <= signal.length <= _LONGEST:
         raise DatabaseError(f"signal {signal.name} has {signal.length} bits; 1 to {_LONGEST} are expected")
     if signal.byte_order == "little_endian":
@@ -149,3 +174,61 @@ def bit_place(signal: Signal) -> BitPlace:
         length=signal.length,
         signed=signal.is_signed,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Multiplexer:
+    """A signal that tells which others a frame has.
+
+    Attributes
+    ----------
+    place : BitPlace
+        Of the multiplexer.
+    codes : frozenset of int
+        Its raw codes with which the other signal is in the frame.
+    """
+
+    place: BitPlace
+    codes: frozenset[int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedSignal:
+    """A signal, and the multiplexers that decide whether it is in a frame."""
+
+    place: BitPlace
+    above: tuple[Multiplexer, ...] = ()
+
+    @property
+    def end(self) -> int:
+        """Bytes that a payload must have for the signal and its multiplexers to be in it."""
+        return max(self.place.end, *(item.place.end for item in self.above), 0)
+
+    def code(self, payload: bytes | bytearray) -> int | None:
+        """Raw code of the signal in a payload; None if it is not there."""
+        if all(item.place.extract(payload) in item.codes for item in self.above):
+            return self.place.extract(payload)
+        return None
+
+
+def multiplexers(message: Message, signal: Signal) -> tuple[Multiplexer, ...]:
+    """Multiplexers that decide whether a signal is in a frame, the nearest one first.
+
+    Parameters
+    ----------
+    message : Message
+        The signal's message.
+    signal : Signal
+        Any of its signals.
+
+    Returns
+    -------
+    tuple of Multiplexer
+        All of them must have one of their codes; empty for a signal of every frame.
+    """
+    found = []
+    while signal.multiplexer_ids is not None and signal.multiplexer_signal is not None:
+        above = message.get_signal_by_name(signal.multiplexer_signal)
+        found.append(Multiplexer(place=bit_place(above), codes=frozenset(signal.multiplexer_ids)))
+        signal = above
+    return tuple(found)

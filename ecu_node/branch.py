@@ -1,220 +1,387 @@
-"""One branch as the node sees it live: its last measured and corrected current, and what may be published of it.
+"""One branch as the node sees it live: its last code, what is made of it, and its recent past.
 
 Currents are positive into the junction. Times are those of one steady clock, passed in. [s]
 """
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections import deque
+from collections.abc import Callable, Iterator
 
-from ecu_node.bits import BitPlace
+from ecu_node.bits import PlacedSignal
 from ecu_node.codes import Codes
-from ecu_node.correction import IntegerPlan, corrected_current
+from ecu_node.correction import NO_FAULT, CorrectionPlan, IntegerPlan, SensorFault, SignPlan, TemperaturePlans
+from ecu_node.counters import Counters
 from ecu_node.status import Quality
 
-__all__ = ["CurrentSensor", "LiveBranch", "PowerSensor", "Reading", "Republished", "SensorFault", "VoltageSensor"]
+__all__ = ["AS_IT_IS", "Auxiliary", "LiveBranch"]
 
-_LEAST_VOLTAGE_V = 10.0
+LEAST_VOLTAGE_V = 10.0
 """Below this the HV net is switched off, and power / voltage says nothing of the current. [V]"""
+_TEMPERATURES = 256
+"""Plans that are kept, one per code of the temperature."""
+
+_Fix = Callable[[int], int | None]
+"""From a measured code to the one to write; None where the code is no value."""
+
+_EVERYTHING = 1 << 64
+AS_IT_IS = IntegerPlan(gain=2, bias=0, shift=1, lowest=-_EVERYTHING, highest=_EVERYTHING)
+"""Writes every value as it was measured."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SensorFault:
-    """What is corrected: drift [1] and offset, positive into the junction [A]; None of it where passed through."""
-
-    drift: float = 0.0
-    offset_a: float = 0.0
-    applied: bool = False
+Frames = deque[tuple[float, bytearray]]
+"""Times [s] and payloads of the last intact frames of a message."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reading:
-    """What one frame says of a branch: the current [A], and the code of a current signal; None where it is no value."""
+class Past:
+    """A signal in the last frames of its message; read only when it is asked for.
 
-    quality: Quality
-    current_a: float | None = None
-    code: int | None = None
+    Parameters
+    ----------
+    signal : PlacedSignal, optional
+        Where it stands.
+    frames : deque
+        Frames that the message's source goes on to add to.
+    """
+
+    def __init__(self, signal: PlacedSignal | None = None, frames: Frames | None = None) -> None:
+        self._signal = signal
+        self._frames: Frames = deque() if frames is None else frames
+
+    @property
+    def is_multiplexed(self) -> bool:
+        """Whether frames may lack the signal."""
+        return self._signal is not None and bool(self._signal.above)
+
+    def newest_first(self) -> Iterator[tuple[float, int]]:
+        """Times and codes, back from the last frame that has the signal. [s]"""
+        for time_s, payload in reversed(self._frames):
+            code = self._signal.code(payload) if self._signal is not None else None
+            if code is not None:
+                yield time_s, code
 
 
-class _Sensor(Protocol):
-    def read(self, payload: bytes | bytearray, now_s: float) -> Reading: ...
-
-
-def _read_value(codes: Codes, payload: bytes | bytearray) -> tuple[Quality | None, int]:
-    """Code of a signal, and why it is no value: None where it is one."""
-    code = codes.place.extract(payload)
-    if code is None:
-        return Quality.INVALID, 0
-    if codes.is_value(code):
-        return None, code
-    return Quality.NOT_AVAILABLE if code in codes.named else Quality.INVALID, code
-
-
-class CurrentSensor:
-    """A branch published as a current.
+class Auxiliary:
+    """A signal that corrections need beside the current: a voltage or a temperature.
 
     Parameters
     ----------
     codes : Codes
-        Of the measured signal. [A]
-    sign : int
-        +1 if the signal is positive into the junction.
+        Of the signal. [V or degC]
+    timeout_s : float
+        Without a frame for this long its value is not used any more. [s]
     """
 
-    def __init__(self, codes: Codes, sign: int) -> None:
+    def __init__(self, codes: Codes, timeout_s: float) -> None:
+        self.code: int | None = None
+        """Last code that is a value."""
+        self.when_changed: list[Callable[[int | None], None]] = []
+        self.is_needed = True
+        """Whether a plan that is in force, or the watch, depends on it."""
         self._codes = codes
-        self._scale = float(sign * codes.scale)
-        self._offset = float(sign * codes.offset)
-
-    def read(self, payload: bytes | bytearray, now_s: float) -> Reading:  # noqa: ARG002  # a current needs no clock
-        """Read the current from a frame."""
-        bad, code = _read_value(self._codes, payload)
-        if bad is not None:
-            return Reading(quality=bad)
-        return Reading(quality=Quality.PASSED_THROUGH, current_a=self._scale * code + self._offset, code=code)
-
-
-class VoltageSensor:
-    """The voltage that turns powers into currents; its last value and when it came."""
-
-    def __init__(self, codes: Codes) -> None:
-        self._codes = codes
-        self._value_v: float | None = None
+        self._timeout_s = timeout_s
         self._time_s = 0.0
+        self._past = Past()
 
-    def update(self, payload: bytes | bytearray, now_s: float) -> None:
-        """Take the voltage of a new frame."""
-        bad, code = _read_value(self._codes, payload)
-        self._value_v = None if bad is not None else float(self._codes.scale * code + self._codes.offset)
+    def follow(self, signal: PlacedSignal, frames: Frames) -> None:
+        """Look for the signal in these frames, when its past is asked for."""
+        self._past = Past(signal, frames)
+
+    def take(self, code: int, now_s: float) -> None:
+        """Take the code of a new frame."""
         self._time_s = now_s
+        self._set(code if self._codes.is_value(code) else None)
 
-    def value_v(self, now_s: float, max_age_s: float) -> float | None:
-        """Voltage [V]; None if there is none, or it is too old or too small to divide by."""
-        if self._value_v is None or now_s - self._time_s > max_age_s or self._value_v < _LEAST_VOLTAGE_V:
-            return None
-        return self._value_v
+    def expire(self, now_s: float) -> None:
+        """Forget a value that is too old."""
+        if self.code is not None and now_s - self._time_s > self._timeout_s:
+            self._set(None)
 
+    def value(self) -> float | None:
+        """Last value; None if there is none, or it is too old."""
+        return None if self.code is None else self._value_of(self.code)
 
-class PowerSensor:
-    """A branch published as a power; its current is power over voltage.
+    def value_at(self, time_s: float) -> float | None:
+        """Value in the last frame up to a time; None if there is none, it is no value, or too old."""
+        for seen_s, code in self._past.newest_first():
+            if seen_s <= time_s:
+                is_known = time_s - seen_s <= self._timeout_s and self._codes.is_value(code)
+                return self._value_of(code) if is_known else None
+        return None
 
-    Parameters
-    ----------
-    codes : Codes
-        Of the power signal. [W]
-    sign : int
-        +1 if the power is positive into the junction.
-    voltage : VoltageSensor
-        Shared by all branches that name the same signal.
-    max_age_s : float
-        Oldest voltage to divide by. [s]
-    """
+    def _value_of(self, code: int) -> float:
+        return float(self._codes.scale) * code + float(self._codes.offset)
 
-    def __init__(self, codes: Codes, sign: int, voltage: VoltageSensor, max_age_s: float) -> None:
-        self._codes = codes
-        self._scale = float(sign * codes.scale)
-        self._offset = float(sign * codes.offset)
-        self._voltage = voltage
-        self._max_age_s = max_age_s
-
-    def read(self, payload: bytes | bytearray, now_s: float) -> Reading:
-        """Read the power from a frame and divide it by the last voltage."""
-        bad, code = _read_value(self._codes, payload)
-        if bad is not None:
-            return Reading(quality=bad)
-        voltage = self._voltage.value_v(now_s, self._max_age_s)
-        if voltage is None:
-            return Reading(quality=Quality.NOT_AVAILABLE)
-        return Reading(quality=Quality.PASSED_THROUGH, current_a=(self._scale * code + self._offset) / voltage)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Republished:
-    """Where the corrected current of a branch goes."""
-
-    plan: IntegerPlan
-    place: BitPlace
-    """Of the corrected signal."""
-    not_available: int
-    """Its code for "no value"."""
-    quality: BitPlace | None
+    def _set(self, code: int | None) -> None:
+        if code != self.code:
+            self.code = code
+            for react in self.when_changed:
+                react(code)
 
 
 class LiveBranch:
-    """One branch: state of its sensor, and its output.
+    """One branch: state of its sensor, and what is made of it.
 
     Parameters
     ----------
     name : str
         As in the layout.
-    sensor : CurrentSensor or PowerSensor
-        Where its current comes from.
-    fault : SensorFault
-        What is corrected.
+    codes : Codes
+        Of the measured signal. [A, or W with a voltage]
+    sign : int
+        +1 if the signal is positive into the junction.
     timeout_s : float
         Without a frame for this long the branch is stale. [s]
-    expected_since_s : float or None
-        Since when its frames are waited for; None: not before the first one (a vehicle may lack the branch).
-    republished : Republished or None
-        Output, if the layout names one.
+    voltage, temperature : Auxiliary or None
+        The voltage of a branch that is a power; the temperature of its sensor.
     """
 
     def __init__(
         self,
         *,
         name: str,
-        sensor: _Sensor,
-        fault: SensorFault,
+        codes: Codes,
+        sign: int,
         timeout_s: float,
-        expected_since_s: float | None,
-        republished: Republished | None,
+        voltage: Auxiliary | None = None,
+        temperature: Auxiliary | None = None,
     ) -> None:
-        self.name = name
-        self.fault = fault
-        self.seen = False
-        self._sensor = sensor
-        self._timeout_s = timeout_s
-        self._last_s = expected_since_s
-        self._republished = republished
-        self._reading = Reading(quality=Quality.NOT_AVAILABLE)
+        self.name, self.codes, self.timeout_s = name, codes, timeout_s
+        self.voltage, self.temperature = voltage, temperature
+        self.fault = NO_FAULT
+        self.delay_s = 0.0
+        self.out: int | None = None
+        """The code to write; None where there is no value."""
+        self.quality = Quality.PASSED_THROUGH
+        """Of values; what is none is told by :meth:`why_no_value`."""
+        self.when_changed: list[Callable[[], None]] = []
+        """Called when :attr:`plan` or :attr:`quality` is another one."""
+        self._past = Past()
+        self._spoilt = False
+        self._expected_s: float | None = None
+        self._awake_s = float("-inf")
+        self._scale, self._offset = float(sign * codes.scale), float(sign * codes.offset)
+        self._passing: CorrectionPlan = AS_IT_IS
+        self._correcting: CorrectionPlan | None = None
+        self._fix = _fixer(codes, AS_IT_IS, voltage, Counters())
+        self.plan: CorrectionPlan = AS_IT_IS
+        """What is done now."""
+        self._active = False
+        self._plans: TemperaturePlans | None = None
+        self._per_temperature: dict[int, IntegerPlan | None] = {}
+        self.counters = Counters()
+        """Where results beyond the ends are counted."""
+        if temperature is not None:
+            temperature.when_changed.append(self._at_temperature)
+
+    def put_in_force(
+        self,
+        *,
+        fault: SensorFault,
+        plan: CorrectionPlan,
+        passing: IntegerPlan,
+        delay_s: float,
+        expected_since_s: float | None,
+        counters: Counters,
+    ) -> None:
+        """Take a correction; it is used once :meth:`activate` says so.
+
+        Parameters
+        ----------
+        fault : SensorFault
+            What is corrected.
+        plan : CorrectionPlan
+            The same in integers.
+        passing : IntegerPlan
+            What is written where nothing is corrected.
+        delay_s : float
+            How much later than the junction it is seen. [s]
+        expected_since_s : float or None
+            Since when its frames are waited for; None: not before the first one (a vehicle may lack the branch).
+        counters : Counters
+            Where results beyond the ends are counted.
+        """
+        self.fault, self.delay_s = fault, delay_s
+        self._expected_s = expected_since_s
+        self._passing, self.counters = passing, counters
+        self._plans = plan if isinstance(plan, TemperaturePlans) else None
+        self._per_temperature = {}
+        self._correcting = None if isinstance(plan, TemperaturePlans) else plan
+        self.activate(active=False)
+        if self.temperature is not None:
+            self._at_temperature(self.temperature.code)
+
+    def activate(self, *, active: bool) -> None:
+        """Correct, or pass through."""
+        self._active = active
+        corrects = active and self.fault.applied and self._correcting is not None
+        self.plan = self._correcting if corrects and self._correcting is not None else self._passing
+        self.quality = Quality.CORRECTED if corrects else Quality.PASSED_THROUGH
+        self._fix = _fixer(self.codes, self.plan, self.voltage, self.counters)
+        for react in self.when_changed:
+            react()
+
+    def follow(self, signal: PlacedSignal, frames: Frames) -> None:
+        """Look for the signal in these frames, when its past is asked for."""
+        self._past = Past(signal, frames)
+
+    def take(self, code: int) -> int | None:
+        """Take the code of an intact frame; the code to write, or None if it is no value."""
+        self._spoilt = False
+        out = self.out = self._fix(code)
+        return out
+
+    def spoil(self) -> None:
+        """A frame came that must not be used: until the next one there is no value."""
+        self.out, self._spoilt = None, True
+
+    @property
+    def is_multiplexed(self) -> bool:
+        """Whether frames of its message may lack it."""
+        return self._past.is_multiplexed
+
+    @property
+    def time_s(self) -> float:
+        """When its last frame came [s]; -infinity if none did."""
+        return next((seen_s for seen_s, _ in self._past.newest_first()), float("-inf"))
+
+    def latest(self) -> tuple[float, int] | None:
+        """When its last frame came, and its code; None if that is no value."""
+        found = next(self._past.newest_first(), None)
+        return found if found is not None and self.codes.is_value(found[1]) else None
+
+    @property
+    def seen(self) -> bool:
+        """Whether a frame came, since the bus was last asleep."""
+        return self.time_s > self._awake_s
 
     @property
     def is_fitted(self) -> bool:
         """Whether the vehicle has this branch: it was seen, or the parameters name it."""
-        return self._last_s is not None
-
-    def update(self, payload: bytes | bytearray, now_s: float) -> None:
-        """Take an intact frame of the branch's source."""
-        self._reading = self._sensor.read(payload, now_s)
-        self._last_s = now_s
-        self.seen = True
+        return self._expected_s is not None or self.time_s > float("-inf")
 
     def is_stale(self, now_s: float) -> bool:
         """Whether a fitted branch has been silent for longer than its timeout."""
-        return self._last_s is not None and now_s - self._last_s > self._timeout_s
+        since_s = self.time_s if self._expected_s is None else max(self.time_s, self._expected_s)
+        return self.is_fitted and now_s - since_s > self.timeout_s
 
-    def measured_a(self, now_s: float) -> float | None:
-        """Last measured current [A]; None if stale or not available."""
-        return None if self.is_stale(now_s) else self._reading.current_a
+    def expect(self, now_s: float) -> None:
+        """Wait for frames from now on, after the bus was asleep."""
+        if self.is_fitted:
+            self._expected_s = self._awake_s = now_s
 
-    def corrected_a(self, now_s: float) -> float | None:
-        """Last current as corrected by (25) [A]; None if stale or not available."""
-        measured = self.measured_a(now_s)
-        if measured is None:
+    def why_no_value(self) -> Quality:
+        """Why :attr:`out` is None: never seen, named "no value", a voltage missing; else its code was impossible."""
+        found = next(self._past.newest_first(), None)
+        if found is None:
+            return Quality.NOT_AVAILABLE
+        _, code = found
+        known = not self._spoilt and (code in self.codes.named or self.codes.is_value(code))
+        return Quality.NOT_AVAILABLE if known else Quality.INVALID
+
+    def currents_at(self, time_s: float) -> tuple[float, float] | None:
+        """Measured current and what the parameters make of it, whether or not they are in force.
+
+        Parameters
+        ----------
+        time_s : float
+            When, by the times of its frames; in between by linear interpolation. [s]
+
+        Returns
+        -------
+        measured_a, corrected_a : float
+            Positive into the junction [A]; None if no value is known of then.
+        """
+        code = self._code_at(time_s)
+        if code is None:
             return None
-        return corrected_current(measured, drift=self.fault.drift, offset_a=self.fault.offset_a)
+        measured = self._scale * code + self._offset
+        if self.voltage is not None:
+            volts = self.voltage.value_at(time_s)
+            if volts is None or volts < LEAST_VOLTAGE_V:
+                return None
+            measured /= volts
+        temperature = self.temperature.value() if self.temperature is not None else None
+        corrected = self.fault.true_current(measured, temperature)
+        return measured, measured if corrected is None else corrected
 
-    def write(self, payload: bytearray, now_s: float) -> bool:
-        """Write corrected code and quality into the payload of the target message; True if the code saturated."""
-        if self._republished is None:
-            return False
-        out, reading = self._republished, self._reading
-        quality, code, saturated = reading.quality, out.not_available, False
-        if self.is_stale(now_s) or not self.seen:
-            quality = Quality.NOT_AVAILABLE
-        elif reading.code is not None:
-            code, saturated = out.plan.apply(reading.code), out.plan.saturates(reading.code)
-            quality = Quality.CORRECTED if self.fault.applied else Quality.PASSED_THROUGH
-        out.place.put(payload, code)
-        if out.quality is not None:
-            out.quality.put(payload, quality)
-        return saturated
+    def _code_at(self, time_s: float) -> float | None:
+        """Code at a time, between codes too; None if it is not known."""
+        later: tuple[float, int] | None = None
+        for sample in self._past.newest_first():
+            seen_s, code = sample
+            if not self.codes.is_value(code):
+                return None
+            if seen_s <= time_s:
+                if later is None or later[0] <= seen_s:
+                    return code
+                return code + (time_s - seen_s) / (later[0] - seen_s) * (later[1] - code)
+            later = sample
+        return later[1] if later is not None and later[0] - time_s <= self.timeout_s else None
+
+    def _at_temperature(self, code: int | None) -> None:
+        """Take the plan of a temperature; without one the branch is passed through."""
+        if self._plans is None:
+            return
+        if code is not None and code not in self._per_temperature:
+            if len(self._per_temperature) >= _TEMPERATURES:
+                self._per_temperature.clear()
+            self._per_temperature[code] = self._plans.at(code)
+        self._correcting = None if code is None else self._per_temperature[code]
+        self.activate(active=self._active)
+
+
+def _fixer(codes: Codes, plan: CorrectionPlan, voltage: Auxiliary | None, counters: Counters) -> _Fix:
+    """Make a function of a plan; what it looks up in every frame is bound to it.
+
+    Parameters
+    ----------
+    codes : Codes
+        Of the measured signal.
+    plan : IntegerPlan or SignPlan
+        Correction in integers; that of one temperature where it depends on it.
+    voltage : Auxiliary or None
+        Of a branch that is a power.
+    counters : Counters
+        Where results beyond the ends are counted.
+
+    Returns
+    -------
+    callable
+        Corrects a code as the plan does.
+    """
+    assert not isinstance(plan, TemperaturePlans), "the temperature chooses one of its plans"
+    if isinstance(plan, SignPlan):
+        return _sign_fixer(codes, plan, voltage, counters)
+    if voltage is not None and plan.voltage_gain:
+        return _voltage_fixer(codes, plan, voltage, counters)
+
+    def fix(code: int) -> int | None:
+        if not codes.is_value(code):
+            return None
+        counters.saturated += plan.saturates(code)
+        return plan.apply(code)
+
+    return fix
+
+
+def _voltage_fixer(codes: Codes, plan: IntegerPlan, voltage: Auxiliary, counters: Counters) -> _Fix:
+    def fix(code: int) -> int | None:
+        if voltage.code is None or not codes.is_value(code):
+            return None
+        counters.saturated += plan.saturates(code, voltage.code)
+        return plan.apply(code, voltage.code)
+
+    return fix
+
+
+def _sign_fixer(codes: Codes, plan: SignPlan, voltage: Auxiliary | None, counters: Counters) -> _Fix:
+    needs_voltage = bool(plan.weights[1])
+
+    def fix(code: int) -> int | None:
+        voltage_code = voltage.code if voltage is not None and needs_voltage else 0
+        if voltage_code is None or not codes.is_value(code):
+            return None
+        chosen = plan.plan(code, voltage_code)
+        counters.saturated += chosen.saturates(code, voltage_code)
+        return chosen.apply(code, voltage_code)
+
+    return fix

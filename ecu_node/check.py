@@ -6,25 +6,20 @@ The node is built as ``ecu-node run`` builds it, so that what is accepted here i
 from pathlib import Path
 from typing import Any
 
+from ecu_node.correction import CorrectionPlan, IntegerPlan, SignPlan
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.guard import needs_fd
+from ecu_node.guard import Mode, needs_fd
 from ecu_node.layout import Branch, read_layout
-from ecu_node.node import choose_parameters
-from ecu_node.wiring import (
-    WHY_NOT_LINEAR,
-    WHY_NOT_PUBLISHED,
-    InForce,
-    branch_plan,
-    not_linear,
-    not_published,
-    sensor_fault,
-    wire,
-)
+from ecu_node.parameter_file import choose_parameters
+from ecu_node.wiring import InForce, branch_plan, no_temperature, not_published, sensor_fault, wire
 
-__all__ = ["check_report", "report_text"]
+__all__ = ["check_report", "report_text", "warnings_of"]
+
+_WHY_NOT_PUBLISHED = "the parameters apply a fault to it, but the layout has no 'corrected' for it"
+_WHY_NO_TEMPERATURE = "its fault depends on the temperature, and the layout names no 'temperature'"
 
 
-def check_report(params: Path, layout: Path, vehicle: str | None) -> dict[str, Any]:
+def check_report(params: Path, layout: Path, vehicle: str | None, mode: Mode = Mode.OVERLAY) -> dict[str, Any]:
     """Check parameters against layout, DBC and vehicle.
 
     Parameters
@@ -33,13 +28,16 @@ def check_report(params: Path, layout: Path, vehicle: str | None) -> dict[str, A
         Parameter file and layout.
     vehicle : str or None
         Identity of the vehicle; None: not checked.
+    mode : Mode
+        Where corrected values go.
 
     Returns
     -------
     dict
         ``fit`` [bool], ``reason`` (name in the status message), ``message`` (why not, or None), ``vehicle``,
-        ``parameter_set``, ``warnings`` (texts), and ``branches``: per branch drift [1], offset_a [A], applied, target,
-        and plan with gain, bias, shift, or None where the branch is not republished.
+        ``parameter_set``, ``warnings`` (texts), and ``branches``: per branch drift [1], offset_a [A], sensor_model (its
+        kind, or None), applied, target, and plan: a dict with gain, voltage_gain, bias and shift; with a gain per sign,
+        positive and negative of these; None where the branch is not written or its plan depends on the temperature.
 
     Raises
     ------
@@ -48,7 +46,7 @@ def check_report(params: Path, layout: Path, vehicle: str | None) -> dict[str, A
     """
     database = read_database(read_layout(layout))
     in_force, why_not = choose_parameters(params, database, vehicle)
-    wire(database, in_force, start_s=0.0)
+    wire(database, in_force, start_s=0.0, mode=mode)
     parameters = in_force.parameters
     return {
         "fit": why_not is None,
@@ -56,8 +54,8 @@ def check_report(params: Path, layout: Path, vehicle: str | None) -> dict[str, A
         "message": why_not,
         "vehicle": parameters.vehicle if parameters is not None else None,
         "parameter_set": parameters.number if parameters is not None else None,
-        "warnings": _warnings(database, in_force),
-        "branches": {branch.name: _branch(database, branch, in_force) for branch in database.layout.branch},
+        "warnings": warnings_of(database, in_force, mode),
+        "branches": {branch.name: _branch(database, branch, in_force, mode) for branch in database.layout.branch},
     }
 
 
@@ -68,33 +66,63 @@ def report_text(report: dict[str, Any]) -> str:
     width = max(map(len, ["branch", *report["branches"]]))
     lines.append(f"{'branch':<{width}}{'drift':>11}{'offset':>13}")
     for name, branch in report["branches"].items():
-        plan = branch["plan"]
         mark = "corrected" if branch["applied"] else "passed through"
         numbers = f"{name:<{width}}{branch['drift']:>+11.4%}{branch['offset_a']:>+11.3f} A"
-        lines.append(f"{numbers}  {mark if plan is not None else 'not published'}")
-        if plan is not None:
+        lines.append(f"{numbers}  {mark if branch['target'] is not None else 'not published'}")
+        if branch["target"] is not None:
             lines.append(f"  target {branch['target']}")
-        if plan is not None and branch["applied"]:
-            lines.append(f"  gain {plan['gain']}, bias {plan['bias']}, shift {plan['shift']}")
+            lines += _plan_lines(branch) if branch["applied"] else []
     lines.append("corrected code = (measured code * gain + bias + 2^(shift - 1)) >> shift")
+    if any("voltage gain" in line for line in lines):
+        lines.append("  of a power: + voltage code * voltage gain in the parentheses")
     return "\n".join([*lines, *(f"warning: {text}" for text in report["warnings"])])
 
 
-def _warnings(database: VehicleDatabase, in_force: InForce) -> list[str]:
-    texts = [f"branch {name} is not published: {WHY_NOT_PUBLISHED}" for name in not_published(database, in_force)]
-    texts += [f"branch {name} is passed through: {WHY_NOT_LINEAR}" for name in not_linear(in_force)]
-    if names := needs_fd(database):
+def warnings_of(database: VehicleDatabase, in_force: InForce, mode: Mode) -> list[str]:
+    """What a user should know of parameters that fit: what of them is not done, and what the bus must be able to do."""
+    hidden = not_published(database, in_force) if mode is Mode.OVERLAY else []
+    texts = [f"branch {name} is not published: {_WHY_NOT_PUBLISHED}" for name in hidden]
+    names = no_temperature(database, in_force)
+    texts += [f"branch {name} is passed through: {_WHY_NO_TEMPERATURE}" for name in names]
+    if names := needs_fd(database, mode):
         texts.append(f"CAN FD messages ({', '.join(names)}): 'ecu-node run' needs --fd")
     return texts
 
 
-def _branch(database: VehicleDatabase, branch: Branch, in_force: InForce) -> dict[str, Any]:
-    fault = sensor_fault(in_force, branch.name)
-    plan = branch_plan(database, branch, fault)
+def _plan_lines(branch: dict[str, Any]) -> list[str]:
+    plan, model = branch["plan"], branch["sensor_model"]
+    if plan is None:
+        return [f"  sensor model {model!r}: a plan for each code of the temperature"]
+    if "positive" in plan:
+        return [
+            f"  sensor model {model!r}, {side} currents: {_numbers(plan[side])}" for side in ("positive", "negative")
+        ]
+    return [f"  {_numbers(plan)}"]
+
+
+def _numbers(plan: dict[str, int]) -> str:
+    shown = {name: value for name, value in plan.items() if value or name != "voltage_gain"}
+    return ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in shown.items())
+
+
+def _branch(database: VehicleDatabase, branch: Branch, in_force: InForce, mode: Mode) -> dict[str, Any]:
+    fault = sensor_fault(database, in_force, branch.name)
+    target = branch.corrected if mode is Mode.OVERLAY else branch.source
+    plan = branch_plan(database, branch, fault, mode) if target is not None else None
     return {
         "drift": fault.drift,
         "offset_a": fault.offset_a,
+        "sensor_model": type(fault.model).__struct_config__.tag if fault.model is not None else None,
         "applied": fault.applied,
-        "target": branch.corrected,
-        "plan": {"gain": plan.gain, "bias": plan.bias, "shift": plan.shift} if plan is not None else None,
+        "target": target,
+        "plan": _plan(plan),
     }
+
+
+def _plan(plan: CorrectionPlan | None) -> dict[str, Any] | None:
+    match plan:
+        case IntegerPlan():
+            return {"gain": plan.gain, "voltage_gain": plan.voltage_gain, "bias": plan.bias, "shift": plan.shift}
+        case SignPlan():
+            return {"positive": _plan(plan.positive), "negative": _plan(plan.negative)}
+    return None

@@ -8,12 +8,9 @@ import argparse
 import json
 import logging
 import os
-import signal
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 
 from ecu_node import __version__
 from ecu_node.errors import UserError
@@ -22,7 +19,6 @@ from ecu_node.interrupts import ending_at_interrupt
 __all__ = ["main"]
 
 _VEHICLE_VARIABLE = "ECU_NODE_VEHICLE"
-_DEFAULT_STATUS_PERIOD_S = 0.1
 _EXIT_CODES = "Exit codes: 0 done (also when ended by a signal), 1 failed, 2 wrong use, 130 interrupted at start."
 
 
@@ -72,14 +68,25 @@ def _parser() -> argparse.ArgumentParser:
         "run",
         help="correct until SIGTERM or SIGINT",
         description="Reads the branch currents from a bus and publishes them corrected, under identifiers of their "
-        "own on the same bus. With parameters that do not fit it passes the measured values through and says so in "
-        "its status message.",
+        "own on the same bus, or, with --gateway, in place on another bus. With parameters that do not fit it passes "
+        "the measured values through and says so in its status message. SIGHUP, or a changed parameter file, makes it "
+        "read the parameters again.",
         epilog=_EXIT_CODES,
     )
     _add_files(run)
     run.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
     run.add_argument("--channel", required=True, help="channel of the interface, such as can0 or vcan0")
+    run.add_argument(
+        "--gateway",
+        metavar="CHANNEL",
+        help="be a gateway: the sensors are on --channel, the rest of the vehicle on this; branch frames are passed "
+        "on with the corrected current in place, all others as they are",
+    )
     run.add_argument("--fd", action="store_true", help="open the bus for CAN FD")
+    run.add_argument("--shadow", action="store_true", help="compute and report the corrected sum, but change nothing")
+    run.add_argument(
+        "--metrics-port", type=int, metavar="PORT", help="let Prometheus ask here (needs prometheus-client)"
+    )
     run.set_defaults(command=_run)
     check = commands.add_parser(
         "check",
@@ -89,6 +96,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Exit codes: 0 they fit, 1 they do not, 2 wrong use, 130 interrupted.",
     )
     _add_files(check)
+    check.add_argument("--gateway", action="store_true", help="as a gateway would apply them")
     check.add_argument("--json", action="store_true", help="print JSON")
     check.set_defaults(command=_check)
     schema = commands.add_parser("schema", help="print the JSON Schema of the parameter file")
@@ -119,44 +127,30 @@ def _load_python_can() -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from ecu_node.database import read_database  # noqa: PLC0415  # after _load_python_can
-    from ecu_node.layout import read_layout  # noqa: PLC0415
-    from ecu_node.node import choose_parameters, open_bus, serve  # noqa: PLC0415
-    from ecu_node.wiring import WHY_NOT_LINEAR, WHY_NOT_PUBLISHED, not_linear, not_published, wire  # noqa: PLC0415
+    from ecu_node.run import RunOptions, run_node  # noqa: PLC0415  # after _load_python_can
 
-    database = read_database(read_layout(options.layout))
-    in_force, why_not = choose_parameters(options.params, database, options.vehicle)
-    corrector = wire(database, in_force, time.monotonic())
-    status = database.layout.status
-    with open_bus(database, interface=options.interface, channel=options.channel, fd=options.fd) as bus:
-        stop = _StopRequest()
-        if why_not is not None:
-            _say(f"passing measured values through: {why_not}")
-        elif options.vehicle is None:
-            _say(f"the vehicle is not checked: give --vehicle or ${_VEHICLE_VARIABLE}")
-        hidden = not_published(database, in_force)
-        for name in hidden:
-            _say(f"branch {name} is not published: {WHY_NOT_PUBLISHED}")
-        for name in not_linear(in_force):
-            _say(f"branch {name} is passed through: {WHY_NOT_LINEAR}")
-        applied = ", ".join(item.name for item in corrector.branches if item.fault.applied and item.name not in hidden)
-        _say(f"running on {options.interface} {options.channel}, correcting {applied or 'nothing'}")
-        try:
-            serve(
-                bus,
-                corrector,
-                stop=stop.requested,
-                status_period_s=status.period_s if status is not None else _DEFAULT_STATUS_PERIOD_S,
-            )
-        finally:
-            _say(f"ended: {corrector.counters.text()}")
-    return 0
+    return run_node(
+        RunOptions(
+            params=options.params,
+            layout=options.layout,
+            vehicle=options.vehicle,
+            interface=options.interface,
+            channel=options.channel,
+            gateway=options.gateway,
+            fd=options.fd,
+            shadow=options.shadow,
+            metrics_port=options.metrics_port,
+        ),
+        vehicle_hint=f"give --vehicle or ${_VEHICLE_VARIABLE}",
+    )
 
 
 def _check(options: argparse.Namespace) -> int:
     from ecu_node.check import check_report, report_text  # noqa: PLC0415  # after _load_python_can
+    from ecu_node.guard import Mode  # noqa: PLC0415
 
-    report = check_report(options.params, options.layout, options.vehicle)
+    mode = Mode.GATEWAY if options.gateway else Mode.OVERLAY
+    report = check_report(options.params, options.layout, options.vehicle, mode)
     print(json.dumps(report, indent=2) if options.json else report_text(report))
     return 0 if report["fit"] else 1
 
@@ -166,21 +160,6 @@ def _schema(options: argparse.Namespace) -> int:  # noqa: ARG001
 
     print(json.dumps(parameter_schema(), indent=2))
     return 0
-
-
-class _StopRequest:
-    """Set by SIGTERM and SIGINT."""
-
-    def __init__(self) -> None:
-        self._set = False
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._on_signal)
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        self._set = True
-
-    def requested(self) -> bool:
-        return self._set
 
 
 def _say(text: str) -> None:

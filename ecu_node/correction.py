@@ -1,35 +1,155 @@
-"""Integer correction plan: one multiply, one add, one shift from the measured code to the corrected one.
+"""Integer correction plan: multiply, add and shift from the measured code to the corrected one.
 
 A sensor shows i_m = (1 + d) i + o, positive into the junction; its true current is, (25) in [1]_,
 
     i = (i_m - o) / (1 + d).
 
 With the DBC's scales and the branch's sign, which both signals share, this is code_out = G * code_in + B with exact
-rational G and B. The plan holds G and B as integers over 2^shift:
+rational G and B. A branch that is published as a power P at the voltage u is corrected as a current and written back as
+a power, P_out = u * i = (P_m - o * u) / (1 + d): code_out = G * code_in + H * voltage_code + B, without a division.
+The plan holds G, H and B as integers over 2^shift:
 
-    code_out = (code_in * gain + bias + half) >> shift,    half = 2^(shift - 1), clamped into the values of the target.
+    code_out = (code_in * gain + voltage_code * voltage_gain + bias + half) >> shift,    half = 2^(shift - 1),
 
-Rounding rule: the exact G * code_in + B, rounded to the nearest code, halves up. The integers approach the exact line
-from above, by less than :data:`LARGEST_ERROR` of a code, so that an exact half is never rounded down; an exact result
-that lies less than that below a half is rounded up. Where 64 bits allow it, the approach is closer by far.
+clamped into the values of the target.
+
+Rounding rule: the exact line, rounded to the nearest code, halves up. The integers approach the exact line from above,
+by less than :data:`LARGEST_ERROR` of a code, so that an exact half is never rounded down; an exact result that lies
+less than that below a half is rounded up. Where 64 bits allow it, the approach is closer by far.
+
+A sensor whose gain depends on the sign of the true current has two plans, and an exact rule which one holds; one whose
+gain depends on its temperature has a plan per code of the temperature signal.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from ecu_node.codes import Codes, as_written, writable_range
+from ecu_node.sensor_models import GainBySign, SensorModel, TemperatureDrift
 
-__all__ = ["LARGEST_ERROR", "IntegerPlan", "corrected_current", "integer_plan"]
+__all__ = [
+    "LARGEST_ERROR",
+    "NO_FAULT",
+    "CorrectionPlan",
+    "IntegerPlan",
+    "Line",
+    "SensorFault",
+    "SignPlan",
+    "Signals",
+    "TemperaturePlans",
+    "correction_plan",
+    "integer_plan",
+]
 
 _ERROR_BITS = 10
 LARGEST_ERROR = Fraction(1, 1 << _ERROR_BITS)
 """The integers lie less than this above the exact line. [code]"""
 
-_WORD_BITS = 62
-"""Products and sums stay below 2^62 where the wanted error allows it, so that C with int64_t gives the same bits."""
+_WORD_BITS = 59
+"""Products and sums stay below 2^59 where the wanted error allows it: C with int64_t gives the same bits, and Python's
+integers have two digits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorFault:
+    """What is corrected on one branch.
+
+    Attributes
+    ----------
+    drift : float
+        d; where a model is given, what it says takes its place or adds to it. [1]
+    offset_a : float
+        o, positive into the junction. [A]
+    model : GainBySign, TemperatureDrift or None
+        None: the sensor is linear.
+    """
+
+    drift: float = 0.0
+    offset_a: float = 0.0
+    model: SensorModel | None = None
+
+    @property
+    def applied(self) -> bool:
+        """Whether there is anything to correct."""
+        return self != NO_FAULT
+
+    def drift_at(self, current_a: float, temperature_c: float | None) -> float | None:
+        """Drift at a current, of which only the sign matters, and a temperature; None if that must be known and is not.
+
+        Parameters
+        ----------
+        current_a : float
+            Positive into the junction. [A]
+        temperature_c : float or None
+            Of the sensor. [degC]
+        """
+        match self.model:
+            case None:
+                return self.drift
+            case GainBySign():
+                return self.model.drift_positive if current_a >= 0.0 else self.model.drift_negative
+            case TemperatureDrift():
+                if temperature_c is None:
+                    return None
+                return self.drift + self.model.drift_per_k * (temperature_c - self.model.reference_c)
+
+    def true_current(self, i_m: float, temperature_c: float | None = None) -> float | None:
+        """Invert the sensor model for one current, (25) in [1]_.
+
+        Parameters
+        ----------
+        i_m : float
+            Measured current, positive into the junction. [A]
+        temperature_c : float or None
+            Of the sensor. [degC]
+
+        Returns
+        -------
+        float or None
+            Corrected current [A]; None if the temperature must be known and is not.
+        """
+        drift = self.drift_at(i_m - self.offset_a, temperature_c)
+        return None if drift is None else (i_m - self.offset_a) / (1.0 + drift)
+
+
+NO_FAULT = SensorFault()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signals:
+    """What a branch is read from and written to.
+
+    Attributes
+    ----------
+    source, target : Codes
+        Measured and corrected signal, both counting in the branch's own direction. [A], or both [W]
+    sign : 1 or -1
+        +1 if the signals are positive into the junction.
+    voltage : Codes or None
+        Of a branch that is a power. [V]
+    """
+
+    source: Codes
+    target: Codes
+    sign: int
+    voltage: Codes | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """Exact correction: code_out = slope * code + voltage_slope * voltage_code + constant."""
+
+    slope: Fraction
+    voltage_slope: Fraction
+    constant: Fraction
+
+    def at(self, code: int, voltage_code: int = 0) -> Fraction:
+        """Exact corrected code, not rounded."""
+        return self.slope * code + self.voltage_slope * voltage_code + self.constant
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,90 +158,182 @@ class IntegerPlan:
 
     Attributes
     ----------
-    gain, bias, shift : int
-        code_out = (code_in * gain + bias + 2^(shift - 1)) >> shift.
+    gain, voltage_gain, bias, shift : int
+        code_out = (code * gain + voltage_code * voltage_gain + bias + 2^(shift - 1)) >> shift.
     lowest, highest : int
         Ends of the codes that may be written.
     """
 
     gain: int
+    voltage_gain: int = 0
     bias: int
     shift: int
     lowest: int
     highest: int
 
-    def apply(self, code: int) -> int:
+    def apply(self, code: int, voltage_code: int = 0) -> int:
         """Correct one code; the result saturates at the ends and never wraps."""
-        return min(max(self._unbounded(code), self.lowest), self.highest)
+        return min(max(self._unbounded(code, voltage_code), self.lowest), self.highest)
 
-    def saturates(self, code: int) -> bool:
+    def saturates(self, code: int, voltage_code: int = 0) -> bool:
         """Whether the result for a code lies beyond the ends, so that :meth:`apply` returns an end instead."""
-        return not self.lowest <= self._unbounded(code) <= self.highest
+        return not self.lowest <= self._unbounded(code, voltage_code) <= self.highest
 
-    def _unbounded(self, code: int) -> int:
-        return (code * self.gain + self.bias + (1 << (self.shift - 1))) >> self.shift
+    def _unbounded(self, code: int, voltage_code: int) -> int:
+        return (code * self.gain + voltage_code * self.voltage_gain + self.bias + (1 << (self.shift - 1))) >> self.shift
 
 
-def integer_plan(source: Codes, target: Codes, *, sign: int, drift: float, offset_a: float) -> IntegerPlan:
+@dataclass(frozen=True, kw_only=True)
+class SignPlan:
+    """Correction of a sensor with one gain per sign of the true current.
+
+    Attributes
+    ----------
+    positive, negative : IntegerPlan
+        For true currents into and out of the junction.
+    weights : tuple of int
+        The current is into the junction, or 0, if code * w0 + voltage_code * w1 + w2 >= 0.
+    """
+
+    positive: IntegerPlan
+    negative: IntegerPlan
+    weights: tuple[int, int, int]
+
+    def plan(self, code: int, voltage_code: int = 0) -> IntegerPlan:
+        """The plan that holds for a code."""
+        of_code, of_voltage, constant = self.weights
+        into = code * of_code + voltage_code * of_voltage + constant >= 0
+        return self.positive if into else self.negative
+
+
+@dataclass(frozen=True, kw_only=True)
+class TemperaturePlans:
+    """Correction of a sensor whose gain depends on its temperature: a plan for each code of the temperature signal."""
+
+    at: Callable[[int], IntegerPlan | None]
+    """Plan for a code; None where the drift is beyond the layout's limit."""
+
+
+CorrectionPlan = IntegerPlan | SignPlan | TemperaturePlans
+"""Any of them."""
+
+
+def correction_plan(
+    signals: Signals, fault: SensorFault, *, temperature: Codes | None = None, largest_drift: float = 1.0
+) -> CorrectionPlan:
     """Build the plan of one branch, once at start.
 
     Parameters
     ----------
-    source, target : Codes
-        Measured and corrected signal, both counting in the branch's own direction. [A]
-    sign : 1 or -1
-        +1 if the signals are positive into the junction.
-    drift, offset_a : float
-        Sensor fault, (13): d [1] and o, positive into the junction [A]; both 0 to pass through.
+    signals : Signals
+        What is read and written.
+    fault : SensorFault
+        What is corrected; :data:`NO_FAULT` to pass through.
+    temperature : Codes or None
+        Of the temperature signal, which a fault with temperature needs. [degC]
+    largest_drift : float
+        Limit of the layout; the drift at a temperature may be beyond it. [1]
 
     Returns
     -------
-    IntegerPlan
-        The plan; for every valid source code its error is at most half a code + 2^-10.
+    IntegerPlan, SignPlan or TemperaturePlans
+        For every valid code its error is at most half a code + 2^-10.
 
     Raises
     ------
     DatabaseError
         If the target's value table leaves no values around 0.
     """
-    slope = 1 / (1 + as_written(drift))
-    gain = source.scale * slope / target.scale
-    bias = ((source.offset - sign * as_written(offset_a)) * slope - target.offset) / target.scale
-    shift = _shift(source, gain, bias)
-    whole_gain = round(gain * (1 << shift))
-    missing = gain * (1 << shift) - whole_gain
-    deepest = max(missing * source.lowest, missing * source.highest)
-    lowest, highest = writable_range(target, f"corrected signal {target.name}")
+    model = fault.model
+    offset = as_written(fault.offset_a)
+    if isinstance(model, GainBySign):
+        return SignPlan(
+            positive=integer_plan(signals, _line(signals, as_written(model.drift_positive), offset)),
+            negative=integer_plan(signals, _line(signals, as_written(model.drift_negative), offset)),
+            weights=_sign_weights(signals, offset),
+        )
+    if isinstance(model, TemperatureDrift):
+        assert temperature is not None, "a fault with temperature is not applied without one"
+        codes, drift, per_k = temperature, as_written(fault.drift), as_written(model.drift_per_k)
+        reference, limit = as_written(model.reference_c), as_written(largest_drift)
+
+        def at(code: int) -> IntegerPlan | None:
+            hot = drift + per_k * (codes.scale * code + codes.offset - reference)
+            return integer_plan(signals, _line(signals, hot, offset)) if abs(hot) <= limit else None
+
+        return TemperaturePlans(at=at)
+    return integer_plan(signals, _line(signals, as_written(fault.drift), offset))
+
+
+def integer_plan(signals: Signals, line: Line) -> IntegerPlan:
+    """Integers that come closest to an exact line.
+
+    Parameters
+    ----------
+    signals : Signals
+        Whose codes it is for.
+    line : Line
+        Exact correction.
+
+    Returns
+    -------
+    IntegerPlan
+        Never below the line, and above it by less than :data:`LARGEST_ERROR` for every valid code.
+
+    Raises
+    ------
+    DatabaseError
+        If the target's value table leaves no values around 0.
+    """
+    ranges = [(line.slope, signals.source)]
+    if signals.voltage is not None and line.voltage_slope:
+        ranges.append((line.voltage_slope, signals.voltage))
+    shift = _shift(ranges, line.constant)
+    gains = [round(slope * (1 << shift)) for slope, _ in ranges]
+    deepest = Fraction(0)
+    for gain, (slope, codes) in zip(gains, ranges, strict=True):
+        missing = slope * (1 << shift) - gain
+        deepest += max(missing * codes.lowest, missing * codes.highest)
+    lowest, highest = writable_range(signals.target, f"corrected signal {signals.target.name}")
     return IntegerPlan(
-        gain=whole_gain,
-        bias=math.ceil(bias * (1 << shift) + deepest),
+        gain=gains[0],
+        voltage_gain=gains[1] if len(gains) > 1 else 0,
+        bias=math.ceil(line.constant * (1 << shift) + deepest),
         shift=shift,
         lowest=lowest,
         highest=highest,
     )
 
 
-def corrected_current(i_m: float, *, drift: float, offset_a: float) -> float:
-    """Invert the sensor model for one current, (25) in [1]_.
-
-    Parameters
-    ----------
-    i_m : float
-        Measured current, positive into the junction. [A]
-    drift, offset_a : float
-        Sensor fault: d [1] and o, positive into the junction [A].
-
-    Returns
-    -------
-    float
-        Corrected current. [A]
-    """
-    return (i_m - offset_a) / (1.0 + drift)
+def _line(signals: Signals, drift: Fraction, offset_a: Fraction) -> Line:
+    source, target, voltage = signals.source, signals.target, signals.voltage
+    slope = 1 / (1 + drift)
+    own_offset = signals.sign * offset_a
+    if voltage is None:
+        per_volt, at_zero = Fraction(0), own_offset
+    else:
+        per_volt, at_zero = own_offset * voltage.scale, own_offset * voltage.offset
+    return Line(
+        slope=source.scale * slope / target.scale,
+        voltage_slope=-per_volt * slope / target.scale,
+        constant=((source.offset - at_zero) * slope - target.offset) / target.scale,
+    )
 
 
-def _shift(source: Codes, gain: Fraction, bias: Fraction) -> int:
+def _sign_weights(signals: Signals, offset_a: Fraction) -> tuple[int, int, int]:
+    """Integers of the exact rule: the current is into the junction where the line without gain is not negative."""
+    unscaled = replace(signals.target, scale=Fraction(1), offset=Fraction(0))
+    line = _line(replace(signals, target=unscaled), Fraction(0), offset_a)
+    weights = [signals.sign * weight for weight in (line.slope, line.voltage_slope, line.constant)]
+    common = math.lcm(*(weight.denominator for weight in weights))
+    of_code, of_voltage, constant = (int(weight * common) for weight in weights)
+    return of_code, of_voltage, constant
+
+
+def _shift(ranges: list[tuple[Fraction, Codes]], constant: Fraction) -> int:
     """Shift that keeps the error below LARGEST_ERROR, and beyond that as large as 64-bit words allow."""
-    span = source.highest - source.lowest
+    span = sum(codes.highest - codes.lowest for _, codes in ranges)
     needed = _ERROR_BITS + (span // 2 + 1).bit_length()
-    largest = abs(gain) * max(abs(source.lowest), abs(source.highest)) + abs(bias) + 1
+    largest = abs(constant) + 1
+    largest += sum(abs(slope) * max(abs(codes.lowest), abs(codes.highest)) for slope, codes in ranges)
     return max(needed, _WORD_BITS - math.ceil(largest).bit_length())

@@ -1,106 +1,24 @@
 """The node without its bus: frames and times go in, corrected frames and the status come out.
 
 Overlay: a branch's frame is answered by its corrected message under an identifier of its own; nothing else is touched.
-A frame that is corrupt or repeated is counted and answered by nothing. Times are those of one steady clock. [s]
+Gateway: a branch's frame goes on to the other bus with its current rewritten in place; only its own bits change, and
+its counter stays, so that a receiver sees every frame that was lost or repeated. A frame that fails its check is never
+given a valid CRC. Times are those of one steady clock. [s]
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass
 
 from ecu_node.bits import BitPlace
-from ecu_node.branch import LiveBranch, VoltageSensor
+from ecu_node.branch import Auxiliary, LiveBranch
 from ecu_node.codes import Codes, as_written
-from ecu_node.e2e import Check, Receiver, Sender
-from ecu_node.status import Reason, State
+from ecu_node.counters import Counters
+from ecu_node.e2e import Protection
+from ecu_node.frames import FrameKey, Source
+from ecu_node.junction_watch import JunctionWatch
+from ecu_node.status import Quality, Reason, State
 
-__all__ = ["Corrector", "Counters", "Frame", "FrameKey", "Source", "StatusFields", "Target"]
-
-
-class FrameKey(NamedTuple):
-    """Identifier of a frame; one number with 11 and with 29 bits are two identifiers."""
-
-    identifier: int
-    extended: bool
-
-
-class Frame(NamedTuple):
-    """One data frame, in or out."""
-
-    key: FrameKey
-    data: bytes
-    fd: bool = False
-    bitrate_switch: bool = False
-
-
-@dataclass(kw_only=True)
-class Counters:
-    """What happened since the start."""
-
-    frames_in: int = 0
-    """Frames of branches (and their voltages) received."""
-    corrected: int = 0
-    """Corrected messages made."""
-    corrupt: int = 0
-    """Frames with a wrong CRC or an impossible counter; nothing was made of them."""
-    repeated: int = 0
-    """Frames with the counter of the one before; nothing was made of them."""
-    gaps: int = 0
-    """Times that the counter showed lost frames."""
-    send_errors: int = 0
-    """Frames that the bus did not take."""
-    saturated: int = 0
-    """Corrected values beyond the ends of their signal; the end was sent instead."""
-
-    def text(self) -> str:
-        """One line for the log."""
-        return ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in asdict(self).items())
-
-
-class Target:
-    """One corrected message: its own payload, branches and protection.
-
-    Parameters
-    ----------
-    key : FrameKey
-        Its identifier.
-    length : int
-        Bytes of the message.
-    fd : bool
-        Whether the DBC sends it as CAN FD.
-    branches : list of LiveBranch
-        The branches written into it.
-    sender : Sender or None
-        End-to-end protection.
-    """
-
-    def __init__(
-        self, *, key: FrameKey, length: int, fd: bool, branches: Sequence[LiveBranch], sender: Sender | None
-    ) -> None:
-        self.key = key
-        self._fd = fd
-        self._branches = branches
-        self._sender = sender
-        self._payload = bytearray(length)
-
-    def frame(self, now_s: float, source: Frame, counters: Counters) -> Frame:
-        """Make the message anew, and count it; CAN FD where the DBC says so or the source's frame was."""
-        counters.corrected += 1
-        for branch in self._branches:
-            counters.saturated += branch.write(self._payload, now_s)
-        if self._sender is not None:
-            self._sender.protect(self._payload)
-        return Frame(self.key, bytes(self._payload), self._fd or source.fd, source.bitrate_switch)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Source:
-    """One incoming message, what is read from it and which messages answer it."""
-
-    receiver: Receiver | None
-    voltages: Sequence[VoltageSensor]
-    branches: Sequence[LiveBranch]
-    targets: Sequence[Target]
+__all__ = ["Corrector", "StatusFields"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,113 +28,153 @@ class StatusFields:
     key: FrameKey
     length: int
     fd: bool
-    sender: Sender | None
+    protection: Protection | None
     state: BitPlace
     reason: BitPlace
     parameter_set: BitPlace | None
+    alive_counter: BitPlace | None
     sum_measured: tuple[Codes, int] | None
     """Signal and its code for "no value"."""
     sum_corrected: tuple[Codes, int] | None
 
 
-@dataclass(kw_only=True)
 class Corrector:
     """The pure core of the node; built by :func:`ecu_node.wiring.wire`.
 
-    Attributes
+    Parameters
     ----------
     sources : mapping of FrameKey to Source
         What is received; no other frame is looked at.
     branches : sequence of LiveBranch
         All branches of the layout.
+    auxiliaries : sequence of Auxiliary
+        Voltages and temperatures.
     status_fields : StatusFields or None
         Status message, if the layout has one.
-    reason : Reason
-        Why measured values are passed through; NONE where parameters are in force.
-    parameter_set : int
-        Number of the parameter set in force, modulo 256; 0 where none is.
+    watch : JunctionWatch
+        Of these branches.
     counters : Counters
-        Counted so far.
+        The same that the sources count in.
+    shadow : bool
+        Compute and report, change nothing.
     """
 
-    sources: Mapping[FrameKey, Source]
-    branches: Sequence[LiveBranch]
-    status_fields: StatusFields | None
-    reason: Reason
-    parameter_set: int
-    counters: Counters = field(default_factory=Counters)
+    def __init__(
+        self,
+        *,
+        sources: Mapping[FrameKey, Source],
+        branches: Sequence[LiveBranch],
+        auxiliaries: Sequence[Auxiliary],
+        status_fields: StatusFields | None,
+        watch: JunctionWatch,
+        counters: Counters,
+        shadow: bool,
+    ) -> None:
+        self.branches, self.shadow, self.watch = branches, shadow, watch
+        self.counters = counters
+        self.reason = Reason.NO_PARAMETERS
+        """Why measured values are passed through, of the parameters; NONE where they fit."""
+        self.latched = Reason.NONE
+        """Why the node has fallen back to passing through, until the bus has slept or parameters are put in force."""
+        self.latched_branches: tuple[str, ...] = ()
+        self.parameter_set = 0
+        self.sources: dict[tuple[int, bool], Source] = dict(sources.items())
+        """Who takes which frames, by identifier and whether it has 29 bits; no other frame is looked at."""
+        self._auxiliaries = auxiliaries
+        self._status_fields = status_fields
+        self._silent = True
+        self._was_awake = False
+        self._alive = 0
+        self._payload = bytearray(status_fields.length if status_fields is not None else 0)
+        if status_fields is not None and status_fields.protection is not None:
+            status_fields.protection.before_first(self._payload)
 
-    def receive(self, frame: Frame, now_s: float) -> list[Frame]:
-        """Take one frame from the bus.
+    def put_in_force(self, *, reason: Reason, parameter_set: int, predicted_worse_a: float) -> None:
+        """Begin with what the branches were just given; what was latched is released.
 
         Parameters
         ----------
-        frame : Frame
-            Any data frame.
-        now_s : float
-            When it came. [s]
-
-        Returns
-        -------
-        list of Frame
-            The corrected messages that answer it; none for foreign, corrupt and repeated frames.
+        reason : Reason
+            NONE if there are parameters that fit.
+        parameter_set : int
+            Its number as it is published; 0 where there is none.
+        predicted_worse_a : float
+            See :meth:`JunctionWatch.restart`. [A]
         """
-        source = self.sources.get(frame.key)
-        if source is None:
-            return []
-        self.counters.frames_in += 1
-        if source.receiver is not None and not self._is_intact(source.receiver.check(frame.data)):
-            return []
-        for voltage in source.voltages:
-            voltage.update(frame.data, now_s)
-        for branch in source.branches:
-            branch.update(frame.data, now_s)
-        return [target.frame(now_s, frame, self.counters) for target in source.targets]
+        self.reason, self.parameter_set = reason, parameter_set
+        self.watch.restart(predicted_worse_a=predicted_worse_a)
+        self._latch(Reason.NONE)
 
-    def state(self, now_s: float) -> tuple[State, Reason]:
-        """What the node does at this instant, and why; it corrects while a branch to be corrected is not stale."""
-        if self.reason is not Reason.NONE:
-            return State.PASSING_THROUGH, self.reason
-        reason = Reason.BRANCH_STALE if any(branch.is_stale(now_s) for branch in self.branches) else Reason.NONE
-        if not any(branch.fault.applied and not branch.is_stale(now_s) for branch in self.branches):
+    def look(self, now_s: float) -> None:
+        """Look at the whole junction; to be called at least every 0.1 s."""
+        for auxiliary in self._auxiliaries:
+            auxiliary.expire(now_s)
+        self._see_whether_asleep(now_s)
+        self.watch.look(now_s)
+        if self.reason is not Reason.NONE or self.latched is not Reason.NONE or self._silent:
+            return
+        if stale := [branch.name for branch in self.branches if branch.is_stale(now_s)]:
+            self._latch(Reason.BRANCH_STALE, stale)
+        elif stuck := self.watch.stuck():
+            self._latch(Reason.BRANCH_STUCK, [branch.name for branch in stuck])
+        elif self.watch.is_worse():
+            self._latch(Reason.CORRECTION_WORSE)
+
+    def state(self) -> tuple[State, Reason]:
+        """What the node does, and why."""
+        reason = self.reason if self.reason is not Reason.NONE else self.latched
+        if reason is not Reason.NONE:
             return State.PASSING_THROUGH, reason
-        waiting = any(branch.is_fitted and not branch.seen for branch in self.branches)
-        return State.STARTING if waiting and reason is Reason.NONE else State.CORRECTING, reason
+        if self._silent and self._was_awake:
+            return State.ASLEEP, Reason.NONE
+        applied = [branch for branch in self.branches if branch.fault.applied]
+        if not applied:
+            return State.PASSING_THROUGH, Reason.NONE
+        if self.shadow:
+            return State.SHADOW, Reason.NONE
+        if any(branch.is_fitted and not branch.seen for branch in self.branches):
+            return State.STARTING, Reason.NONE
+        missing = any(branch.quality is not Quality.CORRECTED for branch in applied)
+        return State.CORRECTING, Reason.INPUT_MISSING if missing else Reason.NONE
 
-    def junction_sums_a(self, now_s: float) -> tuple[float | None, float | None]:
-        """Sum of the last branch currents, measured and corrected [A]; None while any fitted branch has none."""
-        fitted = [branch for branch in self.branches if branch.is_fitted]
-        return (
-            _sum_or_none([branch.measured_a(now_s) for branch in fitted]),
-            _sum_or_none([branch.corrected_a(now_s) for branch in fitted]),
-        )
-
-    def status(self, now_s: float) -> Frame | None:
-        """Make the status message; None if the layout has none."""
-        fields = self.status_fields
+    def status(self) -> tuple[StatusFields, bytes] | None:
+        """Make the status message from the last look; None if the layout has none."""
+        fields = self._status_fields
         if fields is None:
             return None
-        payload = bytearray(fields.length)
-        state, reason = self.state(now_s)
+        payload = self._payload
+        state, reason = self.state()
         fields.state.put(payload, state)
         fields.reason.put(payload, reason)
         if fields.parameter_set is not None:
             fields.parameter_set.put(payload, self.parameter_set)
-        for signal, total in zip((fields.sum_measured, fields.sum_corrected), self.junction_sums_a(now_s), strict=True):
+        if fields.alive_counter is not None:
+            fields.alive_counter.put(payload, self._alive % (fields.alive_counter.highest + 1))
+        self._alive += 1
+        sums = self.watch.sums
+        totals = (None, None) if sums is None else (sums.measured_a, sums.corrected_a)
+        for signal, total in zip((fields.sum_measured, fields.sum_corrected), totals, strict=True):
             if signal is not None:
                 codes, missing = signal
                 codes.place.put(payload, missing if total is None else codes.nearest(as_written(total)))
-        if fields.sender is not None:
-            fields.sender.protect(payload)
-        return Frame(fields.key, bytes(payload), fields.fd)
+        if fields.protection is not None:
+            fields.protection.advance(payload)
+        return fields, bytes(payload)
 
-    def _is_intact(self, check: Check) -> bool:
-        self.counters.corrupt += check is Check.CORRUPT
-        self.counters.repeated += check is Check.REPEATED
-        self.counters.gaps += check is Check.LOST
-        return check.usable
+    def _see_whether_asleep(self, now_s: float) -> None:
+        """All branches silent: the vehicle sleeps, which is no fault; what was latched is tried anew after that."""
+        silent = all(now_s - branch.time_s > branch.timeout_s for branch in self.branches)
+        if silent and not self._silent and self.latched is not Reason.NONE:
+            self._latch(Reason.NONE)
+        if self._silent and not silent:
+            self._was_awake = True
+            for branch in self.branches:
+                if now_s - branch.time_s > branch.timeout_s:
+                    branch.expect(now_s)
+        self._silent = silent
 
-
-def _sum_or_none(currents: Sequence[float | None]) -> float | None:
-    known = [current for current in currents if current is not None]
-    return sum(known) if known and len(known) == len(currents) else None
+    def _latch(self, reason: Reason, branches: Sequence[str] = ()) -> None:
+        self.latched, self.latched_branches = reason, tuple(branches)
+        active = self.reason is Reason.NONE and reason is Reason.NONE and not self.shadow
+        for branch in self.branches:
+            branch.activate(active=active)

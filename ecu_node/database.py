@@ -9,11 +9,12 @@ from cantools.database.can import Database, Message, Signal
 from ecu_node.errors import DatabaseError
 from ecu_node.layout import Layout, file_digest, split_signal
 
-__all__ = ["AMPERE", "VOLT", "WATT", "VehicleDatabase", "read_database", "unit_factor"]
+__all__ = ["AMPERE", "CELSIUS", "VOLT", "WATT", "VehicleDatabase", "read_database", "unit_factor"]
 
 AMPERE: Mapping[str, float] = {"A": 1.0, "mA": 1e-3, "kA": 1e3}
 VOLT: Mapping[str, float] = {"V": 1.0, "mV": 1e-3, "kV": 1e3}
 WATT: Mapping[str, float] = {"W": 1.0, "kW": 1e3, "mW": 1e-3, "MW": 1e6}
+CELSIUS: Mapping[str, float] = dict.fromkeys(("degC", "°C", "C", "deg C", "Celsius"), 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +138,7 @@ def _look_everything_up(vehicle: VehicleDatabase) -> None:
             (branch.signal, AMPERE),
             (branch.power, WATT),
             (branch.voltage, VOLT),
-            (branch.corrected, AMPERE),
+            (branch.corrected, AMPERE if branch.signal is not None else WATT),
         ):
             if name is not None:
                 unit_factor(vehicle.signal(name)[1], unit, where)
@@ -146,10 +147,10 @@ def _look_everything_up(vehicle: VehicleDatabase) -> None:
     for item in layout.input:
         vehicle.signal(item.signal)
     if layout.status is not None:
-        for field in ("state", "reason", "parameter_set", "sum_measured", "sum_corrected"):
+        for field in ("state", "reason", "parameter_set", "alive_counter", "sum_measured", "sum_corrected"):
             signal = getattr(layout.status, field)
             if signal is not None:
                 vehicle.signal(f"{layout.status.message}.{signal}")
-    if layout.e2e is not None:
-        for name in layout.e2e.messages:
+    for entry in layout.e2e:
+        for name in entry.messages:
             vehicle.message(name)

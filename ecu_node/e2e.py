@@ -1,36 +1,89 @@
-"""AUTOSAR E2E profile 1, variant 1A: an 8-bit CRC in byte 0 and a 4-bit counter in the low nibble of byte 1.
+"""End-to-end protection: AUTOSAR profiles P01, P02 and P05, and a counter with a CRC-8 as control units often have it.
 
-The CRC covers a data identifier, which is not sent, and the whole frame; the counter runs from 0 to 14. Incoming frames
-are checked before anything is read from them; outgoing ones get a counter of their own and a new CRC. So a frame that
-came in corrupt can never go out with a valid CRC.
+Incoming frames are checked before anything is read from them; outgoing ones get a new CRC. So a frame that came in
+corrupt can never go out with a valid CRC. The CRCs are computed by autosar-e2e and fastcrc.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum
 
-from e2e.p01 import e2e_p01_check, e2e_p01_protect
+from cantools.database.can import Message
+from e2e.p01 import (
+    E2E_P01_DATAID_ALT,
+    E2E_P01_DATAID_BOTH,
+    E2E_P01_DATAID_LOW,
+    E2E_P01_DATAID_NIBBLE,
+    e2e_p01_check,
+    e2e_p01_protect,
+)
+from e2e.p02 import e2e_p02_check, e2e_p02_protect
+from e2e.p05 import e2e_p05_check, e2e_p05_protect
 
-__all__ = ["HEADER_MASK", "Check", "Receiver", "Sender"]
+from ecu_node.bits import bit_place
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import LayoutError
+from ecu_node.layout import CounterCrc8, EndToEnd, ProfileP01, ProfileP02, ProfileP05
 
-HEADER_MASK = 0xFFF
-"""Bits of CRC and counter in the frame read as one little-endian integer."""
+__all__ = ["Check", "Protection", "Receiver", "protection_of"]
 
-_HEADER_BYTES = 2
-_COUNTER_MASK = 0x0F
-_COUNTER_MODULUS = 15
+_MODES = {
+    "both": E2E_P01_DATAID_BOTH,
+    "alternating": E2E_P01_DATAID_ALT,
+    "low": E2E_P01_DATAID_LOW,
+    "nibble": E2E_P01_DATAID_NIBBLE,
+}
+_NIBBLE = 0x0F
 
 
 class Check(Enum):
     """Outcome of checking one frame."""
 
     OK = "valid, next in order"
-    LOST = "valid, but frames before it were lost"
+    LOST = "valid, but a few frames before it were lost"
     REPEATED = "valid, but seen before"
+    JUMPED = "valid, but its counter is further on than the layout allows"
     CORRUPT = "CRC or counter impossible"
 
-    @property
-    def usable(self) -> bool:
-        """Whether the content is new and intact."""
-        return self in {Check.OK, Check.LOST}
+
+@dataclass(frozen=True, kw_only=True)
+class Protection:
+    """How the frames of one message are protected.
+
+    Attributes
+    ----------
+    header_mask : int
+        Bits of CRC and counter in the frame read as one little-endian integer.
+    least_bytes : int
+        Bytes that a frame must have.
+    modulus : int
+        Number of codes of the counter, which runs from 0.
+    max_step : int
+        Largest step of the counter from one frame to the next that is used.
+    is_sound : callable
+        Whether the CRC of a payload is right; the counter is not looked at.
+    counter_byte, counter_shift, counter_ones : int
+        The counter of a payload is ``payload[counter_byte] >> counter_shift & counter_ones``.
+    seal : callable
+        Writes the CRC into a payload; its counter stays.
+    advance : callable
+        Lets the counter of a payload count on, and writes the CRC.
+    """
+
+    header_mask: int
+    least_bytes: int
+    modulus: int
+    max_step: int
+    is_sound: Callable[[bytearray], bool]
+    counter_byte: int
+    counter_shift: int = 0
+    counter_ones: int
+    seal: Callable[[bytearray], None]
+    advance: Callable[[bytearray], None]
+
+    def before_first(self, payload: bytearray) -> None:
+        """Prepare an empty payload so that its counter is 0 after it has first advanced."""
+        payload[self.counter_byte] |= (self.modulus - 1) << self.counter_shift
 
 
 class Receiver:
@@ -38,52 +91,217 @@ class Receiver:
 
     Parameters
     ----------
-    data_id : int
-        Data identifier of the message, 16 bits.
+    protection : Protection
+        Of the message.
+
+    Attributes
+    ----------
+    expected : int
+        Counter of the next frame in order; -1 before the first intact one.
     """
 
-    def __init__(self, data_id: int) -> None:
-        self._data_id = data_id
-        self._last: int | None = None
+    def __init__(self, protection: Protection) -> None:
+        self.expected = -1
+        self._protection = protection
 
-    def check(self, payload: bytes | bytearray) -> Check:
+    def check(self, payload: bytearray) -> Check:
         """Check one frame and remember its counter.
 
         Parameters
         ----------
-        payload : bytes
+        payload : bytearray
             Data of the frame.
 
         Returns
         -------
         Check
-            A corrupt frame leaves the remembered counter as it was. The first intact frame is OK with any counter.
+            A corrupt frame leaves the remembered counter as it was; after a jump the next frame in order is OK. The
+            first intact frame is OK with any counter.
         """
-        if len(payload) < _HEADER_BYTES or not e2e_p01_check(bytearray(payload), self._data_id):
+        protection = self._protection
+        if len(payload) < protection.least_bytes or not protection.is_sound(payload):
             return Check.CORRUPT
-        counter = payload[1] & _COUNTER_MASK
-        step = 1 if self._last is None else (counter - self._last) % _COUNTER_MODULUS
-        self._last = counter
+        counter = payload[protection.counter_byte] >> protection.counter_shift & protection.counter_ones
+        if counter >= protection.modulus:
+            return Check.CORRUPT
+        before, self.expected = self.expected, (counter + 1) % protection.modulus
+        step = 1 if before < 0 else (counter - before + 1) % protection.modulus
         if step == 0:
             return Check.REPEATED
-        return Check.OK if step == 1 else Check.LOST
+        if step == 1:
+            return Check.OK
+        return Check.LOST if step <= protection.max_step else Check.JUMPED
 
 
-class Sender:
-    """Protects the frames of one message; the counter of the first frame is 0.
+def protection_of(database: VehicleDatabase, message: Message) -> Protection | None:
+    """How a message is protected.
 
     Parameters
     ----------
-    data_id : int
-        Data identifier of the message, 16 bits.
+    database : VehicleDatabase
+        Layout and DBC.
+    message : Message
+        A message of the DBC.
+
+    Returns
+    -------
+    Protection or None
+        None if the layout does not protect it.
+
+    Raises
+    ------
+    LayoutError
+        If the message cannot carry its protection.
     """
+    entry = database.layout.protection(message.name)
+    if entry is None:
+        return None
+    protection = _made(entry, message, f"{database.layout.path}: [e2e]: message {message.name}")
+    if message.length < protection.least_bytes:
+        raise LayoutError(
+            f"{database.layout.path}: [e2e]: message {message.name} has {message.length} bytes, too few for the header "
+            f"of {protection.least_bytes} bytes"
+        )
+    return protection
 
-    def __init__(self, data_id: int) -> None:
-        self._data_id = data_id
-        self._next = 0
 
-    def protect(self, payload: bytearray) -> None:
-        """Write counter and CRC into a frame of at least 2 bytes, in place."""
-        payload[1] = payload[1] & ~_COUNTER_MASK | self._next
-        e2e_p01_protect(payload, self._data_id, increment_counter=False)
-        self._next = (self._next + 1) % _COUNTER_MODULUS
+def _made(entry: EndToEnd, message: Message, where: str) -> Protection:
+    match entry:
+        case ProfileP01():
+            return _p01(entry, _data_id(entry.data_id, message))
+        case ProfileP02():
+            return _p02(entry, bytes(entry.data_id_list[message.name]))
+        case ProfileP05():
+            return _p05(entry, _data_id(entry.data_id, message))
+        case CounterCrc8():
+            return _counter_crc8(entry, message, where)
+
+
+def _data_id(given: dict[str, int], message: Message) -> int:
+    return given.get(message.name, message.frame_id & 0xFFFF)
+
+
+def _p01(entry: ProfileP01, data_id: int) -> Protection:
+    """CRC-8 SAE J1850 in a byte, a counter from 0 to 14 in the low nibble of the next one."""
+    offset, mode = entry.offset, _MODES[entry.data_id_mode]
+    place, modulus = offset + 1, 15
+
+    if (mode, offset) == (E2E_P01_DATAID_BOTH, 0):  # without keyword arguments, which cost time in every frame
+
+        def is_sound(payload: bytearray) -> bool:
+            return e2e_p01_check(payload, data_id)
+
+        def advance(payload: bytearray) -> None:
+            e2e_p01_protect(payload, data_id)
+
+        def seal(payload: bytearray) -> None:
+            payload[place] += -1 if payload[place] & _NIBBLE else modulus - 1  # it counts on to what it was
+            e2e_p01_protect(payload, data_id)
+    else:
+
+        def is_sound(payload: bytearray) -> bool:
+            return e2e_p01_check(payload, data_id, data_id_mode=mode, offset=offset)
+
+        def advance(payload: bytearray) -> None:
+            e2e_p01_protect(payload, data_id, data_id_mode=mode, offset=offset)
+
+        def seal(payload: bytearray) -> None:
+            e2e_p01_protect(payload, data_id, data_id_mode=mode, offset=offset, increment_counter=False)
+
+    return Protection(
+        header_mask=(0xFFFF if entry.data_id_mode == "nibble" else 0xFFF) << 8 * offset,
+        least_bytes=offset + 2,
+        modulus=modulus,
+        max_step=entry.max_delta_counter,
+        is_sound=is_sound,
+        counter_byte=place,
+        counter_ones=_NIBBLE,
+        seal=seal,
+        advance=advance,
+    )
+
+
+def _p02(entry: ProfileP02, data_id_list: bytes) -> Protection:
+    """CRC-8 0x2F in byte 0, a counter from 0 to 15 in the low nibble of byte 1 that selects the data identifier."""
+    return Protection(
+        header_mask=0xFFF,
+        least_bytes=2,
+        modulus=16,
+        max_step=entry.max_delta_counter,
+        is_sound=lambda payload: e2e_p02_check(payload, data_id_list, length=0),
+        counter_byte=1,
+        counter_ones=_NIBBLE,
+        seal=lambda payload: e2e_p02_protect(payload, data_id_list, increment_counter=False),
+        advance=lambda payload: e2e_p02_protect(payload, data_id_list),
+    )
+
+
+def _p05(entry: ProfileP05, data_id: int) -> Protection:
+    """CRC-16 CCITT in two bytes, low one first, and a counter from 0 to 255 in the next one."""
+    offset = entry.offset
+    return Protection(
+        header_mask=0xFFFFFF << 8 * offset,
+        least_bytes=offset + 3,
+        modulus=256,
+        max_step=entry.max_delta_counter,
+        is_sound=lambda payload: e2e_p05_check(payload, data_id, offset=offset),
+        counter_byte=offset + 2,
+        counter_ones=0xFF,
+        seal=lambda payload: e2e_p05_protect(payload, data_id, offset=offset, increment_counter=False),
+        advance=lambda payload: e2e_p05_protect(payload, data_id, offset=offset),
+    )
+
+
+def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> Protection:
+    """A counter and a CRC-8, both signals of the DBC; the CRC covers all other bytes, and a data identifier if any."""
+    signals = {signal.name: signal for signal in message.signals}
+    for name in (entry.counter, entry.crc):
+        if name not in signals:
+            raise LayoutError(f"{where} has no signal {name!r}; it has {', '.join(signals)}")
+    counter_place, crc_place = bit_place(signals[entry.counter]), bit_place(signals[entry.crc])
+    if crc_place.length != 8 or crc_place.shift:
+        raise LayoutError(f"{where}: signal {entry.crc} must be one whole byte to be a CRC-8")
+    modulus = entry.counter_modulus or counter_place.highest + 1
+    if counter_place.end - counter_place.first > 1:
+        raise LayoutError(f"{where}: signal {entry.counter} must be within one byte to be a counter")
+    if counter_place.signed or modulus > counter_place.highest + 1:
+        raise LayoutError(f"{where}: signal {entry.counter} cannot count from 0 to {modulus - 1}")
+    crc8 = _algorithm(entry.algorithm, where)
+    identity = _data_id(entry.data_id, message).to_bytes(2, "little")[: entry.data_id_bytes]
+    before, after = (identity, b"") if entry.data_id_at == "before" else (b"", identity)
+    byte = crc_place.first
+    counter_byte, shift, ones = counter_place.first, counter_place.shift, counter_place.highest
+
+    def crc(payload: bytearray) -> int:
+        return crc8(b"".join((before, payload[:byte], payload[byte + 1 :], after)))
+
+    def seal(payload: bytearray) -> None:
+        payload[byte] = crc(payload)
+
+    def advance(payload: bytearray) -> None:
+        counter = ((payload[counter_byte] >> shift & ones) + 1) % modulus
+        payload[counter_byte] = payload[counter_byte] & ~(ones << shift) | counter << shift
+        seal(payload)
+
+    return Protection(
+        header_mask=counter_place.mask | crc_place.mask,
+        least_bytes=max(counter_place.end, crc_place.end),
+        modulus=modulus,
+        max_step=entry.max_delta_counter,
+        is_sound=lambda payload: payload[byte] == crc(payload),
+        counter_byte=counter_byte,
+        counter_shift=shift,
+        counter_ones=ones,
+        seal=seal,
+        advance=advance,
+    )
+
+
+def _algorithm(name: str, where: str) -> Callable[[bytes], int]:
+    from fastcrc import crc8  # noqa: PLC0415  # most vehicles do not need it, and the node is to stay small
+
+    if name not in crc8.algorithms_available:
+        raise LayoutError(
+            f"{where}: algorithm {name!r} is not known; known are {', '.join(sorted(crc8.algorithms_available))}"
+        )
+    return getattr(crc8, name)  # type: ignore[no-any-return]

@@ -1,23 +1,35 @@
 """What the node receives and sends, and the checks that keep the two apart.
 
-Loop guard: no message that the layout reads may be sent, else the node would correct its own output, or speak in the
-name of another control unit; and by the DBC all that is sent comes from one control unit, which sends nothing that is
-read. And each bit the node sends belongs to one signal only.
+Loop guard: no message that the layout reads may be sent on the same bus, else the node would correct its own output, or
+speak in the name of another control unit; and by the DBC all that is sent comes from one control unit, which sends
+nothing that is read. And each bit the node sends belongs to one signal only. A gateway sends the branches' messages on,
+on the other bus, and in its own name the status alone.
 """
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from enum import Enum
 
 from cantools.database.can import Message, Signal
 
 from ecu_node.bits import bit_place
-from ecu_node.corrector import FrameKey
 from ecu_node.database import VehicleDatabase
-from ecu_node.e2e import HEADER_MASK
+from ecu_node.e2e import protection_of
 from ecu_node.errors import DatabaseError, LayoutError
+from ecu_node.frames import FrameKey
 from ecu_node.status import Quality, Reason, State
 
-__all__ = ["PARAMETER_SETS", "check_output", "is_fd", "key_of", "needs_fd", "received", "transmitted"]
+__all__ = [
+    "PARAMETER_SETS",
+    "Mode",
+    "check_output",
+    "is_fd",
+    "key_of",
+    "needs_fd",
+    "received",
+    "rewritten",
+    "transmitted",
+]
 
 PARAMETER_SETS = 256
 """The status publishes the number of the parameter set modulo this."""
@@ -25,7 +37,13 @@ PARAMETER_SETS = 256
 _NOBODY = "Vector__XXX"
 """How a DBC says that a message has no sender."""
 _CLASSIC_BYTES = 8
-_HEADER_BYTES = 2
+
+
+class Mode(Enum):
+    """Where corrected values go."""
+
+    OVERLAY = "under identifiers of their own, on the same bus"
+    GATEWAY = "in place of the measured ones, on the other bus"
 
 
 def key_of(message: Message) -> FrameKey:
@@ -39,15 +57,22 @@ def is_fd(message: Message) -> bool:
 
 
 def received(database: VehicleDatabase) -> dict[FrameKey, Message]:
-    """Messages that carry the branches and their voltages, by identifier."""
-    branches = database.layout.branch
-    names = [name for branch in branches for name in (branch.source, branch.voltage) if name is not None]
+    """Messages that carry the branches and what else the node needs of the vehicle, by identifier."""
+    layout = database.layout
+    names = [name for branch in layout.branch for name in (branch.source, branch.voltage) if name is not None]
+    names += [item.signal for item in layout.input if item.name in {layout.temperature, layout.watch.input}]
     return {key_of(message): message for message, _ in map(database.signal, names)}
 
 
-def transmitted(database: VehicleDatabase) -> dict[FrameKey, Message]:
-    """Messages that the node sends, by identifier."""
-    messages = {key_of(item.message): item.message for item in _written(database)}
+def rewritten(database: VehicleDatabase) -> dict[FrameKey, Message]:
+    """Messages that a gateway rewrites, by identifier."""
+    pairs = (database.signal(branch.source) for branch in database.layout.branch)
+    return {key_of(message): message for message, _ in pairs}
+
+
+def transmitted(database: VehicleDatabase, mode: Mode) -> dict[FrameKey, Message]:
+    """Messages that the node sends in its own name, by identifier."""
+    messages = {key_of(item.message): item.message for item in _written(database, mode)}
     layout = database.layout
     if layout.status is not None:
         message = database.message(layout.status.message)
@@ -55,19 +80,21 @@ def transmitted(database: VehicleDatabase) -> dict[FrameKey, Message]:
     return messages
 
 
-def needs_fd(database: VehicleDatabase) -> list[str]:
+def needs_fd(database: VehicleDatabase, mode: Mode) -> list[str]:
     """Names of the messages, received or sent, that need CAN FD."""
-    messages = {**received(database), **transmitted(database)}
+    messages = {**received(database), **transmitted(database, mode)}
     return [message.name for message in messages.values() if is_fd(message)]
 
 
-def check_output(database: VehicleDatabase) -> None:
+def check_output(database: VehicleDatabase, mode: Mode) -> None:
     """Refuse a layout with which the node would disturb the bus or itself.
 
     Parameters
     ----------
     database : VehicleDatabase
         Layout and DBC.
+    mode : Mode
+        Where corrected values go.
 
     Raises
     ------
@@ -78,18 +105,17 @@ def check_output(database: VehicleDatabase) -> None:
         If a signal to write does not fit its message or its values do not fit the signal.
     """
     where = database.layout.path
-    sent = transmitted(database)
-    if not sent:
+    sent = transmitted(database, mode)
+    if not sent and mode is Mode.OVERLAY:
         raise LayoutError(f"{where}: nothing to publish: give branches a 'corrected' signal, or add [status]")
     _require_own_messages(database, sent)
-    for message in sent.values():
-        if _is_protected(database, message) and message.length < _HEADER_BYTES:
-            raise DatabaseError(f"{where}: message {message.name} has no room for the E2E header of 2 bytes")
-    taken = {key: HEADER_MASK if _is_protected(database, message) else 0 for key, message in sent.items()}
-    for item in _written(database):
+    taken = {key: _header(database, message) for key, message in sent.items()}
+    for key, message in rewritten(database).items() if mode is Mode.GATEWAY else ():
+        taken[key] = _header(database, message)
+    for item in (*_written(database, mode), *(_rewritten(database) if mode is Mode.GATEWAY else ())):
         _check_place(item)
         key, mask = key_of(item.message), bit_place(item.signal).mask
-        if taken[key] & mask:
+        if taken[key] & mask and item.signal.multiplexer_ids is None:
             raise LayoutError(
                 f"{where}: {item.purpose}: {item.message.name}.{item.signal.name} is written twice, or overlaps "
                 f"another signal that is written, or the E2E header"
@@ -106,11 +132,19 @@ class _Written:
     purpose: str
     largest: int = 0
     """The greatest code it must hold."""
+    own: bool = True
+    """Whether the whole message is the node's."""
 
 
-def _written(database: VehicleDatabase) -> Iterable[_Written]:
+def _rewritten(database: VehicleDatabase) -> Iterable[_Written]:
+    for branch in database.layout.branch:
+        message, signal = database.signal(branch.source)
+        yield _Written(message=message, signal=signal, purpose=f"branch {branch.name}", own=False)
+
+
+def _written(database: VehicleDatabase, mode: Mode) -> Iterable[_Written]:
     layout = database.layout
-    for branch in layout.branch:
+    for branch in layout.branch if mode is Mode.OVERLAY else ():
         for name, largest in ((branch.corrected, 0), (branch.quality, max(Quality))):
             if name is not None:
                 message, signal = database.signal(name)
@@ -122,6 +156,7 @@ def _written(database: VehicleDatabase) -> Iterable[_Written]:
         (status.state, max(State)),
         (status.reason, max(Reason)),
         (status.parameter_set, PARAMETER_SETS - 1),
+        (status.alive_counter, 1),
         (status.sum_measured, 0),
         (status.sum_corrected, 0),
     )
@@ -163,11 +198,16 @@ def _check_place(item: _Written) -> None:
         raise DatabaseError(
             f"{item.purpose}: signal {name} ends in byte {place.end}, but the message has {item.message.length} bytes"
         )
+    if item.own and item.signal.multiplexer_ids is not None:
+        raise DatabaseError(
+            f"{item.purpose}: signal {name} is multiplexed; what the node sends in its own name must be in every frame"
+        )
     if place.highest < item.largest:
         raise DatabaseError(
             f"{item.purpose}: signal {name} holds at most {place.highest}; {item.largest} must fit, widen it in the DBC"
         )
 
 
-def _is_protected(database: VehicleDatabase, message: Message) -> bool:
-    return database.layout.e2e is not None and message.name in database.layout.e2e.messages
+def _header(database: VehicleDatabase, message: Message) -> int:
+    protection = protection_of(database, message)
+    return protection.header_mask if protection is not None else 0

@@ -19,15 +19,20 @@ from ecu_node.formula import formula_names, parse_formula
 __all__ = [
     "Branch",
     "Contactor",
+    "CounterCrc8",
     "Derived",
     "EndToEnd",
     "Input",
     "Layout",
     "Limits",
     "Name",
+    "ProfileP01",
+    "ProfileP02",
+    "ProfileP05",
     "SignalName",
     "StatusMessage",
     "UnmeasuredLoad",
+    "Watch",
     "file_digest",
     "read_layout",
     "split_signal",
@@ -56,6 +61,8 @@ class Branch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """In ground truth made from recordings, this branch is minus the sum of the others, (19) of the paper."""
     corrected: SignalName | None = None
     quality: SignalName | None = None
+    no_value: list[int] = []
+    """Raw codes of the signal that are no values, beyond those that the DBC names."""
 
     @property
     def source(self) -> SignalName:
@@ -113,17 +120,83 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     state: Name
     reason: Name
     parameter_set: Name | None = None
+    alive_counter: Name | None = None
+    """Counts the status messages; for those without a counter by [e2e]."""
     sum_measured: Name | None = None
     sum_corrected: Name | None = None
 
 
-class EndToEnd(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Messages protected by AUTOSAR E2E profile 1 (data identifier in both bytes)."""
+_DataId = Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)]
+_Offset = Annotated[int, msgspec.Meta(ge=0, le=60)]
 
-    profile: Literal["P01"]
+
+class _Protected(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     messages: list[Name]
-    data_id: dict[str, Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)]] = {}
+    max_delta_counter: Annotated[int, msgspec.Meta(ge=1, le=255)] = 3
+    """Largest step of the counter between two frames that is used: one more than the frames that may be lost."""
+
+
+class ProfileP01(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P01"):
+    """AUTOSAR E2E profile 1: CRC-8 and a counter of 4 bits."""
+
+    data_id: dict[str, _DataId] = {}
     """Data identifier per message; the message's own identifier where not given."""
+    data_id_mode: Literal["both", "alternating", "low", "nibble"] = "both"
+    """Which bytes of the data identifier the CRC covers: profile 1A, 1B, the low one only, 1C."""
+    offset: _Offset = 0
+    """First byte of the header."""
+
+
+class ProfileP02(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P02"):
+    """AUTOSAR E2E profile 2: CRC-8 and a counter of 4 bits that selects one of 16 data identifiers."""
+
+    data_id_list: dict[
+        str, Annotated[list[Annotated[int, msgspec.Meta(ge=0, le=255)]], msgspec.Meta(min_length=16, max_length=16)]
+    ]
+    """Data identifiers per message."""
+
+
+class ProfileP05(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P05"):
+    """AUTOSAR E2E profile 5: CRC-16 and a counter of 8 bits."""
+
+    data_id: dict[str, _DataId] = {}
+    """Data identifier per message; the message's own identifier where not given."""
+    offset: _Offset = 0
+    """First byte of the header."""
+
+
+class CounterCrc8(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="counter CRC8"):
+    """A counter and a CRC-8 as signals of the DBC; the CRC covers all bytes but its own."""
+
+    counter: Name
+    crc: Name
+    algorithm: str = "sae_j1850"
+    """As fastcrc names it."""
+    counter_modulus: Annotated[int, msgspec.Meta(ge=2, le=65536)] | None = None
+    """Number of codes of the counter, which runs from 0; all that fit the signal where not given."""
+    data_id: dict[str, _DataId] = {}
+    """Data identifier per message; the message's own identifier where not given."""
+    data_id_bytes: Literal[0, 1, 2] = 0
+    """How many of its bytes the CRC covers too, the low one first."""
+    data_id_at: Literal["before", "after"] = "before"
+    """Whether they come before or after the payload."""
+
+
+EndToEnd = ProfileP01 | ProfileP02 | ProfileP05 | CounterCrc8
+"""How some messages are protected."""
+
+
+class Watch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """When the node holds its own corrections for wrong."""
+
+    window_s: Annotated[float, msgspec.Meta(ge=1.0, le=3600.0)] = 10.0
+    """Over this long the sums are compared. [s]"""
+    margin_a: _Positive | None = None
+    """By how much the corrected sum must be worse (RMS) [A]; 0.25 % of full scale where not given."""
+    input: Name | None = None
+    """Input that tells whether all currents of the junction are measured, as they may not be while it is charged."""
+    valid: list[float] = []
+    """Its values with which they are; the sums of other times are not judged."""
 
 
 class Layout(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -151,7 +224,10 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """If it is known; where not given, it is estimated from the fleet."""
     limits: Limits = Limits()
     status: StatusMessage | None = None
-    e2e: EndToEnd | None = None
+    e2e: list[EndToEnd] = []
+    on_bad_frame: Literal["hold", "invalid"] = "hold"
+    """What the node makes of a frame that fails its check: nothing, or one that is seen to be invalid."""
+    watch: Watch = Watch()
     path: Path = Path()
     """Where the layout was read from; set by :func:`read_layout`."""
     digest: str = ""
@@ -171,6 +247,15 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def offset_limit_a(self) -> float:
         """Largest magnitude of an offset that the node accepts. [A]"""
         return self.limits.offset_a if self.limits.offset_a is not None else 0.4 * self.full_scale_a
+
+    @property
+    def watch_margin_a(self) -> float:
+        """By how much the corrected sum must be worse than the measured one. [A]"""
+        return self.watch.margin_a if self.watch.margin_a is not None else 0.0025 * self.full_scale_a
+
+    def protection(self, message: str) -> EndToEnd | None:
+        """How a message is protected; None if it is not."""
+        return next((entry for entry in self.e2e if message in entry.messages), None)
 
     def find_branch(self, name: str) -> Branch:
         """Return the branch of this name; LayoutError lists the known ones if there is none."""
@@ -207,6 +292,8 @@ def read_layout(path: Path) -> Layout:
         raise LayoutError(f"{path}: not a layout: the file is not UTF-8 text") from None
     except tomllib.TOMLDecodeError as error:
         raise LayoutError(f"{path}: not TOML: {error}") from None
+    if isinstance(document.get("e2e"), dict):  # one profile: a table will do
+        document["e2e"] = [document["e2e"]]
     try:
         layout = msgspec.convert(document, Layout)
     except msgspec.ValidationError as error:
@@ -242,10 +329,21 @@ def _check(layout: Layout, path: Path) -> None:
         refuse("more than one branch has 'balance = true'; at most one can take what the others leave")
     _check_signals(layout, refuse)
     _check_inputs(layout, refuse)
-    if layout.e2e is not None:
-        unknown = [name for name in layout.e2e.data_id if name not in layout.e2e.messages]
+    _check_protection(layout, refuse)
+
+
+def _check_protection(layout: Layout, refuse: Callable[[str], NoReturn]) -> None:
+    for name in _repeated([name for entry in layout.e2e for name in entry.messages]):
+        refuse(f"[e2e] messages: {name} is named twice; a message has one protection")
+    for entry in layout.e2e:
+        given = entry.data_id_list if isinstance(entry, ProfileP02) else entry.data_id
+        unknown = [name for name in given if name not in entry.messages]
         if unknown:
             refuse(f"[e2e] data_id: {', '.join(unknown)} is not in 'messages'; add it there, or leave its data_id out")
+        if isinstance(entry, ProfileP02):
+            missing = [name for name in entry.messages if name not in entry.data_id_list]
+            if missing:
+                refuse(f"[e2e] data_id_list: {', '.join(missing)} has none; profile P02 needs 16 numbers per message")
 
 
 def _repeated(names: Sequence[str]) -> list[str]:
@@ -284,6 +382,11 @@ def _check_inputs(layout: Layout, refuse: Callable[[str], NoReturn]) -> None:
         refuse(f"[contactor] input: {layout.contactor.input!r} is no [[input]]; declare the signal as one")
     if layout.temperature is not None and layout.temperature not in {item.name for item in layout.input}:
         refuse(f"temperature: {layout.temperature!r} is no [[input]]; declare the signal as one, or leave the key out")
+    watch = layout.watch
+    if watch.input is not None and watch.input not in {item.name for item in layout.input}:
+        refuse(f"[watch] input: {watch.input!r} is no [[input]]; declare the signal as one")
+    if (watch.input is None) != (not watch.valid):
+        refuse("[watch]: give both 'input' and 'valid', or neither")
     for key, names in (("model_inputs", layout.model_inputs), ("fleet_inputs", layout.fleet_inputs)):
         unknown = [name for name in names if name not in known]
         if unknown:
@@ -293,8 +396,6 @@ def _check_inputs(layout: Layout, refuse: Callable[[str], NoReturn]) -> None:
 def _check_branch(branch: Branch, refuse: Callable[[str], NoReturn]) -> None:
     if (branch.signal is None) == (branch.power is None) or (branch.power is None) != (branch.voltage is None):
         refuse(f"branch {branch.name}: give either 'signal' (a current), or 'power' and 'voltage'")
-    if branch.corrected is not None and branch.power is not None:
-        refuse(f"branch {branch.name}: 'corrected' needs a branch with a current 'signal'; leave it out here")
     if branch.quality is not None and branch.corrected is None:
         refuse(f"branch {branch.name}: 'quality' without 'corrected'")
     if branch.quality and branch.corrected and split_signal(branch.quality)[0] != split_signal(branch.corrected)[0]:

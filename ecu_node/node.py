@@ -1,75 +1,46 @@
-"""The node on a bus: a thin shell around :class:`~ecu_node.corrector.Corrector` that owns clock, bus and parameters."""
+"""The node on its buses: a thin shell around :class:`~ecu_node.corrector.Corrector` that owns clock, buses and threads.
 
-import errno
+An overlay node works on one bus, in one thread. A gateway has the sensors on one bus and the rest of the vehicle on the
+other: one thread passes frames on from the sensors, and corrects, another one passes all others on the other way.
+"""
+
+import threading
 import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import can
 
-from ecu_node.corrector import Corrector, Frame, FrameKey
+from ecu_node.buses import SteadyBus, connect, steady_time_s
+from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
-from ecu_node.guard import needs_fd, received
-from ecu_node.parameters import UnfitError, check_fit, read_parameters
-from ecu_node.wiring import InForce
+from ecu_node.guard import Mode, needs_fd, received, rewritten, transmitted
+from ecu_node.own_frames import OwnFrames
 
-__all__ = ["choose_parameters", "connect", "open_bus", "receive_filters", "serve"]
+__all__ = ["GatewayNode", "OverlayNode", "open_bus", "receive_filters"]
 
 _LONGEST_WAIT_S = 0.1
 """A wake-up at least this often, so that a request to stop is seen. [s]"""
-_SEND_ATTEMPTS = 3
-_SEND_PAUSE_S = 0.001
-"""A full send queue drains by some frames in this time. [s]"""
+_LISTEN_S = 0.12
+"""Before it says anything the node listens whether another one is there: longer than a status message's period. [s]"""
 _STANDARD_MASK = 0x7FF
 _EXTENDED_MASK = 0x1FFFFFFF
 
 
-def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None) -> tuple[InForce, str | None]:
-    """Read parameters, and decide whether they may be applied here.
-
-    Parameters
-    ----------
-    path : Path
-        Parameter file.
-    database : VehicleDatabase
-        Layout and DBC in use.
-    vehicle : str or None
-        Identity of the vehicle; None: not checked.
-
-    Returns
-    -------
-    InForce
-        The parameters, or the reason why measured values are passed through.
-    str or None
-        That reason in words, one line; None if the parameters fit.
-    """
-    try:
-        parameters = read_parameters(path)
-    except UnfitError as error:
-        return InForce(parameters=None, reason=error.reason), str(error)
-    try:
-        check_fit(parameters, database, vehicle)
-    except UnfitError as error:
-        return InForce(parameters=None, reason=error.reason), f"{path}: {error}"
-    return InForce(parameters=parameters), None
-
-
 def receive_filters(database: VehicleDatabase) -> list[can.typechecking.CanFilter]:
-    """Filters that let only the branches' messages through, for the kernel to apply."""
+    """Filters of an overlay node, for the kernel to apply: the branches' messages, and its own as sent by others."""
     return [
         {
             "can_id": key.identifier,
             "can_mask": _EXTENDED_MASK if key.extended else _STANDARD_MASK,
             "extended": key.extended,
         }
-        for key in received(database)
+        for key in (*received(database), *transmitted(database, Mode.OVERLAY))
     ]
 
 
-def open_bus(database: VehicleDatabase, *, interface: str, channel: str, fd: bool) -> can.BusABC:
-    """Open the bus for the branches' messages only.
+def open_bus(database: VehicleDatabase, *, interface: str, channel: str, fd: bool, mode: Mode) -> can.BusABC:
+    """Open a bus for the node.
 
     Parameters
     ----------
@@ -79,6 +50,8 @@ def open_bus(database: VehicleDatabase, *, interface: str, channel: str, fd: boo
         As python-can names them, such as socketcan and can0.
     fd : bool
         Whether to use CAN FD.
+    mode : Mode
+        An overlay node receives what it needs, a gateway everything.
 
     Returns
     -------
@@ -90,134 +63,255 @@ def open_bus(database: VehicleDatabase, *, interface: str, channel: str, fd: boo
     BusError
         If there is no such bus, or the DBC needs CAN FD and ``fd`` is not given.
     """
-    if not fd and (names := needs_fd(database)):
+    if not fd and (names := needs_fd(database, mode)):
         raise BusError(f"{database.layout.dbc_path}: CAN FD messages ({', '.join(names)}); start with --fd")
-    return connect(interface, channel, fd=fd, filters=receive_filters(database))
+    filters = receive_filters(database) if mode is Mode.OVERLAY else None
+    return connect(interface, channel, fd=fd, filters=filters)
 
 
-def connect(
-    interface: str, channel: str, *, fd: bool = False, filters: list[can.typechecking.CanFilter] | None = None
-) -> can.BusABC:
-    """Open any bus of python-can.
-
-    Parameters
-    ----------
-    interface, channel : str
-        As python-can names them.
-    fd : bool
-        Whether to use CAN FD.
-    filters : list of CanFilter, optional
-        What to receive; everything if not given.
-
-    Returns
-    -------
-    can.BusABC
-        The bus; it does not receive what it sends.
-
-    Raises
-    ------
-    BusError
-        If it cannot be opened; the message says why.
-    """
-    options: dict[str, Any] = {"fd": True} if fd else {}
-    try:
-        return can.Bus(
-            channel=channel,
-            interface=interface,
-            ignore_config=True,
-            can_filters=filters,
-            receive_own_messages=False,
-            **options,
-        )
-    except (can.CanError, OSError, ValueError, TypeError, NotImplementedError) as error:
-        raise BusError(f"{interface} {channel}: cannot open the bus: {_why(error)}") from None
-
-
-def serve(
-    bus: can.BusABC,
-    corrector: Corrector,
-    *,
-    stop: Callable[[], bool],
-    status_period_s: float,
-    clock: Callable[[], float] = time.monotonic,
-) -> None:
-    """Correct until told to stop.
+class _Ticking:
+    """What both kinds of node do now and then: look at the junction, publish the status, and whatever else is due.
 
     Parameters
     ----------
-    bus : can.BusABC
-        An open bus.
     corrector : Corrector
-        The core; its counters tell what happened.
-    stop : callable
-        Asked at every wake-up; True ends the work.
-    status_period_s : float
-        Time between status messages. [s]
-    clock : callable
-        Steady clock. [s]
-
-    Raises
-    ------
-    BusError
-        If the bus fails while receiving.
+        The core.
+    period_s : float
+        Between status messages. [s]
+    on_tick : callable
+        Called with the steady clock's time after each look. [s]
     """
-    status_due_s = clock()
-    while not stop():
-        if clock() >= status_due_s:
-            status_due_s = max(status_due_s + status_period_s, clock())
-            status = corrector.status(clock())
-            if status is not None:
-                corrector.counters.send_errors += not _send(bus, status)
-        message = _receive(bus, min(_LONGEST_WAIT_S, max(0.0, status_due_s - clock())))
-        while message is not None:
-            _answer(bus, corrector, message, clock())
-            message = _receive(bus, 0.0) if clock() < status_due_s and not stop() else None
+
+    def __init__(self, corrector: Corrector, period_s: float, on_tick: Callable[[float], None]) -> None:
+        self._corrector, self._period_s, self._on_tick = corrector, period_s, on_tick
+        self._due_s = float("-inf")
+
+    def wait_s(self, now_s: float) -> float:
+        """How long there is nothing to do but to receive; 0 if it is time. [s]"""
+        return min(_LONGEST_WAIT_S, max(0.0, self._due_s - now_s))
+
+    def tick(self, now_s: float, send: Callable[[can.Message], bool], own: OwnFrames) -> None:
+        """Do it if it is due."""
+        if now_s < self._due_s:
+            return
+        self._due_s = max(self._due_s + self._period_s, now_s)
+        corrector = self._corrector
+        corrector.look(now_s)
+        status = corrector.status()
+        if status is not None:
+            fields, data = status
+            own.sent(fields.key, data)
+            corrector.counters.send_errors += not send(_message(fields.key, data, fd=fields.fd))
+        self._on_tick(now_s)
 
 
-def _answer(bus: can.BusABC, corrector: Corrector, message: can.Message, now_s: float) -> None:
-    if message.is_error_frame or message.is_remote_frame:
-        return
-    frame = Frame(
-        FrameKey(message.arbitration_id, message.is_extended_id),
-        bytes(message.data),
-        message.is_fd,
-        message.bitrate_switch,
+class OverlayNode:
+    """Corrects on one bus.
+
+    Parameters
+    ----------
+    bus : SteadyBus
+        The bus.
+    corrector : Corrector
+        The core.
+    database : VehicleDatabase
+        Layout and DBC.
+    period_s : float
+        Between status messages. [s]
+    on_tick : callable
+        Called with the steady clock's time at every status message. [s]
+    """
+
+    def __init__(
+        self,
+        bus: SteadyBus,
+        corrector: Corrector,
+        database: VehicleDatabase,
+        *,
+        period_s: float,
+        on_tick: Callable[[float], None] = lambda _: None,
+    ) -> None:
+        self._bus, self._corrector = bus, corrector
+        self._own = OwnFrames(transmitted(database, Mode.OVERLAY))
+        self._ticking = _Ticking(corrector, period_s, on_tick)
+
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Correct until told to stop.
+
+        Parameters
+        ----------
+        stop : callable
+            Asked at every wake-up; True ends the work.
+
+        Raises
+        ------
+        BusError
+            If another node sends this node's messages.
+        """
+        heard = _listen(self._bus, self._own, stop)
+        bus, ticking, clock = self._bus, self._ticking, time.monotonic
+        while not stop():
+            now_s = clock()
+            ticking.tick(now_s, bus.send, self._own)
+            ahead_s = time.time() - now_s
+            for early in heard:
+                self._take(early, now_s, ahead_s)
+            heard = []
+            message = bus.receive(ticking.wait_s(clock()))
+            while message is not None:
+                now_s = clock()
+                self._take(message, now_s, ahead_s)
+                message = bus.receive(0.0) if ticking.wait_s(now_s) else None
+
+    def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
+        key = (message.arbitration_id, message.is_extended_id)
+        corrector, own = self._corrector, self._own
+        if key in own:
+            _require_own(message, own, self._bus)
+            corrector.counters.echoes += 1
+            return
+        source = corrector.sources.get(key)
+        if source is None or message.is_remote_frame:
+            return
+        time_s = steady_time_s(message.timestamp, now_s, ahead_s, corrector.counters)
+        for target in source.answer(message.data, time_s):
+            own.sent(target.key, target.data)
+            answer = _message(
+                target.key, target.data, fd=target.fd or message.is_fd, bitrate_switch=message.bitrate_switch
+            )
+            if not self._bus.send(answer):
+                corrector.counters.send_errors += 1
+
+
+class GatewayNode:
+    """Corrects between two buses.
+
+    Parameters
+    ----------
+    sensors : SteadyBus
+        The bus on which the sensors are.
+    vehicle : SteadyBus
+        The bus on which the corrected values are needed; the status goes there too.
+    corrector, database, period_s, on_tick :
+        As for :class:`OverlayNode`.
+    """
+
+    def __init__(
+        self,
+        sensors: SteadyBus,
+        vehicle: SteadyBus,
+        corrector: Corrector,
+        database: VehicleDatabase,
+        *,
+        period_s: float,
+        on_tick: Callable[[float], None] = lambda _: None,
+    ) -> None:
+        self._sensors, self._vehicle, self._corrector = sensors, vehicle, corrector
+        own = transmitted(database, Mode.GATEWAY)
+        self._status = OwnFrames(own)
+        self._not_from_vehicle = OwnFrames([*own, *rewritten(database)])
+        self._ticking = _Ticking(corrector, period_s, on_tick)
+        self._conflict: BusError | None = None
+        self._returned = 0
+
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Correct until told to stop; parameters and errors as for :meth:`OverlayNode.run`."""
+        heard = _listen(self._vehicle, self._not_from_vehicle, stop)
+        ended = threading.Event()
+        back = threading.Thread(target=self._pass_back, args=(heard, lambda: stop() or ended.is_set()), daemon=True)
+        back.start()
+        try:
+            self._pass_on(lambda: stop() or self._conflict is not None)
+        finally:
+            ended.set()
+            back.join()
+        if self._conflict is not None:
+            raise self._conflict
+
+    @property
+    def returned(self) -> int:
+        """Frames passed on from the vehicle to the sensors."""
+        return self._returned
+
+    def _pass_on(self, stop: Callable[[], bool]) -> None:
+        sensors, vehicle, ticking, clock = self._sensors, self._vehicle, self._ticking, time.monotonic
+        corrector, status = self._corrector, self._status
+        counters, sources = corrector.counters, corrector.sources
+        while not stop():
+            now_s = clock()
+            ticking.tick(now_s, vehicle.send, status)
+            ahead_s = time.time() - now_s
+            message = sensors.receive(ticking.wait_s(clock()))
+            while message is not None:
+                now_s = clock()
+                key = (message.arbitration_id, message.is_extended_id)
+                if key in status:
+                    raise _another(message, sensors)
+                source = sources.get(key)
+                if source is not None and not message.is_remote_frame:
+                    time_s = steady_time_s(message.timestamp, now_s, ahead_s, counters)
+                    data = source.forward(message.data, time_s)
+                    if data is not None:
+                        message.data = data
+                        self._send_on(message)
+                else:
+                    self._send_on(message)
+                message = sensors.receive(0.0) if ticking.wait_s(now_s) else None
+
+    def _send_on(self, message: can.Message) -> None:
+        counters = self._corrector.counters
+        if self._vehicle.send(message):
+            counters.forwarded += 1
+        else:
+            counters.send_errors += 1
+
+    def _pass_back(self, heard: Sequence[can.Message], stop: Callable[[], bool]) -> None:
+        """Pass on what the vehicle sends to the sensors' bus; a branch's frame from there must not be."""
+        vehicle, sensors = self._vehicle, self._sensors
+        for early in heard:
+            self._returned += sensors.send(early)
+        while not stop():
+            message = vehicle.receive(_LONGEST_WAIT_S)
+            while message is not None:
+                if (message.arbitration_id, message.is_extended_id) in self._not_from_vehicle:
+                    self._conflict = _another(message, vehicle)
+                    return
+                self._returned += sensors.send(message)
+                message = None if stop() else vehicle.receive(0.0)
+
+
+def _listen(bus: SteadyBus, own: OwnFrames, stop: Callable[[], bool]) -> list[can.Message]:
+    """Hear whether anybody else sends what only this node may send; all that was heard."""
+    heard = []
+    end_s = time.monotonic() + _LISTEN_S
+    while (left_s := end_s - time.monotonic()) > 0.0 and not stop():
+        message = bus.receive(left_s)
+        if message is not None:
+            if (message.arbitration_id, message.is_extended_id) in own:
+                _require_own(message, own, bus)
+            heard.append(message)
+    return heard
+
+
+def _require_own(message: can.Message, own: OwnFrames, bus: SteadyBus) -> None:
+    if own.is_foreign((message.arbitration_id, message.is_extended_id), bytes(message.data)):
+        raise _another(message, bus)
+
+
+def _another(message: can.Message, bus: SteadyBus) -> BusError:
+    return BusError(
+        f"{bus.channel}: another node sends frames 0x{message.arbitration_id:X}, which only this one may send there; "
+        f"two nodes on one bus, or two buses that are joined? Stop one"
     )
-    for answer in corrector.receive(frame, now_s):
-        corrector.counters.send_errors += not _send(bus, answer)
 
 
-def _receive(bus: can.BusABC, timeout_s: float) -> can.Message | None:
-    try:
-        return bus.recv(timeout_s)
-    except can.CanError as error:
-        raise BusError(f"{bus.channel_info}: the bus failed: {error}") from None
-
-
-def _send(bus: can.BusABC, frame: Frame) -> bool:
-    """Send one frame; False if the bus did not take it in a few attempts."""
-    message = can.Message(
-        arbitration_id=frame.key.identifier,
-        is_extended_id=frame.key.extended,
-        is_fd=frame.fd,
-        bitrate_switch=frame.bitrate_switch,
-        data=frame.data,
+def _message(key: tuple[int, bool], data: bytes | bytearray, *, fd: bool, bitrate_switch: bool = False) -> can.Message:
+    identifier, extended = key
+    return can.Message(
+        arbitration_id=identifier,
+        is_extended_id=extended,
+        is_fd=fd,
+        bitrate_switch=bitrate_switch,
+        data=data,
         is_rx=False,
     )
-    for attempt in range(_SEND_ATTEMPTS):
-        if attempt:
-            time.sleep(_SEND_PAUSE_S)
-        try:
-            bus.send(message)
-        except can.CanError:
-            continue
-        return True
-    return False
-
-
-def _why(error: Exception) -> str:
-    if isinstance(error, OSError) and error.errno == errno.EAFNOSUPPORT:
-        return "this kernel has no SocketCAN (try tools/with_vcan)"
-    if isinstance(error, OSError) and error.errno == errno.ENODEV:
-        return "no such interface (see 'ip link')"
-    return str(error).splitlines()[0] if str(error) else type(error).__name__

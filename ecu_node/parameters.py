@@ -14,7 +14,7 @@ import msgspec
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError
 from ecu_node.field_errors import field_error, quoted_place
-from ecu_node.sensor_models import SensorModel
+from ecu_node.sensor_models import GainBySign, SensorModel
 from ecu_node.status import Reason
 
 __all__ = [
@@ -63,9 +63,7 @@ class BranchParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     held_back: Annotated[
         HeldBack | None, msgspec.Meta(description="why a fault that was found is not applied; null: none, or it is")
     ] = None
-    sensor_model: Annotated[
-        SensorModel | None, msgspec.Meta(description="null: linear; the node passes any other branch through")
-    ] = None
+    sensor_model: Annotated[SensorModel | None, msgspec.Meta(description="null: linear")] = None
     delay_s: Annotated[
         float | None, msgspec.Meta(description="how much later than the largest branch it is seen [s]; null: unknown")
     ] = None
@@ -264,17 +262,23 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
             raise UnfitError(Reason.WRONG_LAYOUT, f"parameters for branch {name!r}, which {layout.path} does not have")
         if not branch.apply:
             continue
-        if not abs(branch.drift) <= layout.limits.drift:
-            raise UnfitError(
-                Reason.IMPLAUSIBLE_PARAMETERS,
-                f"branch {name}: drift {branch.drift:+.4g} is beyond the layout's limit of {layout.limits.drift:g}",
-            )
+        for drift in _drifts(branch):
+            if not abs(drift) <= layout.limits.drift:
+                raise UnfitError(
+                    Reason.IMPLAUSIBLE_PARAMETERS,
+                    f"branch {name}: drift {drift:+.4g} is beyond the layout's limit of {layout.limits.drift:g}",
+                )
         if not abs(branch.offset_a) <= layout.offset_limit_a:
             raise UnfitError(
                 Reason.IMPLAUSIBLE_PARAMETERS,
                 f"branch {name}: offset {branch.offset_a:+.4g} A is beyond the layout's limit of "
                 f"{layout.offset_limit_a:g} A",
             )
+
+
+def _drifts(branch: BranchParameters) -> tuple[float, ...]:
+    model = branch.sensor_model
+    return (model.drift_positive, model.drift_negative) if isinstance(model, GainBySign) else (branch.drift,)
 
 
 def encode_parameters(parameters: VehicleParameters, where: str) -> bytes:

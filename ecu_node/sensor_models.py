@@ -1,7 +1,4 @@
-"""Sensor models that are not linear, as the parameter file carries them.
-
-The node corrects linear sensors; a branch with one of these models is passed through.
-"""
+"""Sensor models that are not linear, as the parameter file carries them."""
 
 from typing import Annotated
 

@@ -11,10 +11,12 @@ class State(IntEnum):
     STARTING = 0
     CORRECTING = 1
     PASSING_THROUGH = 2
+    SHADOW = 3
+    ASLEEP = 4
 
 
 class Reason(IntEnum):
-    """Why the node does not correct."""
+    """Why the node does not correct, or not everything."""
 
     NONE = 0
     NO_PARAMETERS = 1
@@ -24,6 +26,9 @@ class Reason(IntEnum):
     WRONG_DBC = 5
     IMPLAUSIBLE_PARAMETERS = 6
     BRANCH_STALE = 7
+    CORRECTION_WORSE = 8
+    BRANCH_STUCK = 9
+    INPUT_MISSING = 10
 
 
 class Quality(IntEnum):

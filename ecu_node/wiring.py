@@ -1,36 +1,48 @@
-"""From layout, DBC and parameters to the node's core: everything is looked up once, at start."""
+"""From layout, DBC and parameters to the node's core: everything is looked up once, at start.
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+The structure (:func:`wire`) depends on layout and DBC alone; parameters are put in force in it, so that they can be
+replaced while the node runs (:func:`put_in_force`).
+"""
 
-from cantools.database.can import Message
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
-from ecu_node.bits import BitPlace, bit_place
-from ecu_node.branch import CurrentSensor, LiveBranch, PowerSensor, Republished, SensorFault, VoltageSensor
+from cantools.database.can import Message, Signal
+
+from ecu_node.bits import BitPlace, PlacedSignal, bit_place, multiplexers
+from ecu_node.branch import AS_IT_IS, Auxiliary, LiveBranch
 from ecu_node.codes import Codes, not_available_code, read_codes, writable_range
-from ecu_node.correction import IntegerPlan, integer_plan
-from ecu_node.corrector import Corrector, FrameKey, Source, StatusFields, Target
-from ecu_node.database import AMPERE, VOLT, WATT, VehicleDatabase
-from ecu_node.e2e import Receiver, Sender
-from ecu_node.guard import PARAMETER_SETS, check_output, is_fd, key_of, received
+from ecu_node.correction import (
+    NO_FAULT,
+    CorrectionPlan,
+    IntegerPlan,
+    SensorFault,
+    Signals,
+    TemperaturePlans,
+    correction_plan,
+)
+from ecu_node.corrector import Corrector, StatusFields
+from ecu_node.counters import Counters
+from ecu_node.database import AMPERE, CELSIUS, VOLT, WATT, VehicleDatabase
+from ecu_node.e2e import protection_of
+from ecu_node.frames import FrameKey, Reader, Source, Target, TargetField
+from ecu_node.guard import PARAMETER_SETS, Mode, check_output, is_fd, key_of, received
+from ecu_node.junction_watch import JunctionWatch
 from ecu_node.layout import Branch, SignalName, split_signal
 from ecu_node.parameters import VehicleParameters
+from ecu_node.sensor_models import TemperatureDrift
 from ecu_node.status import Reason
 
 __all__ = [
-    "WHY_NOT_LINEAR",
-    "WHY_NOT_PUBLISHED",
     "InForce",
     "branch_plan",
-    "not_linear",
+    "branch_signals",
+    "no_temperature",
     "not_published",
+    "put_in_force",
     "sensor_fault",
     "wire",
 ]
-
-WHY_NOT_PUBLISHED = "the parameters apply a fault to it, but the layout has no 'corrected' for it"
-
-WHY_NOT_LINEAR = "its sensor model is not linear, and the node corrects linear sensors only"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,27 +53,61 @@ class InForce:
     reason: Reason = Reason.NONE
 
 
-def sensor_fault(in_force: InForce, branch: str) -> SensorFault:
-    """What is corrected on one branch: nothing without a linear fault that the parameters apply to it."""
+def sensor_fault(database: VehicleDatabase, in_force: InForce, branch: str) -> SensorFault:
+    """What is corrected on one branch; :data:`NO_FAULT` where the parameters apply none, or it cannot be applied."""
     found = in_force.parameters.branches.get(branch) if in_force.parameters is not None else None
-    if found is None or not found.apply or found.drift == found.offset_a == 0.0 or found.sensor_model is not None:
-        return SensorFault()
-    return SensorFault(drift=found.drift, offset_a=found.offset_a, applied=True)
+    if found is None or not found.apply:
+        return NO_FAULT
+    if isinstance(found.sensor_model, TemperatureDrift) and database.layout.temperature is None:
+        return NO_FAULT
+    return SensorFault(drift=found.drift, offset_a=found.offset_a, model=found.sensor_model)
 
 
 def not_published(database: VehicleDatabase, in_force: InForce) -> list[str]:
     """Branches with a fault to correct, but no signal to publish the result in; it counts in the status' sum alone."""
-    branches = database.layout.branch
-    return [item.name for item in branches if item.corrected is None and sensor_fault(in_force, item.name).applied]
+    names = [branch.name for branch in database.layout.branch if branch.corrected is None]
+    return [name for name in names if sensor_fault(database, in_force, name).applied]
 
 
-def not_linear(in_force: InForce) -> list[str]:
-    """Branches that the parameters apply a sensor model to that is not linear; they are passed through."""
-    branches = in_force.parameters.branches.items() if in_force.parameters is not None else ()
-    return [name for name, found in branches if found.apply and found.sensor_model is not None]
+def no_temperature(database: VehicleDatabase, in_force: InForce) -> list[str]:
+    """Branches whose fault depends on a temperature that the layout does not name; they are passed through."""
+    found = in_force.parameters.branches if in_force.parameters is not None else {}
+    names = [name for name, item in found.items() if item.apply and isinstance(item.sensor_model, TemperatureDrift)]
+    return names if database.layout.temperature is None else []
 
 
-def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault) -> IntegerPlan | None:
+def branch_signals(database: VehicleDatabase, branch: Branch, mode: Mode) -> Signals:
+    """What a branch is read from and written to.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        Layout and DBC.
+    branch : Branch
+        A branch of the layout.
+    mode : Mode
+        In a gateway every branch is written back where it was read; else where the layout says, if it does.
+
+    Returns
+    -------
+    Signals
+        The source itself as target where nothing is published.
+
+    Raises
+    ------
+    DatabaseError
+        If the node cannot read or write one of the signals.
+    """
+    units = AMPERE if branch.signal is not None else WATT
+    source = _codes(database, branch.source, units, f"branch {branch.name}", branch.no_value)
+    target = source
+    if mode is Mode.OVERLAY and branch.corrected is not None:
+        target = _codes(database, branch.corrected, units, f"branch {branch.name}")
+    voltage = _codes(database, branch.voltage, VOLT, f"branch {branch.name}") if branch.voltage is not None else None
+    return Signals(source=source, target=target, sign=branch.sign, voltage=voltage)
+
+
+def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault, mode: Mode) -> CorrectionPlan:
     """Integer plan of one branch.
 
     Parameters
@@ -72,25 +118,35 @@ def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault) -
         A branch of the layout.
     fault : SensorFault
         What is corrected on it.
+    mode : Mode
+        Where it is written.
 
     Returns
     -------
-    IntegerPlan or None
-        None for a branch that is not republished.
+    CorrectionPlan
+        The plan.
 
     Raises
     ------
     DatabaseError
         If the node cannot read or write one of the signals.
     """
-    if branch.signal is None or branch.corrected is None:
-        return None
-    source = _codes(database, branch.signal, AMPERE, branch)
-    target = _codes(database, branch.corrected, AMPERE, branch)
-    return integer_plan(source, target, sign=branch.sign, drift=fault.drift, offset_a=fault.offset_a)
+    return correction_plan(
+        branch_signals(database, branch, mode),
+        fault,
+        temperature=_temperature_codes(database),
+        largest_drift=database.layout.limits.drift,
+    )
 
 
-def wire(database: VehicleDatabase, in_force: InForce, start_s: float) -> Corrector:
+def wire(
+    database: VehicleDatabase,
+    in_force: InForce,
+    start_s: float,
+    *,
+    mode: Mode | None = None,
+    shadow: bool = False,
+) -> Corrector:
     """Build the node's core.
 
     Parameters
@@ -101,6 +157,10 @@ def wire(database: VehicleDatabase, in_force: InForce, start_s: float) -> Correc
         Checked parameters, or why there are none.
     start_s : float
         Now; branches that the parameters name are waited for from here. [s]
+    mode : Mode, optional
+        Overlay if not given.
+    shadow : bool
+        Compute and report, change nothing.
 
     Returns
     -------
@@ -112,99 +172,190 @@ def wire(database: VehicleDatabase, in_force: InForce, start_s: float) -> Correc
     LayoutError, DatabaseError
         If the node cannot do its work with this layout and DBC, see :func:`ecu_node.guard.check_output`.
     """
-    check_output(database)
+    mode = mode or Mode.OVERLAY
+    check_output(database, mode)
     layout = database.layout
-    voltages = {
-        branch.voltage: VoltageSensor(_codes(database, branch.voltage, VOLT, branch))
-        for branch in layout.branch
-        if branch.voltage is not None
-    }
-    branches = [_live(database, branch, in_force, voltages, start_s) for branch in layout.branch]
-    return Corrector(
-        sources=_sources(database, branches, voltages),
-        branches=branches,
+    parts = _parts(database)
+    targets = _targets(database, parts) if mode is Mode.OVERLAY else {}
+    counters = Counters()
+    corrector = Corrector(
+        sources=_sources(database, parts, targets, counters),
+        branches=list(parts.branches.values()),
+        auxiliaries=parts.auxiliaries,
         status_fields=_status_fields(database),
+        watch=JunctionWatch(
+            list(parts.branches.values()),
+            window_s=layout.watch.window_s,
+            margin_a=layout.watch_margin_a,
+            full_scale_a=layout.full_scale_a,
+            is_whole=parts.is_whole,
+        ),
+        counters=counters,
+        shadow=shadow,
+    )
+    put_in_force(corrector, database, in_force, start_s, mode=mode)
+    return corrector
+
+
+def put_in_force(
+    corrector: Corrector, database: VehicleDatabase, in_force: InForce, now_s: float, *, mode: Mode
+) -> None:
+    """Let a corrector work with these parameters from now on.
+
+    Parameters
+    ----------
+    corrector : Corrector
+        Built from the same layout and DBC.
+    database : VehicleDatabase
+        Layout and DBC.
+    in_force : InForce
+        Checked parameters, or why there are none.
+    now_s : float
+        Now; branches that the parameters name are waited for from here. [s]
+    mode : Mode
+        Where corrected values go.
+    """
+    parameters = in_force.parameters
+    found = parameters.branches if parameters is not None else {}
+    plans = []  # all of them before the first is put in force: either all or none
+    for branch in database.layout.branch:
+        fault = sensor_fault(database, in_force, branch.name)
+        plans.append((branch, fault, branch_plan(database, branch, fault, mode)))
+    hot = any(isinstance(plan, TemperaturePlans) for _, _, plan in plans)
+    for live in corrector.branches:
+        if live.temperature is not None:
+            live.temperature.is_needed = hot
+    for (branch, fault, plan), live in zip(plans, corrector.branches, strict=True):
+        delay_s = found[branch.name].delay_s if branch.name in found else None
+        live.put_in_force(
+            fault=fault,
+            plan=plan,
+            passing=_passing(database, branch, mode),
+            delay_s=delay_s or 0.0,
+            expected_since_s=now_s if branch.name in found else None,
+            counters=corrector.counters,
+        )
+    residual = parameters.junction_residual if parameters is not None else None
+    corrector.put_in_force(
         reason=in_force.reason,
-        parameter_set=in_force.parameters.number % PARAMETER_SETS if in_force.parameters is not None else 0,
+        parameter_set=parameters.number % PARAMETER_SETS if parameters is not None else 0,
+        predicted_worse_a=residual.corrected_a - residual.measured_a if residual is not None else 0.0,
     )
 
 
-def _codes(database: VehicleDatabase, name: SignalName, units: Mapping[str, float], branch: Branch) -> Codes:
-    return read_codes(database.signal(name)[1], units, f"{database.layout.path}: branch {branch.name}")
+@dataclass(kw_only=True)
+class _Parts:
+    """Branches and auxiliary signals, and by which signal each is read."""
+
+    branches: dict[str, LiveBranch]
+    signals: list[tuple[SignalName, Auxiliary | LiveBranch]]
+    auxiliaries: list[Auxiliary] = field(default_factory=list)
+    whole: tuple[Auxiliary, frozenset[float]] | None = None
+    """The input that tells whether all currents are measured, and its values with which they are."""
+
+    def is_whole(self) -> bool:
+        """Whether all currents of the junction are measured now."""
+        return self.whole is None or self.whole[0].value() in self.whole[1]
 
 
-def _live(
-    database: VehicleDatabase,
-    branch: Branch,
-    in_force: InForce,
-    voltages: Mapping[SignalName, VoltageSensor],
-    start_s: float,
-) -> LiveBranch:
-    fault = sensor_fault(in_force, branch.name)
-    expected = in_force.parameters is not None and branch.name in in_force.parameters.branches
-    return LiveBranch(
-        name=branch.name,
-        sensor=_sensor(database, branch, voltages),
-        fault=fault,
-        timeout_s=branch.timeout_s,
-        expected_since_s=start_s if expected else None,
-        republished=_republished(database, branch, fault),
-    )
+def _parts(database: VehicleDatabase) -> _Parts:
+    layout = database.layout
+    parts = _Parts(branches={}, signals=[])
+
+    def auxiliary(name: SignalName, codes: Codes, timeout_s: float) -> Auxiliary:
+        item = Auxiliary(codes, timeout_s)
+        parts.auxiliaries.append(item)
+        parts.signals.append((name, item))
+        return item
+
+    temperature_name, temperature_codes = _input_signal(database, layout.temperature), _temperature_codes(database)
+    temperature = None
+    if temperature_name is not None and temperature_codes is not None:
+        temperature = auxiliary(temperature_name, temperature_codes, layout.max_age_s)
+    whole_name = _input_signal(database, layout.watch.input)
+    if whole_name is not None:
+        unit = database.signal(whole_name)[1].unit or ""
+        codes = _codes(database, whole_name, {unit: 1.0}, "[watch] input")
+        every_code = replace(codes, named={})  # states have names, which are no lack of a value here
+        parts.whole = auxiliary(whole_name, every_code, layout.max_age_s), frozenset(layout.watch.valid)
+    voltages: dict[SignalName, Auxiliary] = {}
+    for branch in layout.branch:
+        if branch.voltage is not None and branch.voltage not in voltages:
+            codes = _codes(database, branch.voltage, VOLT, f"branch {branch.name}")
+            timeout_s = max(item.timeout_s for item in layout.branch if item.voltage == branch.voltage)
+            voltages[branch.voltage] = auxiliary(branch.voltage, codes, timeout_s)
+    for branch in layout.branch:
+        signals = branch_signals(database, branch, Mode.GATEWAY)
+        live = LiveBranch(
+            name=branch.name,
+            codes=signals.source,
+            sign=branch.sign,
+            timeout_s=branch.timeout_s,
+            voltage=voltages[branch.voltage] if branch.voltage is not None else None,
+            temperature=temperature,
+        )
+        parts.branches[branch.name] = live
+        parts.signals.append((branch.source, live))
+    return parts
 
 
-def _sensor(
-    database: VehicleDatabase, branch: Branch, voltages: Mapping[SignalName, VoltageSensor]
-) -> CurrentSensor | PowerSensor:
-    if branch.power is None or branch.voltage is None:
-        return CurrentSensor(_codes(database, branch.source, AMPERE, branch), branch.sign)
-    power = _codes(database, branch.power, WATT, branch)
-    return PowerSensor(power, branch.sign, voltages[branch.voltage], branch.timeout_s)
-
-
-def _republished(database: VehicleDatabase, branch: Branch, fault: SensorFault) -> Republished | None:
-    plan = branch_plan(database, branch, fault)
-    if plan is None or branch.corrected is None:
-        return None
-    target = _codes(database, branch.corrected, AMPERE, branch)
-    return Republished(
-        plan=plan,
-        place=target.place,
-        not_available=not_available_code(target, f"{database.layout.path}: branch {branch.name}"),
-        quality=bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None,
-    )
+def _passing(database: VehicleDatabase, branch: Branch, mode: Mode) -> IntegerPlan:
+    """What is written of a branch where nothing is corrected: its code, or the same current in the target's codes."""
+    if mode is Mode.GATEWAY or branch.corrected is None:
+        return AS_IT_IS
+    plan = branch_plan(database, branch, NO_FAULT, mode)
+    assert isinstance(plan, IntegerPlan)
+    return plan
 
 
 def _sources(
-    database: VehicleDatabase, branches: Sequence[LiveBranch], voltages: Mapping[SignalName, VoltageSensor]
+    database: VehicleDatabase, parts: _Parts, targets: Mapping[str, Target], counters: Counters
 ) -> dict[FrameKey, Source]:
-    pairs = list(zip(database.layout.branch, branches, strict=True))
-    targets = _targets(database, branches)
     sources = {}
     for key, message in received(database).items():
-        inside = [(branch, live) for branch, live in pairs if split_signal(branch.source)[0] == message.name]
-        answers = {split_signal(branch.corrected)[0]: None for branch, _ in inside if branch.corrected is not None}
+        inside = [(name, part) for name, part in parts.signals if split_signal(name)[0] == message.name]
+        readers = [Reader(part, _placed(message, database.signal(name)[1])) for name, part in inside]
+        branches = [branch for branch in database.layout.branch if split_signal(branch.source)[0] == message.name]
+        answers = dict.fromkeys(
+            split_signal(branch.corrected)[0] for branch in branches if branch.corrected is not None
+        )
         sources[key] = Source(
-            receiver=Receiver(data_id) if (data_id := _data_id(database, message)) is not None else None,
-            voltages=[sensor for name, sensor in voltages.items() if split_signal(name)[0] == message.name],
-            branches=[live for _, live in inside],
-            targets=[targets[name] for name in answers],
+            length=message.length,
+            protection=protection_of(database, message),
+            readers=readers,
+            targets=[targets[name] for name in answers if name in targets],
+            counters=counters,
+            pass_on_invalid=database.layout.on_bad_frame == "invalid",
         )
     return sources
 
 
-def _targets(database: VehicleDatabase, branches: Sequence[LiveBranch]) -> dict[str, Target]:
-    inside: dict[str, list[LiveBranch]] = {}
-    for branch, live in zip(database.layout.branch, branches, strict=True):
-        if branch.corrected is not None:
-            inside.setdefault(split_signal(branch.corrected)[0], []).append(live)
-    messages = {name: database.message(name) for name in inside}
+def _placed(message: Message, signal: Signal) -> PlacedSignal:
+    return PlacedSignal(place=bit_place(signal), above=multiplexers(message, signal))
+
+
+def _targets(database: VehicleDatabase, parts: _Parts) -> dict[str, Target]:
+    fields: dict[str, list[TargetField]] = {}
+    for branch in database.layout.branch:
+        if branch.corrected is None:
+            continue
+        codes = branch_signals(database, branch, Mode.OVERLAY).target
+        fields.setdefault(split_signal(branch.corrected)[0], []).append(
+            TargetField(
+                branch=parts.branches[branch.name],
+                place=codes.place,
+                not_available=not_available_code(codes, f"{database.layout.path}: branch {branch.name}"),
+                quality=bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None,
+            )
+        )
+    messages = {name: database.message(name) for name in fields}
     return {
         name: Target(
             key=key_of(message),
             length=message.length,
             fd=is_fd(message),
-            branches=inside[name],
-            sender=_sender(database, message),
+            fields=fields[name],
+            protection=protection_of(database, message),
         )
         for name, message in messages.items()
     }
@@ -220,6 +371,9 @@ def _status_fields(database: VehicleDatabase) -> StatusFields | None:
     def place(name: str) -> BitPlace:
         return bit_place(database.signal(f"{message.name}.{name}")[1])
 
+    def place_or_none(name: str | None) -> BitPlace | None:
+        return place(name) if name is not None else None
+
     def current(name: str | None) -> tuple[Codes, int] | None:
         if name is None:
             return None
@@ -231,23 +385,32 @@ def _status_fields(database: VehicleDatabase) -> StatusFields | None:
         key=key_of(message),
         length=message.length,
         fd=is_fd(message),
-        sender=_sender(database, message),
+        protection=protection_of(database, message),
         state=place(status.state),
         reason=place(status.reason),
-        parameter_set=place(status.parameter_set) if status.parameter_set is not None else None,
+        parameter_set=place_or_none(status.parameter_set),
+        alive_counter=place_or_none(status.alive_counter),
         sum_measured=current(status.sum_measured),
         sum_corrected=current(status.sum_corrected),
     )
 
 
-def _data_id(database: VehicleDatabase, message: Message) -> int | None:
-    """E2E data identifier of a message; None if the layout does not protect it."""
-    e2e = database.layout.e2e
-    if e2e is None or message.name not in e2e.messages:
-        return None
-    return e2e.data_id.get(message.name, message.frame_id & 0xFFFF)
+def _codes(
+    database: VehicleDatabase,
+    name: SignalName,
+    units: Mapping[str, float],
+    what: str,
+    no_value: list[int] | None = None,
+) -> Codes:
+    codes = read_codes(database.signal(name)[1], units, f"{database.layout.path}: {what}")
+    extra = dict.fromkeys(no_value or [], "no value")
+    return replace(codes, named={**extra, **codes.named}) if extra else codes
 
 
-def _sender(database: VehicleDatabase, message: Message) -> Sender | None:
-    data_id = _data_id(database, message)
-    return Sender(data_id) if data_id is not None else None
+def _input_signal(database: VehicleDatabase, name: str | None) -> SignalName | None:
+    return next((item.signal for item in database.layout.input if item.name == name), None)
+
+
+def _temperature_codes(database: VehicleDatabase) -> Codes | None:
+    name = _input_signal(database, database.layout.temperature)
+    return None if name is None else _codes(database, name, CELSIUS, "temperature")

@@ -23,10 +23,13 @@ import typer
 from calibrator.artificial.truth import FleetTruth, read_truth
 from calibrator.errors import FleetError
 from calibrator.report.progress import progress_bar
+from ecu_node.buses import SteadyBus
 from ecu_node.database import read_database
 from ecu_node.errors import UserError
+from ecu_node.guard import Mode
 from ecu_node.layout import read_layout
-from ecu_node.node import choose_parameters, open_bus, serve
+from ecu_node.node import OverlayNode, open_bus
+from ecu_node.parameter_file import choose_parameters
 from ecu_node.parameters import read_parameters
 from ecu_node.wiring import wire
 from replay import read_log, replay
@@ -201,16 +204,22 @@ def node_thread(parameters: Path, vehicle: str, interface: str, channel: str) ->
     if why_not is not None:
         fail(why_not)
     stop = threading.Event()
-    with open_bus(database, interface=interface, channel=channel, fd=False) as bus:
-        corrector = wire(database, in_force, time.monotonic())
-        options = {"stop": stop.is_set, "status_period_s": 0.1}
-        node = threading.Thread(target=serve, args=(bus, corrector), kwargs=options)
+    corrector = wire(database, in_force, time.monotonic())
+    bus = SteadyBus(
+        lambda: open_bus(database, interface=interface, channel=channel, fd=False, mode=Mode.OVERLAY),
+        corrector.counters,
+        say,
+    )
+    try:
+        node = threading.Thread(target=OverlayNode(bus, corrector, database, period_s=0.1).run, args=(stop.is_set,))
         node.start()
         try:
             yield
         finally:
             stop.set()
             node.join()
+    finally:
+        bus.close()
     say(f"node: {corrector.counters.text()}")
 
 

@@ -19,8 +19,8 @@ import can
 from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import CLASSIC_BYTES, EXTENDED_BIT, Frames
 from calibrator.recordings.frames import LOG_SUFFIXES, read_frames
+from ecu_node.buses import connect
 from ecu_node.errors import BusError, UserError
-from ecu_node.node import connect
 
 __all__ = ["main", "read_log", "replay"]
 

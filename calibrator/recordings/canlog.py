@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 from cantools.database.can import Signal
-from e2e.p01 import e2e_p01_protect
 from numpy.typing import NDArray
 
 from calibrator.drive import Array
 from ecu_node.database import VehicleDatabase
+from ecu_node.e2e import Protection, protection_of
 from ecu_node.parameters import write_atomically
 
 __all__ = ["FrameSeries", "encode_message", "sent_values", "write_candump"]
@@ -20,7 +20,6 @@ __all__ = ["FrameSeries", "encode_message", "sent_values", "write_candump"]
 CLASSIC_BYTES = 8
 """Longer frames are CAN FD."""
 
-COUNTER_MODULUS = 15
 """The counter of AUTOSAR E2E profile 1 runs from 0 to 14."""
 
 
@@ -73,9 +72,9 @@ def encode_message(
         for weight, position in enumerate(_bit_positions(signal)):
             bits[:, position] = (raw >> weight) & 1
     data = np.packbits(bits, axis=1, bitorder="little")
-    layout = database.layout
-    if layout.e2e is not None and message_name in layout.e2e.messages:
-        _protect(data, layout.e2e.data_id.get(message_name, message.frame_id & 0xFFFF))
+    protection = protection_of(database, message)
+    if protection is not None:
+        _protect(data, protection)
     return FrameSeries(
         arbitration_id=message.frame_id, extended=message.is_extended_frame, time_s=np.asarray(time_s), data=data
     )
@@ -172,10 +171,15 @@ def _bit_positions(signal: Signal) -> list[int]:
     return positions[::-1]
 
 
-def _protect(data: NDArray[np.uint8], data_id: int) -> None:
-    """Fill counter and CRC of AUTOSAR E2E profile 1A in place."""
-    counter = (np.arange(len(data)) % COUNTER_MODULUS).astype(np.uint8)
-    data[:, 1] = (data[:, 1] & 0xF0) | counter
-    length = data.shape[1]
+def _protect(data: NDArray[np.uint8], protection: Protection) -> None:
+    """Fill counter and CRC in place; the counter of the first frame is 0."""
+    payload = bytearray(data.shape[1])
+    protection.before_first(payload)
+    last = payload[protection.counter_byte] >> protection.counter_shift & protection.counter_ones
+    hole, shift = 0xFF & ~(protection.counter_ones << protection.counter_shift), protection.counter_shift
     for row in data:
-        e2e_p01_protect(row, data_id, length=length, increment_counter=False)
+        payload[:] = row.tobytes()
+        payload[protection.counter_byte] = payload[protection.counter_byte] & hole | last << shift
+        protection.advance(payload)
+        last = (last + 1) % protection.modulus
+        row[:] = np.frombuffer(payload, np.uint8)

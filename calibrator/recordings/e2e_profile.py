@@ -1,16 +1,17 @@
-"""AUTOSAR E2E profile 1A over whole columns of payloads.
+"""End-to-end protection over whole columns of payloads: profile 1A at once, others frame by frame.
 
-Byte 0 is CRC-8 SAE J1850 (polynomial 0x1D, start and final value 0x00 in this profile) over the low and the high byte
-of the data identifier and the bytes after the CRC. AUTOSAR, "E2E Protocol Specification", profile 1, both bytes of the
-data identifier included.
+In AUTOSAR E2E profile 1A byte 0 is CRC-8 SAE J1850 (polynomial 0x1D, start and final value 0x00 in this profile) over
+the low and the high byte of the data identifier and the bytes after the CRC. AUTOSAR, "E2E Protocol Specification",
+profile 1, both bytes of the data identifier included.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibrator.drive import Mask
+from ecu_node.e2e import Protection
 
-__all__ = ["p01_is_sound"]
+__all__ = ["is_sound", "p01_is_sound"]
 
 _POLYNOMIAL = 0x1D
 _NO_COUNTER = 15
@@ -48,3 +49,27 @@ def p01_is_sound(data: NDArray[np.uint8], length: NDArray[np.uint8], data_id: in
     for column in range(1, data.shape[1]):
         crc = np.where(length > column, _TABLE[crc ^ data[:, column]], crc)
     return np.asarray((length >= 2) & (crc == data[:, 0]) & (data[:, 1] & 0x0F != _NO_COUNTER))
+
+
+def is_sound(data: NDArray[np.uint8], length: NDArray[np.uint8], protection: Protection) -> Mask:
+    """Check CRC and range of the counter of frames of one message, with any protection.
+
+    Parameters
+    ----------
+    data, length :
+        As for :func:`p01_is_sound`.
+    protection : Protection
+        Of the message.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        True where CRC and counter are possible; False for frames that are too short.
+    """
+    sound = np.zeros(len(data), np.bool_)
+    for index, (row, size) in enumerate(zip(data, length.tolist(), strict=True)):
+        if size >= protection.least_bytes:
+            payload = bytearray(row[:size].tobytes())
+            counter = payload[protection.counter_byte] >> protection.counter_shift & protection.counter_ones
+            sound[index] = counter < protection.modulus and protection.is_sound(payload)
+    return sound

@@ -80,7 +80,6 @@ def test_a_code_beyond_the_width_is_refused_and_never_wraps() -> None:
             Signal("S", start=0, length=32, conversion=BaseConversion.factory(is_float=True)),
             "S is a floating-point number",
         ),
-        (Signal("S", start=0, length=8, multiplexer_ids=[1], multiplexer_signal="X"), "S is multiplexed"),
         (Signal("S", start=0, length=65), "has 65 bits"),
     ],
 )

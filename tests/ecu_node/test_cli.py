@@ -104,12 +104,13 @@ def test_check_says_that_run_needs_fd(small: Callable[..., list[str]], capsys: p
 def test_run_does_not_claim_to_correct_what_it_cannot_publish(
     small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ecu_node.cli._StopRequest.requested", lambda self: True)
-    handlers = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
+    monkeypatch.setattr("ecu_node.service.Requests.stop", lambda self: True)
+    handlers = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)]
     try:
         assert main(["run", *small(), "--interface", "virtual", "--channel", "c0"]) == 0
     finally:
         signal.signal(signal.SIGTERM, handlers[0])
+        signal.signal(signal.SIGHUP, handlers[2])
     assert signal.getsignal(signal.SIGINT) == handlers[1]
     lines = capsys.readouterr().err.splitlines()
     assert lines[0].startswith("ecu-node: branch heater is not published: ")

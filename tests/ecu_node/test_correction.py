@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ecu_node.codes import Codes, not_available_code, read_codes, writable_range
-from ecu_node.correction import LARGEST_ERROR, IntegerPlan, corrected_current, integer_plan
+from ecu_node.correction import LARGEST_ERROR, IntegerPlan, SensorFault, Signals, correction_plan
 from ecu_node.database import AMPERE
 from ecu_node.errors import DatabaseError
 
@@ -39,6 +39,14 @@ def current(
         unit=unit,
     )
     return read_codes(signal, AMPERE, "test")
+
+
+def integer_plan(source: Codes, target: Codes, *, sign: int, drift: float, offset_a: float) -> IntegerPlan:
+    plan = correction_plan(
+        Signals(source=source, target=target, sign=sign), SensorFault(drift=drift, offset_a=offset_a)
+    )
+    assert isinstance(plan, IntegerPlan)
+    return plan
 
 
 def exact(source: Codes, target: Codes, code: int, *, sign: int, drift: str, offset_a: str) -> Fraction:
@@ -139,7 +147,7 @@ def test_correcting_undoes_the_sensor_fault() -> None:
     for i in (-300.0, 0.0, 57.6):
         measured = (1 + fault["drift"]) * i + fault["offset_a"]
         assert plan.apply(round(measured / 0.02)) == pytest.approx(i / 0.02, abs=1)
-        assert corrected_current(measured, **fault) == pytest.approx(i)
+        assert SensorFault(drift=fault["drift"], offset_a=fault["offset_a"]).true_current(measured) == pytest.approx(i)
 
 
 def test_turning_sign_and_offset_gives_the_same_plan() -> None:

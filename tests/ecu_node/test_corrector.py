@@ -1,17 +1,23 @@
 """The node's core, frame by frame: what is answered, what is counted, what the status says."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 from e2e.p01 import e2e_p01_check
+from msgspec.structs import replace
 
-from ecu_node.corrector import Corrector, Frame, FrameKey
+from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
+from ecu_node.e2e import protection_of
 from ecu_node.errors import DatabaseError, LayoutError
+from ecu_node.frames import FrameKey
+from ecu_node.guard import Mode
+from ecu_node.parameters import JunctionResidual
 from ecu_node.status import Quality, Reason, State
-from ecu_node.wiring import InForce, wire
-from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, decoded, parameters_for, protected
+from ecu_node.wiring import InForce, put_in_force, wire
+from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, Frame, answers, decoded, parameters_for, protected
 
 MakeDatabase = Callable[..., VehicleDatabase]
 BATTERY, MOTOR, STATUS = FrameKey(0x110, False), FrameKey(0x120, False), FrameKey(0x5F0, False)
@@ -33,16 +39,28 @@ def motor(database: VehicleDatabase, counter: int, current: float = 100.0) -> Fr
 
 
 def status_of(database: VehicleDatabase, corrector: Corrector, now_s: float) -> dict[str, Any]:
-    frame = corrector.status(now_s)
-    assert frame is not None
-    assert frame.key == STATUS
-    assert e2e_p01_check(bytearray(frame.data), 0x5F0)
-    return decoded(database, "HV_CorrectionStatus", frame.data)
+    corrector.look(now_s)
+    status = corrector.status()
+    assert status is not None
+    fields, data = status
+    assert fields.key == STATUS
+    assert e2e_p01_check(bytearray(data), 0x5F0)
+    return decoded(database, "HV_CorrectionStatus", data)
+
+
+def state_at(corrector: Corrector, now_s: float) -> tuple[State, Reason]:
+    corrector.look(now_s)
+    return corrector.state()
+
+
+def sums_at(corrector: Corrector, now_s: float) -> tuple[float | None, float | None]:
+    sums = corrector.watch.look(now_s)
+    return (None, None) if sums is None else (sums.measured_a, sums.corrected_a)
 
 
 def test_a_branch_frame_is_answered_by_its_corrected_frame(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0))
-    (answer,) = corrector.receive(battery(database, 3), 0.0)
+    (answer,) = answers(corrector, battery(database, 3), 0.0)
     values = decoded(database, "HV_BatteryCorrected", answer.data)
     assert answer.key == FrameKey(1296, False)
     assert values["BatteryCurrentCorrected"] == pytest.approx((100.0 - 5.0) / 1.25)
@@ -52,7 +70,7 @@ def test_a_branch_frame_is_answered_by_its_corrected_frame(database: VehicleData
 
 def test_a_consumer_is_corrected_with_its_offset_into_the_junction(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, motor=(0.25, 5.0))
-    (answer,) = corrector.receive(motor(database, 0), 0.0)
+    (answer,) = answers(corrector, motor(database, 0), 0.0)
     assert decoded(database, "HV_MotorCorrected", answer.data)["MotorCurrentCorrected"] == pytest.approx(
         -(-100.0 - 5.0) / 1.25
     )
@@ -60,8 +78,8 @@ def test_a_consumer_is_corrected_with_its_offset_into_the_junction(database: Veh
 
 def test_corrected_frames_count_on_their_own(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.1, 0.0))
-    answers = [corrector.receive(battery(database, counter % 15), 0.0)[0] for counter in range(7, 27)]
-    assert [decoded(database, "HV_BatteryCorrected", answer.data)["AliveCounter"] for answer in answers] == [
+    found = [answers(corrector, battery(database, counter % 15), 0.0)[0] for counter in range(7, 27)]
+    assert [decoded(database, "HV_BatteryCorrected", answer.data)["AliveCounter"] for answer in found] == [
         *range(15),
         *range(5),
     ]
@@ -69,14 +87,14 @@ def test_corrected_frames_count_on_their_own(database: VehicleDatabase) -> None:
 
 def test_without_parameters_every_branch_is_passed_through(database: VehicleDatabase) -> None:
     corrector = corrector_for(database)
-    (answer,) = corrector.receive(battery(database, 3, 123.5), 0.0)
+    (answer,) = answers(corrector, battery(database, 3, 123.5), 0.0)
     values = decoded(database, "HV_BatteryCorrected", answer.data)
     assert (values["BatteryCurrentCorrected"], values["BatteryCurrentQuality"]) == (123.5, Quality.PASSED_THROUGH)
 
 
 def test_a_branch_that_the_parameters_do_not_name_is_passed_through(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.1, 0.0))
-    (answer,) = corrector.receive(motor(database, 0), 0.0)
+    (answer,) = answers(corrector, motor(database, 0), 0.0)
     values = decoded(database, "HV_MotorCorrected", answer.data)
     assert (values["MotorCurrentCorrected"], values["MotorCurrentQuality"]) == (100.0, Quality.PASSED_THROUGH)
 
@@ -86,30 +104,30 @@ def test_codes_that_are_no_values_come_out_as_not_available(
     database: VehicleDatabase, current: float, quality: Quality
 ) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0))
-    (answer,) = corrector.receive(battery(database, 3, current), 0.0)
+    (answer,) = answers(corrector, battery(database, 3, current), 0.0)
     values = decoded(database, "HV_BatteryCorrected", answer.data)
     assert (values["BatteryCurrentCorrected"], values["BatteryCurrentQuality"]) == (-655.36, quality)
-    assert corrector.junction_sums_a(0.0) == (None, None)
+    assert sums_at(corrector, 0.0) == (None, None)
 
 
 def test_a_branch_without_a_fault_is_passed_through(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
-    (answer,) = corrector.receive(motor(database, 0), 0.0)
+    (answer,) = answers(corrector, motor(database, 0), 0.0)
     values = decoded(database, "HV_MotorCorrected", answer.data)
     assert (values["MotorCurrentCorrected"], values["MotorCurrentQuality"]) == (100.0, Quality.PASSED_THROUGH)
 
 
 def test_parameters_without_any_fault_pass_everything_through(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.0, 0.0))
-    corrector.receive(battery(database, 0), 0.0)
-    assert corrector.state(0.01) == (State.PASSING_THROUGH, Reason.NONE)
+    answers(corrector, battery(database, 0), 0.0)
+    assert state_at(corrector, 0.01) == (State.PASSING_THROUGH, Reason.NONE)
 
 
 def test_a_result_beyond_the_signal_is_clamped_and_counted(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(-0.2, 0.0))
     frames = [battery(database, counter, current) for counter, current in enumerate((520.0, 520.02, -640.0))]
-    answers = [corrector.receive(frame, 0.0)[0] for frame in frames]
-    values = [decoded(database, "HV_BatteryCorrected", answer.data) for answer in answers]
+    found = [answers(corrector, frame, 0.0)[0] for frame in frames]
+    values = [decoded(database, "HV_BatteryCorrected", answer.data) for answer in found]
     assert [value["BatteryCurrentCorrected"] for value in values] == [650.0, 650.0, -650.0]
     assert {value["BatteryCurrentQuality"] for value in values} == {Quality.CORRECTED}
     assert corrector.counters.saturated == 2
@@ -121,24 +139,24 @@ def test_nothing_is_made_of_a_corrupt_frame(database: VehicleDatabase) -> None:
     good = battery(database, 3)
     for bit in range(64):
         damaged = (int.from_bytes(good.data, "little") ^ 1 << bit).to_bytes(8, "little")
-        assert corrector.receive(Frame(BATTERY, damaged), 0.0) == []
-    assert corrector.receive(Frame(BATTERY, b""), 0.0) == []
+        assert answers(corrector, Frame(BATTERY, damaged), 0.0) == []
+    assert answers(corrector, Frame(BATTERY, b""), 0.0) == []
     assert (corrector.counters.corrupt, corrector.counters.corrected) == (65, 0)
-    assert len(corrector.receive(good, 0.0)) == 1
+    assert len(answers(corrector, good, 0.0)) == 1
 
 
 def test_a_repeated_frame_is_counted_and_not_answered_and_a_gap_is_counted(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.1, 0.0))
-    answers = [len(corrector.receive(battery(database, counter), 0.0)) for counter in (1, 1, 2, 9)]
-    assert answers == [1, 0, 1, 1]
+    found = [len(answers(corrector, battery(database, counter), 0.0)) for counter in (1, 1, 2, 4)]
+    assert found == [1, 0, 1, 1]
     assert (corrector.counters.repeated, corrector.counters.gaps) == (1, 1)
 
 
 def test_foreign_frames_and_own_output_are_not_looked_at(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.1, 0.0))
-    (own,) = corrector.receive(battery(database, 0), 0.0)
+    (own,) = answers(corrector, battery(database, 0), 0.0)
     for frame in (own, Frame(FrameKey(0x110, True), own.data), Frame(FrameKey(0x7FF, False), b"x")):
-        assert corrector.receive(frame, 0.0) == []
+        assert answers(corrector, frame, 0.0) == []
     assert corrector.counters.frames_in == 1
 
 
@@ -147,8 +165,8 @@ def test_the_status_says_starting_then_correcting(database: VehicleDatabase) -> 
     before = status_of(database, corrector, 0.01)
     assert (before["State"], before["Reason"], before["ParameterSet"]) == (State.STARTING, Reason.NONE, 300 % 256)
     assert before["JunctionSumMeasured"] == before["JunctionSumCorrected"] == -3276.8
-    corrector.receive(battery(database, 0, 80.0), 0.02)
-    corrector.receive(motor(database, 0, 60.0), 0.03)
+    answers(corrector, battery(database, 0, 80.0), 0.02)
+    answers(corrector, motor(database, 0, 60.0), 0.03)
     after = status_of(database, corrector, 0.04)
     assert (after["State"], after["Reason"]) == (State.CORRECTING, Reason.NONE)
     assert after["JunctionSumMeasured"] == pytest.approx(80.0 - 60.0)
@@ -156,42 +174,170 @@ def test_the_status_says_starting_then_correcting(database: VehicleDatabase) -> 
     assert (before["AliveCounter"], after["AliveCounter"]) == (0, 1)
 
 
-def test_a_silent_branch_is_stale_and_the_others_go_on(database: VehicleDatabase) -> None:
+def drive(
+    database: VehicleDatabase,
+    corrector: Corrector,
+    start_s: float,
+    end_s: float,
+    *,
+    silent: str = "",
+) -> None:
+    """Battery and motor frames, and a look after each pair; one of the two may be silent."""
+    period_s = 0.05
+    for k in range(round(start_s / period_s), round(end_s / period_s)):
+        if silent != "battery":
+            answers(corrector, battery(database, k % 15, 80.0), k * period_s)
+        if silent != "motor":
+            answers(corrector, motor(database, k % 15, 60.0), k * period_s)
+        corrector.look((k + 0.5) * period_s)
+
+
+def test_a_silent_branch_makes_the_node_fall_back_for_the_rest_of_the_drive(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
-    corrector.receive(battery(database, 0), 0.0)
-    corrector.receive(motor(database, 0), 0.0)
-    (answer,) = corrector.receive(battery(database, 1), 0.15)
-    assert decoded(database, "HV_BatteryCorrected", answer.data)["BatteryCurrentQuality"] == Quality.CORRECTED
-    status = status_of(database, corrector, 0.15)
-    assert (status["State"], status["Reason"]) == (State.CORRECTING, Reason.BRANCH_STALE)
+    drive(database, corrector, 0.0, 1.0)
+    assert corrector.state() == (State.CORRECTING, Reason.NONE)
+    drive(database, corrector, 1.0, 1.5, silent="motor")
+    status = status_of(database, corrector, 1.5)
+    assert (status["State"], status["Reason"]) == (State.PASSING_THROUGH, Reason.BRANCH_STALE)
     assert status["JunctionSumCorrected"] == -3276.8
-    corrector.receive(motor(database, 1), 0.16)
-    assert status_of(database, corrector, 0.17)["Reason"] == Reason.NONE
+    assert corrector.latched_branches == ("motor",)
+    drive(database, corrector, 1.5, 3.0)
+    assert state_at(corrector, 3.0) == (State.PASSING_THROUGH, Reason.BRANCH_STALE)
+    (answer,) = answers(corrector, battery(database, 0, 80.0), 3.0)
+    values = decoded(database, "HV_BatteryCorrected", answer.data)
+    assert (values["BatteryCurrentCorrected"], values["BatteryCurrentQuality"]) == (80.0, Quality.PASSED_THROUGH)
+
+
+def test_after_the_bus_has_slept_a_stale_branch_is_given_another_chance(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
+    drive(database, corrector, 0.0, 1.0)
+    drive(database, corrector, 1.0, 1.5, silent="motor")
+    assert state_at(corrector, 9.0) == (State.ASLEEP, Reason.NONE)
+    drive(database, corrector, 10.0, 11.0)
+    assert corrector.state() == (State.CORRECTING, Reason.NONE)
+
+
+def test_falling_asleep_is_no_fault(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
+    drive(database, corrector, 0.0, 1.0)
+    for k in range(20, 60):
+        corrector.look(0.05 * k)
+    assert corrector.state() == (State.ASLEEP, Reason.NONE)
+    drive(database, corrector, 3.0, 4.0)
+    assert corrector.state() == (State.CORRECTING, Reason.NONE)
+
+
+def test_waiting_for_a_vehicle_that_is_not_awake_yet_is_no_fault(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
+    for k in range(100):
+        corrector.look(0.1 * k)
+        assert corrector.state() == (State.STARTING, Reason.NONE)
+    drive(database, corrector, 10.0, 11.0)
+    assert corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
 def test_a_branch_of_the_parameters_that_never_appears_is_stale_after_its_timeout(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
-    corrector.receive(battery(database, 0), 0.05)
-    assert corrector.state(0.09) == (State.STARTING, Reason.NONE)
-    assert corrector.state(0.11) == (State.CORRECTING, Reason.BRANCH_STALE)
+    drive(database, corrector, 0.0, 0.1, silent="motor")
+    assert corrector.state() == (State.STARTING, Reason.NONE)
+    drive(database, corrector, 0.1, 0.5, silent="motor")
+    assert corrector.state() == (State.PASSING_THROUGH, Reason.BRANCH_STALE)
 
 
-def test_the_node_does_not_say_that_it_corrects_when_every_branch_is_stale(database: VehicleDatabase) -> None:
-    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.1, 0.0))
-    corrector.receive(battery(database, 0), 0.0)
-    corrector.receive(motor(database, 0), 0.05)
-    assert corrector.state(0.12) == (State.CORRECTING, Reason.BRANCH_STALE)
-    assert corrector.state(0.2) == (State.PASSING_THROUGH, Reason.BRANCH_STALE)
-    corrector.receive(motor(database, 1), 0.21)
-    assert corrector.state(0.22) == (State.CORRECTING, Reason.BRANCH_STALE)
+def test_a_set_that_makes_the_sum_worse_is_given_up_and_a_new_one_is_tried(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.2, 0.0), motor=(0.0, 0.0))
+    drive_balanced(database, corrector, 0.0, 9.0)
+    assert corrector.state() == (State.CORRECTING, Reason.NONE)
+    drive_balanced(database, corrector, 9.0, 12.0)
+    assert corrector.state() == (State.PASSING_THROUGH, Reason.CORRECTION_WORSE)
+    assert corrector.watch.sums is not None
+    assert corrector.watch.sums.corrected_a == pytest.approx(100.0 / 1.2 - 100.0)
+    parameters = parameters_for(database, battery=(0.0, 0.5), motor=(0.0, 0.0))
+    put_in_force(corrector, database, InForce(parameters=parameters), 12.0, mode=Mode.OVERLAY)
+    drive_balanced(database, corrector, 12.0, 30.0)
+    assert corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
-def test_the_node_does_not_say_that_it_corrects_when_only_branches_passed_through_are_alive(
-    database: VehicleDatabase,
+def test_sums_are_not_judged_while_the_layout_says_that_a_current_is_not_measured(
+    make_database: MakeDatabase, database: VehicleDatabase
 ) -> None:
-    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
-    corrector.receive(motor(database, 0), 0.2)
-    assert corrector.state(0.21) == (State.PASSING_THROUGH, Reason.BRANCH_STALE)
+    text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
+    text += '\n[watch]\ninput = "contactor_state"\nvalid = [2]\n'
+    own = make_database(text, database.layout.dbc_path.read_text())
+    found = []
+    for contactor in (1, 2):
+        corrector = corrector_for(own, battery=(0.2, 0.0), motor=(0.0, 0.0))
+        for k in range(240):
+            data = protected(own, "HV_Battery", k % 15, BatteryCurrent=100.0, ContactorState=contactor)
+            answers(corrector, Frame(BATTERY, data), 0.05 * k)
+            answers(corrector, motor(own, k % 15), 0.05 * k)
+            corrector.look(0.05 * k + 0.01)
+        found.append(corrector.state()[1])
+        assert corrector.watch.sums is not None
+    assert found == [Reason.NONE, Reason.CORRECTION_WORSE]
+
+
+def test_a_set_of_which_the_calibrator_expects_no_better_sum_is_kept(database: VehicleDatabase) -> None:
+    parameters = parameters_for(database, battery=(0.02, 0.0), motor=(0.0, 0.0))
+    expected = replace(parameters, junction_residual=JunctionResidual(measured_a=0.0, corrected_a=3.0))
+    for item, reason in ((parameters, Reason.CORRECTION_WORSE), (expected, Reason.NONE)):
+        corrector = wire(database, InForce(parameters=item), start_s=0.0)
+        drive_balanced(database, corrector, 0.0, 12.0)
+        assert corrector.state()[1] == reason
+
+
+def drive_balanced(database: VehicleDatabase, corrector: Corrector, start_s: float, end_s: float) -> None:
+    """Battery and motor that sum to 0 A, and looks."""
+    for k in range(round(start_s / 0.05), round(end_s / 0.05)):
+        answers(corrector, battery(database, k % 15), 0.05 * k)
+        answers(corrector, motor(database, k % 15), 0.05 * k)
+        corrector.look(0.05 * k + 0.01)
+
+
+def test_a_branch_whose_code_never_changes_while_the_sum_moves_is_stuck(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.1, 0.0), motor=(0.0, 0.0))
+    for k in range(240):
+        answers(corrector, battery(database, k % 15, 100.0 + 50.0 * math.sin(0.1 * k)), 0.05 * k)
+        answers(corrector, motor(database, k % 15, 60.0), 0.05 * k)
+        corrector.look(0.05 * k + 0.01)
+    assert corrector.state() == (State.PASSING_THROUGH, Reason.BRANCH_STUCK)
+    assert corrector.latched_branches == ("motor",)
+
+
+def test_a_motor_at_rest_is_not_stuck(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(-0.2, 0.0), motor=(0.0, 0.0))
+    for k in range(240):
+        answers(corrector, battery(database, k % 15, 10.0 * math.sin(0.1 * k)), 0.05 * k)
+        answers(corrector, motor(database, k % 15, 0.0), 0.05 * k)
+        corrector.look(0.05 * k + 0.01)
+    assert corrector.latched is not Reason.BRANCH_STUCK
+
+
+def test_shadow_mode_computes_and_changes_nothing(database: VehicleDatabase) -> None:
+    parameters = parameters_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
+    corrector = wire(database, InForce(parameters=parameters), start_s=0.0, shadow=True)
+    (answer,) = answers(corrector, battery(database, 0, 80.0), 0.0)
+    answers(corrector, motor(database, 0, 60.0), 0.0)
+    values = decoded(database, "HV_BatteryCorrected", answer.data)
+    assert (values["BatteryCurrentCorrected"], values["BatteryCurrentQuality"]) == (80.0, Quality.PASSED_THROUGH)
+    status = status_of(database, corrector, 0.01)
+    assert (status["State"], status["Reason"]) == (State.SHADOW, Reason.NONE)
+    assert status["JunctionSumMeasured"] == pytest.approx(20.0)
+    assert status["JunctionSumCorrected"] == pytest.approx((80.0 - 5.0) / 1.25 - 60.0)
+
+
+def test_branches_that_lag_are_looked_at_in_the_same_instant(database: VehicleDatabase) -> None:
+    parameters = parameters_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
+    late = {**parameters.branches, "motor": replace(parameters.branches["motor"], delay_s=0.2)}
+    corrector = wire(database, InForce(parameters=replace(parameters, branches=late)), start_s=0.0)
+    worst = 0.0
+    for k in range(100):
+        answers(corrector, battery(database, k % 15, 3.0 * k), 0.05 * k)
+        answers(corrector, motor(database, k % 15, 3.0 * (k - 4)), 0.05 * k)
+        corrector.look(0.05 * k + 0.01)
+        if k > 10 and corrector.watch.sums is not None:
+            worst = max(worst, abs(corrector.watch.sums.measured_a))
+    assert worst < 0.03
 
 
 @pytest.mark.parametrize(("signal", "codes"), [("State", State), ("Reason", Reason)])
@@ -205,14 +351,14 @@ def test_the_dbc_names_the_codes_of_the_status(
 
 def test_a_branch_that_is_neither_named_nor_seen_is_not_fitted(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0))
-    corrector.receive(battery(database, 0), 0.0)
-    assert corrector.state(0.05) == (State.CORRECTING, Reason.NONE)
-    assert corrector.junction_sums_a(0.05)[0] == pytest.approx(100.0)
+    answers(corrector, battery(database, 0), 0.0)
+    assert state_at(corrector, 0.05) == (State.CORRECTING, Reason.NONE)
+    assert sums_at(corrector, 0.05)[0] == pytest.approx(100.0)
 
 
 def test_the_reason_for_passing_through_comes_before_a_stale_branch(database: VehicleDatabase) -> None:
     corrector = corrector_for(database)
-    corrector.receive(battery(database, 0), 0.0)
+    answers(corrector, battery(database, 0), 0.0)
     status = status_of(database, corrector, 9.0)
     assert (status["State"], status["Reason"]) == (State.PASSING_THROUGH, Reason.NO_PARAMETERS)
     assert status["ParameterSet"] == 0
@@ -222,45 +368,62 @@ def test_two_branches_share_source_and_target(make_database: MakeDatabase) -> No
     database = make_database()
     corrector = corrector_for(database, battery=(0.5, 3.0), motor=(0.0, -2.0))
     data = database.message("Pair").encode({"Battery": 153.0, "Motor": 40.0})
-    (answer,) = corrector.receive(Frame(PAIR, data), 0.0)
+    (answer,) = answers(corrector, Frame(PAIR, data), 0.0)
     assert decoded(database, "PairOut", answer.data) == {"Battery": 100.0, "Motor": 38.0, "Quality": Quality.CORRECTED}
 
 
 def test_a_power_counts_in_the_sum_as_power_over_voltage(make_database: MakeDatabase) -> None:
     database = make_database()
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0), heater=(0.25, 0.0))
-    corrector.receive(Frame(PAIR, database.message("Pair").encode({"Battery": 50.0, "Motor": 40.0})), 0.0)
+    answers(corrector, Frame(PAIR, database.message("Pair").encode({"Battery": 50.0, "Motor": 40.0})), 0.0)
     heater = Frame(HEATER, database.message("Heater").encode({"Power": 4000}))
-    corrector.receive(heater, 0.0)
-    assert corrector.junction_sums_a(0.0) == (None, None)
-    corrector.receive(Frame(NET, database.message("Net").encode({"Voltage": 400.0})), 0.0)
-    assert corrector.receive(heater, 0.1) == []
-    assert corrector.junction_sums_a(0.1) == pytest.approx((50.0 - 40.0 - 10.0, 50.0 - 40.0 - 8.0))
-    corrector.receive(heater, 0.7)
-    assert corrector.branches[2].measured_a(0.7) is None, "a voltage 0.7 s old is not divided by"
+    answers(corrector, heater, 0.0)
+    assert sums_at(corrector, 0.0) == (None, None)
+    answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": 400.0})), 0.0)
+    assert answers(corrector, heater, 0.1) == []
+    assert sums_at(corrector, 0.1) == pytest.approx((50.0 - 40.0 - 10.0, 50.0 - 40.0 - 8.0))
+    answers(corrector, heater, 0.7)
+    assert corrector.branches[2].currents_at(0.7) is None, "a voltage 0.7 s old is not divided by"
 
 
 def test_a_voltage_near_zero_is_not_divided_by(make_database: MakeDatabase) -> None:
     database = make_database()
     corrector = corrector_for(database, heater=(0.0, 0.0))
-    corrector.receive(Frame(NET, database.message("Net").encode({"Voltage": 0.5})), 0.0)
-    corrector.receive(Frame(HEATER, database.message("Heater").encode({"Power": 4000})), 0.0)
-    assert corrector.junction_sums_a(0.0) == (None, None)
+    answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": 0.5})), 0.0)
+    answers(corrector, Frame(HEATER, database.message("Heater").encode({"Power": 4000})), 0.0)
+    assert sums_at(corrector, 0.0) == (None, None)
 
 
-def test_a_frame_shorter_than_its_signal_is_invalid(make_database: MakeDatabase) -> None:
+def test_a_signal_beyond_the_end_of_its_frame_is_invalid(make_database: MakeDatabase) -> None:
     database = make_database()
     corrector = corrector_for(database, battery=(0.1, 0.0))
-    (answer,) = corrector.receive(Frame(PAIR, b"\x00\x10\x00"), 0.0)
+    answers(corrector, Frame(PAIR, b"\x00\x10\x00\x10\x00\x00\x00\x00"), 0.0)
+    (answer,) = answers(corrector, Frame(PAIR, b"\x00\x10\x00"), 0.0)
     values = decoded(database, "PairOut", answer.data)
     assert values["Battery"] == pytest.approx(1.6 / 1.1, abs=0.05)
     assert values["Motor"] == pytest.approx(0.05 * 32768)
+    assert corrector.counters.short == 1
 
 
-def test_the_answer_is_can_fd_where_the_source_is(make_database: MakeDatabase) -> None:
-    corrector = corrector_for(make_database(), battery=(0.1, 0.0))
-    (answer,) = corrector.receive(Frame(PAIR, bytes(8), fd=True, bitrate_switch=True), 0.0)
-    assert (answer.fd, answer.bitrate_switch) == (True, True)
+def test_what_a_bad_frame_would_have_said_is_published_as_invalid_where_the_layout_says_so(
+    make_database: MakeDatabase,
+) -> None:
+    layout = SMALL_LAYOUT.replace("full_scale_a", 'on_bad_frame = "invalid"\nfull_scale_a', 1)
+    entry = '\n[e2e]\nprofile = "counter CRC8"\nmessages = ["Pair"]\ncounter = "Count"\ncrc = "Sum"\n'
+    header = ' SG_ Count : 32|4@1+ (1,0) [0|15] "" Node\n SG_ Sum : 40|8@1+ (1,0) [0|255] "" Node\n'
+    database = make_database(layout + entry, SMALL_DBC.replace(" SG_ Battery", header + " SG_ Battery", 1))
+    protection = protection_of(database, database.message("Pair"))
+    assert protection is not None
+    corrector = corrector_for(database, battery=(0.5, 3.0))
+    payload = bytearray(b"\x05\xfa\x00\x00\x00\x00\x00\x00")
+    protection.seal(payload)
+    found = []
+    for damage in (0, 1):
+        payload[0] ^= damage
+        (answer,) = answers(corrector, Frame(PAIR, bytes(payload)), 0.0)
+        values = decoded(database, "PairOut", answer.data)
+        found.append((values["Battery"], values["Quality"]))
+    assert found == [(100.0, Quality.CORRECTED), (-3276.8, Quality.INVALID)]
 
 
 LOOP = ("PairOut.Motor", "Pair.Spare")
@@ -294,7 +457,11 @@ STATUS_TABLE = '\n[status]\nmessage = "PairOut"\nstate = "Quality"\nreason = "Ba
             SMALL_DBC.replace('512 Motor -32768 "SNA"', '512 Motor 32767 "Max"'),
             "Motor needs a code named SNA",
         ),
-        (SMALL_LAYOUT + STATUS_TABLE, SMALL_DBC, "status: PairOut.Quality is written twice"),
+        (
+            SMALL_LAYOUT + STATUS_TABLE,
+            SMALL_DBC.replace("Quality : 32|2", "Quality : 32|4"),
+            "PairOut.Quality is written",
+        ),
         (
             SMALL_LAYOUT + '\n[e2e]\nprofile = "P01"\nmessages = ["PairOut"]\n',
             SMALL_DBC,
@@ -312,7 +479,7 @@ def test_a_layout_that_would_disturb_the_bus_is_refused(
 @pytest.mark.parametrize(("old", "new"), [("8 Corrector", "8 Vector__XXX"), ("8 Other", "8 Corrector")])
 def test_messages_of_one_control_unit_or_of_none_may_be_sent(make_database: MakeDatabase, old: str, new: str) -> None:
     database = make_database(SMALL_LAYOUT + OWN_STATUS, OTHER_SENDER.replace(old, new))
-    assert corrector_for(database).status_fields is not None
+    assert corrector_for(database).status() is not None
 
 
 def test_a_layout_that_publishes_nothing_is_refused(make_database: MakeDatabase) -> None:

@@ -1,73 +1,207 @@
-"""E2E profile 1: what is accepted, what is counted out."""
+"""End-to-end protection: what is accepted, what is counted out; the libraries find the frames sound."""
+
+from collections.abc import Callable
 
 import pytest
-from e2e.p01 import e2e_p01_check
-from hypothesis import given
-from hypothesis import strategies as st
+from e2e.p01 import E2E_P01_DATAID_ALT, E2E_P01_DATAID_LOW, E2E_P01_DATAID_NIBBLE, e2e_p01_check
+from e2e.p02 import e2e_p02_check
+from e2e.p05 import e2e_p05_check
 
-from ecu_node.e2e import Check, Receiver, Sender
+from ecu_node.database import VehicleDatabase
+from ecu_node.e2e import Check, Protection, Receiver, protection_of
+from ecu_node.errors import LayoutError
+from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT
 
-DATA_ID = 0x110
+MakeDatabase = Callable[..., VehicleDatabase]
+ROOM = 'BO_ 700 Room: 16 Node\n SG_ Count : 36|4@1+ (1,0) [0|15] "" Node\n SG_ Sum : 56|8@1+ (1,0) [0|255] "" Node\n'
+LIST = list(range(100, 116))
+ENTRIES = {
+    "P01": 'profile = "P01"\nmessages = ["Room"]\ndata_id = { Room = 0x1234 }',
+    "P01 alternating": 'profile = "P01"\nmessages = ["Room"]\ndata_id_mode = "alternating"',
+    "P01 low": 'profile = "P01"\nmessages = ["Room"]\ndata_id_mode = "low"',
+    "P01 nibble": 'profile = "P01"\nmessages = ["Room"]\ndata_id_mode = "nibble"\noffset = 3',
+    "P02": f'profile = "P02"\nmessages = ["Room"]\ndata_id_list = {{ Room = {LIST} }}',
+    "P05": 'profile = "P05"\nmessages = ["Room"]\noffset = 2',
+    "OEM": 'profile = "counter CRC8"\nmessages = ["Room"]\ncounter = "Count"\ncrc = "Sum"\ndata_id_bytes = 2',
+    "OEM after": 'profile = "counter CRC8"\nmessages = ["Room"]\ncounter = "Count"\ncrc = "Sum"\ncounter_modulus = 15\n'
+    'algorithm = "autosar"\ndata_id_bytes = 1\ndata_id_at = "after"',
+}
+MODULUS = {"P02": 16, "P05": 256, "OEM": 16}
 
 
-def stream(count: int, size: int = 8) -> list[bytes]:
-    sender = Sender(DATA_ID)
+@pytest.fixture(params=list(ENTRIES))
+def kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def protect(make_database: MakeDatabase) -> Callable[[str], Protection]:
+    def make(entry: str) -> Protection:
+        database = make_database(f"{SMALL_LAYOUT}\n[e2e]\n{entry}\n", SMALL_DBC.replace("VAL_", ROOM + "VAL_", 1))
+        protection = protection_of(database, database.message("Room"))
+        assert protection is not None
+        return protection
+
+    return make
+
+
+def stream(protection: Protection, count: int, size: int = 16) -> list[bytearray]:
+    payload = bytearray(b"\xa5" * size)
+    payload[protection.counter_byte] &= ~(protection.counter_ones << protection.counter_shift) & 0xFF
+    protection.before_first(payload)
     frames = []
     for _ in range(count):
-        payload = bytearray(size)
-        sender.protect(payload)
-        frames.append(bytes(payload))
+        protection.advance(payload)
+        frames.append(bytearray(payload))
     return frames
 
 
-def test_the_counter_starts_at_0_and_runs_to_14() -> None:
-    assert [frame[1] for frame in stream(17)] == [*range(15), 0, 1]
+def counter(protection: Protection, frame: bytearray) -> int:
+    return frame[protection.counter_byte] >> protection.counter_shift & protection.counter_ones
 
 
-def test_an_unbroken_stream_is_ok() -> None:
-    receiver = Receiver(DATA_ID)
-    assert {receiver.check(frame) for frame in stream(40)} == {Check.OK}
+def test_the_counter_starts_at_0_runs_through_and_every_frame_in_order_is_ok(
+    kind: str, protect: Callable[[str], Protection]
+) -> None:
+    protection = protect(ENTRIES[kind])
+    frames = stream(protection, 300)
+    modulus = MODULUS.get(kind, 15)
+    assert [counter(protection, frame) for frame in frames] == [k % modulus for k in range(300)]
+    check = Receiver(protection).check
+    assert {check(frame) for frame in frames} == {Check.OK}
 
 
-def test_protection_keeps_all_other_bits() -> None:
-    payload = bytearray(b"\xaa\xbf\x01\x02\x03\x04\x05\x06")
-    Sender(DATA_ID).protect(payload)
-    assert payload[1:] == b"\xb0\x01\x02\x03\x04\x05\x06"
-    assert e2e_p01_check(payload, DATA_ID)
+def test_only_the_header_is_written(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind])
+    for frame in stream(protection, 20):
+        changed = int.from_bytes(frame, "little") ^ int.from_bytes(b"\xa5" * 16, "little")
+        assert changed & ~protection.header_mask == 0
 
 
-@given(st.integers(0, 63), st.integers(1, 64))
-def test_any_flipped_bit_is_noticed(bit: int, width: int) -> None:
-    frame = int.from_bytes(stream(1)[0], "big")
-    burst = ((1 << min(width, 8)) - 1) << bit & (1 << 64) - 1
-    damaged = (frame ^ burst).to_bytes(8, "big")
-    assert Receiver(DATA_ID).check(damaged) is Check.CORRUPT
+def test_sealing_keeps_the_counter(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind])
+    for frame in stream(protection, 20):
+        before = counter(protection, frame)
+        frame[-1] ^= 0xFF
+        assert not protection.is_sound(frame)
+        protection.seal(frame)
+        assert protection.is_sound(frame)
+        assert counter(protection, frame) == before
 
 
-def test_a_frame_of_another_message_is_corrupt() -> None:
-    assert Receiver(DATA_ID + 1).check(stream(1)[0]) is Check.CORRUPT
+def test_any_flipped_bit_is_noticed(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind])
+    (frame,) = stream(protection, 1)
+    for bit in range(8 * 16):
+        damaged = bytearray((int.from_bytes(frame, "little") ^ 1 << bit).to_bytes(16, "little"))
+        assert Receiver(protection).check(damaged) is Check.CORRUPT
 
 
-@pytest.mark.parametrize("payload", [b"", b"\x00"])
-def test_a_frame_without_room_for_the_header_is_corrupt(payload: bytes) -> None:
-    assert Receiver(DATA_ID).check(payload) is Check.CORRUPT
+def test_the_libraries_find_the_frames_sound(protect: Callable[[str], Protection]) -> None:
+    def frames(kind: str) -> list[bytearray]:
+        return stream(protect(ENTRIES[kind]), 40)
+
+    assert all(e2e_p01_check(frame, 0x1234) for frame in frames("P01"))
+    for kind, mode, offset in (
+        ("P01 alternating", E2E_P01_DATAID_ALT, 0),
+        ("P01 low", E2E_P01_DATAID_LOW, 0),
+        ("P01 nibble", E2E_P01_DATAID_NIBBLE, 3),
+    ):
+        assert all(e2e_p01_check(frame, 700, data_id_mode=mode, offset=offset) for frame in frames(kind))
+    assert all(e2e_p02_check(frame, bytes(LIST), length=0) for frame in frames("P02"))
+    assert all(e2e_p05_check(frame, 700, offset=2) for frame in frames("P05"))
 
 
-def test_counter_15_is_impossible_with_any_crc() -> None:
-    assert {Receiver(DATA_ID).check(bytes([crc, 15, 0, 0])) for crc in range(256)} == {Check.CORRUPT}
+def crc8(data: bytes, polynomial: int) -> int:
+    """CRC-8 with start and final value 0xFF, bit by bit."""
+    crc = 0xFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ (polynomial if crc & 0x80 else 0)) & 0xFF
+    return crc ^ 0xFF
 
 
-def test_a_repeated_frame_is_not_usable_and_a_gap_is() -> None:
-    frames = stream(6)
-    receiver = Receiver(DATA_ID)
-    checks = [receiver.check(frames[k]) for k in (0, 1, 1, 2, 5)]
-    assert checks == [Check.OK, Check.OK, Check.REPEATED, Check.OK, Check.LOST]
-    assert [check.usable for check in checks] == [True, True, False, True, True]
+def test_the_crc_of_a_control_unit_is_what_its_words_say(protect: Callable[[str], Protection]) -> None:
+    for frame in stream(protect(ENTRIES["OEM"]), 20):
+        assert frame[7] == crc8((700).to_bytes(2, "little") + frame[:7] + frame[8:], 0x1D)
+    for frame in stream(protect(ENTRIES["OEM after"]), 20):
+        assert frame[7] == crc8(bytes(frame[:7] + frame[8:]) + bytes([700 & 0xFF]), 0x2F)
 
 
-def test_a_corrupt_frame_leaves_the_counter_as_it_was() -> None:
-    frames = stream(3)
-    receiver = Receiver(DATA_ID)
-    receiver.check(frames[0])
-    receiver.check(b"\x00" + frames[1][1:])
-    assert receiver.check(frames[1]) is Check.OK
+def test_a_frame_of_another_message_is_corrupt(protect: Callable[[str], Protection]) -> None:
+    (frame,) = stream(protect(ENTRIES["P01"]), 1)
+    other = protect(ENTRIES["P01"].replace("0x1234", "0x1235"))
+    assert Receiver(other).check(frame) is Check.CORRUPT
+
+
+def test_a_frame_without_room_for_the_header_is_corrupt(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind])
+    assert {Receiver(protection).check(bytearray(size)) for size in range(protection.least_bytes)} == {Check.CORRUPT}
+
+
+def test_counter_15_is_impossible_with_any_crc(protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES["P01"])
+    assert {Receiver(protection).check(bytearray([crc, 15, 0, 0])) for crc in range(256)} == {Check.CORRUPT}
+
+
+def test_repeated_frames_gaps_and_jumps(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind] + "\nmax_delta_counter = 3")
+    frames = stream(protection, 20)
+    check = Receiver(protection).check
+    found = [check(frames[k]) for k in (5, 5, 6, 9, 10, 14, 15, 16)]
+    ok, jump = Check.OK, Check.JUMPED
+    assert found == [ok, Check.REPEATED, ok, Check.LOST, ok, jump, ok, ok]
+
+
+def test_a_corrupt_frame_leaves_the_counter_as_it_was(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind])
+    frames = stream(protection, 3)
+    check = Receiver(protection).check
+    check(frames[0])
+    damaged = bytearray(frames[1])
+    damaged[-1] ^= 1
+    assert check(damaged) is Check.CORRUPT
+    assert check(frames[1]) is Check.OK
+
+
+OEM = ENTRIES["OEM"]
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        (
+            ENTRIES["P01"].replace("Room", "Net") + "\noffset = 1",
+            "message Net has 2 bytes, too few for the header of 3",
+        ),
+        (OEM.replace('"Count"', '"Alive"'), r"message Room has no signal 'Alive'; it has Count, Sum"),
+        (OEM.replace('crc = "Sum"', 'crc = "Count"'), "signal Count must be one whole byte"),
+        (OEM + "\ncounter_modulus = 17", "signal Count cannot count from 0 to 16"),
+        (OEM + '\nalgorithm = "md5"', "algorithm 'md5' is not known; known are autosar, bluetooth,"),
+        (ENTRIES["P02"].replace("100, ", ""), "16"),
+        (ENTRIES["P02"].replace("Room = [", "Net = ["), "Net is not in 'messages'"),
+        ('profile = "P02"\nmessages = ["Room"]\ndata_id_list = {}', "data_id_list: Room has none"),
+        ('profile = "P99"\nmessages = ["Room"]', "profile"),
+    ],
+)
+def test_protection_that_cannot_be_is_one_line(make_database: MakeDatabase, entry: str, words: str) -> None:
+    dbc = SMALL_DBC.replace("VAL_", ROOM + "VAL_", 1)
+    with pytest.raises(LayoutError, match=words) as caught:  # noqa: PT012  # either of the two may find it
+        database = make_database(f"{SMALL_LAYOUT}\n[e2e]\n{entry}\n", dbc)
+        for name in ("Room", "Net"):
+            protection_of(database, database.message(name))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_message_has_one_protection(make_database: MakeDatabase) -> None:
+    twice = "".join(f"\n[[e2e]]\n{ENTRIES[kind]}\n" for kind in ("P01", "P05"))
+    with pytest.raises(LayoutError, match="messages: Room is named twice"):
+        make_database(SMALL_LAYOUT + twice, SMALL_DBC.replace("VAL_", ROOM + "VAL_", 1))
+
+
+def test_messages_may_be_protected_in_different_ways(make_database: MakeDatabase) -> None:
+    entries = f'\n[[e2e]]\n{ENTRIES["P05"]}\n\n[[e2e]]\nprofile = "P01"\nmessages = ["Net", "Heater"]\n'
+    database = make_database(SMALL_LAYOUT + entries, SMALL_DBC.replace("VAL_", ROOM + "VAL_", 1))
+    found = {name: protection_of(database, database.message(name)) for name in ("Room", "Net", "Pair")}
+    assert {name: item and item.modulus for name, item in found.items()} == {"Room": 256, "Net": 15, "Pair": None}

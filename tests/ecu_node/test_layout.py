@@ -61,8 +61,10 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
         ('name = "battery"', 'name = "motor"', "motor is named twice"),
         (BATTERY, BATTERY + ', power = "Heater.Power"', "branch battery: give either 'signal'"),
         (', voltage = "Net.Voltage"', "", "branch heater: give either 'signal'"),
-        ('voltage = "Net.Voltage"', 'voltage = "Net.Voltage", corrected = "PairOut.Motor"', "'corrected' needs"),
+        ('voltage = "Net.Voltage"', 'voltage = "Net.Voltage", corrected = "PairOut.Motor"', "PairOut.Motor is written"),
         ('"Net.Voltage"', '"Net.Voltage", quality = "PairOut.Quality"', "'quality' without 'corrected'"),
+        ("full_scale_a", 'watch.input = "x"\nwatch.valid = [1]\nfull_scale_a', r"input: 'x' is no \[\[input\]\]"),
+        ("full_scale_a", "watch.valid = [1]\nfull_scale_a", "give both 'input' and 'valid', or neither"),
         ('quality = "PairOut.Quality"', 'quality = "Net.Voltage"', "must be signals of one message"),
         (
             "\n]\n",

@@ -1,19 +1,24 @@
 """The node on python-can's virtual bus: a real bus object, the node in a thread of its own."""
 
+import errno
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from copy import deepcopy
 
 import can
 import pytest
 from can.interfaces.virtual import VirtualBus
 from e2e.p01 import e2e_p01_check
 
+from ecu_node.buses import SteadyBus
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
-from ecu_node.node import open_bus, receive_filters, serve
+from ecu_node.guard import Mode
+from ecu_node.node import GatewayNode, OverlayNode, open_bus, receive_filters
 from ecu_node.wiring import InForce, wire
 from tests.ecu_node.vehicles import SMALL_DBC, decoded, parameters_for, protected
 
@@ -21,20 +26,33 @@ LONGEST_WAIT_S = 10.0
 
 
 @contextmanager
-def node_on(database: VehicleDatabase, channel: str, bus: can.BusABC | None = None) -> Iterator[Corrector]:
+def node_on(
+    database: VehicleDatabase, channel: str, opened: Callable[[], can.BusABC] | None = None
+) -> Iterator[Corrector]:
     corrector = wire(database, InForce(parameters=parameters_for(database, battery=(0.25, 5.0))), time.monotonic())
-    stop = threading.Event()
-    with bus or open_bus(database, interface="virtual", channel=channel, fd=False) as own:
-        thread = threading.Thread(
-            target=serve, args=(own, corrector), kwargs={"stop": stop.is_set, "status_period_s": 0.02}
-        )
-        thread.start()
-        try:
+    bus = SteadyBus(opened or (lambda: overlay_bus(database, channel)), corrector.counters)
+    try:
+        with at_work(OverlayNode(bus, corrector, database, period_s=0.02)):
             yield corrector
+    finally:
+        bus.close()
+
+
+def overlay_bus(database: VehicleDatabase, channel: str) -> can.BusABC:
+    return open_bus(database, interface="virtual", channel=channel, fd=False, mode=Mode.OVERLAY)
+
+
+@contextmanager
+def at_work(node: OverlayNode | GatewayNode) -> Iterator[None]:
+    """Run a node in a thread; what ends it, ends the test."""
+    stop = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(node.run, stop.is_set)
+        try:
+            yield
         finally:
             stop.set()
-            thread.join(LONGEST_WAIT_S)
-            assert not thread.is_alive()
+            running.result(LONGEST_WAIT_S)
 
 
 def receive(bus: can.BusABC, identifier: int, count: int) -> list[can.Message]:
@@ -84,14 +102,45 @@ def test_the_status_comes_again_and_again_without_any_frame(
     assert all(e2e_p01_check(frame.data, 0x5F0) for frame in frames)
 
 
-def test_own_output_comes_back_from_another_and_is_ignored(
+def test_a_node_that_starts_beside_another_one_refuses_and_leaves_it_alone(
     database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
 ) -> None:
-    with node_on(database, request.node.name) as corrector:
-        peer.send(can.Message(arbitration_id=0x510, is_extended_id=False, data=bytes(8)))
-        peer.send(can.Message(arbitration_id=0x5F0, is_extended_id=False, data=bytes(8)))
+    with node_on(database, request.node.name):
+        receive(peer, 0x5F0, 1)
+        words = r"another node sends frames 0x5F0, which only this one may send there; two nodes on one bus"
+        with pytest.raises(BusError, match=words), node_on(database, request.node.name):
+            receive(peer, 0x5F0, 20)
         receive(peer, 0x5F0, 3)
-    assert corrector.counters.frames_in == 0
+
+
+def test_a_node_that_hears_its_own_messages_from_another_ends(
+    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
+) -> None:
+    words = "another node sends frames 0x510, which only this one may send there"
+    with pytest.raises(BusError, match=words), node_on(database, request.node.name):  # noqa: PT012
+        receive(peer, 0x5F0, 1)
+        peer.send(can.Message(arbitration_id=0x510, is_extended_id=False, data=bytes(8)))
+        receive(peer, 0x5F0, 2)
+
+
+class EchoingBus(VirtualBus):
+    """A bus that returns what is sent, as some adapters do."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        super().send(msg, timeout)
+        self.queue.put(deepcopy(msg))
+
+
+def test_own_frames_that_come_back_are_counted_and_nothing_more(
+    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
+) -> None:
+    with node_on(database, "", lambda: EchoingBus(request.node.name)) as corrector:
+        receive(peer, 0x5F0, 1)
+        peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=protected(database, "HV_Battery", 0)))
+        receive(peer, 0x510, 1)
+        receive(peer, 0x5F0, 5)
+    assert corrector.counters.echoes >= 5
+    assert (corrector.counters.frames_in, corrector.counters.corrected) == (1, 1)
 
 
 class FullBus(VirtualBus):
@@ -102,16 +151,16 @@ class FullBus(VirtualBus):
 
 
 class BrokenBus(VirtualBus):
-    """A bus that is gone."""
+    """A bus that is gone as soon as one listens."""
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        raise can.CanOperationError("Network is down")
+        raise can.CanOperationError("Network is down", errno.ENETDOWN)
 
 
 def test_frames_that_the_bus_does_not_take_are_dropped_and_counted(
     database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
 ) -> None:
-    with node_on(database, "", FullBus(request.node.name)) as corrector:
+    with node_on(database, "", lambda: FullBus(request.node.name)) as corrector:
         peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=protected(database, "HV_Battery", 0)))
         give_up = time.monotonic() + LONGEST_WAIT_S
         while corrector.counters.corrected == 0 or corrector.counters.send_errors < 3:
@@ -119,31 +168,47 @@ def test_frames_that_the_bus_does_not_take_are_dropped_and_counted(
             time.sleep(0.01)
 
 
-def test_a_bus_that_fails_ends_the_work_with_one_line(database: VehicleDatabase) -> None:
-    corrector = wire(database, InForce(parameters=None), 0.0)
-    with BrokenBus("broken") as bus, pytest.raises(BusError, match=r"^Virtual bus.*the bus failed: Network is down"):
-        serve(bus, corrector, stop=lambda: False, status_period_s=0.1)
+def test_a_bus_that_goes_away_is_opened_again(
+    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
+) -> None:
+    channel, opened = request.node.name, 0
+
+    def reopen() -> can.BusABC:
+        nonlocal opened
+        opened += 1
+        if opened == 2:
+            raise BusError("no such interface")
+        return BrokenBus(channel) if opened == 1 else overlay_bus(database, channel)
+
+    with node_on(database, "", reopen) as corrector:
+        receive(peer, 0x5F0, 3)
+    assert opened == 3
+    assert corrector.counters.reopened == 1
 
 
 def test_the_kernel_is_asked_for_the_branches_only(
     database: VehicleDatabase, make_database: Callable[..., VehicleDatabase]
 ) -> None:
-    assert sorted(item["can_id"] for item in receive_filters(database)) == [0x110, 0x120, 0x128, 0x130, 0x140]
+    assert sorted(item["can_id"] for item in receive_filters(database)) == [
+        *(0x110, 0x120, 0x128, 0x130, 0x140),
+        *(0x510, 0x520, 0x528, 0x530, 0x540, 0x5F0),
+    ]
     assert {(item["can_id"], item["can_mask"], item["extended"]) for item in receive_filters(make_database())} == {
         (256, 0x7FF, False),
         (512, 0x1FFFFFFF, True),
         (258, 0x7FF, False),
+        (512, 0x7FF, False),
     }
 
 
 def test_an_unknown_interface_is_one_line(database: VehicleDatabase) -> None:
     with pytest.raises(BusError, match=r"^carrier_pigeon c0: cannot open the bus: .*carrier_pigeon"):
-        open_bus(database, interface="carrier_pigeon", channel="c0", fd=False)
+        open_bus(database, interface="carrier_pigeon", channel="c0", fd=False, mode=Mode.OVERLAY)
 
 
 def test_a_can_fd_database_needs_fd(make_database: Callable[..., VehicleDatabase]) -> None:
     database = make_database(dbc=SMALL_DBC.replace("PairOut: 8", "PairOut: 16"))
     with pytest.raises(BusError, match=r"CAN FD messages \(PairOut\); start with --fd"):
-        open_bus(database, interface="virtual", channel="c0", fd=False)
-    with open_bus(database, interface="virtual", channel="c0", fd=True):
+        open_bus(database, interface="virtual", channel="c0", fd=False, mode=Mode.OVERLAY)
+    with open_bus(database, interface="virtual", channel="c0", fd=True, mode=Mode.OVERLAY):
         pass

@@ -13,7 +13,14 @@ from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
 from ecu_node.layout import read_layout
-from ecu_node.parameters import UnfitError, VehicleParameters, parameter_schema, read_parameters, write_parameters
+from ecu_node.parameters import (
+    UnfitError,
+    VehicleParameters,
+    check_fit,
+    parameter_schema,
+    read_parameters,
+    write_parameters,
+)
 from ecu_node.sensor_models import GainBySign, SensorModel, TemperatureDrift
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, as_document, parameters_for
 
@@ -58,7 +65,7 @@ def test_what_is_no_sensor_model_is_refused(database: VehicleDatabase, tmp_path:
         read_parameters(tmp_path / "p.json")
 
 
-def test_a_branch_whose_sensor_is_not_linear_is_passed_through_and_said(
+def test_check_shows_the_plans_of_a_gain_by_sign(
     tmp_path: Path, make_database: Callable[..., VehicleDatabase], capsys: pytest.CaptureFixture[str]
 ) -> None:
     database = make_database(dbc=SMALL_DBC)
@@ -66,9 +73,30 @@ def test_a_branch_whose_sensor_is_not_linear_is_passed_through_and_said(
     write_parameters(_bent(database, MODELS[0]), path)
     assert main(["check", "--params", str(path), "--layout", str(database.layout.path)]) == 0
     lines = capsys.readouterr().out.splitlines()
+    battery = next(index for index, line in enumerate(lines) if line.startswith("battery"))
+    assert lines[battery].endswith("A  corrected")
+    assert lines[battery + 2].startswith("  sensor model 'gain by sign', positive currents: gain ")
+    assert lines[battery + 3].startswith("  sensor model 'gain by sign', negative currents: gain ")
+
+
+def test_a_branch_that_needs_a_temperature_that_the_layout_lacks_is_passed_through_and_said(
+    tmp_path: Path, make_database: Callable[..., VehicleDatabase], capsys: pytest.CaptureFixture[str]
+) -> None:
+    database = make_database(dbc=SMALL_DBC)
+    path = tmp_path / "bent.json"
+    write_parameters(_bent(database, MODELS[1]), path)
+    assert main(["check", "--params", str(path), "--layout", str(database.layout.path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
     assert next(line for line in lines if line.startswith("battery")).endswith("A  passed through")
     assert next(line for line in lines if line.startswith("motor")).endswith("A  corrected")
-    assert "warning: branch battery is passed through: its sensor model is not linear" in lines[-1]
+    assert lines[-1].startswith("warning: branch battery is passed through: its fault depends on the temperature, and")
+
+
+@pytest.mark.parametrize(("positive", "negative"), [(0.5, 0.0), (0.0, -0.41)])
+def test_a_gain_beyond_the_limits_does_not_fit(database: VehicleDatabase, positive: float, negative: float) -> None:
+    model = GainBySign(drift_positive=positive, drift_negative=negative)
+    with pytest.raises(UnfitError, match=r"branch battery: drift [+-]0\.\d+ is beyond the layout's limit of 0\.4"):
+        check_fit(_bent(database, model), database, None)
 
 
 def test_the_projects_own_layout_names_its_temperature() -> None:

@@ -1,12 +1,14 @@
 """Small vehicles for the node's tests: layouts and DBCs made to measure, parameters, and frames with cantools."""
 
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import msgspec
 from e2e.p01 import e2e_p01_protect
 
+from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
+from ecu_node.frames import FrameKey
 from ecu_node.parameters import (
     BranchParameters,
     FileReference,
@@ -91,3 +93,27 @@ def protected(database: VehicleDatabase, message: str, counter: int, **values: f
 def decoded(database: VehicleDatabase, message: str, data: bytes) -> dict[str, Any]:
     """The signals of a frame by cantools; named codes as numbers."""
     return cast("dict[str, Any]", database.message(message).decode(data, decode_choices=False))
+
+
+class Frame(NamedTuple):
+    """One data frame."""
+
+    key: FrameKey
+    data: bytes
+
+
+def answers(corrector: Corrector, frame: Frame, now_s: float) -> list[Frame]:
+    """What an overlay node sends when it receives a frame."""
+    source = corrector.sources.get(frame.key)
+    if source is None:
+        return []
+    return [Frame(target.key, bytes(target.data)) for target in source.answer(bytearray(frame.data), now_s)]
+
+
+def passed_on(corrector: Corrector, frame: Frame, now_s: float) -> bytes | None:
+    """What a gateway sends on when it receives a frame."""
+    source = corrector.sources.get(frame.key)
+    if source is None:
+        return frame.data
+    data = source.forward(bytearray(frame.data), now_s)
+    return None if data is None else bytes(data)

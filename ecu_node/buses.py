@@ -1,0 +1,195 @@
+"""Opening a bus, sending on it with bounded patience, and opening it again after it was gone.
+
+Whatever python-can's interfaces raise becomes :class:`~ecu_node.errors.BusError` or is counted here.
+"""
+
+import errno
+import time
+from collections.abc import Callable
+from typing import Any
+
+import can
+
+from ecu_node.counters import Counters
+from ecu_node.errors import BusError
+
+__all__ = ["SteadyBus", "connect"]
+
+_SEND_ATTEMPTS = 3
+_SEND_PAUSE_S = 0.001
+"""A full send queue drains by some frames in this time. [s]"""
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 2.0
+"""Between attempts to open a bus again. [s]"""
+_OLDEST_FRAME_S = 1.0
+"""A time stamp further from now is one of another clock. [s]"""
+_BUS_OFF = 0x40
+"""Class of error frames of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
+
+
+def connect(
+    interface: str, channel: str, *, fd: bool = False, filters: list[can.typechecking.CanFilter] | None = None
+) -> can.BusABC:
+    """Open any bus of python-can.
+
+    Parameters
+    ----------
+    interface, channel : str
+        As python-can names them.
+    fd : bool
+        Whether to use CAN FD.
+    filters : list of CanFilter, optional
+        What to receive; everything if not given.
+
+    Returns
+    -------
+    can.BusABC
+        The bus; it does not receive what it sends.
+
+    Raises
+    ------
+    BusError
+        If it cannot be opened; the message says why.
+    """
+    options: dict[str, Any] = {"fd": True} if fd else {}
+    try:
+        return can.Bus(
+            channel=channel,
+            interface=interface,
+            ignore_config=True,
+            can_filters=filters,
+            receive_own_messages=False,
+            **options,
+        )
+    except (can.CanError, OSError, ValueError, TypeError, NotImplementedError) as error:
+        raise BusError(f"{interface} {channel}: cannot open the bus: {_why(error)}") from None
+
+
+class SteadyBus:
+    """A bus that survives what buses do: going down, away, off, or being full.
+
+    Parameters
+    ----------
+    open_bus : callable
+        Opens it, raising :class:`BusError` if it cannot.
+    counters : Counters
+        Where it is counted what happened.
+    say : callable
+        Takes one line for the log.
+
+    Raises
+    ------
+    BusError
+        If it cannot be opened the first time.
+    """
+
+    def __init__(
+        self, open_bus: Callable[[], can.BusABC], counters: Counters, say: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self._open, self._counters, self._say = open_bus, counters, say
+        self._bus: can.BusABC | None = open_bus()
+        self._retry_s, self._pause_s = 0.0, _FIRST_PAUSE_S
+        self.channel = self._bus.channel_info
+
+    def receive(self, timeout_s: float) -> can.Message | None:
+        """Wait for a data or remote frame; None if none came in time, or the bus is gone."""
+        bus = self._bus
+        if bus is None:
+            bus = self._reopened(timeout_s)
+            if bus is None:
+                return None
+        try:
+            message = bus.recv(timeout_s)
+        except (can.CanError, OSError) as error:
+            self._gone(error)
+            return None
+        if message is not None and message.is_error_frame:
+            self._counters.bus_errors += 1
+            self._counters.bus_off += bool(message.arbitration_id & _BUS_OFF)
+            return None
+        return message
+
+    def send(self, message: can.Message) -> bool:
+        """Send one frame; False if the bus did not take it in a few attempts."""
+        for attempt in range(_SEND_ATTEMPTS):
+            bus = self._bus
+            if bus is None:
+                return False
+            if attempt:
+                time.sleep(_SEND_PAUSE_S)
+            try:
+                bus.send(message)
+            except (can.CanError, OSError) as error:
+                if _number(error) in {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF}:
+                    return False  # what is received tells the same, and opens the bus again
+                continue
+            return True
+        return False
+
+    def close(self) -> None:
+        """Close it."""
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            bus.shutdown()
+
+    def _gone(self, error: Exception) -> None:
+        self._say(f"{self.channel}: the bus failed: {_why(error)}; trying to open it again")
+        self._retry_s, self._pause_s = time.monotonic() + _FIRST_PAUSE_S, _FIRST_PAUSE_S
+        try:
+            self.close()
+        except (can.CanError, OSError):
+            self._bus = None
+
+    def _reopened(self, timeout_s: float) -> can.BusABC | None:
+        """Open it again if it is time to; wait no longer than the timeout."""
+        now_s = time.monotonic()
+        if now_s < self._retry_s:
+            time.sleep(min(timeout_s, self._retry_s - now_s))
+            return None
+        self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
+        self._retry_s = now_s + self._pause_s
+        try:
+            self._bus = self._open()
+        except BusError:
+            return None
+        self._counters.reopened += 1
+        self._say(f"{self.channel}: the bus is open again")
+        return self._bus
+
+
+def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float, counters: Counters) -> float:
+    """When a frame came, on the steady clock.
+
+    Parameters
+    ----------
+    stamp_s : float
+        Its time stamp by the kernel or the adapter. [s]
+    now_s : float
+        The steady clock now. [s]
+    clock_ahead_s : float
+        By how much the time of day is ahead of the steady clock. [s]
+    counters : Counters
+        Where stamps are counted that cannot be.
+
+    Returns
+    -------
+    float
+        The stamp on the steady clock; now if that would be in the future or long ago, as after the clock was set.
+    """
+    time_s = stamp_s - clock_ahead_s
+    if now_s - _OLDEST_FRAME_S <= time_s <= now_s:
+        return time_s
+    counters.clock_steps += time_s < now_s - _OLDEST_FRAME_S or time_s > now_s + _OLDEST_FRAME_S
+    return now_s
+
+
+def _number(error: Exception) -> int | None:
+    code = getattr(error, "error_code", None)
+    return code if code is not None else getattr(error, "errno", None)
+
+
+def _why(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno == errno.EAFNOSUPPORT:
+        return "this kernel has no SocketCAN (try tools/with_vcan)"
+    if isinstance(error, OSError) and error.errno == errno.ENODEV:
+        return "no such interface (see 'ip link')"
+    return str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -1,0 +1,181 @@
+"""``ecu-node run``: parameters, core, buses and service put together."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import can
+
+from ecu_node.buses import SteadyBus
+from ecu_node.corrector import Corrector
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.guard import Mode
+from ecu_node.layout import read_layout
+from ecu_node.node import GatewayNode, OverlayNode, open_bus
+from ecu_node.parameter_file import ParameterFile
+from ecu_node.service import Log, Requests, ServiceManager
+from ecu_node.status import Reason
+from ecu_node.wiring import not_published, wire
+
+__all__ = ["RunOptions", "run_node"]
+
+_DEFAULT_PERIOD_S = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """What was asked for on the command line.
+
+    Attributes
+    ----------
+    params, layout : Path
+        Parameter file and layout.
+    vehicle : str or None
+        Identity of the vehicle; None: not checked.
+    interface, channel : str
+        Bus of the sensors, as python-can names it.
+    gateway : str or None
+        Channel of the bus on the other side; None: overlay.
+    fd : bool
+        Whether to use CAN FD.
+    shadow : bool
+        Compute and report, change nothing.
+    metrics_port : int or None
+        Port on which Prometheus may ask.
+    """
+
+    params: Path
+    layout: Path
+    vehicle: str | None
+    interface: str
+    channel: str
+    gateway: str | None
+    fd: bool
+    shadow: bool
+    metrics_port: int | None
+
+
+def run_node(options: RunOptions, vehicle_hint: str) -> int:
+    """Run a node until SIGTERM or SIGINT.
+
+    Parameters
+    ----------
+    options : RunOptions
+        What was asked for.
+    vehicle_hint : str
+        What to do for the vehicle to be checked.
+
+    Returns
+    -------
+    int
+        Exit code 0.
+
+    Raises
+    ------
+    UserError
+        If layout, DBC or bus cannot be used, or another node is on the bus.
+    """
+    say, manager = Log().say, ServiceManager()
+    mode = Mode.OVERLAY if options.gateway is None else Mode.GATEWAY
+    database = read_database(read_layout(options.layout))
+    file = ParameterFile(options.params, database, options.vehicle, mode=mode, say=say)
+    corrector = wire(database, file.in_force, time.monotonic(), mode=mode, shadow=options.shadow)
+    buses = []
+    try:
+        for channel in (options.channel, options.gateway):
+            if channel is None:
+                break
+            buses.append(SteadyBus(_opener(database, options, channel, mode), corrector.counters, say))
+        requests = Requests()
+        if options.metrics_port is not None:
+            from ecu_node.metrics import serve_metrics  # noqa: PLC0415  # prometheus_client is optional
+
+            serve_metrics(corrector, options.metrics_port)
+        if file.why_not is not None:
+            say(f"passing measured values through: {file.why_not}")
+        elif options.vehicle is None:
+            say(f"the vehicle is not checked: {vehicle_hint}")
+        _say_what_is_not_done(database, file, mode, say)
+        what = _what(corrector, database, file, mode)
+        where = f"{options.interface} {options.channel}{f' to {options.gateway}' if options.gateway else ''}"
+        say(f"running on {where}{', shadow mode' if options.shadow else ''}, correcting {what or 'nothing'}")
+        manager.ready(f"correcting {what or 'nothing'}")
+        tick = _Tick(corrector, file, requests, manager, say)
+        period_s = database.layout.status.period_s if database.layout.status is not None else _DEFAULT_PERIOD_S
+        try:
+            _node(buses, corrector, database, period_s, tick).run(requests.stop)
+        finally:
+            manager.stopping()
+            say(f"ended: {corrector.counters.text()}")
+    finally:
+        for bus in buses:
+            bus.close()
+    return 0
+
+
+def _opener(database: VehicleDatabase, options: RunOptions, channel: str, mode: Mode) -> Callable[[], can.BusABC]:
+    return lambda: open_bus(database, interface=options.interface, channel=channel, fd=options.fd, mode=mode)
+
+
+def _node(
+    buses: list[SteadyBus], corrector: Corrector, database: VehicleDatabase, period_s: float, tick: "_Tick"
+) -> OverlayNode | GatewayNode:
+    if len(buses) == 1:
+        return OverlayNode(buses[0], corrector, database, period_s=period_s, on_tick=tick)
+    return GatewayNode(buses[0], buses[1], corrector, database, period_s=period_s, on_tick=tick)
+
+
+class _Tick:
+    """What is done beside the frames: watchdog, parameters, and a line in the log when the state changes."""
+
+    def __init__(
+        self,
+        corrector: Corrector,
+        file: ParameterFile,
+        requests: Requests,
+        manager: ServiceManager,
+        say: Callable[[str], None],
+    ) -> None:
+        self._corrector, self._file, self._requests = corrector, file, requests
+        self._manager, self._say = manager, say
+        self._before = corrector.latched
+
+    def __call__(self, now_s: float) -> None:
+        corrector = self._corrector
+        self._manager.alive(now_s)
+        self._file.look(corrector, now_s, asked=self._requests.take_reload())
+        if corrector.latched is not self._before:
+            self._before = corrector.latched
+            text = self._text()
+            self._say(text)
+            self._manager.status(text)
+
+    def _text(self) -> str:
+        corrector = self._corrector
+        which = ", ".join(corrector.latched_branches)
+        match corrector.latched:
+            case Reason.BRANCH_STALE:
+                return f"passing measured values through until the bus has slept: no frames of {which}"
+            case Reason.BRANCH_STUCK:
+                return f"passing measured values through until the bus has slept: {which} never changes"
+            case Reason.CORRECTION_WORSE:
+                return (
+                    "passing measured values through until the bus has slept: the corrected Kirchhoff sum is worse "
+                    "than the measured one"
+                )
+        return "correcting again"
+
+
+def _what(corrector: Corrector, database: VehicleDatabase, file: ParameterFile, mode: Mode) -> str:
+    hidden = not_published(database, file.in_force) if mode is Mode.OVERLAY else []
+    return ", ".join(item.name for item in corrector.branches if item.fault.applied and item.name not in hidden)
+
+
+def _say_what_is_not_done(
+    database: VehicleDatabase, file: ParameterFile, mode: Mode, say: Callable[[str], None]
+) -> None:
+    from ecu_node.check import warnings_of  # noqa: PLC0415  # it builds a node itself
+
+    for text in warnings_of(database, file.in_force, mode):
+        say(text)

@@ -1,0 +1,97 @@
+"""What a service needs of its surroundings: signals, the service manager, and a log that does not flood."""
+
+import os
+import signal
+import socket
+import sys
+import time
+from types import FrameType
+
+__all__ = ["Log", "Requests", "ServiceManager"]
+
+_SAME_LINE_EVERY_S = 10.0
+"""A line is not written again before this has passed. [s]"""
+_REMEMBERED_LINES = 100
+
+
+class Requests:
+    """Signals that came: SIGTERM and SIGINT ask to stop, SIGHUP to read the parameters again."""
+
+    def __init__(self) -> None:
+        self._stop = self._reload = False
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._on_stop)
+        signal.signal(signal.SIGHUP, self._on_reload)
+
+    def stop(self) -> bool:
+        """Whether the node is to stop."""
+        return self._stop
+
+    def take_reload(self) -> bool:
+        """Whether the parameters are to be read again; asked once per signal."""
+        asked, self._reload = self._reload, False
+        return asked
+
+    def _on_stop(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        self._stop = True
+
+    def _on_reload(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        self._reload = True
+
+
+class Log:
+    """Lines on standard error; the same line again only after a while, with how often it came in between."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[float, int]] = {}
+
+    def say(self, text: str) -> None:
+        """Write a line."""
+        now_s = time.monotonic()
+        last_s, held_back = self._last.get(text, (float("-inf"), 0))
+        if now_s - last_s < _SAME_LINE_EVERY_S:
+            self._last[text] = last_s, held_back + 1
+            return
+        if len(self._last) >= _REMEMBERED_LINES:
+            self._last.clear()
+        self._last[text] = now_s, 0
+        again = f" (and {held_back} times before)" if held_back else ""
+        print(f"ecu-node: {text}{again}", file=sys.stderr, flush=True)
+
+
+class ServiceManager:
+    """systemd, if it started the node: told that the node is ready, alive, and what it does; see sd_notify(3)."""
+
+    def __init__(self) -> None:
+        self._address = os.environ.get("NOTIFY_SOCKET")
+        period_us = os.environ.get("WATCHDOG_USEC", "")
+        self._period_s = int(period_us) / 2e6 if period_us.isdecimal() else None
+        self._due_s = 0.0
+
+    def ready(self, text: str) -> None:
+        """The node is at work."""
+        self._notify(f"READY=1\nSTATUS={text}")
+
+    def alive(self, now_s: float) -> None:
+        """The node has just done its work; told at half the time that the watchdog allows."""
+        if self._period_s is not None and now_s >= self._due_s:
+            self._due_s = now_s + self._period_s
+            self._notify("WATCHDOG=1")
+
+    def status(self, text: str) -> None:
+        """What the node does now."""
+        self._notify(f"STATUS={text}")
+
+    def stopping(self) -> None:
+        """The node ends."""
+        self._notify("STOPPING=1")
+
+    def _notify(self, text: str) -> None:
+        if not self._address:
+            return
+        address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+                notify.sendto(text.encode(), address)
+        except OSError:
+            pass  # a service manager that is gone must not end the node

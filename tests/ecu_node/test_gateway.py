@@ -1,0 +1,196 @@
+"""The gateway's core: branch frames rewritten in place, bit by bit, and nothing else."""
+
+from collections.abc import Callable
+
+import pytest
+from e2e.p01 import e2e_p01_check
+from msgspec.structs import replace
+
+from ecu_node.corrector import Corrector
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import LayoutError
+from ecu_node.frames import FrameKey
+from ecu_node.guard import Mode, transmitted
+from ecu_node.sensor_models import TemperatureDrift
+from ecu_node.wiring import InForce, wire
+from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, Frame, decoded, parameters_for, passed_on, protected
+
+MakeDatabase = Callable[..., VehicleDatabase]
+BATTERY, PAIR, HEATER, NET = FrameKey(0x110, False), FrameKey(256, False), FrameKey(512, True), FrameKey(258, False)
+INVALID = ("full_scale_a = 400.0", 'full_scale_a = 400.0\non_bad_frame = "invalid"')
+
+
+def gateway_for(database: VehicleDatabase, *, shadow: bool = False, **faults: tuple[float, float]) -> Corrector:
+    in_force = InForce(parameters=parameters_for(database, **faults))
+    return wire(database, in_force, start_s=0.0, mode=Mode.GATEWAY, shadow=shadow)
+
+
+def battery(database: VehicleDatabase, counter: int, current: float = 100.0, **more: float) -> Frame:
+    return Frame(BATTERY, protected(database, "HV_Battery", counter, BatteryCurrent=current, **more))
+
+
+def test_only_the_current_and_the_crc_change(database: VehicleDatabase) -> None:
+    corrector = gateway_for(database, battery=(0.25, 5.0))
+    for counter in (*range(15), 0):
+        frame = battery(database, counter, 100.0, BatteryVoltage=355.5, JunctionBoxTemperature=33.0)
+        out = passed_on(corrector, frame, 0.0)
+        assert out is not None
+        assert e2e_p01_check(bytearray(out), 0x110)
+        before, after = (decoded(database, "HV_Battery", data) for data in (frame.data, out))
+        assert after.pop("BatteryCurrent") == pytest.approx(76.0)
+        assert (before.pop("BatteryCurrent"), before.pop("Crc") != after.pop("Crc")) == (100.0, True)
+        assert after == before
+
+
+def test_bits_that_no_signal_covers_survive(make_database: MakeDatabase) -> None:
+    database = make_database()
+    corrector = gateway_for(database, battery=(0.5, 3.0))
+    data = bytearray(database.message("Pair").encode({"Battery": 153.0, "Motor": 40.0}))
+    data[4:] = b"\xde\xad\xbe\xef"
+    out = passed_on(corrector, Frame(PAIR, bytes(data)), 0.0)
+    assert out is not None
+    assert out[4:] == b"\xde\xad\xbe\xef"
+    assert decoded(database, "Pair", out) == {"Battery": 100.0, "Motor": 40.0}
+
+
+@pytest.mark.parametrize("code", [-32768, 32501, -32501])
+def test_codes_that_are_no_values_are_passed_on_untouched(database: VehicleDatabase, code: int) -> None:
+    corrector = gateway_for(database, battery=(0.25, 5.0))
+    frame = battery(database, 3, code * 0.02)
+    assert passed_on(corrector, frame, 0.0) == frame.data
+
+
+def test_codes_that_the_layout_calls_no_value_are_passed_on_untouched(make_database: MakeDatabase) -> None:
+    layout = SMALL_LAYOUT.replace('signal = "Pair.Motor"', 'signal = "Pair.Motor", no_value = [77, -300]')
+    database = make_database(layout)
+    corrector = gateway_for(database, motor=(0.5, 3.0))
+    found = []
+    for code in (76, 77, -300):
+        data = database.message("Pair").encode({"Battery": 0, "Motor": code}, scaling=False)
+        out = passed_on(corrector, Frame(PAIR, data), 0.0)
+        found.append(out == data)
+    assert found == [False, True, True]
+
+
+def test_other_frames_pass_as_they_are(database: VehicleDatabase) -> None:
+    corrector = gateway_for(database, battery=(0.25, 5.0))
+    for key in (FrameKey(0x110, True), FrameKey(0x111, False), FrameKey(0x510, False)):
+        assert passed_on(corrector, Frame(key, b"\x01\x02"), 0.0) == b"\x01\x02"
+    assert corrector.counters.frames_in == 0
+
+
+def test_bad_frames_are_held_back(database: VehicleDatabase) -> None:
+    corrector = gateway_for(database, battery=(0.25, 5.0))
+    good = battery(database, 3)
+    damaged = Frame(BATTERY, bytes([good.data[0] ^ 1]) + good.data[1:])
+    found = [passed_on(corrector, frame, 0.0) is None for frame in (good, damaged, good, battery(database, 13))]
+    assert found == [False, True, True, True]
+    counters = corrector.counters
+    assert (counters.corrupt, counters.repeated, counters.jumped, counters.held_back) == (1, 1, 1, 3)
+
+
+def test_bad_frames_are_passed_on_so_that_they_are_seen_to_be_bad(
+    make_database: MakeDatabase, database: VehicleDatabase
+) -> None:
+    layout = database.layout.path.read_text().replace(
+        "full_scale_a = 400.0", 'on_bad_frame = "invalid"\nfull_scale_a = 400.0'
+    )
+    own = make_database(layout.replace("hv_powertrain.dbc", "small.dbc"), database.layout.dbc_path.read_text())
+    corrector = gateway_for(own, battery=(0.25, 5.0))
+    good = battery(own, 3)
+    damaged = Frame(BATTERY, bytes([good.data[0] ^ 1]) + good.data[1:])
+    first = passed_on(corrector, good, 0.0)
+    assert passed_on(corrector, damaged, 0.0) == damaged.data, "its CRC stays wrong"
+    assert passed_on(corrector, good, 0.0) == first, "its counter stays the one before"
+    jumped = passed_on(corrector, battery(own, 13), 0.0)
+    assert jumped is not None
+    assert decoded(own, "HV_Battery", jumped)["AliveCounter"] == 13
+    assert corrector.counters.held_back == 0
+
+
+def test_shadow_mode_passes_all_on_as_it_is(database: VehicleDatabase) -> None:
+    corrector = gateway_for(database, shadow=True, battery=(0.25, 5.0))
+    frame = battery(database, 3)
+    assert passed_on(corrector, frame, 0.0) == frame.data
+    sums = corrector.watch.look(0.0)
+    assert sums is not None
+    assert (sums.measured_a, sums.corrected_a) == pytest.approx((100.0, 76.0))
+
+
+def test_a_power_is_written_back_as_a_power(make_database: MakeDatabase) -> None:
+    database = make_database()
+    corrector = gateway_for(database, heater=(0.25, -2.0))
+    heater = Frame(HEATER, database.message("Heater").encode({"Power": 4000}))
+    assert passed_on(corrector, heater, 0.0) == heater.data, "without a voltage it is passed through"
+    passed_on(corrector, Frame(NET, database.message("Net").encode({"Voltage": 400.0})), 0.0)
+    out = passed_on(corrector, heater, 0.1)
+    assert out is not None
+    current_a = (-4000 / 400 + 2.0) / 1.25
+    assert decoded(database, "Heater", out)["Power"] == round(-current_a * 400)
+    corrector.look(0.7)
+    assert passed_on(corrector, heater, 0.7) == heater.data, "the voltage is too old"
+
+
+MULTIPLEXED = SMALL_DBC.replace(
+    ' SG_ Battery : 7|16@0- (0.1,0) [-3000|3000] "A" Node\n SG_ Motor : 23|16@0- (-0.05,0) [-1600|1600] "A" Node\n',
+    ' SG_ Which M : 0|8@1+ (1,0) [0|255] "" Node\n'
+    ' SG_ Battery m1 : 15|16@0- (0.1,0) [-3000|3000] "A" Node\n'
+    ' SG_ Motor m2 : 15|16@0- (-0.05,0) [-1600|1600] "A" Node\n',
+)
+
+
+def test_a_multiplexed_branch_is_rewritten_where_it_is(make_database: MakeDatabase) -> None:
+    database = make_database(dbc=MULTIPLEXED)
+    corrector = gateway_for(database, battery=(0.5, 3.0), motor=(0.25, 0.0))
+    found = {}
+    for which in (1, 2, 3):
+        data = bytes([which]) + (1530).to_bytes(2, "big") + b"\xaa\xbb\xcc\xdd\xee"
+        out = passed_on(corrector, Frame(PAIR, data), 0.0)
+        assert out is not None
+        assert out[:1] + out[3:] == data[:1] + data[3:]
+        found[which] = int.from_bytes(out[1:3], "big", signed=True)
+    assert found == {1: 1000, 2: 1224, 3: 1530}
+
+
+def test_a_multiplexer_may_have_another_byte_order(make_database: MakeDatabase) -> None:
+    database = make_database(dbc=MULTIPLEXED.replace("Which M : 0|8", "Which M : 28|12"))
+    corrector = gateway_for(database, battery=(0.5, 3.0))
+    found = []
+    for which in (1, 0x101):
+        data = bytes(1) + (1530).to_bytes(2, "big") + (which << 4).to_bytes(2, "little") + bytes(3)
+        out = passed_on(corrector, Frame(PAIR, data), 0.0)
+        assert out is not None
+        found.append(int.from_bytes(out[1:3], "big"))
+    assert found == [1000, 1530]
+
+
+def test_a_frame_too_short_for_one_signal_keeps_it_out(make_database: MakeDatabase) -> None:
+    database = make_database()
+    corrector = gateway_for(database, battery=(0.5, 0.0), motor=(0.5, 0.0))
+    assert passed_on(corrector, Frame(PAIR, b"\x01\x2c\x01"), 0.0) == b"\x00\xc8\x01"
+    assert passed_on(corrector, Frame(PAIR, b"\x01"), 0.0) == b"\x01"
+
+
+def test_a_temperature_changes_the_correction_at_once(database: VehicleDatabase) -> None:
+    parameters = parameters_for(database, motor=(0.0, 0.0), battery=(0.1, 0.0))
+    model = TemperatureDrift(drift_per_k=0.005, reference_c=20.0)
+    bent = {**parameters.branches, "battery": replace(parameters.branches["battery"], sensor_model=model)}
+    in_force = InForce(parameters=replace(parameters, branches=bent))
+    corrector = wire(database, in_force, start_s=0.0, mode=Mode.GATEWAY)
+    found = []
+    for counter, temperature in enumerate((20.0, 20.0, 40.0, 60.0, 215.0, 20.0)):
+        frame = battery(database, counter, 110.0, JunctionBoxTemperature=temperature)
+        out = passed_on(corrector, frame, 0.0)
+        assert out is not None
+        found.append(decoded(database, "HV_Battery", out)["BatteryCurrent"])
+    assert found == pytest.approx([100.0, 100.0, 110 / 1.2, 110 / 1.3, 110.0, 100.0], abs=0.0101)
+
+
+def test_a_gateway_sends_nothing_in_its_own_name_but_the_status(database: VehicleDatabase) -> None:
+    assert [key.identifier for key in transmitted(database, Mode.GATEWAY)] == [0x5F0]
+
+
+def test_a_branch_that_overlaps_the_header_is_refused(make_database: MakeDatabase) -> None:
+    layout = SMALL_LAYOUT + '\n[e2e]\nprofile = "P01"\nmessages = ["Pair"]\n'
+    with pytest.raises(LayoutError, match=r"branch battery: Pair\.Battery is written twice, or overlaps"):
+        gateway_for(make_database(layout))

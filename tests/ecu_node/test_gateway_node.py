@@ -1,0 +1,198 @@
+"""A gateway on two of python-can's virtual buses: real bus objects, the node in threads of its own."""
+
+import random
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+
+import can
+import pytest
+
+from ecu_node.buses import SteadyBus
+from ecu_node.corrector import Corrector
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import BusError
+from ecu_node.guard import Mode
+from ecu_node.node import GatewayNode, open_bus
+from ecu_node.status import Reason, State
+from ecu_node.wiring import InForce, wire
+from tests.ecu_node.vehicles import decoded, parameters_for, protected
+
+LONGEST_WAIT_S = 20.0
+Ends = tuple[can.BusABC, can.BusABC]
+
+
+@pytest.fixture
+def ends(request: pytest.FixtureRequest) -> Iterator[Ends]:
+    """The sensors' and the vehicle's bus, as the rest of the car sees them."""
+    name = request.node.name
+    with (
+        can.Bus(interface="virtual", channel=f"{name} a") as sensors,
+        can.Bus(interface="virtual", channel=f"{name} b") as rest,
+    ):
+        yield sensors, rest
+
+
+@contextmanager
+def gateway(database: VehicleDatabase, name: str, other: str | None = None) -> Iterator[tuple[Corrector, Future[None]]]:
+    """A gateway between the two buses, with a fault of the battery's sensor in force."""
+    in_force = InForce(parameters=parameters_for(database, battery=(0.25, 5.0)))
+    corrector = wire(database, in_force, time.monotonic(), mode=Mode.GATEWAY)
+
+    def opened(channel: str) -> SteadyBus:
+        return SteadyBus(
+            lambda: open_bus(database, interface="virtual", channel=channel, fd=True, mode=Mode.GATEWAY),
+            corrector.counters,
+        )
+
+    buses = opened(f"{name} a"), opened(other or f"{name} b")
+    stop = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(GatewayNode(*buses, corrector, database, period_s=0.02).run, stop.is_set)
+        try:
+            yield corrector, running
+        finally:
+            stop.set()
+            try:
+                running.exception(LONGEST_WAIT_S)
+            finally:
+                for bus in buses:
+                    bus.close()
+
+
+def received(bus: can.BusABC, count: int, *, status: bool = False) -> list[can.Message]:
+    """The next frames; those of the status only if asked for, else all others."""
+    found: list[can.Message] = []
+    give_up = time.monotonic() + LONGEST_WAIT_S
+    while len(found) < count:
+        message = bus.recv(0.5)
+        assert time.monotonic() < give_up, f"{len(found)} of {count} frames came"
+        if message is not None and (message.arbitration_id == 0x5F0) is status:
+            found.append(message)
+    return found
+
+
+def random_frames(database: VehicleDatabase, count: int) -> list[can.Message]:
+    """Branch frames among frames of others: standard, extended, remote, FD, of any length."""
+    chance, counter, frames = random.Random(1), 0, []
+    for _ in range(count):
+        kind = chance.choice(("branch", "standard", "extended", "remote", "fd"))
+        data = chance.randbytes(chance.randrange(9))
+        if kind == "branch":
+            data, counter = protected(database, "HV_Battery", counter % 15, BatteryCurrent=100.0), counter + 1
+        frames.append(
+            can.Message(
+                arbitration_id=0x110 if kind == "branch" else chance.randrange(0x150, 0x4FF),
+                is_extended_id=kind == "extended",
+                is_remote_frame=kind == "remote",
+                is_fd=kind == "fd",
+                bitrate_switch=kind == "fd",
+                dlc=4 if kind == "remote" else None,
+                data=None if kind == "remote" else data if kind != "fd" else chance.randbytes(64),
+            )
+        )
+    return frames
+
+
+def as_sent(message: can.Message) -> tuple[object, ...]:
+    kinds = message.is_extended_id, message.is_remote_frame, message.is_fd, message.bitrate_switch
+    return message.arbitration_id, kinds, message.dlc, bytes(message.data)
+
+
+def test_branch_frames_are_corrected_and_all_others_pass_unchanged_and_in_order(
+    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+) -> None:
+    sensors, vehicle = ends
+    sent = random_frames(database, 2000)
+    with gateway(database, request.node.name) as (corrector, _):
+        for message in sent:
+            sensors.send(message)
+        found = received(vehicle, len(sent))
+        assert corrector.counters.forwarded == len(sent)
+    for before, after in zip(sent, found, strict=True):
+        if before.arbitration_id == 0x110:
+            assert decoded(database, "HV_Battery", bytes(after.data))["BatteryCurrent"] == pytest.approx(76.0)
+        else:
+            assert as_sent(after) == as_sent(before)
+    assert sensors.recv(0.0) is None, "nothing comes back"
+
+
+def test_frames_of_the_vehicle_reach_the_sensors_bus_unchanged_and_in_order(
+    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+) -> None:
+    sensors, vehicle = ends
+    sent = [message for message in random_frames(database, 1000) if message.arbitration_id != 0x110]
+    with gateway(database, request.node.name):
+        received(vehicle, 1, status=True)
+        for message in sent:
+            vehicle.send(message)
+        found = received(sensors, len(sent))
+    assert list(map(as_sent, found)) == list(map(as_sent, sent))
+
+
+def test_frames_that_come_while_it_listens_are_not_lost(
+    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+) -> None:
+    sensors, vehicle = ends
+    sent = [can.Message(arbitration_id=0x300 + k, is_extended_id=False, data=[k]) for k in range(50)]
+    with gateway(database, request.node.name):
+        for message in sent:
+            vehicle.send(message)
+            time.sleep(0.001)
+        assert list(map(as_sent, received(sensors, 50))) == list(map(as_sent, sent))
+
+
+def test_the_status_goes_to_the_vehicle_alone(
+    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+) -> None:
+    sensors, vehicle = ends
+    with gateway(database, request.node.name):
+        for counter in range(10):
+            data = protected(database, "HV_Battery", counter, BatteryCurrent=100.0)
+            sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
+            (status,) = received(vehicle, 1, status=True)
+    values = decoded(database, "HV_CorrectionStatus", bytes(status.data))
+    assert (values["State"], values["Reason"]) == (State.CORRECTING, Reason.NONE)
+    assert (values["JunctionSumMeasured"], values["JunctionSumCorrected"]) == pytest.approx((100.0, 76.0))
+    assert sensors.recv(0.0) is None
+
+
+WORDS = "another node sends frames 0x(110|5F0), which only this one may send there; two nodes on one bus, or two buses"
+
+
+def test_a_branch_frame_from_the_vehicle_ends_it(
+    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+) -> None:
+    sensors, vehicle = ends
+    with gateway(database, request.node.name) as (_, running):
+        received(vehicle, 1, status=True)
+        vehicle.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=bytes(8)))
+        with pytest.raises(BusError, match=WORDS):
+            running.result(LONGEST_WAIT_S)
+    assert sensors.recv(0.0) is None, "it was not passed on"
+
+
+def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest) -> None:
+    sensors, _ = ends
+    name = request.node.name
+    with gateway(database, name, f"{name} a") as (_, running):
+        data = protected(database, "HV_Battery", 0, BatteryCurrent=100.0)
+        for _ in range(3):
+            sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
+        with pytest.raises(BusError, match=WORDS):
+            running.result(LONGEST_WAIT_S)
+
+
+def test_a_second_gateway_between_the_same_buses_refuses(
+    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+) -> None:
+    _, vehicle = ends
+    name = request.node.name
+    with gateway(database, name) as (_, first):
+        received(vehicle, 1, status=True)
+        with gateway(database, name) as (_, second), pytest.raises(BusError, match=WORDS):
+            second.result(LONGEST_WAIT_S)
+        received(vehicle, 3, status=True)
+        assert not first.done()

@@ -1,0 +1,108 @@
+"""Parameters of a running node: replaced by what fits, kept otherwise."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from ecu_node.corrector import Corrector
+from ecu_node.database import VehicleDatabase
+from ecu_node.guard import Mode
+from ecu_node.parameter_file import ParameterFile
+from ecu_node.parameters import write_parameters
+from ecu_node.status import Reason
+from ecu_node.wiring import wire
+from tests.ecu_node.vehicles import parameters_for
+
+
+@pytest.fixture
+def path(database: VehicleDatabase, tmp_path: Path) -> Path:
+    path = tmp_path / "v1.json"
+    write_parameters(parameters_for(database, battery=(0.25, 5.0)), path)
+    return path
+
+
+class Running:
+    """A corrector with its parameter file, and what was said."""
+
+    def __init__(self, path: Path, database: VehicleDatabase) -> None:
+        self.said: list[str] = []
+        self.file = ParameterFile(path, database, "v1", mode=Mode.OVERLAY, say=self.said.append)
+        self.corrector: Corrector = wire(database, self.file.in_force, 0.0)
+        self.file.look(self.corrector, 0.0)
+
+    @property
+    def drift(self) -> float:
+        return self.corrector.branches[0].fault.drift
+
+
+def test_a_changed_file_is_put_in_force_within_a_second(path: Path, database: VehicleDatabase) -> None:
+    running = Running(path, database)
+    assert (running.drift, running.file.look(running.corrector, 5.0)) == (0.25, False)
+    write_parameters(parameters_for(database, battery=(0.125, 5.0)), path)
+    assert not running.file.look(running.corrector, 5.5), "it looks once a second"
+    assert running.file.look(running.corrector, 6.0)
+    assert running.drift == 0.125
+    assert running.said == ["parameter set 300 of vehicle v1 is in force"]
+    assert running.corrector.counters.reloads == 1
+
+
+def test_when_asked_it_is_read_at_once(path: Path, database: VehicleDatabase) -> None:
+    running = Running(path, database)
+    assert running.file.look(running.corrector, 0.1, asked=True)
+
+
+@pytest.mark.parametrize("cut", [0, 1, 300])
+def test_a_file_that_is_half_written_changes_nothing_and_counts_once_it_is_whole(
+    path: Path, database: VehicleDatabase, tmp_path: Path, cut: int
+) -> None:
+    running = Running(path, database)
+    write_parameters(parameters_for(database, battery=(0.125, 5.0)), tmp_path / "new.json")
+    whole = (tmp_path / "new.json").read_bytes()
+    path.write_bytes(whole[:cut])
+    assert not running.file.look(running.corrector, 2.0)
+    assert (running.drift, running.corrector.reason) == (0.25, Reason.NONE)
+    (line,) = running.said
+    assert line.startswith(f"new parameters are not used, those before stay in force: {path}: not a parameter file")
+    assert not running.file.look(running.corrector, 4.0)
+    path.write_bytes(whole)
+    assert running.file.look(running.corrector, 6.0)
+    assert running.drift == 0.125
+    assert running.corrector.counters.reload_failures == 1
+
+
+def test_a_file_that_is_gone_changes_nothing(path: Path, database: VehicleDatabase) -> None:
+    running = Running(path, database)
+    path.unlink()
+    running.file.look(running.corrector, 2.0)
+    assert running.drift == 0.25
+    assert running.said[0].endswith("no such parameter file")
+
+
+def test_parameters_of_another_vehicle_change_nothing(path: Path, database: VehicleDatabase) -> None:
+    running = Running(path, database)
+    path.write_bytes(path.read_bytes().replace(b'"v1"', b'"v2"'))
+    running.file.look(running.corrector, 2.0)
+    assert running.drift == 0.25
+    assert "parameters are for vehicle 'v2', this is 'v1'" in running.said[0]
+
+
+def test_a_file_that_comes_later_is_put_in_force(path: Path, database: VehicleDatabase) -> None:
+    content = path.read_bytes()
+    path.unlink()
+    running = Running(path, database)
+    assert running.corrector.reason is Reason.NO_PARAMETERS
+    path.write_bytes(content)
+    assert running.file.look(running.corrector, 2.0)
+    assert (running.corrector.reason, running.drift) == (Reason.NONE, 0.25)
+
+
+def test_a_new_file_of_the_same_size_and_time_is_noticed(path: Path, database: VehicleDatabase) -> None:
+    running = Running(path, database)
+    found = path.stat()
+    write_parameters(parameters_for(database, battery=(0.75, 5.0)), path)
+    path.write_bytes(path.read_bytes().replace(b"0.75", b"0.15"))
+    os.utime(path, ns=(found.st_atime_ns, found.st_mtime_ns))
+    assert path.stat().st_size == found.st_size
+    assert running.file.look(running.corrector, 2.0)
+    assert running.drift == 0.15
