@@ -1,4 +1,4 @@
-"""Command line of the node: ``ecu-node run``, ``ecu-node check``, ``ecu-node schema``.
+"""Command line of the node: ``ecu-node run``, ``ecu-node monitor``, ``ecu-node check``, ``ecu-node schema``.
 
 Results go to standard output, what happens to standard error. Exit code 0: done, 1: failed, 2: wrong use,
 130: interrupted by Ctrl-C before the node was at work (at work, Ctrl-C and SIGTERM end it with 0).
@@ -7,6 +7,7 @@ Results go to standard output, what happens to standard error. Exit code 0: done
 import argparse
 import json
 import logging
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -19,6 +20,8 @@ from ecu_node.interrupts import ending_at_interrupt
 __all__ = ["main"]
 
 _VEHICLE_VARIABLE = "ECU_NODE_VEHICLE"
+_LONGEST_ONCE_S = 86400.0
+"""For ``monitor --once``. [s]"""
 _EXIT_CODES = "Exit codes: 0 done (also when ended by a signal), 1 failed, 2 wrong use, 130 interrupted at start."
 
 
@@ -74,20 +77,19 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_EXIT_CODES,
     )
     _add_files(run)
-    run.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
-    run.add_argument("--channel", required=True, help="channel of the interface, such as can0 or vcan0")
+    _add_bus(run)
     run.add_argument(
         "--gateway",
         metavar="CHANNEL",
         help="be a gateway: the sensors are on --channel, the rest of the vehicle on this; branch frames are passed "
         "on with the corrected current in place, all others as they are",
     )
-    run.add_argument("--fd", action="store_true", help="open the bus for CAN FD")
     run.add_argument("--shadow", action="store_true", help="compute and report the corrected sum, but change nothing")
     run.add_argument(
         "--metrics-port", type=int, metavar="PORT", help="let Prometheus ask here (needs prometheus-client)"
     )
     run.set_defaults(command=_run)
+    _add_monitor(commands)
     check = commands.add_parser(
         "check",
         help="would these parameters be applied?",
@@ -104,9 +106,49 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_monitor(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    monitor = commands.add_parser(
+        "monitor",
+        help="show the branches, their sum and the node, live",
+        description="Listens to a bus, and never sends: measured and corrected currents, frame rates, faults, the "
+        "Kirchhoff sum, and what the node says of itself. A table in a terminal (needs rich), else a block of text "
+        "per second.",
+        epilog="Exit codes: 0 done (also when ended by a signal), 1 failed, or with --once no branch was seen, "
+        "2 wrong use, 130 interrupted at start.",
+    )
+    _add_layout(monitor)
+    _add_bus(monitor)
+    monitor.add_argument(
+        "--once", type=_seconds, metavar="SECONDS", help="listen this long, print what was seen, and end"
+    )
+    monitor.add_argument("--json", action="store_true", help="print JSON; with --once")
+    monitor.set_defaults(command=_monitor, error=monitor.error)
+
+
+def _seconds(text: str) -> float:
+    """A time of the command line. [s]"""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0.0 < seconds <= _LONGEST_ONCE_S:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a number of seconds above 0, at most {_LONGEST_ONCE_S:g}")
+    return seconds
+
+
+def _add_bus(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
+    parser.add_argument("--channel", required=True, help="channel of the interface, such as can0 or vcan0")
+    parser.add_argument("--fd", action="store_true", help="open the bus for CAN FD")
+
+
+def _add_layout(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--layout", type=Path, required=True, metavar="FILE", help="layout (TOML), which names the DBC")
+
+
 def _add_files(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--params", type=Path, required=True, metavar="FILE", help="parameter file of this vehicle")
-    parser.add_argument("--layout", type=Path, required=True, metavar="FILE", help="layout (TOML), which names the DBC")
+    _add_layout(parser)
     parser.add_argument(
         "--vehicle",
         default=os.environ.get(_VEHICLE_VARIABLE) or None,
@@ -142,6 +184,23 @@ def _run(options: argparse.Namespace) -> int:
             metrics_port=options.metrics_port,
         ),
         vehicle_hint=f"give --vehicle or ${_VEHICLE_VARIABLE}",
+    )
+
+
+def _monitor(options: argparse.Namespace) -> int:
+    from ecu_node.monitor import MonitorOptions, run_monitor  # noqa: PLC0415  # after _load_python_can
+
+    if options.json and options.once is None:
+        options.error("--json needs --once SECONDS")
+    return run_monitor(
+        MonitorOptions(
+            layout=options.layout,
+            interface=options.interface,
+            channel=options.channel,
+            fd=options.fd,
+            once_s=options.once,
+            as_json=options.json,
+        )
     )
 
 

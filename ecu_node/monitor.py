@@ -1,0 +1,238 @@
+"""``ecu-node monitor``: bus, clock and terminal around :mod:`ecu_node.monitor_model`; it listens, and never sends."""
+
+import json
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import can
+
+from ecu_node.buses import SteadyBus, steady_time_s
+from ecu_node.counters import Counters
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.errors import UserError
+from ecu_node.guard import Mode
+from ecu_node.layout import read_layout
+from ecu_node.monitor_model import BusMonitor, View
+from ecu_node.monitor_text import COLUMNS, LEFT, as_json, node_line, notes, plain_block, rows
+from ecu_node.node import open_bus
+from ecu_node.service import Log, Requests
+
+__all__ = ["MonitorOptions", "listen", "run_monitor"]
+
+_LIVE_PERIOD_S, _PLAIN_PERIOD_S = 0.25, 1.0
+"""Between two pictures. [s]"""
+_LONGEST_WAIT_S = 0.25
+"""A wake-up at least this often, so that a request to stop is seen. [s]"""
+_RECEIVE_BUFFER_BYTES = 1 << 20
+"""Asked of the kernel, which gives what it allows: frames of the time in which a table is drawn."""
+_SO_MEMINFO, _DROPS = 55, 8
+"""Socket option, and the place of the dropped frames in it (asm-generic/socket.h, linux/sock_diag.h)."""
+
+_LEAST_WORDS, _LONGEST_NUMBER, _WIDE = 7, "+999.99", 100
+"""Of the live table: width of its columns of words, what its numbers need, and a terminal with room for gaps."""
+
+_Show = Callable[[View, list[str]], None]
+"""Takes what is to be shown, and further lines."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MonitorOptions:
+    """What was asked for on the command line.
+
+    Attributes
+    ----------
+    layout : Path
+        Layout of the vehicle.
+    interface, channel : str
+        Bus, as python-can names it.
+    fd : bool
+        Whether to open it for CAN FD.
+    once_s : float or None
+        Listen this long, and tell once what was seen [s]; None: until interrupted.
+    as_json : bool
+        Tell it as JSON.
+    """
+
+    layout: Path
+    interface: str
+    channel: str
+    fd: bool
+    once_s: float | None
+    as_json: bool
+
+
+def run_monitor(options: MonitorOptions) -> int:
+    """Show what is on a bus until SIGINT, SIGTERM or SIGHUP.
+
+    Parameters
+    ----------
+    options : MonitorOptions
+        What was asked for.
+
+    Returns
+    -------
+    int
+        Exit code: 0, or 1 if it was to listen once and no branch was seen.
+
+    Raises
+    ------
+    UserError
+        If layout, DBC or bus cannot be used, or rich is missing for a live table.
+    """
+    database = read_database(read_layout(options.layout))
+    where = f"{options.interface} {options.channel}"
+    requests = Requests()
+    was_hung_up = False
+
+    def stop() -> bool:
+        nonlocal was_hung_up
+        was_hung_up |= requests.take_reload()  # SIGHUP: the terminal was closed
+        return was_hung_up or requests.stop()
+
+    counters = Counters()
+    opener = _Opener(database, options)
+    with _display(options, where) as (show, period_s):
+        bus = SteadyBus(opener, counters, Log().say)
+        try:
+            monitor = BusMonitor(database, time.monotonic())
+            view = None
+            while view is None or (options.once_s is None and not stop()):
+                listen(bus, monitor, time.monotonic() + period_s, stop, counters)
+                view = monitor.look(time.monotonic())
+                show(view, _bus_notes(counters, opener.dropped()))
+        finally:
+            bus.close()
+    if options.once_s is not None and not view.is_any_branch_seen:
+        print(f"ecu-node: {where}: no branch of {options.layout} was seen", file=sys.stderr)
+        return 1
+    return 0
+
+
+def listen(bus: SteadyBus, monitor: BusMonitor, until_s: float, stop: Callable[[], bool], counters: Counters) -> None:
+    """Take what comes until a time of the steady clock.
+
+    Parameters
+    ----------
+    bus : SteadyBus
+        Bus to listen to.
+    monitor : BusMonitor
+        Takes the frames.
+    until_s : float
+        When to return. [s]
+    stop : callable
+        Whether to return earlier; asked at least every 0.25 s.
+    counters : Counters
+        Where time stamps are counted that cannot be.
+    """
+    clock, receive, take = time.monotonic, bus.receive, monitor.take
+    while (now_s := clock()) < until_s and not stop():
+        ahead_s = time.time() - now_s
+        turn_end_s = min(until_s, now_s + _LONGEST_WAIT_S)
+        while now_s < turn_end_s and (message := receive(turn_end_s - now_s)) is not None:
+            now_s = clock()
+            if not message.is_remote_frame:
+                time_s = steady_time_s(message.timestamp, now_s, ahead_s, counters)
+                take((message.arbitration_id, message.is_extended_id), message.data, time_s)
+
+
+class _Opener:
+    """Opens the bus, and tells how many frames the kernel dropped because they were not read in time."""
+
+    def __init__(self, database: VehicleDatabase, options: MonitorOptions) -> None:
+        self._database, self._options = database, options
+        self._queue: socket.socket | None = None
+
+    def __call__(self) -> can.BusABC:
+        bus = open_bus(
+            self._database,
+            interface=self._options.interface,
+            channel=self._options.channel,
+            fd=self._options.fd,
+            mode=Mode.OVERLAY,
+        )
+        queue = getattr(bus, "socket", None)
+        self._queue = queue if isinstance(queue, socket.socket) else None
+        if self._queue is not None:
+            self._queue.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+        return bus
+
+    def dropped(self) -> int:
+        """Frames of this socket; 0 where that is not known."""
+        if self._queue is None:
+            return 0
+        try:
+            info = self._queue.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_DROPS + 1))
+        except OSError:  # closed meanwhile, or a kernel before 4.12
+            return 0
+        return struct.unpack(f"={_DROPS + 1}I", info)[_DROPS] if len(info) == 4 * (_DROPS + 1) else 0
+
+
+def _bus_notes(counters: Counters, dropped: int) -> list[str]:
+    lines = []
+    if counters.bus_errors:
+        lines.append(f"error frames of the bus: {counters.bus_errors}; a wrong bit rate, or a fault in the wiring?")
+    if dropped:
+        lines.append(f"frames that this computer was too slow to read: {dropped}; they count as lost above")
+    return lines
+
+
+@contextmanager
+def _display(options: MonitorOptions, where: str) -> Iterator[tuple[_Show, float]]:
+    """How views are shown, and after how long the first and each further one. [s]"""
+    if options.once_s is None and sys.stdout.isatty():
+        with _live_table(where) as show:
+            yield show, _LIVE_PERIOD_S
+        return
+
+    def show_plainly(view: View, more: list[str]) -> None:
+        text = json.dumps(as_json(view), indent=2) if options.as_json else plain_block(view, where, more)
+        print(text if options.once_s is not None else f"{text}\n", flush=True)
+
+    yield show_plainly, options.once_s or _PLAIN_PERIOD_S
+
+
+@contextmanager
+def _live_table(where: str) -> Iterator[_Show]:
+    try:
+        from rich.box import SIMPLE_HEAD  # noqa: PLC0415  # optional
+        from rich.console import Group  # noqa: PLC0415
+        from rich.live import Live  # noqa: PLC0415
+        from rich.table import Table  # noqa: PLC0415
+        from rich.text import Text  # noqa: PLC0415
+    except ImportError:
+        raise UserError(
+            "a live table needs rich; install it with pip install 'hv-current-correction[monitor]', "
+            "or give --once SECONDS"
+        ) from None
+
+    def table_of(view: View, gap: int) -> Table:
+        table = Table(box=SIMPLE_HEAD, padding=(0, gap, 0, 0), pad_edge=False)
+        for name in COLUMNS:
+            if name in LEFT:  # a narrow terminal wraps words, and never cuts a number
+                table.add_column(name, min_width=_LEAST_WORDS, no_wrap=name == COLUMNS[0])
+            else:
+                table.add_column(Text(name), justify="right", width=max(map(len, (*name.split(), _LONGEST_NUMBER))))
+        for position, row in enumerate(rows(view), start=1):
+            style = "yellow" if row.is_faulty else "" if row.is_seen else "dim"
+            table.add_row(*map(Text, row.cells), style=style, end_section=position == len(view.branches))
+        return table
+
+    last = ""
+    with Live(auto_refresh=False, screen=True) as live:
+
+        def show(view: View, more: list[str]) -> None:
+            nonlocal last
+            last = plain_block(view, where, more)
+            head = Text(f"{where}: {node_line(view)}", style="bold")
+            gap = int(live.console.width >= _WIDE)
+            live.update(Group(head, table_of(view, gap), *map(Text, [*notes(view), *more])), refresh=True)
+
+        yield show
+    if last:
+        print(last)  # what was seen last stays on the screen

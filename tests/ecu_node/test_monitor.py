@@ -1,0 +1,212 @@
+"""``ecu-node monitor`` on python-can's virtual bus: plain blocks, JSON, a real terminal, exit codes."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import can
+import pytest
+
+from ecu_node.buses import SteadyBus
+from ecu_node.cli import main
+from ecu_node.counters import Counters
+from ecu_node.database import VehicleDatabase
+from ecu_node.monitor import listen
+from ecu_node.monitor_model import BusMonitor
+from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, protected
+
+CHANNEL = "monitor"
+MONITOR = ["monitor", "--layout", str(LAYOUT), "--interface", "virtual", "--channel", CHANNEL]
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """Leave signal handlers as they were."""
+    numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+
+
+def battery_frame(database: VehicleDatabase, counter: int) -> can.Message:
+    data = protected(database, "HV_Battery", counter % 15, BatteryCurrent=100.0)
+    return can.Message(arbitration_id=0x110, is_extended_id=False, data=data)
+
+
+@contextmanager
+def battery_on_bus(database: VehicleDatabase) -> Iterator[can.BusABC]:
+    """A battery that sends; the bus to listen on whether anybody else does."""
+    ended = threading.Event()
+
+    def send(bus: can.BusABC) -> None:
+        counter = 0
+        while not ended.wait(0.01):
+            bus.send(battery_frame(database, counter))
+            counter += 1
+
+    with can.Bus(interface="virtual", channel=CHANNEL) as bus:
+        thread = threading.Thread(target=send, args=(bus,))
+        thread.start()
+        try:
+            yield bus
+        finally:
+            ended.set()
+            thread.join()
+
+
+def test_once_prints_what_was_seen_and_sends_nothing(
+    database: VehicleDatabase, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with battery_on_bus(database) as bus:
+        assert main([*MONITOR, "--once", "0.5"]) == 0
+        assert bus.recv(0.0) is None
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"virtual {CHANNEL}: no node on this bus"
+    battery = next(line.split() for line in lines if line.startswith("battery"))
+    assert battery[1] == "+100.00"
+    assert lines[-1] == "no corrected messages on this bus: the currents are shown as they are on it"
+
+
+def test_once_as_json(database: VehicleDatabase, capsys: pytest.CaptureFixture[str]) -> None:
+    with battery_on_bus(database):
+        assert main([*MONITOR, "--once", "0.5", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["branches"][0]["measured_a"] == pytest.approx(100.0)
+    assert document["branches"][0]["rate_hz"] > 0.0
+
+
+def test_a_bus_without_any_branch_ends_in_1(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*MONITOR, "--once", "0.1"]) == 1
+    captured = capsys.readouterr()
+    assert captured.err == f"ecu-node: virtual {CHANNEL}: no branch of {LAYOUT} was seen\n"
+    assert captured.out.splitlines()[-1].startswith("no frame of any branch")
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_without_a_terminal_a_block_comes_per_second_until_a_signal(
+    how: signal.Signals, capsys: pytest.CaptureFixture[str]
+) -> None:
+    timer = threading.Timer(1.3, os.kill, (os.getpid(), how))
+    timer.start()
+    start_s = time.monotonic()
+    assert main(MONITOR) == 0
+    timer.join()
+    assert time.monotonic() - start_s < 10.0
+    blocks = capsys.readouterr().out.strip().split("\n\n")
+    assert len(blocks) == 2
+    assert all(block.startswith(f"virtual {CHANNEL}: no node on this bus\nbranch ") for block in blocks)
+
+
+def test_in_a_terminal_a_table_is_drawn_and_ctrl_c_ends_it_with_0() -> None:
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-m", "ecu_node", *MONITOR]
+    shown = b""
+    with subprocess.Popen(
+        command, stdin=theirs, stdout=theirs, stderr=theirs, env={**os.environ, "TERM": "xterm", "COLUMNS": "120"}
+    ) as process:
+        os.close(theirs)
+        while b"motor_rear" not in shown:
+            shown += os.read(ours, 65536)
+        process.send_signal(signal.SIGINT)
+        try:
+            while chunk := os.read(ours, 65536):
+                shown += chunk
+        except OSError:  # EIO: the terminal has no other end any more
+            pass
+        assert process.wait(timeout=60) == 0
+    os.close(ours)
+    text = shown.decode()
+    assert "\x1b[?1049h" in text  # on a screen of its own, which is given back
+    assert "\x1b[?1049l" in text
+    assert "not fitted?" in text.rpartition("\x1b[?1049l")[2]
+
+
+def test_without_rich_one_line_says_what_to_install() -> None:
+    ours, theirs = pty.openpty()
+    code = f"import sys; sys.modules['rich.live'] = None; from ecu_node.cli import main; sys.exit(main({MONITOR!r}))"
+    result = subprocess.run(
+        [sys.executable, "-c", code], stdout=theirs, stderr=subprocess.PIPE, text=True, timeout=60, check=False
+    )
+    os.close(theirs)
+    os.close(ours)
+    assert result.returncode == 1
+    assert result.stderr == (
+        "ecu-node: a live table needs rich; install it with pip install 'hv-current-correction[monitor]', "
+        "or give --once SECONDS\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--json"], "--json needs --once SECONDS"),
+        (["--once", "0"], "expected a number of seconds above 0"),
+        (["--once", "nan"], "expected a number of seconds above 0"),
+        (["--once", "soon"], "expected a number of seconds above 0"),
+        (["--params", "p.json"], "unrecognized arguments"),
+    ],
+)
+def test_wrong_use_ends_in_2(options: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([*MONITOR, *options])
+    assert caught.value.code == 2
+    assert words in capsys.readouterr().err
+
+
+def test_help_is_given(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["monitor", "--help"])
+    assert caught.value.code == 0
+    assert "Listens to a bus, and never sends" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("layout", "interface", "words"),
+    [
+        ("missing.toml", "virtual", "ecu-node: missing.toml: cannot read the layout: "),
+        (str(LAYOUT), "carrier_pigeon", "ecu-node: carrier_pigeon nobus0: cannot open the bus: "),
+        (str(LAYOUT), "socketcan", "ecu-node: socketcan nobus0: cannot open the bus: "),
+    ],
+)
+def test_what_keeps_it_from_listening_is_one_line(
+    layout: str, interface: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["monitor", "--layout", layout, "--interface", interface, "--channel", "nobus0", "--once", "1"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(words)
+    assert captured.err.count("\n") == 1
+
+
+def test_a_layout_that_needs_can_fd_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
+    (tmp_path / "small.dbc").write_text(SMALL_DBC.replace("PairOut: 8", "PairOut: 16"))
+    command = ["monitor", "--layout", str(tmp_path / "small.toml"), "--interface", "virtual", "--channel", CHANNEL]
+    assert main([*command, "--once", "0.1"]) == 1
+    assert "CAN FD messages (PairOut); start with --fd" in capsys.readouterr().err
+
+
+def test_of_many_frames_none_is_left_out(database: VehicleDatabase) -> None:
+    """All that are there at once are taken in one turn, remote frames left alone."""
+    counters = Counters()
+    bus = SteadyBus(lambda: can.Bus(interface="virtual", channel=CHANNEL), counters)
+    with can.Bus(interface="virtual", channel=CHANNEL) as other:
+        for counter in range(5000):
+            other.send(battery_frame(database, counter))
+            other.send(can.Message(arbitration_id=0x110, is_extended_id=False, is_remote_frame=True))
+        start_s = time.monotonic()
+        monitor = BusMonitor(database, start_s)
+        listen(bus, monitor, start_s + 5.0, lambda: time.monotonic() > start_s + 1.0, counters)
+        bus.close()
+    battery = monitor.look(start_s + 1.0).branches[0]
+    assert battery.rate_hz == pytest.approx(5000.0)
+    assert (battery.faults.corrupt, battery.faults.lost, battery.faults.repeated) == (0, 0, 0)

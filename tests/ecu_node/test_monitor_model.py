@@ -1,0 +1,276 @@
+"""What the monitor makes of frames: frames by cantools and autosar-e2e, without terminal, bus or clock."""
+
+import dataclasses
+from collections.abc import Callable
+
+import pytest
+
+from ecu_node.database import VehicleDatabase
+from ecu_node.guard import key_of
+from ecu_node.monitor_model import BranchView, BusMonitor, FrameFaults, Sums, View
+from ecu_node.status import Quality, Reason, State
+from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, protected
+
+
+class Bus:
+    """Frames of the project's DBC, each message with its own counter."""
+
+    def __init__(self, database: VehicleDatabase, start_s: float = 0.0) -> None:
+        self.database, self.monitor = database, BusMonitor(database, start_s)
+        self.counters: dict[str, int] = {}
+
+    def send(self, message: str, time_s: float, *, step: int = 1, spoilt: bool = False, **values: float) -> None:
+        counter = (self.counters.get(message, -1) + step) % 15
+        self.counters[message] = counter
+        data = bytearray(protected(self.database, message, counter, **values))
+        data[7] ^= spoilt
+        self.monitor.take(key_of(self.database.message(message)), data, time_s)
+
+    def battery(self, time_s: float, measured_a: float, corrected_a: float | None = None, quality: int = 2) -> None:
+        self.send("HV_Battery", time_s, BatteryCurrent=measured_a)
+        if corrected_a is not None:
+            self.send(
+                "HV_BatteryCorrected",
+                time_s + 0.001,
+                BatteryCurrentCorrected=corrected_a,
+                BatteryCurrentQuality=quality,
+            )
+
+    def motor(self, time_s: float, measured_a: float, corrected_a: float | None = None) -> None:
+        """In the direction of the signal: consumption positive."""
+        self.send("HV_Motor", time_s, MotorCurrent=measured_a)
+        if corrected_a is not None:
+            self.send("HV_MotorCorrected", time_s + 0.001, MotorCurrentCorrected=corrected_a, MotorCurrentQuality=2)
+
+    def look(self, now_s: float) -> View:
+        return self.monitor.look(now_s)
+
+
+@pytest.fixture
+def bus(database: VehicleDatabase) -> Bus:
+    return Bus(database)
+
+
+def of(view: View, name: str) -> BranchView:
+    return next(branch for branch in view.branches if branch.name == name)
+
+
+def test_a_branch_shows_what_was_measured_what_is_published_and_the_difference(bus: Bus) -> None:
+    bus.battery(0.01, 100.0, 95.5)
+    bus.motor(0.01, 80.0, 81.0)
+    view = bus.look(0.05)
+    battery, motor = of(view, "battery"), of(view, "motor")
+    assert (battery.measured_a, battery.corrected_a, battery.correction_a) == pytest.approx((100.0, 95.5, -4.5))
+    assert (motor.measured_a, motor.corrected_a, motor.correction_a) == pytest.approx((-80.0, -81.0, -1.0))
+    assert battery.quality is Quality.CORRECTED
+    assert battery.age_s == pytest.approx(0.04)
+    assert view.publishes_corrected
+
+
+def test_a_measured_frame_is_shown_with_its_own_answer(bus: Bus) -> None:
+    bus.battery(0.01, 100.0, 95.0)
+    bus.battery(0.03, 200.0)
+    battery = of(bus.look(0.031), "battery")
+    assert (battery.measured_a, battery.corrected_a, battery.correction_a) == pytest.approx((100.0, 95.0, -5.0))
+
+
+def test_measured_frames_that_nobody_answers_any_more_are_shown_all_the_same(bus: Bus) -> None:
+    bus.battery(0.01, 100.0, 95.0)
+    for k in range(20):
+        bus.battery(0.03 + 0.02 * k, 200.0)
+    battery = of(bus.look(0.42), "battery")
+    assert battery.measured_a == pytest.approx(200.0)
+    assert (battery.is_stale, battery.corrected_is_stale) == (False, True)
+
+
+def test_sums_are_taken_in_one_instant(bus: Bus) -> None:
+    """Currents that rise by 1000 A/s sum to 0 at every instant, though no two frames come at the same time."""
+    for k in range(4):
+        t = 0.02 * k
+        bus.battery(t, 1000.0 * t, 500.0 * t)
+        bus.motor(t + 0.01, 1000.0 * (t + 0.01), 500.0 * (t + 0.01))
+    sums = bus.look(0.08).sums
+    assert sums.measured_a == pytest.approx(0.0, abs=0.02)
+    assert sums.corrected_a == pytest.approx(0.0, abs=0.02)
+
+
+def test_a_sum_is_not_known_while_a_branch_is_stale_or_unanswered(bus: Bus) -> None:
+    bus.battery(0.0, 100.0, 90.0)
+    bus.motor(0.0, 80.0)
+    sums = bus.look(0.01).sums
+    assert sums.measured_a == pytest.approx(20.0)
+    assert sums.corrected_a is None
+    bus.battery(0.3, 100.0, 90.0)
+    view = bus.look(0.31)
+    assert view.sums == Sums()
+    assert of(view, "motor").is_stale
+
+
+def test_frames_that_fail_their_check_are_counted_and_not_used(bus: Bus) -> None:
+    bus.send("HV_Battery", 0.01, BatteryCurrent=100.0)
+    bus.send("HV_Battery", 0.02, step=0, BatteryCurrent=200.0)
+    bus.send("HV_Battery", 0.03, spoilt=True, BatteryCurrent=300.0)
+    bus.send("HV_Battery", 0.04, step=7, BatteryCurrent=400.0)
+    bus.monitor.take((0x110, False), bytearray(), 0.05)
+    battery = of(bus.look(0.06), "battery")
+    assert battery.faults == FrameFaults(corrupt=2, repeated=1, lost=1)
+    assert battery.measured_a == pytest.approx(100.0)
+    assert battery.age_s == pytest.approx(0.05)
+    bus.send("HV_Battery", 0.07, step=2, BatteryCurrent=500.0)
+    battery = of(bus.look(0.08), "battery")
+    assert battery.faults == FrameFaults(corrupt=2, repeated=1, lost=2)
+    assert battery.measured_a == pytest.approx(500.0)
+
+
+def test_faults_of_corrected_messages_are_counted_apart(bus: Bus) -> None:
+    bus.battery(0.01, 100.0, 95.0)
+    bus.send("HV_BatteryCorrected", 0.02, spoilt=True)
+    battery = of(bus.look(0.03), "battery")
+    assert (battery.faults, battery.corrected_faults) == (FrameFaults(), FrameFaults(corrupt=1))
+
+
+def test_a_code_that_is_no_value_is_not_shown_as_a_current(bus: Bus) -> None:
+    sna_a = -32768 * 0.02
+    bus.battery(0.01, sna_a, sna_a, quality=Quality.NOT_AVAILABLE)
+    battery = of(bus.look(0.02), "battery")
+    assert (battery.measured_a, battery.corrected_a, battery.correction_a) == (None, None, None)
+    assert battery.quality is Quality.NOT_AVAILABLE
+    assert battery.is_seen
+
+
+def test_branches_that_were_never_seen_do_not_count_in_the_sum(bus: Bus) -> None:
+    bus.battery(0.0, 100.0)
+    bus.motor(0.0, 80.0)
+    view = bus.look(0.01)
+    assert [branch.name for branch in view.branches if branch.is_seen] == ["battery", "motor"]
+    assert view.sums.measured_a == pytest.approx(20.0)
+    assert (of(view, "dcdc").age_s, of(view, "dcdc").rate_hz) == (None, 0.0)
+
+
+def test_without_corrected_messages_the_branches_are_shown_as_they_are(bus: Bus) -> None:
+    bus.battery(0.0, 100.0)
+    view = bus.look(0.01)
+    assert (view.publishes_corrected, view.node, view.has_status) == (False, None, True)
+    assert view.sums.measured_a == pytest.approx(100.0)
+    assert view.sums.corrected_a is None
+    assert of(view, "battery").quality is None
+
+
+@pytest.mark.parametrize("looks_hz", [4, 1])
+def test_rates_are_those_of_the_last_seconds(bus: Bus, looks_hz: int) -> None:
+    """50 frames/s for 5 s, then 100 frames/s for 5 s, corrupt ones included."""
+    times = [0.02 * k for k in range(250)] + [5.0 + 0.01 * k for k in range(500)]
+    looks = [(k + 1) / looks_hz for k in range(10 * looks_hz)]
+    rates = {}
+    for look_s in looks:
+        while times and times[0] < look_s:
+            bus.send("HV_Battery", times.pop(0), spoilt=len(times) % 10 == 0)
+        rates[look_s] = of(bus.look(look_s), "battery").rate_hz
+    assert rates[5.0] == pytest.approx(50.0)
+    assert rates[6.0] == pytest.approx(75.0)
+    assert rates[10.0] == pytest.approx(100.0)
+
+
+def test_the_status_is_read_as_the_node_wrote_it(bus: Bus) -> None:
+    bus.send(
+        "HV_CorrectionStatus",
+        1.0,
+        State=State.PASSING_THROUGH,
+        Reason=Reason.BRANCH_STALE,
+        ParameterSet=44,
+        JunctionSumMeasured=-12.3,
+        JunctionSumCorrected=0.4,
+    )
+    node = bus.look(1.25).node
+    assert node is not None
+    assert (node.state, node.reason, node.parameter_set) == (State.PASSING_THROUGH, Reason.BRANCH_STALE, 44)
+    assert node.sums.measured_a == pytest.approx(-12.3)
+    assert node.sums.corrected_a == pytest.approx(0.4)
+    assert node.age_s == pytest.approx(0.25)
+    assert not node.is_silent
+    gone = bus.look(4.0).node
+    assert gone is not None
+    assert gone.is_silent
+
+
+def test_sums_that_the_node_does_not_know_are_not_shown(bus: Bus) -> None:
+    bus.send("HV_CorrectionStatus", 1.0, JunctionSumMeasured=-3276.8, JunctionSumCorrected=-3276.8)
+    node = bus.look(1.0).node
+    assert node is not None
+    assert node.sums == Sums()
+
+
+def test_the_view_depends_on_time_differences_alone(database: VehicleDatabase) -> None:
+    views = []
+    for start_s in (0.0, 4096.0):
+        bus = Bus(database, start_s)
+        bus.battery(start_s + 0.5, 100.0, 95.0)
+        bus.motor(start_s + 0.75, 80.0, 81.0)
+        bus.send("HV_CorrectionStatus", start_s + 0.75, State=1)
+        views.append(bus.look(start_s + 1.0))
+    assert views[0] == views[1]
+
+
+def test_frames_of_others_change_nothing(bus: Bus) -> None:
+    bus.battery(0.0, 100.0, 95.0)
+    before = bus.look(0.01)
+    bus.monitor.take((0x3AB, False), bytearray(8), 0.01)
+    bus.monitor.take((0x110, True), bytearray(8), 0.01)
+    after = bus.look(0.01)
+    assert dataclasses.asdict(after)["branches"] == dataclasses.asdict(before)["branches"]
+
+
+class SmallBus:
+    """Frames of the small vehicle, by raw codes."""
+
+    def __init__(self, database: VehicleDatabase) -> None:
+        self.database, self.monitor = database, BusMonitor(database, 0.0)
+
+    def send(self, message: str, time_s: float, **codes: int) -> None:
+        definition = self.database.message(message)
+        data = definition.encode({signal.name: 0 for signal in definition.signals} | codes, scaling=False, strict=False)
+        self.monitor.take(key_of(definition), bytearray(data), time_s)
+
+
+def test_a_power_branch_is_shown_as_a_current(make_database: Callable[..., VehicleDatabase]) -> None:
+    bus = SmallBus(make_database())
+    bus.send("Heater", 0.0, Power=4000)
+    assert of(bus.monitor.look(0.01), "heater").measured_a is None
+    bus.send("Net", 0.02, Voltage=40000)
+    for k in range(2):
+        bus.send("Heater", 0.03 + 0.01 * k, Power=4000)
+        bus.send("Pair", 0.03 + 0.01 * k, Battery=150, Motor=-100)
+        bus.send("PairOut", 0.031 + 0.01 * k, Battery=140, Motor=-100, Quality=2)
+    view = bus.monitor.look(0.05)
+    assert of(view, "heater").measured_a == pytest.approx(-10.0)
+    assert of(view, "heater").corrected_a is None
+    assert view.sums.measured_a == pytest.approx(0.0)
+    assert view.sums.corrected_a == pytest.approx(-1.0)
+    assert view.has_status is False
+
+
+def test_a_multiplexed_branch_keeps_its_value_between_its_frames(
+    make_database: Callable[..., VehicleDatabase],
+) -> None:
+    dbc = SMALL_DBC.replace(
+        ' SG_ Battery : 7|16@0- (0.1,0) [-3000|3000] "A" Node\n SG_ Motor : 23|16@0-',
+        ' SG_ Page M : 32|8@1+ (1,0) [0|255] "" Node\n SG_ Battery m0 : 7|16@0- (0.1,0) [-3000|3000] "A" Node\n'
+        " SG_ Motor m1 : 7|16@0-",
+    )
+    monitor = BusMonitor(make_database(dbc=dbc), 0.0)
+    for page, code in ((0, 150), (1, -100), (1, -120)):
+        monitor.take((256, False), bytearray([*code.to_bytes(2, "big", signed=True), 0, 0, page, 0, 0, 0]), 0.01)
+    view = monitor.look(0.02)
+    assert of(view, "battery").measured_a == pytest.approx(15.0)
+    assert of(view, "motor").measured_a == pytest.approx(-6.0)
+
+
+def test_a_layout_that_publishes_nothing_can_be_watched(make_database: Callable[..., VehicleDatabase]) -> None:
+    layout = SMALL_LAYOUT.replace(', corrected = "PairOut.Battery", quality = "PairOut.Quality"', "").replace(
+        ', corrected = "PairOut.Motor"', ""
+    )
+    bus = SmallBus(make_database(layout=layout))
+    bus.send("Pair", 0.0, Battery=150, Motor=-100)
+    view = bus.monitor.look(0.01)
+    assert not view.publishes_corrected
+    assert view.sums.measured_a == pytest.approx(10.0)
