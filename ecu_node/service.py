@@ -5,6 +5,7 @@ import signal
 import socket
 import sys
 import time
+from contextlib import suppress
 from types import FrameType
 
 __all__ = ["Log", "Requests", "ServiceManager"]
@@ -12,6 +13,8 @@ __all__ = ["Log", "Requests", "ServiceManager"]
 _SAME_LINE_EVERY_S = 10.0
 """A line is not written again before this has passed. [s]"""
 _REMEMBERED_LINES = 100
+_LONGEST_NOTIFY_S = 0.1
+"""A service manager that does not read must not hold up the bus. [s]"""
 
 
 class Requests:
@@ -56,7 +59,8 @@ class Log:
             self._last.clear()
         self._last[text] = now_s, 0
         again = f" (and {held_back} times before)" if held_back else ""
-        print(f"ecu-node: {text}{again}", file=sys.stderr, flush=True)
+        with suppress(OSError):  # a log that is gone, as when the journal is started anew, must not end the node
+            print(f"ecu-node: {text}{again}", file=sys.stderr, flush=True)
 
 
 class ServiceManager:
@@ -65,7 +69,8 @@ class ServiceManager:
     def __init__(self) -> None:
         self._address = os.environ.get("NOTIFY_SOCKET")
         period_us = os.environ.get("WATCHDOG_USEC", "")
-        self._period_s = int(period_us) / 2e6 if period_us.isdecimal() else None
+        is_for_us = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())  # see sd_watchdog_enabled(3)
+        self._period_s = int(period_us) / 2e6 if period_us.isdecimal() and is_for_us else None
         self._due_s = 0.0
 
     def ready(self, text: str) -> None:
@@ -92,6 +97,7 @@ class ServiceManager:
         address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+                notify.settimeout(_LONGEST_NOTIFY_S)
                 notify.sendto(text.encode(), address)
         except OSError:
             pass  # a service manager that is gone must not end the node

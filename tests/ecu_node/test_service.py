@@ -1,0 +1,176 @@
+"""What the service manager is told, over a real socket; the log's rate limit; signals."""
+
+import os
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from ecu_node.service import Log, Requests, ServiceManager
+
+WATCHDOG_S = 4.0
+
+
+class Manager:
+    """A datagram socket in the place of systemd's."""
+
+    def __init__(self, address: str | Path) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind(str(address))
+        self.socket.settimeout(0.0)
+
+    def told(self) -> list[str]:
+        """Everything told so far."""
+        texts = []
+        while True:
+            try:
+                texts.append(self.socket.recv(4096).decode())
+            except BlockingIOError:
+                return texts
+
+
+@pytest.fixture
+def managed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager]:
+    """A service manager that wants to hear from the node every 4 s."""
+    manager = Manager(tmp_path / "notify")
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    monkeypatch.setenv("WATCHDOG_USEC", str(int(1e6 * WATCHDOG_S)))
+    monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
+    yield manager
+    manager.socket.close()
+
+
+def test_the_manager_is_told_ready_status_and_stopping(managed: Manager) -> None:
+    service = ServiceManager()
+    service.ready("correcting battery")
+    service.status("passing through")
+    service.stopping()
+    assert managed.told() == ["READY=1\nSTATUS=correcting battery", "STATUS=passing through", "STOPPING=1"]
+
+
+def test_the_watchdog_is_fed_at_half_its_time(managed: Manager) -> None:
+    service = ServiceManager()
+    fed_s = []
+    for tick in range(100):
+        now_s = 1000.0 + 0.1 * tick
+        service.alive(now_s)
+        if managed.told() == ["WATCHDOG=1"]:
+            fed_s.append(now_s)
+    assert fed_s == pytest.approx([1000.0, 1002.0, 1004.0, 1006.0, 1008.0], abs=0.11)
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"), [("WATCHDOG_PID", "1"), ("WATCHDOG_USEC", None), ("WATCHDOG_USEC", "soon")]
+)
+def test_a_watchdog_that_is_none_or_another_process_s_is_not_fed(
+    managed: Manager, monkeypatch: pytest.MonkeyPatch, variable: str, value: str | None
+) -> None:
+    if value is None:
+        monkeypatch.delenv(variable)
+    else:
+        monkeypatch.setenv(variable, value)
+    ServiceManager().alive(1.0)
+    assert managed.told() == []
+
+
+def test_an_abstract_address_is_understood(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = f"ecu-node-test-{os.getpid()}"
+    manager = Manager(f"\0{name}")
+    monkeypatch.setenv("NOTIFY_SOCKET", f"@{name}")
+    ServiceManager().ready("x")
+    assert manager.told() == ["READY=1\nSTATUS=x"]
+    manager.socket.close()
+
+
+@pytest.mark.parametrize("address", [None, "", "missing"])
+def test_without_a_manager_nothing_happens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, address: str | None
+) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    if address is not None:
+        monkeypatch.setenv("NOTIFY_SOCKET", address and str(tmp_path / address))
+    monkeypatch.setenv("WATCHDOG_USEC", "1000000")
+    service = ServiceManager()
+    service.ready("x")
+    service.alive(1.0)
+    service.stopping()
+
+
+def test_a_manager_that_does_not_read_does_not_hold_the_node_up(managed: Manager) -> None:
+    service = ServiceManager()
+    start_s = time.monotonic()
+    told = int(Path("/proc/sys/net/unix/max_dgram_qlen").read_text()) + 3
+    for number in range(told):
+        service.status(str(number))
+    assert time.monotonic() - start_s < 5.0
+    assert len(managed.told()) < told
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Sets the steady clock of the log. [s]"""
+
+    def at(time_s: float) -> None:
+        monkeypatch.setattr("ecu_node.service.time.monotonic", lambda: time_s)
+
+    return at
+
+
+def test_the_same_line_comes_once_in_ten_seconds(
+    clock: Callable[[float], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = Log()
+    for tenth in range(201):
+        clock(0.1 * tenth)
+        log.say("bus gone")
+    assert capsys.readouterr().err.splitlines() == [
+        "ecu-node: bus gone",
+        "ecu-node: bus gone (and 99 times before)",
+        "ecu-node: bus gone (and 99 times before)",
+    ]
+
+
+def test_different_lines_do_not_wait_for_each_other(
+    clock: Callable[[float], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock(0.0)
+    log = Log()
+    for text in ("a", "b", "a", "c"):
+        log.say(text)
+    assert capsys.readouterr().err.splitlines() == ["ecu-node: a", "ecu-node: b", "ecu-node: c"]
+
+
+def test_a_log_that_is_gone_does_not_end_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w", buffering=1) as gone:
+        monkeypatch.setattr(sys, "stderr", gone)
+        Log().say("nobody reads this")
+        monkeypatch.undo()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), gone.fileno())  # what is left in its buffer can be closed
+
+
+@pytest.fixture
+def requests() -> Iterator[Requests]:
+    numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in numbers]
+    yield Requests()
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_signals_that_ask_to_stop(requests: Requests, how: signal.Signals) -> None:
+    assert not requests.stop()
+    os.kill(os.getpid(), how)
+    assert requests.stop()
+    assert not requests.take_reload()
+
+
+def test_sighup_asks_once_for_the_parameters(requests: Requests) -> None:
+    os.kill(os.getpid(), signal.SIGHUP)
+    assert [requests.take_reload(), requests.take_reload(), requests.stop()] == [True, False, False]
