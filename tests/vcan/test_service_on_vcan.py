@@ -1,0 +1,117 @@
+"""The node as its service runs it, without any privilege, and the monitor beside it on a real SocketCAN bus."""
+
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.layout import read_layout
+from ecu_node.parameters import write_parameters
+from tests.vcan.conftest import LAYOUT
+from tests.vcan.processes import (
+    CHANNEL,
+    ECU_NODE,
+    LONGEST_WAIT_S,
+    Recording,
+    play,
+    running_node,
+    running_recording,
+    wait_until,
+)
+from tests.vcan.small_drive import BRANCHES, VEHICLE, true_parameters, write_drive
+
+MONITOR = [str(ECU_NODE), "monitor", "--layout", str(LAYOUT), "--channel", CHANNEL]
+UNPRIVILEGED = ["setpriv", "--bounding-set=-all", "--inh-caps=-all", "--ambient-caps=-all", "--no-new-privs"]
+CORRECTED_BATTERY, STATUS = 0x510, 0x5F0
+
+
+@pytest.fixture
+def params(database: VehicleDatabase, tmp_path: Path) -> Path:
+    path = tmp_path / "params.json"
+    write_parameters(true_parameters(database), path)
+    return path
+
+
+def filters() -> int:
+    """Identifiers that sockets wait for on vcan0."""
+    files = Path("/proc/net/can").glob("rcvlist_*")
+    return sum(line.split()[0] == CHANNEL for file in files for line in file.read_text().splitlines() if line.split())
+
+
+@contextmanager
+def playing(log: Path) -> Iterator[None]:
+    """A drive on vcan0 that goes on for longer than it is looked at."""
+    with subprocess.Popen(["canplayer", "-I", str(log), f"{CHANNEL}=can0"]) as process:
+        try:
+            yield
+        finally:
+            process.terminate()
+
+
+@pytest.fixture
+def patient(tmp_path: Path) -> VehicleDatabase:
+    """The layout with timeouts that a slow machine keeps."""
+    shutil.copy(LAYOUT.with_suffix(".dbc"), tmp_path)
+    path = tmp_path / LAYOUT.name
+    path.write_text(re.sub(r"^timeout_s = .*$", "timeout_s = 30.0", LAYOUT.read_text(), flags=re.MULTILINE))
+    return read_database(read_layout(path))
+
+
+def test_the_monitor_shows_branches_sums_and_node(patient: VehicleDatabase, tmp_path: Path) -> None:
+    write_drive(tmp_path / "drive.log", patient, 500)
+    write_parameters(true_parameters(patient), tmp_path / "params.json")
+    files = ["--layout", str(patient.layout.path), "--channel", CHANNEL]
+    command = [str(ECU_NODE), "monitor", *files, "--once", "4", "--json"]
+    with running_node(tmp_path / "node.err", "--params", str(tmp_path / "params.json"), *files) as node:
+        before = filters()
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as monitor:
+            wait_until(lambda: filters() > before, "the monitor to listen")
+            with playing(tmp_path / "drive.log"):
+                out, _ = monitor.communicate(timeout=LONGEST_WAIT_S)
+        assert node.stop() == 0
+    view = json.loads(out)
+    branches = {branch["name"]: branch for branch in view["branches"]}
+    assert monitor.returncode == 0
+    assert [name for name, branch in branches.items() if branch["is_seen"]] == list(BRANCHES)
+    assert {branches[name]["quality"] for name in BRANCHES} == {"CORRECTED"}
+    assert branches["motor"]["faults"]["corrupt"] > 0
+    assert (view["node"]["state"], view["node"]["parameter_set"]) == ("CORRECTING", 7)
+    assert abs(view["sums"]["corrected_a"]) < 3.0
+
+
+def test_the_monitor_sends_nothing(tmp_path: Path) -> None:
+    with running_recording(tmp_path / "recorded.log") as recording:
+        result = subprocess.run(
+            [*MONITOR, "--once", "2"], capture_output=True, text=True, timeout=LONGEST_WAIT_S, check=False
+        )
+        subprocess.run(["cansend", CHANNEL, "123#00"], check=True, timeout=LONGEST_WAIT_S)
+        recording.wait_for(0x123, 1)
+    assert [frame.identifier for frame in recording.frames] == ["123"]
+    assert result.returncode == 1
+    assert "no branch of" in result.stderr
+
+
+def test_the_node_needs_no_capability(
+    database: VehicleDatabase, params: Path, tmp_path: Path, recording: Recording
+) -> None:
+    """As in deploy/ecu-node@.service: an empty bounding set, no ambient capabilities, no new privileges."""
+    write_drive(tmp_path / "drive.log", database, 20)
+    options = ["--params", str(params), "--layout", str(LAYOUT), "--vehicle", VEHICLE, "--channel", CHANNEL]
+    log = tmp_path / "node.err"
+    with log.open("wb") as file, subprocess.Popen([*UNPRIVILEGED, ECU_NODE, "run", *options], stderr=file) as process:
+        try:
+            wait_until(lambda: "running on" in log.read_text() or process.poll() is not None, "the node to start")
+            capabilities = Path(f"/proc/{process.pid}/status").read_text().partition("CapPrm:")[2].split()
+            assert int(capabilities[0], 16) == 0
+            play(tmp_path / "drive.log")
+            assert len(recording.wait_for(CORRECTED_BATTERY, 20)) == 20
+            assert recording.wait_for(STATUS, 1)
+        finally:
+            process.terminate()
+    assert process.returncode == 0
