@@ -21,6 +21,8 @@ __all__ = ["GatewayNode", "OverlayNode", "open_bus", "receive_filters"]
 
 _LONGEST_WAIT_S = 0.1
 """A wake-up at least this often, so that a request to stop is seen. [s]"""
+_LOOK_EVERY_S = 0.1
+"""The junction is looked at, and the watchdog fed, at least this often, however rare the status is. [s]"""
 _LISTEN_S = 0.12
 """Before it says anything the node listens whether another one is there: longer than a status message's period. [s]"""
 _STANDARD_MASK = 0x7FF
@@ -84,7 +86,7 @@ class _Ticking:
 
     def __init__(self, corrector: Corrector, period_s: float, on_tick: Callable[[float], None]) -> None:
         self._corrector, self._period_s, self._on_tick = corrector, period_s, on_tick
-        self._due_s = float("-inf")
+        self._due_s = self._status_due_s = float("-inf")
 
     def wait_s(self, now_s: float) -> float:
         """How long there is nothing to do but to receive; 0 if it is time. [s]"""
@@ -94,11 +96,12 @@ class _Ticking:
         """Do it if it is due."""
         if now_s < self._due_s:
             return
-        self._due_s = max(self._due_s + self._period_s, now_s)
+        self._due_s = max(self._due_s + min(self._period_s, _LOOK_EVERY_S), now_s)
         corrector = self._corrector
         corrector.look(now_s)
-        status = corrector.status()
+        status = corrector.status() if now_s >= self._status_due_s else None
         if status is not None:
+            self._status_due_s = max(self._status_due_s + self._period_s, now_s)
             fields, data = status
             own.sent(fields.key, data)
             corrector.counters.send_errors += not send(_message(fields.key, data, fd=fields.fd))

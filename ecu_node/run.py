@@ -144,7 +144,8 @@ class _Tick:
     def __call__(self, now_s: float) -> None:
         corrector = self._corrector
         self._manager.alive(now_s)
-        self._file.look(corrector, now_s, asked=self._requests.take_reload())
+        if self._file.look(corrector, now_s, asked=self._requests.take_reload()):
+            self._manager.status(f"parameter set {corrector.parameter_set} is in force")
         if corrector.latched is not self._before:
             self._before = corrector.latched
             text = self._text()
