@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from bench import fleet_run, identification, ingest, posterior
+from bench import fleet_run, identification, ingest, node, posterior
 from bench.row import Row
 
 GROUPS: dict[str, Callable[..., list[Row]]] = {
@@ -17,6 +17,7 @@ GROUPS: dict[str, Callable[..., list[Row]]] = {
     "posterior": posterior.rows,
     "ingest": ingest.rows,
     "fleet run": fleet_run.rows,
+    "node": node.rows,
 }
 OUT = Path("build") / "bench.json"
 

@@ -1,0 +1,227 @@
+"""The node as a process on SocketCAN, beside other ways from vcan0 to vcan1: run with ``tools/with_vcan``.
+
+    PYTHONPATH=tools tools/with_vcan python -m bench.node_socketcan --frames 20000
+
+Compared are ``ecu-node run --gateway``, a python-can loop that only receives and sends, the plain version with Notifier
+and cantools, and the kernel's own gateway (cangw), which changes nothing. One raw socket sends, another one receives
+and compares each frame. Where this runs on user-mode-linux a system call costs ten times more than on a bare machine,
+and all share one processor: the ratios count there, not the rates.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median, quantiles
+
+from bench.node_plain import plain_job
+from bench.node_process import command_line
+from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle
+from bench.row import Row
+from ecu_node.guard import Mode
+from ecu_node.parameters import write_parameters
+
+__all__ = ["rows"]
+
+IN, OUT = "vcan0", "vcan1"
+WINDOW = 64
+"""Frames that are on their way at most: a socket's buffer holds some hundreds."""
+PATIENCE_S = 60.0
+QUIET_S = 0.5
+"""When no frame comes for this long none is on its way. [s]"""
+LATENCY_SHARE = 10
+"""Every so many-th frame is sent alone, for its latency."""
+MEBIBYTE = 1024.0**2
+_FRAME = struct.Struct("=IB3x8s")
+"""Of linux/can.h, struct can_frame: identifier, length, data."""
+
+
+def rows(frames: int) -> list[Row]:
+    """Measure.
+
+    Parameters
+    ----------
+    frames : int
+        Sent through each of the ways.
+
+    Returns
+    -------
+    list of Row
+        Rate, latency, processor time, start and memory of each.
+    """
+    with tempfile.TemporaryDirectory(prefix="bench-") as folder:
+        vehicle = make_vehicle(Path(folder), numbered=True)
+        write_parameters(vehicle.parameters, Path(folder) / "params.json")
+        same = [bytes(payload) for payload in vehicle.frames]
+        plain = [bytes(found) for found in map(plain_job(vehicle, Mode.GATEWAY), vehicle.frames) if found is not None]
+        node = command_line(vehicle, "--interface", "socketcan", "--channel", IN, "--gateway", OUT)
+        python = [sys.executable, "-m"]
+        seen = {
+            "cangw": _kernel(vehicle, same, frames),
+            "bare loop": _process([*python, "bench.node_peer", "bare", IN, OUT], vehicle, same, frames),
+            "plain": _process([*python, "bench.node_peer", "plain", IN, OUT], vehicle, plain, frames),
+            "ecu-node": _process([*python, "ecu_node", *node], vehicle, vehicle.corrected(Mode.GATEWAY), frames),
+        }
+    return [row for name, figures in seen.items() for row in _rows(name, figures, seen["ecu-node"])]
+
+
+def _rows(name: str, figures: dict[str, float], node: dict[str, float]) -> Iterator[Row]:
+    for what, value in figures.items():
+        label, _, unit = what.rpartition(", ")
+        peer = ratio = None
+        if name != "ecu-node" and label in {"rate", "CPU per 10^6 frames"}:
+            ours = node[what]
+            peer = f"as the peer of ecu-node, {ours:.3g} {unit}"
+            ratio = value / ours if label == "rate" else ours / value
+        yield Row(name=f"SocketCAN, {name}: {label}", value=value, unit=unit, peer=peer, ratio=ratio)
+
+
+def _kernel(vehicle: BenchVehicle, expected: list[bytes], frames: int) -> dict[str, float]:
+    subprocess.run(["cangw", "-A", "-s", IN, "-d", OUT, "-e"], check=True)
+    try:
+        with _line(vehicle, expected) as line:
+            return line.measured(frames)
+    finally:
+        subprocess.run(["cangw", "-F"], check=True)
+
+
+def _process(command: list[str], vehicle: BenchVehicle, expected: list[bytes], frames: int) -> dict[str, float]:
+    with _line(vehicle, expected) as line:
+        start_s = time.monotonic()
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+            try:
+                line.wait_for_first(lambda: process.poll() is None)
+                begin_s = time.monotonic() - start_s
+                line.let_run_dry()
+                before_s = _cpu_s(process.pid)
+                figures = line.measured(frames)
+                all_frames = frames + frames // LATENCY_SHARE
+                figures["CPU per 10^6 frames, s"] = 1e6 * (_cpu_s(process.pid) - before_s) / all_frames
+                figures["start to first frame, s"] = begin_s
+                figures["memory, MiB"] = _resident_bytes(process.pid) / MEBIBYTE
+            finally:
+                process.terminate()
+    return figures
+
+
+class _Line:
+    """Both ends: frames go in at one and are compared at the other."""
+
+    def __init__(self, near: socket.socket, far: socket.socket, vehicle: BenchVehicle, expected: list[bytes]) -> None:
+        self._near, self._far = near, far
+        self._frames = [_FRAME.pack(IDENTIFIER, len(payload), bytes(payload)) for payload in vehicle.frames]
+        self._expected = {payload[6:8]: payload for payload in expected}
+        self._sent = 0
+
+    def send(self) -> None:
+        """The next frame."""
+        self._near.send(self._frames[self._sent % len(self._frames)])
+        self._sent += 1
+
+    def receive(self) -> int:
+        """Number of the frame that arrives next, once it is compared."""
+        _, length, data = _FRAME.unpack(self._far.recv(_FRAME.size))
+        if data[:length] != self._expected[data[6:8]]:
+            raise RuntimeError(f"{data.hex()} arrived, must be {self._expected[data[6:8]].hex()}")
+        return int.from_bytes(data[6:8], "little")
+
+    def wait_for_first(self, lives: Callable[[], bool]) -> None:
+        """Send now and then until the first one arrives."""
+        give_up_s = time.monotonic() + PATIENCE_S
+        self._far.settimeout(0.01)
+        while True:
+            self.send()
+            try:
+                self.receive()
+            except TimeoutError:
+                if not lives() or time.monotonic() > give_up_s:
+                    raise RuntimeError("nothing passes the frames on") from None
+            else:
+                return
+
+    def let_run_dry(self) -> None:
+        """Receive what is still on its way."""
+        self._far.settimeout(QUIET_S)
+        try:
+            while True:
+                self.receive()
+        except TimeoutError:
+            pass
+
+    def measured(self, frames: int) -> dict[str, float]:
+        """Rate and latencies; frames must arrive in order and all."""
+        self._far.settimeout(PATIENCE_S)
+        received = first = self._sent
+        start_s = time.monotonic()
+        while received < first + frames:
+            while self._sent < min(received + WINDOW, first + frames):
+                self.send()
+            self._require(received)
+            received += 1
+        per_frame_s = (time.monotonic() - start_s) / frames
+        latencies_s = []
+        for _ in range(frames // LATENCY_SHARE):
+            time.sleep(0.001)
+            start_s = time.monotonic()
+            self.send()
+            self._require(self._sent - 1)
+            latencies_s.append(time.monotonic() - start_s)
+        return {
+            "rate, frames/s": 1.0 / per_frame_s,
+            "latency, median, us": 1e6 * median(latencies_s),
+            "latency, 99 %, us": 1e6 * quantiles(latencies_s, n=100, method="inclusive")[98],
+        }
+
+    def _require(self, number: int) -> None:
+        found = self.receive()
+        if found != number % len(self._frames):
+            raise RuntimeError(f"frame {found} arrived, expected {number % len(self._frames)}")
+
+
+@contextmanager
+def _line(vehicle: BenchVehicle, expected: list[bytes]) -> Iterator[_Line]:
+    kind = socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW
+    with socket.socket(*kind) as near, socket.socket(*kind) as far:
+        near.bind((IN,))
+        far.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", IDENTIFIER, socket.CAN_SFF_MASK))
+        far.bind((OUT,))
+        yield _Line(near, far, vehicle, expected)
+
+
+def _cpu_s(process: int) -> float:
+    """Processor time of a process so far. [s]"""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / float(os.sysconf("SC_CLK_TCK"))
+
+
+def _resident_bytes(process: int) -> float:
+    return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * float(os.sysconf("SC_PAGE_SIZE"))
+
+
+def main() -> None:
+    """Measure and print one line per row, or JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--frames", type=int, default=20_000)
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    arguments = parser.parse_args()
+    if shutil.which("cangw") is None:
+        parser.exit(2, "cangw is not installed: apt-get install can-utils\n")
+    found = rows(arguments.frames)
+    if arguments.json:
+        print(json.dumps([vars(row) for row in found]))
+    else:
+        for row in found:
+            print(f"{row.name}: {row.value:.4g} {row.unit}")
+
+
+if __name__ == "__main__":
+    main()
