@@ -30,8 +30,6 @@ from ecu_node.wiring import InForce, wire
 __all__ = ["WrongFrameError", "fuzz"]
 
 FRAMES_PER_VEHICLE = 20_000
-_SETTLE_S = 0.15
-"""A node listens to others for a moment before it begins. [s]"""
 _FOREVER_S = 1e6
 _FD_SIZES = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 
@@ -161,11 +159,11 @@ class _ScriptedBus(can.BusABC):
         super().__init__("scripted")
         self.channel_info = "scripted"
         self._frames, self._next, self._sent = frames, 0, sent
-        self._begin_s = time.monotonic() + _SETTLE_S
-        self.done = False
+        self.begun = self.done = False
+        """Whether the node has begun its work: before that it only listens to others."""
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        if self.done or not self._frames or (self._next == 0 and time.monotonic() < self._begin_s):
+        if self.done or not self.begun:
             time.sleep(min(timeout or 0.0, 0.02))
             return None
         if self._next == len(self._frames):
@@ -207,12 +205,16 @@ def _passed(
     """What a node sends for each frame."""
     sent: list[list[FuzzFrame]] = []
     script, silent = _ScriptedBus(frames, sent), _ScriptedBus((), sent)
+
+    def begin(_: float) -> None:
+        script.begun = True
+
     corrector = wire(database, InForce(parameters=parameters), time.monotonic(), mode=mode)
     near, far = SteadyBus(lambda: script, Counters()), SteadyBus(lambda: silent, Counters())
     node = (
-        OverlayNode(near, corrector, database, period_s=_FOREVER_S)
+        OverlayNode(near, corrector, database, period_s=_FOREVER_S, on_tick=begin)
         if mode is Mode.OVERLAY
-        else GatewayNode(near, far, corrector, database, period_s=_FOREVER_S)
+        else GatewayNode(near, far, corrector, database, period_s=_FOREVER_S, on_tick=begin)
     )
     node.run(lambda: script.done)
     near.close()

@@ -167,8 +167,8 @@ class _Branch:
         self._outcomes = [self._outcome(code, voltage, temperature)]
 
     def at_temperature(self, voltage: int | None, temperature: Fraction | None) -> None:
-        """The temperature changed: the last value may stay as it was, or be made anew."""
-        if self.allowed is not None and isinstance(self.branch.model, TemperatureDrift):
+        """The temperature changed: the last value may stay as it was, or be made anew, for which there may be none."""
+        if self._outcomes[-1].allowed is not None and isinstance(self.branch.model, TemperatureDrift):
             self._outcomes = [self._outcomes[0], self._outcome(self._code, voltage, temperature)]
 
     def _outcome(self, code: int, voltage: int | None, temperature: Fraction | None) -> _Outcome:
@@ -300,8 +300,10 @@ class Oracle:
         heat = self._vehicle.temperature
         if heat is not None and heat[0] is source.message and heat[1].name in codes:
             worth, code = _worth(heat[1]), codes[heat[1].name]
-            self._temperature = worth.scale * code + worth.offset if worth.is_value(code) else None
-            for branch in self._branches:
+            before, self._temperature = self._temperature, worth.scale * code + worth.offset
+            if not worth.is_value(code):
+                self._temperature = None
+            for branch in self._branches if self._temperature != before else ():
                 branch.at_temperature(self._voltage_code, self._temperature)
         for branch in self._own(source):
             if size < branch.least_size:
