@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bench.node_vehicle import FAULTS, BenchVehicle
-from ecu_node.e2e import Check, Protection, protection_of, receiver
+from ecu_node.e2e import Check, Protection, Receiver, protection_of
 from ecu_node.guard import Mode
 from ecu_node.status import Quality
 
@@ -35,7 +35,7 @@ def plain_job(vehicle: BenchVehicle, mode: Mode) -> PlainJob:
     """
     database = vehicle.database
     message, answer = database.message("Pair"), database.message("PairOut")
-    check = receiver(_protection(vehicle, "Pair"))
+    check = Receiver(_protection(vehicle, "Pair")).check
     seal, advance = _protection(vehicle, "Pair").seal, _protection(vehicle, "PairOut").advance
 
     def corrected(payload: bytearray) -> dict[str, Any]:
