@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import quantiles
 
@@ -40,6 +40,8 @@ BLOCK, BLOCKS = 100, 2
 """As fast as it goes, so many frames are on their way at most."""
 PATIENCE_S = 5.0
 """A frame that is not there by then is lost. [s]"""
+ROUNDS = 3
+"""In which all take their turns: what else the machine does hits one of them, and the best counts."""
 MEBIBYTE = 1024.0**2
 
 Channels = tuple[str, str]
@@ -93,11 +95,15 @@ def rows(frames: int, latency_frames: int) -> list[Row]:
     found: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         vehicle = make_vehicle(Path(folder), numbered=True)
-        seen = {name: _both(name, contender, vehicle, frames) for name, contender in CONTENDERS.items()}
+        rounds = [
+            {name: _pass(name, contender, vehicle, frames) for name, contender in CONTENDERS.items()}
+            for _ in range(ROUNDS)
+        ]
         single = {
             name: _pass(name, contender, vehicle, latency_frames, rate_hz=LATENCY_HZ)
             for name, contender in CONTENDERS.items()
         }
+    seen = {name: _best([found[name] for found in rounds]) for name in CONTENDERS}
     for name, plain in (("gateway", "plain gateway"), ("overlay", "plain overlay")):
         for peer in ("bare loop", plain):
             found += _beside(name, seen[name], peer, seen[peer])
@@ -169,9 +175,10 @@ def _latency_rows(name: str, passage: Passage) -> list[Row]:
     ]
 
 
-def _both(name: str, contender: Contender, vehicle: BenchVehicle, frames: int) -> Passage:
-    """The quicker one of two passages."""
-    return min((_pass(name, contender, vehicle, frames) for _ in range(2)), key=lambda item: item.per_frame_s)
+def _best(passages: Sequence[Passage]) -> Passage:
+    """Least time and least processor time of some passages."""
+    quickest = min(passages, key=lambda item: item.per_frame_s)
+    return replace(quickest, cpu_s=min(item.cpu_s for item in passages))
 
 
 def _pass(
