@@ -37,7 +37,7 @@ class Sizes:
     process_frames : int
         Through ``ecu-node run``.
     socketcan_frames : int
-        Through each way between two SocketCAN interfaces; 0: none.
+        Through each way between two SocketCAN interfaces, three times; 0: none.
     """
 
     repeats: int
@@ -54,7 +54,7 @@ FULL = Sizes(
     latency_frames=10_000,
     load_frames=10_000_000,
     process_frames=10_000_000,
-    socketcan_frames=20_000,
+    socketcan_frames=10_000,
 )
 QUICK = Sizes(
     repeats=20,
@@ -62,7 +62,7 @@ QUICK = Sizes(
     latency_frames=1_000,
     load_frames=100_000,
     process_frames=100_000,
-    socketcan_frames=2_000,
+    socketcan_frames=1_000,
 )
 
 
