@@ -313,6 +313,24 @@ def test_a_motor_at_rest_is_not_stuck(database: VehicleDatabase) -> None:
     assert corrector.latched is not Reason.BRANCH_STUCK
 
 
+def test_what_is_still_published_is_of_the_quality_that_is_told_of_it(make_database: MakeDatabase) -> None:
+    layout = SMALL_LAYOUT.replace(
+        'corrected = "PairOut.Motor" }', 'corrected = "PairOut.Motor", timeout_s = 60.0 }'
+    ).replace("Pair.Motor", "Other.Motor")
+    dbc = SMALL_DBC.replace(' SG_ Motor : 23|16@0- (-0.05,0) [-1600|1600] "A" Node\n', "", 1).replace(
+        "BO_ 258", 'BO_ 257 Other: 2 Node\n SG_ Motor : 7|16@0- (-0.05,0) [-1600|1600] "A" Node\nBO_ 258', 1
+    )
+    database = make_database(layout, dbc)
+    corrector = corrector_for(database, battery=(0.5, 3.0), motor=(0.25, 0.0))
+    pair = Frame(PAIR, database.message("Pair").encode({"Battery": 153.0}))
+    answers(corrector, pair, 0.0)
+    answers(corrector, Frame(FrameKey(257, False), database.message("Other").encode({"Motor": 50.0})), 0.0)
+    for branch, active, motor_a in ((corrector.branches[1], False, 50.0), (corrector.branches[1], True, 40.0)):
+        branch.activate(active=active)
+        (answer,) = answers(corrector, pair, 0.1)
+        assert decoded(database, "PairOut", answer.data)["Motor"] == motor_a
+
+
 def test_shadow_mode_computes_and_changes_nothing(database: VehicleDatabase) -> None:
     parameters = parameters_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
     corrector = wire(database, InForce(parameters=parameters), start_s=0.0, shadow=True)
