@@ -3,6 +3,7 @@
 Whatever python-can's interfaces raise becomes :class:`~ecu_node.errors.BusError` or is counted here.
 """
 
+import contextlib
 import errno
 import time
 from collections.abc import Callable
@@ -22,6 +23,8 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 2.0
 """Between attempts to open a bus again. [s]"""
 _OLDEST_FRAME_S = 1.0
 """A time stamp further from now is one of another clock. [s]"""
+_GONE = {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF}
+"""Errors of sending after which only opening the bus again helps."""
 _BUS_OFF = 0x40
 """Class of error frames of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
 
@@ -67,6 +70,8 @@ def connect(
 class SteadyBus:
     """A bus that survives what buses do: going down, away, off, or being full.
 
+    One thread may receive while another one sends; the one that receives opens the bus again.
+
     Parameters
     ----------
     open_bus : callable
@@ -87,26 +92,26 @@ class SteadyBus:
     ) -> None:
         self._open, self._counters, self._say = open_bus, counters, say
         self._bus: can.BusABC | None = open_bus()
+        self._failed: tuple[can.BusABC, Exception] | None = None
         self._retry_s, self._pause_s = 0.0, _FIRST_PAUSE_S
         self.channel = self._bus.channel_info
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """Wait for a data or remote frame; None if none came in time, or the bus is gone."""
+        if self._failed is not None:
+            failed, error = self._failed
+            self._failed = None
+            if failed is self._bus:
+                self._gone(error)
         bus = self._bus
         if bus is None:
-            bus = self._reopened(timeout_s)
-            if bus is None:
-                return None
+            return self._reopened(timeout_s)
         try:
             message = bus.recv(timeout_s)
         except (can.CanError, OSError) as error:
             self._gone(error)
             return None
-        if message is not None and message.is_error_frame:
-            self._counters.bus_errors += 1
-            self._counters.bus_off += bool(message.arbitration_id & _BUS_OFF)
-            return None
-        return message
+        return self._not_an_error(message)
 
     def send(self, message: can.Message) -> bool:
         """Send one frame; False if the bus did not take it in a few attempts."""
@@ -118,9 +123,11 @@ class SteadyBus:
                 time.sleep(_SEND_PAUSE_S)
             try:
                 bus.send(message)
-            except (can.CanError, OSError) as error:
-                if _number(error) in {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF}:
-                    return False  # what is received tells the same, and opens the bus again
+            except (can.CanError, OSError, ValueError) as error:  # ValueError: closed by the other thread just now
+                if _number(error) in _GONE:
+                    # Whoever asks first is told that the bus is gone, and nobody after: receiving need not fail, too.
+                    self._failed = bus, error
+                    return False
                 continue
             return True
         return False
@@ -131,6 +138,14 @@ class SteadyBus:
         if bus is not None:
             bus.shutdown()
 
+    def _not_an_error(self, message: can.Message | None) -> can.Message | None:
+        """The same message; None in place of an error frame, which is counted."""
+        if message is None or not message.is_error_frame:
+            return message
+        self._counters.bus_errors += 1
+        self._counters.bus_off += bool(message.arbitration_id & _BUS_OFF)
+        return None
+
     def _gone(self, error: Exception) -> None:
         self._say(f"{self.channel}: the bus failed: {_why(error)}; trying to open it again")
         self._retry_s, self._pause_s = time.monotonic() + _FIRST_PAUSE_S, _FIRST_PAUSE_S
@@ -139,8 +154,8 @@ class SteadyBus:
         except (can.CanError, OSError):
             self._bus = None
 
-    def _reopened(self, timeout_s: float) -> can.BusABC | None:
-        """Open it again if it is time to; wait no longer than the timeout."""
+    def _reopened(self, timeout_s: float) -> can.Message | None:
+        """Open it again if it is time to, and receive; wait no longer than the timeout."""
         now_s = time.monotonic()
         if now_s < self._retry_s:
             time.sleep(min(timeout_s, self._retry_s - now_s))
@@ -148,12 +163,19 @@ class SteadyBus:
         self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
         self._retry_s = now_s + self._pause_s
         try:
-            self._bus = self._open()
+            bus = self._open()
         except BusError:
             return None
+        try:
+            message = bus.recv(0.0)  # an interface that is down can be opened, but not received from
+        except (can.CanError, OSError):
+            with contextlib.suppress(can.CanError, OSError):
+                bus.shutdown()
+            return None
+        self._bus = bus
         self._counters.reopened += 1
         self._say(f"{self.channel}: the bus is open again")
-        return self._bus
+        return self._not_an_error(message)
 
 
 def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float, counters: Counters) -> float:

@@ -15,6 +15,7 @@ from e2e.p01 import e2e_p01_check
 
 from ecu_node.buses import SteadyBus
 from ecu_node.corrector import Corrector
+from ecu_node.counters import Counters
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
 from ecu_node.guard import Mode
@@ -184,6 +185,58 @@ def test_a_bus_that_goes_away_is_opened_again(
         receive(peer, 0x5F0, 3)
     assert opened == 3
     assert corrector.counters.reopened == 1
+
+
+def test_a_bus_that_can_be_opened_but_is_down_is_not_said_to_be_open(
+    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
+) -> None:
+    channel, opened = request.node.name, 0
+    said: list[str] = []
+
+    def reopen() -> can.BusABC:
+        nonlocal opened
+        opened += 1
+        return BrokenBus(channel) if opened < 4 else overlay_bus(database, channel)
+
+    counters = Counters()
+    bus = SteadyBus(reopen, counters, said.append)
+    give_up = time.monotonic() + LONGEST_WAIT_S
+    while counters.reopened == 0:
+        assert bus.receive(0.01) is None
+        assert time.monotonic() < give_up
+    bus.close()
+    assert (opened, counters.reopened) == (4, 1)
+    assert [line.partition(": ")[2].partition(":")[0] for line in said] == ["the bus failed", "the bus is open again"]
+
+
+class GoneForSendersBus(VirtualBus):
+    """A bus that is gone, and says so only to who sends: the kernel tells it once."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise can.CanOperationError("No such device or address", errno.ENXIO)
+
+
+def test_a_bus_of_which_only_sending_tells_that_it_is_gone_is_opened_again(
+    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
+) -> None:
+    channel = request.node.name
+    buses = iter([GoneForSendersBus(channel), overlay_bus(database, channel)])
+    with node_on(database, "", lambda: next(buses)) as corrector:
+        receive(peer, 0x5F0, 3)
+    assert corrector.counters.reopened == 1
+
+
+def test_a_bus_that_the_other_thread_has_just_closed_is_no_surprise(request: pytest.FixtureRequest) -> None:
+    bus = SteadyBus(lambda: ClosedBus(request.node.name), Counters())
+    assert not bus.send(can.Message(arbitration_id=1, is_extended_id=False))
+    bus.close()
+
+
+class ClosedBus(VirtualBus):
+    """A SocketCAN bus that is closed answers like this."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise ValueError("file descriptor cannot be a negative integer (-1)")
 
 
 def test_the_kernel_is_asked_for_the_branches_only(
