@@ -14,7 +14,7 @@ import can
 from ecu_node.counters import Counters
 from ecu_node.errors import BusError
 
-__all__ = ["SteadyBus", "connect"]
+__all__ = ["SteadyBus", "connect", "steady_time_s"]
 
 _SEND_ATTEMPTS = 3
 _SEND_PAUSE_S = 0.001
@@ -178,7 +178,7 @@ class SteadyBus:
         return self._not_an_error(message)
 
 
-def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float, counters: Counters) -> float:
+def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float, counters: Counters | None = None) -> float:
     """When a frame came, on the steady clock.
 
     Parameters
@@ -189,7 +189,7 @@ def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float, counters: 
         The steady clock now. [s]
     clock_ahead_s : float
         By how much the time of day is ahead of the steady clock. [s]
-    counters : Counters
+    counters : Counters, optional
         Where stamps are counted that cannot be.
 
     Returns
@@ -200,7 +200,8 @@ def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float, counters: 
     time_s = stamp_s - clock_ahead_s
     if now_s - _OLDEST_FRAME_S <= time_s <= now_s:
         return time_s
-    counters.clock_steps += time_s < now_s - _OLDEST_FRAME_S or time_s > now_s + _OLDEST_FRAME_S
+    if counters is not None:
+        counters.clock_steps += abs(time_s - now_s) > _OLDEST_FRAME_S
     return now_s
 
 

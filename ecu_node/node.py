@@ -92,13 +92,13 @@ class _Ticking:
         """How long there is nothing to do but to receive; 0 if it is time. [s]"""
         return min(_LONGEST_WAIT_S, max(0.0, self._due_s - now_s))
 
-    def tick(self, now_s: float, send: Callable[[can.Message], bool], own: OwnFrames) -> None:
-        """Do it if it is due."""
+    def tick(self, now_s: float, heard_s: float, send: Callable[[can.Message], bool], own: OwnFrames) -> None:
+        """Do it if it is due; no branch is stale for what has not been heard yet."""
         if now_s < self._due_s:
             return
         self._due_s = max(self._due_s + min(self._period_s, _LOOK_EVERY_S), now_s)
         corrector = self._corrector
-        corrector.look(now_s)
+        corrector.look(heard_s)
         status = corrector.status() if now_s >= self._status_due_s else None
         if status is not None:
             self._status_due_s = max(self._status_due_s + self._period_s, now_s)
@@ -106,6 +106,37 @@ class _Ticking:
             own.sent(fields.key, data)
             corrector.counters.send_errors += not send(_message(fields.key, data, fd=fields.fd))
         self._on_tick(now_s)
+
+
+def _hear(bus: SteadyBus, ticking: _Ticking, take: Callable[[can.Message, float, float], None]) -> float:
+    """Take what comes until there is something else to do.
+
+    Parameters
+    ----------
+    bus : SteadyBus
+        Where to listen.
+    ticking : _Ticking
+        Says when there is something else to do.
+    take : callable
+        Takes a frame, the steady clock [s], and by how much the time of day is ahead of it [s].
+
+    Returns
+    -------
+    float
+        Up to when the bus was heard: now, or when the last frame came if there may be more. After a pause of the whole
+        process, frames of all branches wait to be read, and none of these is stale. [s]
+    """
+    clock = time.monotonic
+    message = bus.receive(ticking.wait_s(clock()))
+    now_s = clock()
+    ahead_s = time.time() - now_s  # after the wait, in which the clock may have been set
+    while message is not None:
+        take(message, now_s, ahead_s)
+        if not ticking.wait_s(now_s):
+            return steady_time_s(message.timestamp, now_s, ahead_s)
+        message = bus.receive(0.0)
+        now_s = clock()
+    return now_s
 
 
 class OverlayNode:
@@ -151,20 +182,15 @@ class OverlayNode:
         BusError
             If another node sends this node's messages.
         """
-        heard = _listen(self._bus, self._own, stop)
+        early = _listen(self._bus, self._own, stop)
         bus, ticking, clock = self._bus, self._ticking, time.monotonic
+        now_s = heard_s = clock()
+        ahead_s = time.time() - now_s
+        for message in early:
+            self._take(message, now_s, ahead_s)
         while not stop():
-            now_s = clock()
-            ticking.tick(now_s, bus.send, self._own)
-            ahead_s = time.time() - now_s
-            for early in heard:
-                self._take(early, now_s, ahead_s)
-            heard = []
-            message = bus.receive(ticking.wait_s(clock()))
-            while message is not None:
-                now_s = clock()
-                self._take(message, now_s, ahead_s)
-                message = bus.receive(0.0) if ticking.wait_s(now_s) else None
+            ticking.tick(clock(), heard_s, bus.send, self._own)
+            heard_s = _hear(bus, ticking, self._take)
 
     def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
         key = (message.arbitration_id, message.is_extended_id)
@@ -219,9 +245,9 @@ class GatewayNode:
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Correct until told to stop; parameters and errors as for :meth:`OverlayNode.run`."""
-        heard = _listen(self._vehicle, self._not_from_vehicle, stop)
+        early = _listen(self._vehicle, self._not_from_vehicle, stop)
         ended = threading.Event()
-        back = threading.Thread(target=self._pass_back, args=(heard, lambda: stop() or ended.is_set()), daemon=True)
+        back = threading.Thread(target=self._pass_back, args=(early, lambda: stop() or ended.is_set()), daemon=True)
         back.start()
         try:
             self._pass_on(lambda: stop() or self._conflict is not None)
@@ -237,50 +263,42 @@ class GatewayNode:
         return self._returned
 
     def _pass_on(self, stop: Callable[[], bool]) -> None:
-        sensors, vehicle, ticking, clock = self._sensors, self._vehicle, self._ticking, time.monotonic
-        corrector, status = self._corrector, self._status
-        counters, sources = corrector.counters, corrector.sources
+        vehicle, ticking, clock = self._vehicle, self._ticking, time.monotonic
+        heard_s = clock()
         while not stop():
-            now_s = clock()
-            ticking.tick(now_s, vehicle.send, status)
-            ahead_s = time.time() - now_s
-            message = sensors.receive(ticking.wait_s(clock()))
-            while message is not None:
-                now_s = clock()
-                key = (message.arbitration_id, message.is_extended_id)
-                if key in status:
-                    raise _another(message, sensors)
-                source = sources.get(key)
-                if source is not None and not message.is_remote_frame:
-                    time_s = steady_time_s(message.timestamp, now_s, ahead_s, counters)
-                    data = source.forward(message.data, time_s)
-                    if data is not None:
-                        message.data = data
-                        self._send_on(message)
-                else:
-                    self._send_on(message)
-                message = sensors.receive(0.0) if ticking.wait_s(now_s) else None
+            ticking.tick(clock(), heard_s, vehicle.send, self._status)
+            heard_s = _hear(self._sensors, ticking, self._take)
 
-    def _send_on(self, message: can.Message) -> None:
-        counters = self._corrector.counters
+    def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
+        key = (message.arbitration_id, message.is_extended_id)
+        if key in self._status:
+            raise _another(message, self._sensors)
+        corrector = self._corrector
+        source = corrector.sources.get(key)
+        if source is not None and not message.is_remote_frame:
+            time_s = steady_time_s(message.timestamp, now_s, ahead_s, corrector.counters)
+            data = source.forward(message.data, time_s)
+            if data is None:
+                return
+            message.data = data
         if self._vehicle.send(message):
-            counters.forwarded += 1
+            corrector.counters.forwarded += 1
         else:
-            counters.send_errors += 1
+            corrector.counters.send_errors += 1
 
-    def _pass_back(self, heard: Sequence[can.Message], stop: Callable[[], bool]) -> None:
+    def _pass_back(self, early: Sequence[can.Message], stop: Callable[[], bool]) -> None:
         """Pass on what the vehicle sends to the sensors' bus; a branch's frame from there must not be."""
         vehicle, sensors = self._vehicle, self._sensors
-        for early in heard:
-            self._returned += sensors.send(early)
+        for message in early:
+            self._returned += sensors.send(message)
         while not stop():
-            message = vehicle.receive(_LONGEST_WAIT_S)
-            while message is not None:
-                if (message.arbitration_id, message.is_extended_id) in self._not_from_vehicle:
-                    self._conflict = _another(message, vehicle)
+            received = vehicle.receive(_LONGEST_WAIT_S)
+            while received is not None:
+                if (received.arbitration_id, received.is_extended_id) in self._not_from_vehicle:
+                    self._conflict = _another(received, vehicle)
                     return
-                self._returned += sensors.send(message)
-                message = None if stop() else vehicle.receive(0.0)
+                self._returned += sensors.send(received)
+                received = None if stop() else vehicle.receive(0.0)
 
 
 def _listen(bus: SteadyBus, own: OwnFrames, stop: Callable[[], bool]) -> list[can.Message]:

@@ -20,6 +20,7 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
 from ecu_node.guard import Mode
 from ecu_node.node import GatewayNode, OverlayNode, open_bus, receive_filters
+from ecu_node.status import Reason, State
 from ecu_node.wiring import InForce, wire
 from tests.ecu_node.vehicles import SMALL_DBC, decoded, parameters_for, protected
 
@@ -167,6 +168,90 @@ def test_frames_that_the_bus_does_not_take_are_dropped_and_counted(
         while corrector.counters.corrected == 0 or corrector.counters.send_errors < 3:
             assert time.monotonic() < give_up
             time.sleep(0.01)
+
+
+class DrivingBus(VirtualBus):
+    """A bus on which three branches send in turn, one frame each 5 ms; reading may pause, then frames wait to be read.
+
+    Two of the branches have a timeout of 0.1 s, one of 0.25 s.
+    """
+
+    pause_s = 0.0
+
+    def __init__(self, channel: str, database: VehicleDatabase) -> None:
+        super().__init__(channel)
+        self._database, self._sent, self._start_s = database, 0, time.time()
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        pause_s, self.pause_s = self.pause_s, 0.0
+        time.sleep(pause_s)
+        due_s = self._start_s + 0.005 * self._sent
+        if time.time() < due_s:
+            return super().recv(min(timeout or 0.0, 0.005))
+        round_, which = divmod(self._sent, 3)
+        self._sent += 1
+        name = ("HV_Battery", "HV_Motor", "HV_Auxiliary")[which]
+        identifier = self._database.message(name).frame_id
+        data = protected(self._database, name, round_ % 15)
+        return can.Message(due_s, identifier, is_extended_id=False, data=data)
+
+
+def test_a_pause_of_the_process_makes_no_branch_stale(
+    database: VehicleDatabase, request: pytest.FixtureRequest
+) -> None:
+    bus = DrivingBus(request.node.name, database)
+    with node_on(database, "", lambda: bus) as corrector:
+        wait_until(lambda: corrector.counters.frames_in > 20)
+        bus.pause_s = 0.18
+        before = corrector.counters.frames_in
+        wait_until(lambda: corrector.counters.frames_in > before + 60)
+        assert corrector.latched is Reason.NONE
+    assert corrector.counters.clock_steps == 0
+
+
+class SetClockBus(VirtualBus):
+    """A bus during whose waits the system's time is set back by half a second each time; then a frame comes."""
+
+    clock: "SetClock"
+    frames: list[bytes]
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        if not self.frames or not timeout:
+            return super().recv(timeout)
+        self.clock.ahead_s -= 0.5
+        return can.Message(self.clock.time(), 0x110, is_extended_id=False, data=self.frames.pop(0))
+
+
+class SetClock:
+    """The module ``time`` with a time of day that can be set."""
+
+    monotonic = staticmethod(time.monotonic)
+    ahead_s = 0.0
+
+    def time(self) -> float:
+        return time.time() + self.ahead_s
+
+
+def test_a_frame_that_comes_after_the_clock_was_set_is_not_taken_for_an_old_one(
+    database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    bus = SetClockBus(request.node.name)
+    bus.clock, bus.frames = SetClock(), []
+    monkeypatch.setattr("ecu_node.node.time", bus.clock)
+    with node_on(database, "", lambda: bus) as corrector:
+        wait_until(lambda: corrector.state()[0] is State.STARTING)
+        bus.frames = [protected(database, "HV_Battery", k) for k in range(8)]
+        wait_until(lambda: corrector.counters.frames_in == 8)
+        age_s = time.monotonic() - corrector.branches[0].time_s
+    assert age_s < 0.4
+    assert corrector.counters.clock_steps == 0
+
+
+def wait_until(done: Callable[[], bool]) -> None:
+    give_up = time.monotonic() + LONGEST_WAIT_S
+    while not done():
+        assert time.monotonic() < give_up, "waited in vain"
+        time.sleep(0.002)
 
 
 def test_a_bus_that_goes_away_is_opened_again(
