@@ -7,6 +7,7 @@ other: one thread passes frames on from the sensors, and corrects, another one p
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import can
 
@@ -23,8 +24,8 @@ _LONGEST_WAIT_S = 0.1
 """A wake-up at least this often, so that a request to stop is seen. [s]"""
 _LOOK_EVERY_S = 0.1
 """The junction is looked at, and the watchdog fed, at least this often, however rare the status is. [s]"""
-_LISTEN_S = 0.12
-"""Before it says anything the node listens whether another one is there: longer than a status message's period. [s]"""
+_LISTEN_PERIODS, _LONGEST_LISTEN_S = 1.5, 1.5
+"""So many status periods, but no longer than this [s], the node listens for another one before it says anything."""
 _STANDARD_MASK = 0x7FF
 _EXTENDED_MASK = 0x1FFFFFFF
 
@@ -85,7 +86,7 @@ class _Ticking:
     """
 
     def __init__(self, corrector: Corrector, period_s: float, on_tick: Callable[[float], None]) -> None:
-        self._corrector, self._period_s, self._on_tick = corrector, period_s, on_tick
+        self._corrector, self.period_s, self._on_tick = corrector, period_s, on_tick
         self._due_s = self._status_due_s = float("-inf")
 
     def wait_s(self, now_s: float) -> float:
@@ -96,12 +97,12 @@ class _Ticking:
         """Do it if it is due; no branch is stale for what has not been heard yet."""
         if now_s < self._due_s:
             return
-        self._due_s = max(self._due_s + min(self._period_s, _LOOK_EVERY_S), now_s)
+        self._due_s = max(self._due_s + min(self.period_s, _LOOK_EVERY_S), now_s)
         corrector = self._corrector
         corrector.look(heard_s)
         status = corrector.status() if now_s >= self._status_due_s else None
         if status is not None:
-            self._status_due_s = max(self._status_due_s + self._period_s, now_s)
+            self._status_due_s = max(self._status_due_s + self.period_s, now_s)
             fields, data = status
             own.sent(fields.key, data)
             corrector.counters.send_errors += not send(_message(fields.key, data, fd=fields.fd))
@@ -182,7 +183,7 @@ class OverlayNode:
         BusError
             If another node sends this node's messages.
         """
-        early = _listen(self._bus, self._own, stop)
+        early = _listen(self._bus, self._own, stop, self._ticking.period_s)
         bus, ticking, clock = self._bus, self._ticking, time.monotonic
         now_s = heard_s = clock()
         ahead_s = time.time() - now_s
@@ -240,22 +241,19 @@ class GatewayNode:
         self._status = OwnFrames(own)
         self._not_from_vehicle = OwnFrames([*own, *rewritten(database)])
         self._ticking = _Ticking(corrector, period_s, on_tick)
-        self._conflict: BusError | None = None
         self._returned = 0
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Correct until told to stop; parameters and errors as for :meth:`OverlayNode.run`."""
-        early = _listen(self._vehicle, self._not_from_vehicle, stop)
+        early = _listen(self._vehicle, self._not_from_vehicle, stop, self._ticking.period_s)
         ended = threading.Event()
-        back = threading.Thread(target=self._pass_back, args=(early, lambda: stop() or ended.is_set()), daemon=True)
-        back.start()
-        try:
-            self._pass_on(lambda: stop() or self._conflict is not None)
-        finally:
-            ended.set()
-            back.join()
-        if self._conflict is not None:
-            raise self._conflict
+        with ThreadPoolExecutor(1, "back") as pool:
+            back = pool.submit(self._pass_back, early, lambda: stop() or ended.is_set())
+            try:
+                self._pass_on(lambda: stop() or back.done())
+            finally:
+                ended.set()
+        back.result()  # raises what ended it
 
     @property
     def returned(self) -> int:
@@ -295,18 +293,17 @@ class GatewayNode:
             received = vehicle.receive(_LONGEST_WAIT_S)
             while received is not None:
                 if (received.arbitration_id, received.is_extended_id) in self._not_from_vehicle:
-                    self._conflict = _another(received, vehicle)
-                    return
+                    raise _another(received, vehicle)
                 self._returned += sensors.send(received)
                 received = None if stop() else vehicle.receive(0.0)
 
 
-def _listen(bus: SteadyBus, own: OwnFrames, stop: Callable[[], bool]) -> list[can.Message]:
+def _listen(bus: SteadyBus, own: OwnFrames, stop: Callable[[], bool], period_s: float) -> list[can.Message]:
     """Hear whether anybody else sends what only this node may send; all that was heard."""
     heard = []
-    end_s = time.monotonic() + _LISTEN_S
+    end_s = time.monotonic() + min(_LISTEN_PERIODS * period_s, _LONGEST_LISTEN_S)
     while (left_s := end_s - time.monotonic()) > 0.0 and not stop():
-        message = bus.receive(left_s)
+        message = bus.receive(min(left_s, _LONGEST_WAIT_S))
         if message is not None:
             if (message.arbitration_id, message.is_extended_id) in own:
                 _require_own(message, own, bus)

@@ -29,12 +29,12 @@ LONGEST_WAIT_S = 10.0
 
 @contextmanager
 def node_on(
-    database: VehicleDatabase, channel: str, opened: Callable[[], can.BusABC] | None = None
+    database: VehicleDatabase, channel: str, opened: Callable[[], can.BusABC] | None = None, *, period_s: float = 0.02
 ) -> Iterator[Corrector]:
     corrector = wire(database, InForce(parameters=parameters_for(database, battery=(0.25, 5.0))), time.monotonic())
     bus = SteadyBus(opened or (lambda: overlay_bus(database, channel)), corrector.counters)
     try:
-        with at_work(OverlayNode(bus, corrector, database, period_s=0.02)):
+        with at_work(OverlayNode(bus, corrector, database, period_s=period_s)):
             yield corrector
     finally:
         bus.close()
@@ -115,6 +115,16 @@ def test_a_node_that_starts_beside_another_one_refuses_and_leaves_it_alone(
         receive(peer, 0x5F0, 3)
 
 
+def test_a_node_listens_as_long_as_another_one_may_be_silent(
+    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
+) -> None:
+    with node_on(database, request.node.name, period_s=0.5):
+        receive(peer, 0x5F0, 2)
+        with pytest.raises(BusError, match="0x5F0"), node_on(database, request.node.name, period_s=0.5):
+            receive(peer, 0x5F0, 3)
+        receive(peer, 0x5F0, 1)
+
+
 def test_a_node_that_hears_its_own_messages_from_another_ends(
     database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
 ) -> None:
@@ -143,6 +153,61 @@ def test_own_frames_that_come_back_are_counted_and_nothing_more(
         receive(peer, 0x5F0, 5)
     assert corrector.counters.echoes >= 5
     assert (corrector.counters.frames_in, corrector.counters.corrected) == (1, 1)
+
+
+@contextmanager
+def gateway_between(database: VehicleDatabase, sensors: can.BusABC, vehicle: can.BusABC) -> Iterator[Corrector]:
+    in_force = InForce(parameters=parameters_for(database, battery=(0.25, 5.0)))
+    corrector = wire(database, in_force, time.monotonic(), mode=Mode.GATEWAY)
+    buses = [SteadyBus(lambda bus=bus: bus, corrector.counters) for bus in (sensors, vehicle)]  # type: ignore[misc]
+    try:
+        with at_work(GatewayNode(buses[0], buses[1], corrector, database, period_s=0.02)):
+            yield corrector
+    finally:
+        for bus in buses:
+            bus.close()
+
+
+def test_a_gateway_passes_frames_on_in_both_directions(
+    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
+) -> None:
+    other = f"{request.node.name} vehicle"
+    data = protected(database, "HV_Battery", 0, BatteryCurrent=100.0)
+    with (
+        can.Bus(interface="virtual", channel=other) as vehicle,
+        gateway_between(database, VirtualBus(request.node.name), VirtualBus(other)) as corrector,
+    ):
+        receive(vehicle, 0x5F0, 1)
+        peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
+        peer.send(can.Message(arbitration_id=0x111, is_extended_id=False, data=data))
+        vehicle.send(can.Message(arbitration_id=0x222, is_extended_id=False, data=data))
+        (rewritten,) = receive(vehicle, 0x110, 1)
+        (passed,) = receive(vehicle, 0x111, 1)
+        (returned,) = receive(peer, 0x222, 1)
+    assert decoded(database, "HV_Battery", bytes(rewritten.data))["BatteryCurrent"] == pytest.approx(76.0)
+    assert passed.data == returned.data == data
+    assert corrector.counters.forwarded == 2
+
+
+class DefectBus(VirtualBus):
+    """A bus with an adapter whose software is defect as soon as the node is at work."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise RuntimeError("defect")
+
+
+def test_a_gateway_of_which_one_direction_fails_ends(database: VehicleDatabase, request: pytest.FixtureRequest) -> None:
+    other = f"{request.node.name} vehicle"
+    frame = can.Message(arbitration_id=0x222, is_extended_id=False)
+    with (  # noqa: PT012
+        can.Bus(interface="virtual", channel=other) as vehicle,
+        pytest.raises(RuntimeError, match="defect"),
+        gateway_between(database, DefectBus(request.node.name), VirtualBus(other)),
+    ):
+        receive(vehicle, 0x5F0, 1)
+        vehicle.send(frame)
+        while vehicle.recv(1.0) is not None:
+            pass
 
 
 class FullBus(VirtualBus):
