@@ -1,0 +1,98 @@
+"""What docs/fault_table.md says of faults, where no other test shows it; and that each test it names exists."""
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from ecu_node.corrector import Corrector
+from ecu_node.counters import Counters
+from ecu_node.database import VehicleDatabase
+from ecu_node.frames import FrameKey
+from ecu_node.guard import Mode
+from ecu_node.sensor_models import TemperatureDrift
+from ecu_node.status import Quality, Reason, State
+from ecu_node.wiring import InForce, wire
+from tests.ecu_node.vehicles import Frame, answers, decoded, parameters_for, passed_on, protected
+
+TABLE = Path(__file__).parents[2] / "docs" / "fault_table.md"
+TESTS = Path(__file__).parents[1]
+BATTERY, MOTOR = FrameKey(0x110, False), FrameKey(0x120, False)
+
+
+def corrector_for(database: VehicleDatabase, mode: Mode) -> Corrector:
+    parameters = parameters_for(database, battery=(0.25, 5.0))
+    return wire(database, InForce(parameters=parameters), start_s=0.0, mode=mode)
+
+
+def used(database: VehicleDatabase, mode: Mode, frames: Sequence[bytes]) -> tuple[list[bool], Counters]:
+    """Which of these battery frames are answered by an overlay node, or passed on by a gateway; what is counted."""
+    corrector = corrector_for(database, mode)
+    take: Callable[[Corrector, Frame, float], object] = answers if mode is Mode.OVERLAY else passed_on
+    return [bool(take(corrector, Frame(BATTERY, data), 0.02 * k)) for k, data in enumerate(frames)], corrector.counters
+
+
+def battery(database: VehicleDatabase, *counters: int) -> list[bytes]:
+    return [protected(database, "HV_Battery", counter, BatteryCurrent=100.0) for counter in counters]
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_after_a_lost_frame_the_next_one_is_used(database: VehicleDatabase, mode: Mode) -> None:
+    found, counters = used(database, mode, battery(database, 0, 1, 3, 4, 7))
+    assert found == [True] * 5
+    assert counters.gaps == 2
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_a_repeated_frame_is_used_once(database: VehicleDatabase, mode: Mode) -> None:
+    found, counters = used(database, mode, battery(database, 0, 1, 1, 2))
+    assert found == [True, True, False, True]
+    assert (counters.repeated, counters.held_back) == (1, 0 if mode is Mode.OVERLAY else 1)
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_a_frame_whose_counter_jumps_is_not_used_but_the_next_one_is(database: VehicleDatabase, mode: Mode) -> None:
+    found, counters = used(database, mode, battery(database, 0, 1, 9, 10))
+    assert found == [True, True, False, True]
+    assert (counters.jumped, counters.gaps) == (1, 0)
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_a_frame_with_a_wrong_crc_is_as_if_it_had_not_come(database: VehicleDatabase, mode: Mode) -> None:
+    first, second, third = battery(database, 0, 1, 2)
+    damaged = second[:2] + bytes([second[2] ^ 0x10]) + second[3:]
+    found, counters = used(database, mode, [first, damaged, second, third, b""])
+    assert found == [True, False, True, True, False]
+    assert (counters.corrupt, counters.gaps, counters.repeated) == (2, 0, 0)
+
+
+def test_without_the_temperature_a_branch_is_passed_through_and_the_status_says_so(database: VehicleDatabase) -> None:
+    parameters = parameters_for(database, battery=(0.1, 0.0), motor=(0.0, 0.0))
+    model = TemperatureDrift(drift_per_k=0.005, reference_c=20.0)
+    bent = {**parameters.branches, "battery": replace(parameters.branches["battery"], sensor_model=model)}
+    corrector = wire(database, InForce(parameters=replace(parameters, branches=bent)), start_s=0.0)
+    found = []
+    for counter, temperature in enumerate((20.0, 215.0, 20.0)):  # 215: the code that says that there is none
+        data = protected(database, "HV_Battery", counter, BatteryCurrent=110.0, JunctionBoxTemperature=temperature)
+        (answer,) = answers(corrector, Frame(BATTERY, data), 0.02 * counter)
+        answers(corrector, Frame(MOTOR, protected(database, "HV_Motor", counter)), 0.02 * counter)
+        corrector.look(0.02 * counter)
+        values = decoded(database, "HV_BatteryCorrected", answer.data)
+        found.append((values["BatteryCurrentCorrected"], values["BatteryCurrentQuality"], corrector.state()))
+    corrected = (100.0, Quality.CORRECTED, (State.CORRECTING, Reason.NONE))
+    assert found == [corrected, (110.0, Quality.PASSED_THROUGH, (State.CORRECTING, Reason.INPUT_MISSING)), corrected]
+
+
+def test_every_row_names_tests_and_every_test_exists() -> None:
+    defined = {
+        name for path in TESTS.rglob("test_*.py") for name in re.findall(r"(?m)^def (test_\w+)", path.read_text())
+    }
+    rows = [
+        line for line in TABLE.read_text().splitlines() if line.startswith("| ") and not line.startswith("| fault |")
+    ]
+    named = [re.findall(r"`(test_\w+)`", line.rsplit("|", 2)[1]) for line in rows]
+    assert len(rows) >= 25
+    assert [row for row, names in zip(rows, named, strict=True) if not names] == []
+    assert {name for names in named for name in names} - defined == set()
