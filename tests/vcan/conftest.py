@@ -1,5 +1,7 @@
 """A real SocketCAN kernel with can-utils as the other party: run with ``tools/with_vcan``; nothing here ever skips."""
 
+import os
+import re
 import shutil
 import socket
 from collections.abc import Iterator
@@ -11,9 +13,13 @@ import pytest
 
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
-from tests.vcan.processes import CHANNEL, NodeProcess, Recording, running_node, running_recording
+from ecu_node.parameters import write_parameters
+from tests.vcan.processes import CHANNEL, OTHER_CHANNEL, NodeProcess, Recording, running_node, running_recording
+from tests.vcan.small_drive import true_parameters
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
+TIMEOUT_S = 5.0
+"""Branches are stale after this. [s]"""
 
 
 class StartNode(Protocol):
@@ -25,9 +31,11 @@ class StartNode(Protocol):
 @pytest.fixture(scope="session", autouse=True)
 def socketcan() -> None:
     """Fail at once where the tests of this folder cannot run."""
-    missing = [name for name in ("candump", "canplayer", "cansend") if shutil.which(name) is None]
+    missing = [name for name in ("candump", "cangen", "cangw", "canplayer", "cansend") if shutil.which(name) is None]
     if missing:
         pytest.exit(f"{', '.join(missing)} not found: apt-get install can-utils", returncode=1)
+    if os.geteuid() != 0:
+        pytest.exit("not root, which taking interfaces down needs; run tools/with_vcan", returncode=1)
     try:
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as bus:
             bus.bind((CHANNEL,))
@@ -35,18 +43,41 @@ def socketcan() -> None:
         pytest.exit(f"no SocketCAN with {CHANNEL} here ({error}); run tools/with_vcan", returncode=1)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def long_queues(socketcan: None) -> Iterator[None]:
+    """Let sockets hold the frames of many seconds: a slow kernel on a busy machine may pause any process that long."""
+    setting = Path("/proc/sys/net/core/rmem_default")
+    before = setting.read_text()
+    setting.write_text("8000000")
+    yield
+    setting.write_text(before)
+
+
 @pytest.fixture(scope="session")
-def database() -> VehicleDatabase:
-    """The project's own layout and DBC."""
-    return read_database(read_layout(LAYOUT))
+def database(tmp_path_factory: pytest.TempPathFactory) -> VehicleDatabase:
+    """The project's own layout and DBC, but with timeouts that a slow kernel keeps."""
+    folder = tmp_path_factory.mktemp("vehicle")
+    shutil.copy(LAYOUT.with_suffix(".dbc"), folder)
+    patient, _ = re.subn(r"(?m)^timeout_s = [0-9.]+$", f"timeout_s = {TIMEOUT_S}", LAYOUT.read_text())
+    (folder / LAYOUT.name).write_text(patient)
+    return read_database(read_layout(folder / LAYOUT.name))
 
 
 @pytest.fixture
-def start_node(tmp_path: Path) -> StartNode:
-    """The node as a process of its own on vcan0."""
+def params(database: VehicleDatabase, tmp_path: Path) -> Path:
+    """A parameter file with the true faults of the small drive."""
+    path = tmp_path / "params.json"
+    write_parameters(true_parameters(database), path)
+    return path
+
+
+@pytest.fixture
+def start_node(database: VehicleDatabase, tmp_path: Path) -> StartNode:
+    """The node as a process of its own on vcan0; what it says is in node.err, of a second one in node2.err."""
+    logs = (tmp_path / name for name in ("node.err", "node2.err"))
 
     def start(params: Path, *options: str) -> AbstractContextManager[NodeProcess]:
-        return running_node(tmp_path / "node.err", "--params", str(params), "--layout", str(LAYOUT), *options)
+        return running_node(next(logs), "--params", str(params), "--layout", str(database.layout.path), *options)
 
     return start
 
@@ -55,4 +86,11 @@ def start_node(tmp_path: Path) -> StartNode:
 def recording(tmp_path: Path) -> Iterator[Recording]:
     """candump, recording vcan0 from before the test's first frame."""
     with running_recording(tmp_path / "recorded.log") as running:
+        yield running
+
+
+@pytest.fixture
+def other_recording(tmp_path: Path) -> Iterator[Recording]:
+    """candump, recording vcan1 from before the test's first frame."""
+    with running_recording(tmp_path / "other.log", OTHER_CHANNEL) as running:
         yield running

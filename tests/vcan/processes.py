@@ -1,4 +1,4 @@
-"""Processes on vcan0: the node, candump, canplayer, cansend."""
+"""Processes on vcan0 and vcan1: the node, candump, canplayer, cansend, cangen, ip, tc."""
 
 import signal
 import subprocess
@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-CHANNEL = "vcan0"
-ECU_NODE = Path(sys.executable).parent / "ecu-node"
+CHANNEL, OTHER_CHANNEL = "vcan0", "vcan1"
 LONGEST_WAIT_S = 60.0
 """System calls of user-mode-linux are slow; nothing here takes this long unless it is broken. [s]"""
 
@@ -21,6 +20,23 @@ class LoggedFrame(NamedTuple):
 
     identifier: str
     data: str
+
+
+def ip_link(*arguments: str) -> None:
+    """Change an interface with ip(8); needs root."""
+    run_tool("ip", "link", *arguments)
+
+
+def run_tool(*command: str) -> None:
+    """Run a program that must succeed."""
+    subprocess.run(command, check=True, timeout=LONGEST_WAIT_S)
+
+
+def bring_up(channel: str) -> None:
+    """Bring an interface up as tools/with_vcan does."""
+    ip_link("set", channel, "mtu", "72")
+    ip_link("set", channel, "txqueuelen", "1000")
+    ip_link("set", channel, "up")
 
 
 def frames_of(log: Path) -> list[LoggedFrame]:
@@ -44,6 +60,15 @@ class NodeProcess:
     process: subprocess.Popen[bytes]
     log: Path
 
+    def wait_for(self, words: str) -> None:
+        """Wait until it has said this."""
+        wait_until(lambda: words in self.messages or self.process.poll() is not None, f"the node to say {words!r}")
+        assert words in self.messages, self.messages
+
+    def wait_for_end(self) -> int:
+        """Wait until it ends by itself; its exit code."""
+        return self.process.wait(timeout=LONGEST_WAIT_S)
+
     def stop(self, how: signal.Signals = signal.SIGTERM) -> int:
         """End the node within a second and return its exit code."""
         self.process.send_signal(how)
@@ -58,7 +83,7 @@ class NodeProcess:
 @contextmanager
 def running_node(log: Path, *options: str) -> Iterator[NodeProcess]:
     """The node on vcan0, from when it says that it runs."""
-    command = [str(ECU_NODE), "run", "--interface", "socketcan", "--channel", CHANNEL, *options]
+    command = [sys.executable, "-m", "ecu_node", "run", "--interface", "socketcan", "--channel", CHANNEL, *options]
     with log.open("wb") as file, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=file) as process:
         node = NodeProcess(process=process, log=log)
         try:
@@ -92,12 +117,13 @@ class Recording:
 
 
 @contextmanager
-def running_recording(log: Path) -> Iterator[Recording]:
-    """Record vcan0 with candump, from when it listens."""
-    before = _listeners()
-    with log.open("wb") as file, subprocess.Popen(["candump", "-L", CHANNEL], stdout=file) as process:
+def running_recording(log: Path, channel: str = CHANNEL) -> Iterator[Recording]:
+    """Record a bus with candump, from when it listens; it goes on when the bus goes down and up."""
+    before = _listeners(channel)
+    command = ["candump", "-L", "-D", channel]
+    with log.open("wb") as file, subprocess.Popen(command, stdout=file, stderr=subprocess.DEVNULL) as process:
         try:
-            wait_until(lambda: _listeners() > before, "candump to listen")
+            wait_until(lambda: _listeners(channel) > before, "candump to listen")
             yield Recording(log=log)
         finally:
             process.terminate()
@@ -105,15 +131,31 @@ def running_recording(log: Path) -> Iterator[Recording]:
 
 def play(log: Path) -> None:
     """Play a log of can0 on vcan0 with canplayer, in its own timing."""
-    subprocess.run(["canplayer", "-I", str(log), f"{CHANNEL}=can0"], check=True, timeout=LONGEST_WAIT_S)
+    run_tool("canplayer", "-I", str(log), f"{CHANNEL}=can0")
 
 
-def send(frame: str) -> None:
+@contextmanager
+def playing(log: Path, *, endlessly: bool = False) -> Iterator[subprocess.Popen[bytes]]:
+    """The same meanwhile."""
+    command = ["canplayer", "-I", str(log), *(("-l", "i") if endlessly else ()), f"{CHANNEL}=can0"]
+    with subprocess.Popen(command) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+def generate(channel: str, count: int, *options: str) -> None:
+    """Send so many frames with cangen, no faster than a slow kernel hands them on; random data unless given."""
+    run_tool("cangen", channel, "-n", str(count), "-g", "8", *options)
+
+
+def send(frame: str, channel: str = CHANNEL) -> None:
     """Send one frame with cansend, such as 123#00FF."""
-    subprocess.run(["cansend", CHANNEL, frame], check=True, timeout=LONGEST_WAIT_S)
+    run_tool("cansend", channel, frame)
 
 
-def _listeners() -> int:
-    """Sockets that receive every frame of vcan0."""
+def _listeners(channel: str) -> int:
+    """Sockets that receive every frame of a bus."""
     lines = Path("/proc/net/can/rcvlist_all").read_text().splitlines()
-    return sum(line.split()[0] == CHANNEL for line in lines if line.split())
+    return sum(line.split()[0] == channel for line in lines if line.split())

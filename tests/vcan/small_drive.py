@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
-from e2e.p01 import e2e_p01_protect
+from e2e.p01 import e2e_p01_check, e2e_p01_protect
 
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import (
@@ -112,6 +112,20 @@ def write_drive(path: Path, database: VehicleDatabase, instants: int) -> dict[st
         lines += [f"({t + 0.001 * n:.6f}) can0 {name}#{data.hex().upper()}" for n, (name, data) in enumerate(frames)]
     path.write_text("\n".join(lines) + "\n")
     return codes
+
+
+def passed_on(database: VehicleDatabase, identifier: str, data: bytes) -> bytes | None:
+    """What a gateway makes of a frame of this drive: its current and its CRC another one; None if it holds it back."""
+    for branch in BRANCHES.values():
+        frame_id = database.message(branch.message).frame_id
+        if identifier == f"{frame_id:03X}":
+            if not e2e_p01_check(bytearray(data), frame_id):
+                return None
+            code = branch.corrected_code(int.from_bytes(data[2:4], "little", signed=True))
+            rewritten = bytearray(data[:2] + code.to_bytes(2, "little", signed=True) + data[4:])
+            e2e_p01_protect(rewritten, frame_id, increment_counter=False)
+            return bytes(rewritten)
+    return data
 
 
 def _foreign_frames(database: VehicleDatabase, k: int) -> Iterator[tuple[str, bytes]]:

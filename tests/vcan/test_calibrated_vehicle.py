@@ -28,15 +28,15 @@ def run(*command: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fleet(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four vehicles on a common trip, calibrated with the perfect classifier."""
-    fleet = tmp_path_factory.mktemp("calibrated") / "fleet"
+    fleet, layout = tmp_path_factory.mktemp("calibrated") / "fleet", database.layout.path
     run(
         *("calibrator", "simulate", "--vehicles", 4, "--sparsity", 60, "--common-drive", "--symmetric", "--balanced"),
-        *("--minutes", 3, "--unseen-minutes", 1, "--seed", 5, "--layout", LAYOUT, "--out", fleet, "--workers", 1),
+        *("--minutes", 3, "--unseen-minutes", 1, "--seed", 5, "--layout", layout, "--out", fleet, "--workers", 1),
     )
     run(
-        *("calibrator", "calibrate", fleet, "--layout", LAYOUT, "--out", fleet.parent / "result", "--workers", 1),
+        *("calibrator", "calibrate", fleet, "--layout", layout, "--out", fleet.parent / "result", "--workers", 1),
         *("--method", "published", "--classifier", "perfect", "--truth", fleet / "truth.json"),
     )
     return fleet

@@ -1,0 +1,239 @@
+"""What docs/fault_table.md says of faults that take a kernel, or a process of its own."""
+
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import write_parameters
+from ecu_node.status import Quality, Reason, State
+from tests.vcan.conftest import StartNode
+from tests.vcan.processes import (
+    CHANNEL,
+    OTHER_CHANNEL,
+    Recording,
+    bring_up,
+    ip_link,
+    play,
+    playing,
+    run_tool,
+    running_recording,
+    send,
+    wait_until,
+)
+from tests.vcan.small_drive import BRANCHES, passed_on, protected, true_parameters, write_drive
+
+INSTANTS = 45
+"""A multiple of the counter's period, so that a drive may follow itself."""
+STATUS, BATTERY, BATTERY_CORRECTED = 0x5F0, 0x110, 0x510
+GATEWAY = ("--gateway", OTHER_CHANNEL)
+
+
+@pytest.fixture
+def drive(database: VehicleDatabase, tmp_path: Path) -> Path:
+    path = tmp_path / "drive.log"
+    write_drive(path, database, INSTANTS)
+    return path
+
+
+def expected_battery(database: VehicleDatabase, drive: Path) -> list[bytes]:
+    """The battery's frames of a drive as a gateway passes them on."""
+    lines = [line.split()[2].split("#") for line in drive.read_text().splitlines()]
+    frames = [bytes.fromhex(data) for identifier, data in lines if identifier == f"{BATTERY:03X}"]
+    return [found for frame in frames if (found := passed_on(database, f"{BATTERY:03X}", frame)) is not None]
+
+
+def qualities(frames: list[bytes]) -> set[int]:
+    return {frame[1] >> 4 & 3 for frame in frames}
+
+
+def state_of(frame: bytes) -> tuple[State, Reason]:
+    """What a status frame says."""
+    return State(frame[1] >> 4), Reason(frame[2])
+
+
+def wait_for_correcting(recording: Recording) -> None:
+    wait_until(
+        lambda: state_of(recording.data_of(STATUS)[-1]) == (State.CORRECTING, Reason.NONE), "the node to correct"
+    )
+
+
+def send_branches(database: VehicleDatabase, k: int) -> None:
+    """One frame of each branch."""
+    for branch in BRANCHES.values():
+        data = protected(database, branch.message, k, **{branch.signal: 1000 + k})
+        send(f"{database.message(branch.message).frame_id:03X}#{data.hex()}")
+
+
+@pytest.fixture
+def bus_is_back() -> Iterator[None]:
+    """The next test finds vcan0 as this one did."""
+    yield
+    if not Path(f"/sys/class/net/{CHANNEL}").exists():
+        ip_link("add", CHANNEL, "type", "vcan")
+    bring_up(CHANNEL)
+
+
+@pytest.mark.parametrize("how", ["down", "deleted"])
+@pytest.mark.usefixtures("bus_is_back")
+def test_a_bus_that_was_away_is_used_again(
+    params: Path, tmp_path: Path, drive: Path, start_node: StartNode, how: str
+) -> None:
+    with start_node(params) as node:
+        with running_recording(tmp_path / "before.log") as before:
+            play(drive)
+            before.wait_for(BATTERY_CORRECTED, INSTANTS)
+        if how == "deleted":
+            ip_link("del", CHANNEL)
+            node.wait_for("the bus failed")
+            ip_link("add", CHANNEL, "type", "vcan")
+        else:
+            ip_link("set", CHANNEL, "down")
+            node.wait_for("the bus failed")
+        bring_up(CHANNEL)
+        node.wait_for("the bus is open again")
+        with running_recording(tmp_path / "after.log") as after:
+            play(drive)
+            corrected = after.wait_for(BATTERY_CORRECTED, INSTANTS)
+            wait_for_correcting(after)
+        assert node.stop() == 0
+    assert qualities(corrected) == {Quality.CORRECTED}
+    lines = node.messages.splitlines()
+    assert [("the bus failed" in line, "is open again" in line) for line in lines[-3:-1]] == [(1, 0), (0, 1)]
+    assert "reopened 1" in lines[-1]
+
+
+def test_a_full_send_queue_costs_the_frames_that_it_does_not_take(
+    database: VehicleDatabase, params: Path, drive: Path, start_node: StartNode, other_recording: Recording
+) -> None:
+    expected = expected_battery(database, drive)
+    with start_node(params, *GATEWAY) as node:
+        other_recording.wait_for(STATUS, 1)
+        run_tool("tc", "qdisc", "add", "dev", OTHER_CHANNEL, "root", "plug", "limit", "400")
+        try:
+            play(drive)
+        finally:
+            run_tool("tc", "qdisc", "del", "dev", OTHER_CHANNEL, "root")
+        assert node.process.poll() is None
+        play(drive)
+        wait_until(lambda: other_recording.data_of(BATTERY)[-INSTANTS:] == expected, "the second drive")
+        assert node.stop() == 0
+    assert len(other_recording.data_of(BATTERY)) < 2 * INSTANTS
+    assert "send errors" in node.messages.splitlines()[-1]
+    assert "bus failed" not in node.messages
+
+
+def test_error_frames_are_counted_and_not_passed_on(
+    database: VehicleDatabase, params: Path, start_node: StartNode, other_recording: Recording
+) -> None:
+    with start_node(params, *GATEWAY) as node:
+        other_recording.wait_for(STATUS, 1)
+        send("20000004#0008000000000000")
+        send("20000040#0000000000000000")
+        send_branches(database, 0)
+        other_recording.wait_for(BATTERY, 1)
+        assert node.stop() == 0
+    assert "frames in 3, corrected 3, forwarded 3, bus errors 2, bus off 1" in node.messages
+    assert {item.identifier for item in other_recording.frames} == {"110", "120", "130", "5F0"}
+
+
+def test_sighup_reads_the_parameters_again(
+    database: VehicleDatabase, params: Path, start_node: StartNode, recording: Recording
+) -> None:
+    with start_node(params) as node:
+        recording.wait_for(STATUS, 1)
+        node.process.send_signal(signal.SIGHUP)
+        node.wait_for("parameter set 7 of vehicle v0007 is in force")
+        params.write_text("{")
+        node.wait_for("new parameters are not used, those before stay in force")
+        send_branches(database, 0)
+        corrected = recording.wait_for(BATTERY_CORRECTED, 1)
+        write_parameters(replace(true_parameters(database), number=8), params)
+        node.wait_for("parameter set 8 of vehicle v0007 is in force")
+        wait_for_correcting(recording)
+        assert node.stop() == 0
+    assert qualities(corrected) == {Quality.CORRECTED}
+    assert "reloads 2, reload failures" in node.messages.splitlines()[-1]
+
+
+@pytest.mark.parametrize("options", [(), GATEWAY], ids=["overlay", "gateway"])
+def test_a_second_node_refuses_and_the_first_one_goes_on(
+    params: Path,
+    start_node: StartNode,
+    recording: Recording,
+    other_recording: Recording,
+    options: tuple[str, ...],
+) -> None:
+    bus = other_recording if options else recording
+    with start_node(params, *options) as first:
+        bus.wait_for(STATUS, 1)
+        with start_node(params, *options) as second:
+            assert second.wait_for_end() == 1
+        bus.wait_for(STATUS, len(bus.data_of(STATUS)) + 3)
+        assert first.stop() == 0
+    assert (
+        "another node sends frames 0x5F0, which only this one may send there; two nodes on one bus" in second.messages
+    )
+    counters = [data[1] & 15 for data in bus.data_of(STATUS)]
+    assert counters == [k % 15 for k in range(len(counters))], "all of the first one"
+
+
+@pytest.mark.parametrize("joined", ["one bus", "two buses and a bridge"])
+def test_a_gateway_on_joined_buses_ends(
+    params: Path, drive: Path, start_node: StartNode, recording: Recording, joined: str
+) -> None:
+    bridge = ("-s", OTHER_CHANNEL, "-d", CHANNEL, "-e")
+    if joined != "one bus":
+        run_tool("cangw", "-A", *bridge)
+    try:
+        options = ("--gateway", CHANNEL) if joined == "one bus" else GATEWAY
+        with start_node(params, *options) as node:
+            assert node.wait_for_end() == 1
+    finally:
+        if joined != "one bus":
+            run_tool("cangw", "-D", *bridge)
+    assert "which only this one may send there; two nodes on one bus, or two buses that are joined?" in node.messages
+
+
+def test_a_clock_that_is_set_makes_no_branch_stale(
+    database: VehicleDatabase, params: Path, start_node: StartNode, recording: Recording
+) -> None:
+    k = 0
+    with start_node(params) as node:
+        recording.wait_for(STATUS, 1)
+        right_s = time.time() - time.monotonic()
+        try:
+            for step_s in (0.0, 3600.0, -0.4, -86400.0):
+                time.clock_settime(time.CLOCK_REALTIME, time.monotonic() + right_s + step_s)
+                for _ in range(2):
+                    send_branches(database, k)
+                    k += 1
+                recording.wait_for(BATTERY_CORRECTED, k)
+                recording.wait_for(STATUS, len(recording.data_of(STATUS)) + 2)
+        finally:
+            time.clock_settime(time.CLOCK_REALTIME, time.monotonic() + right_s)
+        assert node.stop() == 0
+    assert qualities(recording.data_of(BATTERY_CORRECTED)) == {Quality.CORRECTED}
+    assert {state_of(data)[0] for data in recording.data_of(STATUS)} <= {State.STARTING, State.CORRECTING}
+
+
+def test_a_node_that_was_killed_goes_on_after_a_restart(
+    params: Path, drive: Path, start_node: StartNode, recording: Recording
+) -> None:
+    with playing(drive, endlessly=True):
+        with start_node(params) as node:
+            recording.wait_for(BATTERY_CORRECTED, 5)
+            assert node.stop(signal.SIGKILL) == -signal.SIGKILL
+        first = len(recording.data_of(BATTERY_CORRECTED))
+        with start_node(params) as node:
+            recording.wait_for(BATTERY_CORRECTED, first + 20)
+            wait_for_correcting(recording)
+            assert node.stop() == 0
+    corrected = recording.data_of(BATTERY_CORRECTED)
+    assert qualities(corrected) == {Quality.CORRECTED}
+    counters = [data[1] & 15 for data in corrected]
+    assert counters[first : first + 20] == [k % 15 for k in range(20)], "receivers see it count from 0 again"
