@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 CHANNEL, OTHER_CHANNEL = "vcan0", "vcan1"
+ECU_NODE = (sys.executable, "-m", "ecu_node")
 LONGEST_WAIT_S = 60.0
 """System calls of user-mode-linux are slow; nothing here takes this long unless it is broken. [s]"""
 
@@ -83,7 +84,7 @@ class NodeProcess:
 @contextmanager
 def running_node(log: Path, *options: str) -> Iterator[NodeProcess]:
     """The node on vcan0, from when it says that it runs."""
-    command = [sys.executable, "-m", "ecu_node", "run", "--interface", "socketcan", "--channel", CHANNEL, *options]
+    command = [*ECU_NODE, "run", "--interface", "socketcan", "--channel", CHANNEL, *options]
     with log.open("wb") as file, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=file) as process:
         node = NodeProcess(process=process, log=log)
         try:

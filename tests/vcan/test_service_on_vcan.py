@@ -26,7 +26,7 @@ from tests.vcan.processes import (
 )
 from tests.vcan.small_drive import BRANCHES, VEHICLE, true_parameters, write_drive
 
-MONITOR = [str(ECU_NODE), "monitor", "--layout", str(LAYOUT), "--channel", CHANNEL]
+MONITOR = [*ECU_NODE, "monitor", "--layout", str(LAYOUT), "--channel", CHANNEL]
 UNPRIVILEGED = ["setpriv", "--bounding-set=-all", "--inh-caps=-all", "--ambient-caps=-all", "--no-new-privs"]
 CORRECTED_BATTERY, STATUS = 0x510, 0x5F0
 
@@ -67,7 +67,7 @@ def test_the_monitor_shows_branches_sums_and_node(patient: VehicleDatabase, tmp_
     write_drive(tmp_path / "drive.log", patient, 500)
     write_parameters(true_parameters(patient), tmp_path / "params.json")
     files = ["--layout", str(patient.layout.path), "--channel", CHANNEL]
-    command = [str(ECU_NODE), "monitor", *files, "--once", "4", "--json"]
+    command = [*ECU_NODE, "monitor", *files, "--once", "4", "--json"]
     with running_node(tmp_path / "node.err", "--params", str(tmp_path / "params.json"), *files) as node:
         before = filters()
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as monitor:
@@ -104,7 +104,7 @@ def test_the_node_needs_no_capability(
     write_drive(tmp_path / "drive.log", database, 20)
     options = ["--params", str(params), "--layout", str(LAYOUT), "--vehicle", VEHICLE, "--channel", CHANNEL]
     log = tmp_path / "node.err"
-    with log.open("wb") as file, subprocess.Popen([*UNPRIVILEGED, ECU_NODE, "run", *options], stderr=file) as process:
+    with log.open("wb") as file, subprocess.Popen([*UNPRIVILEGED, *ECU_NODE, "run", *options], stderr=file) as process:
         try:
             wait_until(lambda: "running on" in log.read_text() or process.poll() is not None, "the node to start")
             capabilities = Path(f"/proc/{process.pid}/status").read_text().partition("CapPrm:")[2].split()
