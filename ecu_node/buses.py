@@ -5,6 +5,8 @@ Whatever python-can's interfaces raise becomes :class:`~ecu_node.errors.BusError
 
 import contextlib
 import errno
+import socket
+import struct
 import time
 from collections.abc import Callable
 from typing import Any
@@ -25,6 +27,10 @@ _OLDEST_FRAME_S = 1.0
 """A time stamp further from now is one of another clock. [s]"""
 _GONE = {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF}
 """Errors of sending after which only opening the bus again helps."""
+_RECEIVE_BUFFER_BYTES = 1 << 20
+"""Asked of the kernel, which gives what it allows: frames of the time in which the node does something else."""
+_SO_MEMINFO, _DROPS = 55, 8
+"""Socket option, and the place of the dropped frames in it (asm-generic/socket.h, linux/sock_diag.h)."""
 _BUS_OFF = 0x40
 """Class of error frames of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
 
@@ -55,7 +61,7 @@ def connect(
     """
     options: dict[str, Any] = {"fd": True} if fd else {}
     try:
-        return can.Bus(
+        bus = can.Bus(
             channel=channel,
             interface=interface,
             ignore_config=True,
@@ -65,6 +71,10 @@ def connect(
         )
     except (can.CanError, OSError, ValueError, TypeError, NotImplementedError) as error:
         raise BusError(f"{interface} {channel}: cannot open the bus: {_why(error)}") from None
+    queue = _queue(bus)
+    if queue is not None:
+        queue.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+    return bus
 
 
 class SteadyBus:
@@ -94,6 +104,7 @@ class SteadyBus:
         self._bus: can.BusABC | None = open_bus()
         self._failed: tuple[can.BusABC, Exception] | None = None
         self._retry_s, self._pause_s = 0.0, _FIRST_PAUSE_S
+        self._dropped = 0
         self.channel = self._bus.channel_info
 
     def receive(self, timeout_s: float) -> can.Message | None:
@@ -131,6 +142,14 @@ class SteadyBus:
                 continue
             return True
         return False
+
+    def count_dropped(self) -> None:
+        """Count the frames that the kernel dropped since the last time, because they were not read in time."""
+        bus = self._bus
+        if bus is not None:
+            dropped = _dropped(bus)
+            self._counters.dropped += max(dropped - self._dropped, 0)
+            self._dropped = dropped
 
     def close(self) -> None:
         """Close it."""
@@ -172,7 +191,7 @@ class SteadyBus:
             with contextlib.suppress(can.CanError, OSError):
                 bus.shutdown()
             return None
-        self._bus = bus
+        self._bus, self._dropped = bus, 0
         self._counters.reopened += 1
         self._say(f"{self.channel}: the bus is open again")
         return self._not_an_error(message)
@@ -184,7 +203,7 @@ def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float, counters: 
     Parameters
     ----------
     stamp_s : float
-        Its time stamp by the kernel or the adapter. [s]
+        Its time stamp by the kernel or the adapter; 0 if there is none. [s]
     now_s : float
         The steady clock now. [s]
     clock_ahead_s : float
@@ -200,9 +219,27 @@ def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float, counters: 
     time_s = stamp_s - clock_ahead_s
     if now_s - _OLDEST_FRAME_S <= time_s <= now_s:
         return time_s
-    if counters is not None:
+    if counters is not None and stamp_s:
         counters.clock_steps += abs(time_s - now_s) > _OLDEST_FRAME_S
     return now_s
+
+
+def _queue(bus: can.BusABC) -> socket.socket | None:
+    """Socket of a bus of SocketCAN."""
+    found = getattr(bus, "socket", None)
+    return found if isinstance(found, socket.socket) else None
+
+
+def _dropped(bus: can.BusABC) -> int:
+    """Frames that the kernel has dropped; 0 where that is not known."""
+    queue = _queue(bus)
+    if queue is None:
+        return 0
+    try:
+        info = queue.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_DROPS + 1))
+    except OSError:  # closed meanwhile, or a kernel before 4.12
+        return 0
+    return int(struct.unpack(f"={_DROPS + 1}I", info)[_DROPS]) if len(info) == 4 * (_DROPS + 1) else 0
 
 
 def _number(error: Exception) -> int | None:

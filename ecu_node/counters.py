@@ -27,6 +27,8 @@ class Counters:
     """Times that the counter showed a few lost frames."""
     short: int = 0
     """Frames too short for a signal that the layout reads from them."""
+    dropped: int = 0
+    """Frames that the kernel dropped because they were not read in time."""
     saturated: int = 0
     """Corrected values beyond the ends of their signal; the end was sent instead."""
     echoes: int = 0

@@ -1,8 +1,6 @@
 """``ecu-node monitor``: bus, clock and terminal around :mod:`ecu_node.monitor_model`; it listens, and never sends."""
 
 import json
-import socket
-import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +12,7 @@ import can
 
 from ecu_node.buses import SteadyBus, steady_time_s
 from ecu_node.counters import Counters
-from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.database import read_database
 from ecu_node.errors import UserError
 from ecu_node.guard import Mode
 from ecu_node.layout import read_layout
@@ -29,10 +27,6 @@ _LIVE_PERIOD_S, _PLAIN_PERIOD_S = 0.25, 1.0
 """Between two pictures. [s]"""
 _LONGEST_WAIT_S = 0.25
 """A wake-up at least this often, so that a request to stop is seen. [s]"""
-_RECEIVE_BUFFER_BYTES = 1 << 20
-"""Asked of the kernel, which gives what it allows: frames of the time in which a table is drawn."""
-_SO_MEMINFO, _DROPS = 55, 8
-"""Socket option, and the place of the dropped frames in it (asm-generic/socket.h, linux/sock_diag.h)."""
 
 _LEAST_WORDS, _LONGEST_NUMBER, _WIDE = 7, "+999.99", 100
 """Of the live table: width of its columns of words, what its numbers need, and a terminal with room for gaps."""
@@ -96,16 +90,21 @@ def run_monitor(options: MonitorOptions) -> int:
         return was_hung_up or requests.stop()
 
     counters = Counters()
-    opener = _Opener(database, options)
+
+    def opened() -> can.BusABC:
+        interface, channel = options.interface, options.channel
+        return open_bus(database, interface=interface, channel=channel, fd=options.fd, mode=Mode.OVERLAY)
+
     with _display(options, where) as (show, period_s):
-        bus = SteadyBus(opener, counters, Log().say)
+        bus = SteadyBus(opened, counters, Log().say)
         try:
             monitor = BusMonitor(database, time.monotonic())
             view = None
             while view is None or (options.once_s is None and not stop()):
                 listen(bus, monitor, time.monotonic() + period_s, stop, counters)
                 view = monitor.look(time.monotonic())
-                show(view, _bus_notes(counters, opener.dropped()))
+                bus.count_dropped()
+                show(view, _bus_notes(counters))
         finally:
             bus.close()
     if options.once_s is not None and not view.is_any_branch_seen:
@@ -141,44 +140,12 @@ def listen(bus: SteadyBus, monitor: BusMonitor, until_s: float, stop: Callable[[
                 take((message.arbitration_id, message.is_extended_id), message.data, time_s)
 
 
-class _Opener:
-    """Opens the bus, and tells how many frames the kernel dropped because they were not read in time."""
-
-    def __init__(self, database: VehicleDatabase, options: MonitorOptions) -> None:
-        self._database, self._options = database, options
-        self._queue: socket.socket | None = None
-
-    def __call__(self) -> can.BusABC:
-        bus = open_bus(
-            self._database,
-            interface=self._options.interface,
-            channel=self._options.channel,
-            fd=self._options.fd,
-            mode=Mode.OVERLAY,
-        )
-        queue = getattr(bus, "socket", None)
-        self._queue = queue if isinstance(queue, socket.socket) else None
-        if self._queue is not None:
-            self._queue.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
-        return bus
-
-    def dropped(self) -> int:
-        """Frames of this socket; 0 where that is not known."""
-        if self._queue is None:
-            return 0
-        try:
-            info = self._queue.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_DROPS + 1))
-        except OSError:  # closed meanwhile, or a kernel before 4.12
-            return 0
-        return struct.unpack(f"={_DROPS + 1}I", info)[_DROPS] if len(info) == 4 * (_DROPS + 1) else 0
-
-
-def _bus_notes(counters: Counters, dropped: int) -> list[str]:
+def _bus_notes(counters: Counters) -> list[str]:
     lines = []
     if counters.bus_errors:
         lines.append(f"error frames of the bus: {counters.bus_errors}; a wrong bit rate, or a fault in the wiring?")
-    if dropped:
-        lines.append(f"frames that this computer was too slow to read: {dropped}; they count as lost above")
+    if counters.dropped:
+        lines.append(f"frames that this computer was too slow to read: {counters.dropped}; they count as lost above")
     return lines
 
 

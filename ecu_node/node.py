@@ -89,6 +89,10 @@ class _Ticking:
         self._corrector, self.period_s, self._on_tick = corrector, period_s, on_tick
         self._due_s = self._status_due_s = float("-inf")
 
+    def is_due(self, now_s: float) -> bool:
+        """Whether there is something else to do than to receive."""
+        return now_s >= self._due_s
+
     def wait_s(self, now_s: float) -> float:
         """How long there is nothing to do but to receive; 0 if it is time. [s]"""
         return min(_LONGEST_WAIT_S, max(0.0, self._due_s - now_s))
@@ -97,16 +101,21 @@ class _Ticking:
         """Do it if it is due; no branch is stale for what has not been heard yet."""
         if now_s < self._due_s:
             return
-        self._due_s = max(self._due_s + min(self.period_s, _LOOK_EVERY_S), now_s)
+        self._due_s = _next_s(self._due_s, min(self.period_s, _LOOK_EVERY_S), now_s)
         corrector = self._corrector
         corrector.look(heard_s)
         status = corrector.status() if now_s >= self._status_due_s else None
         if status is not None:
-            self._status_due_s = max(self._status_due_s + self.period_s, now_s)
+            self._status_due_s = _next_s(self._status_due_s, self.period_s, now_s)
             fields, data = status
             own.sent(fields.key, data)
             corrector.counters.send_errors += not send(_message(fields.key, data, fd=fields.fd))
         self._on_tick(now_s)
+
+
+def _next_s(due_s: float, period_s: float, now_s: float) -> float:
+    """When something periodic is due again: in step, unless it is late by a whole period. [s]"""
+    return due_s + period_s if due_s + period_s > now_s else now_s + period_s
 
 
 def _hear(bus: SteadyBus, ticking: _Ticking, take: Callable[[can.Message, float, float], None]) -> float:
@@ -133,7 +142,7 @@ def _hear(bus: SteadyBus, ticking: _Ticking, take: Callable[[can.Message, float,
     ahead_s = time.time() - now_s  # after the wait, in which the clock may have been set
     while message is not None:
         take(message, now_s, ahead_s)
-        if not ticking.wait_s(now_s):
+        if ticking.is_due(now_s):
             return steady_time_s(message.timestamp, now_s, ahead_s)
         message = bus.receive(0.0)
         now_s = clock()

@@ -1,7 +1,7 @@
 """``ecu-node run``: parameters, core, buses and service put together."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -101,7 +101,7 @@ def run_node(options: RunOptions, vehicle_hint: str) -> int:
         where = f"{options.interface} {options.channel}{f' to {options.gateway}' if options.gateway else ''}"
         say(f"running on {where}{', shadow mode' if options.shadow else ''}, correcting {what or 'nothing'}")
         manager.ready(f"correcting {what or 'nothing'}")
-        tick = _Tick(corrector, file, requests, manager, say)
+        tick = _Tick(corrector=corrector, buses=buses, file=file, requests=requests, manager=manager, say=say)
         period_s = database.layout.status.period_s if database.layout.status is not None else _DEFAULT_PERIOD_S
         try:
             _node(buses, corrector, database, period_s, tick).run(requests.stop)
@@ -131,19 +131,23 @@ class _Tick:
 
     def __init__(
         self,
+        *,
         corrector: Corrector,
+        buses: Sequence[SteadyBus],
         file: ParameterFile,
         requests: Requests,
         manager: ServiceManager,
         say: Callable[[str], None],
     ) -> None:
-        self._corrector, self._file, self._requests = corrector, file, requests
+        self._corrector, self._buses, self._file, self._requests = corrector, buses, file, requests
         self._manager, self._say = manager, say
         self._before = corrector.latched
 
     def __call__(self, now_s: float) -> None:
         corrector = self._corrector
         self._manager.alive(now_s)
+        for bus in self._buses:
+            bus.count_dropped()
         if self._file.look(corrector, now_s, asked=self._requests.take_reload()):
             self._manager.status(f"parameter set {corrector.parameter_set} is in force")
         if corrector.latched is not self._before:

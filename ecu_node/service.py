@@ -10,8 +10,8 @@ from types import FrameType
 
 __all__ = ["Log", "Requests", "ServiceManager"]
 
-_SAME_LINE_EVERY_S = 10.0
-"""A line is not written again before this has passed. [s]"""
+_WHILE_S, _SAME_LINE_TIMES = 10.0, 3
+"""The same line is written so many times in so long [s]: enough to see it come and go, and no flood."""
 _REMEMBERED_LINES = 100
 _LONGEST_NOTIFY_S = 0.1
 """A service manager that does not read must not hold up the bus. [s]"""
@@ -43,22 +43,24 @@ class Requests:
 
 
 class Log:
-    """Lines on standard error; the same line again only after a while, with how often it came in between."""
+    """Lines on standard error; the same line a few times in a while, and then with how often it came in between."""
 
     def __init__(self) -> None:
-        self._last: dict[str, tuple[float, int]] = {}
+        self._said: dict[str, tuple[float, int]] = {}
 
     def say(self, text: str) -> None:
         """Write a line."""
         now_s = time.monotonic()
-        last_s, held_back = self._last.get(text, (float("-inf"), 0))
-        if now_s - last_s < _SAME_LINE_EVERY_S:
-            self._last[text] = last_s, held_back + 1
+        since_s, times = self._said.get(text, (now_s, 0))
+        is_over = now_s - since_s >= _WHILE_S
+        if times >= _SAME_LINE_TIMES and not is_over:
+            self._said[text] = since_s, times + 1
             return
-        if len(self._last) >= _REMEMBERED_LINES:
-            self._last.clear()
-        self._last[text] = now_s, 0
-        again = f" (and {held_back} times before)" if held_back else ""
+        if len(self._said) >= _REMEMBERED_LINES:
+            self._said.clear()
+        held_back = times - _SAME_LINE_TIMES if is_over else 0
+        self._said[text] = (now_s, 1) if is_over else (since_s, times + 1)
+        again = f" (and {held_back} times before)" if held_back > 0 else ""
         with suppress(OSError):  # a log that is gone, as when the journal is started anew, must not end the node
             print(f"ecu-node: {text}{again}", file=sys.stderr, flush=True)
 

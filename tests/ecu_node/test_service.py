@@ -128,20 +128,21 @@ def test_the_same_line_comes_once_in_ten_seconds(
         clock(0.1 * tenth)
         log.say("bus gone")
     assert capsys.readouterr().err.splitlines() == [
-        "ecu-node: bus gone",
-        "ecu-node: bus gone (and 99 times before)",
-        "ecu-node: bus gone (and 99 times before)",
+        *3 * ["ecu-node: bus gone"],
+        "ecu-node: bus gone (and 97 times before)",
+        *2 * ["ecu-node: bus gone"],
+        "ecu-node: bus gone (and 97 times before)",
     ]
 
 
-def test_different_lines_do_not_wait_for_each_other(
+def test_a_line_that_comes_and_goes_is_seen_to(
     clock: Callable[[float], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock(0.0)
     log = Log()
     for text in ("a", "b", "a", "c"):
         log.say(text)
-    assert capsys.readouterr().err.splitlines() == ["ecu-node: a", "ecu-node: b", "ecu-node: c"]
+    assert capsys.readouterr().err.splitlines() == ["ecu-node: a", "ecu-node: b", "ecu-node: a", "ecu-node: c"]
 
 
 def test_a_log_that_is_gone_does_not_end_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
