@@ -46,11 +46,6 @@ class Past:
         self._signal = signal
         self._frames: Frames = deque() if frames is None else frames
 
-    @property
-    def is_multiplexed(self) -> bool:
-        """Whether frames may lack the signal."""
-        return self._signal is not None and bool(self._signal.above)
-
     def newest_first(self) -> Iterator[tuple[float, int]]:
         """Times and codes, back from the last frame that has the signal. [s]"""
         for time_s, payload in reversed(self._frames):
@@ -130,6 +125,8 @@ class LiveBranch:
         +1 if the signal is positive into the junction.
     timeout_s : float
         Without a frame for this long the branch is stale. [s]
+    start_s : float
+        So long after the bus has woken up its first frame may come, if that is longer. [s]
     voltage, temperature : Auxiliary or None
         The voltage of a branch that is a power; the temperature of its sensor.
     """
@@ -141,10 +138,11 @@ class LiveBranch:
         codes: Codes,
         sign: int,
         timeout_s: float,
+        start_s: float = 0.0,
         voltage: Auxiliary | None = None,
         temperature: Auxiliary | None = None,
     ) -> None:
-        self.name, self.codes, self.timeout_s = name, codes, timeout_s
+        self.name, self.codes, self.timeout_s, self._start_s = name, codes, timeout_s, start_s
         self.voltage, self.temperature = voltage, temperature
         self.fault = NO_FAULT
         self.delay_s = 0.0
@@ -156,8 +154,8 @@ class LiveBranch:
         """Called when :attr:`plan` or :attr:`quality` is another one."""
         self._past = Past()
         self._spoilt = False
-        self._expected_s: float | None = None
-        self._awake_s = float("-inf")
+        self._is_named = False
+        self._time_s = self._awake_s = self._waited_s = float("-inf")
         self._scale, self._offset = float(sign * codes.scale), float(sign * codes.offset)
         self._passing: CorrectionPlan = AS_IT_IS
         self._correcting: CorrectionPlan | None = None
@@ -200,7 +198,9 @@ class LiveBranch:
             Where results beyond the ends are counted.
         """
         self.fault, self.delay_s = fault, delay_s
-        self._expected_s = expected_since_s
+        self._is_named = expected_since_s is not None
+        if expected_since_s is not None:
+            self._waited_s = max(self._waited_s, expected_since_s)
         self._passing, self.counters = passing, counters
         self._plans = plan if isinstance(plan, TemperaturePlans) else None
         self._per_temperature = {}
@@ -236,15 +236,15 @@ class LiveBranch:
         """A frame came that must not be used: until the next one there is no value."""
         self.out, self._spoilt = None, True
 
-    @property
-    def is_multiplexed(self) -> bool:
-        """Whether frames of its message may lack it."""
-        return self._past.is_multiplexed
+    def fixed(self, code: int) -> int | None:
+        """What would be written for a code; nothing is remembered."""
+        return self._fix(code)
 
     @property
     def time_s(self) -> float:
         """When its last frame came [s]; -infinity if none did."""
-        return next((seen_s for seen_s, _ in self._past.newest_first()), float("-inf"))
+        self._time_s = next((seen_s for seen_s, _ in self._past.newest_first()), self._time_s)
+        return self._time_s
 
     def latest(self) -> tuple[float, int] | None:
         """When its last frame came, and its code; None if that is no value."""
@@ -253,23 +253,45 @@ class LiveBranch:
 
     @property
     def seen(self) -> bool:
-        """Whether a frame came, since the bus was last asleep."""
+        """Whether a frame came since the bus was last asleep."""
         return self.time_s > self._awake_s
 
     @property
     def is_fitted(self) -> bool:
-        """Whether the vehicle has this branch: it was seen, or the parameters name it."""
-        return self._expected_s is not None or self.time_s > float("-inf")
+        """Whether the vehicle has this branch: the parameters name it, or it was seen in this drive."""
+        return self._is_named or self.seen
+
+    @property
+    def deadline_s(self) -> float:
+        """Until when its next frame must have come; infinity for a branch that is not fitted. [s]"""
+        if self.seen:
+            return self.time_s + self.timeout_s
+        if self._is_named:
+            return self._waited_s + max(self.timeout_s, self._start_s)
+        return float("inf")
 
     def is_stale(self, now_s: float) -> bool:
-        """Whether a fitted branch has been silent for longer than its timeout."""
-        since_s = self.time_s if self._expected_s is None else max(self.time_s, self._expected_s)
-        return self.is_fitted and now_s - since_s > self.timeout_s
+        """Whether its next frame is overdue."""
+        return now_s > self.deadline_s
+
+    def is_old(self, now_s: float) -> bool:
+        """Whether its last value is older than the timeout, whatever is waited for."""
+        return now_s - self.time_s > self.timeout_s
 
     def expect(self, now_s: float) -> None:
-        """Wait for frames from now on, after the bus was asleep."""
-        if self.is_fitted:
-            self._expected_s = self._awake_s = now_s
+        """Wait for frames from now on: the bus has woken up."""
+        self._awake_s = self._waited_s = now_s
+
+    @property
+    def lacks_input(self) -> bool:
+        """Whether a fault is applied to it, and yet it is not corrected now: something that this needs is missing."""
+        if not self.fault.applied:
+            return False
+        plan = self.plan
+        of_voltage = plan.weights[1] if isinstance(plan, SignPlan) else 0
+        of_voltage = plan.voltage_gain if isinstance(plan, IntegerPlan) else of_voltage
+        no_voltage = self.voltage is not None and bool(of_voltage) and self.voltage.code is None
+        return self.quality is not Quality.CORRECTED or no_voltage or (self.seen and self.latest() is None)
 
     def why_no_value(self) -> Quality:
         """Why :attr:`out` is None: never seen, named "no value", a voltage missing; else its code was impossible."""

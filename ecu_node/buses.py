@@ -16,15 +16,17 @@ import can
 from ecu_node.counters import Counters
 from ecu_node.errors import BusError
 
-__all__ = ["SteadyBus", "connect", "steady_time_s"]
+__all__ = ["SteadyBus", "TimeOfDay", "connect", "steady_time_s"]
 
 _SEND_ATTEMPTS = 3
 _SEND_PAUSE_S = 0.001
 """A full send queue drains by some frames in this time. [s]"""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 2.0
 """Between attempts to open a bus again. [s]"""
-_OLDEST_FRAME_S = 1.0
-"""A time stamp further from now is one of another clock. [s]"""
+_OLDEST_FRAME_S = 10.0
+"""No frame waits for longer: an older time stamp is one of another clock. [s]"""
+_LARGEST_JITTER_S = 0.05
+"""By more than this the time of day changes against the steady clock only if it is set. [s]"""
 _GONE = {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF}
 """Errors of sending after which only opening the bus again helps."""
 _RECEIVE_BUFFER_BYTES = 1 << 20
@@ -104,7 +106,7 @@ class SteadyBus:
         self._bus: can.BusABC | None = open_bus()
         self._failed: tuple[can.BusABC, Exception] | None = None
         self._retry_s, self._pause_s = 0.0, _FIRST_PAUSE_S
-        self._dropped = 0
+        self._dropped, self._is_full = 0, False
         self.channel = self._bus.channel_info
 
     def receive(self, timeout_s: float) -> can.Message | None:
@@ -119,14 +121,17 @@ class SteadyBus:
             return self._reopened(timeout_s)
         try:
             message = bus.recv(timeout_s)
+            while message is not None and message.is_error_frame:
+                self._count_error(message)
+                message = bus.recv(0.0)
         except (can.CanError, OSError) as error:
             self._gone(error)
             return None
-        return self._not_an_error(message)
+        return message
 
     def send(self, message: can.Message) -> bool:
-        """Send one frame; False if the bus did not take it in a few attempts."""
-        for attempt in range(_SEND_ATTEMPTS):
+        """Send one frame; False if the bus did not take it in a few attempts, or in one while it is full."""
+        for attempt in range(1 if self._is_full else _SEND_ATTEMPTS):
             bus = self._bus
             if bus is None:
                 return False
@@ -140,7 +145,9 @@ class SteadyBus:
                     self._failed = bus, error
                     return False
                 continue
+            self._is_full = False
             return True
+        self._is_full = True
         return False
 
     def count_dropped(self) -> None:
@@ -157,13 +164,9 @@ class SteadyBus:
         if bus is not None:
             bus.shutdown()
 
-    def _not_an_error(self, message: can.Message | None) -> can.Message | None:
-        """The same message; None in place of an error frame, which is counted."""
-        if message is None or not message.is_error_frame:
-            return message
+    def _count_error(self, message: can.Message) -> None:
         self._counters.bus_errors += 1
         self._counters.bus_off += bool(message.arbitration_id & _BUS_OFF)
-        return None
 
     def _gone(self, error: Exception) -> None:
         self._say(f"{self.channel}: the bus failed: {_why(error)}; trying to open it again")
@@ -194,10 +197,13 @@ class SteadyBus:
         self._bus, self._dropped = bus, 0
         self._counters.reopened += 1
         self._say(f"{self.channel}: the bus is open again")
-        return self._not_an_error(message)
+        if message is not None and message.is_error_frame:
+            self._count_error(message)
+            return None
+        return message
 
 
-def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float, counters: Counters | None = None) -> float:
+def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float) -> float:
     """When a frame came, on the steady clock.
 
     Parameters
@@ -207,21 +213,39 @@ def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float, counters: 
     now_s : float
         The steady clock now. [s]
     clock_ahead_s : float
-        By how much the time of day is ahead of the steady clock. [s]
-    counters : Counters, optional
-        Where stamps are counted that cannot be.
+        By how much the time of day is ahead of the steady clock; infinity if it was set a short while ago. [s]
 
     Returns
     -------
     float
-        The stamp on the steady clock; now if that would be in the future or long ago, as after the clock was set.
+        The stamp on the steady clock; now if that would be in the future or very long ago, or the clock was set.
     """
     time_s = stamp_s - clock_ahead_s
-    if now_s - _OLDEST_FRAME_S <= time_s <= now_s:
-        return time_s
-    if counters is not None and stamp_s:
-        counters.clock_steps += abs(time_s - now_s) > _OLDEST_FRAME_S
-    return now_s
+    return time_s if now_s - _OLDEST_FRAME_S <= time_s <= now_s else now_s
+
+
+class TimeOfDay:
+    """By how much the time of day is ahead of the steady clock, and whether it was set.
+
+    Parameters
+    ----------
+    counters : Counters
+        Where it is counted how often it was set.
+    """
+
+    def __init__(self, counters: Counters) -> None:
+        self._counters = counters
+        self._ahead_s = time.time() - time.monotonic()
+        self._set_s = float("-inf")
+
+    def ahead_s(self, now_s: float) -> float:
+        """Now, on the steady clock; infinity while frames may be waiting that were stamped before it was set."""
+        ahead_s = time.time() - now_s
+        if abs(ahead_s - self._ahead_s) > _LARGEST_JITTER_S:
+            self._set_s = now_s
+            self._counters.clock_steps += 1
+        self._ahead_s = ahead_s
+        return ahead_s if now_s - self._set_s > _OLDEST_FRAME_S else float("inf")
 
 
 def _queue(bus: can.BusABC) -> socket.socket | None:

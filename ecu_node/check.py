@@ -78,13 +78,13 @@ def report_text(report: dict[str, Any]) -> str:
     return "\n".join([*lines, *(f"warning: {text}" for text in report["warnings"])])
 
 
-def warnings_of(database: VehicleDatabase, in_force: InForce, mode: Mode) -> list[str]:
+def warnings_of(database: VehicleDatabase, in_force: InForce, mode: Mode, *, fd: bool = False) -> list[str]:
     """What a user should know of parameters that fit: what of them is not done, and what the bus must be able to do."""
     hidden = not_published(database, in_force) if mode is Mode.OVERLAY else []
     texts = [f"branch {name} is not published: {_WHY_NOT_PUBLISHED}" for name in hidden]
     names = no_temperature(database, in_force)
     texts += [f"branch {name} is passed through: {_WHY_NO_TEMPERATURE}" for name in names]
-    if names := needs_fd(database, mode):
+    if not fd and (names := needs_fd(database, mode)):
         texts.append(f"CAN FD messages ({', '.join(names)}): 'ecu-node run' needs --fd")
     return texts
 

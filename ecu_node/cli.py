@@ -22,6 +22,7 @@ __all__ = ["main"]
 _VEHICLE_VARIABLE = "ECU_NODE_VEHICLE"
 _LONGEST_ONCE_S = 86400.0
 """For ``monitor --once``. [s]"""
+_LARGEST_PORT = 65535
 _EXIT_CODES = "Exit codes: 0 done (also when ended by a signal), 1 failed, 2 wrong use, 130 interrupted at start."
 
 
@@ -80,13 +81,14 @@ def _parser() -> argparse.ArgumentParser:
     _add_bus(run)
     run.add_argument(
         "--gateway",
+        type=_name,
         metavar="CHANNEL",
         help="be a gateway: the sensors are on --channel, the rest of the vehicle on this; branch frames are passed "
         "on with the corrected current in place, all others as they are",
     )
     run.add_argument("--shadow", action="store_true", help="compute and report the corrected sum, but change nothing")
     run.add_argument(
-        "--metrics-port", type=int, metavar="PORT", help="let Prometheus ask here (needs prometheus-client)"
+        "--metrics-port", type=_port, metavar="PORT", help="let Prometheus ask here (needs prometheus-client)"
     )
     run.set_defaults(command=_run)
     _add_monitor(commands)
@@ -138,12 +140,24 @@ def _seconds(text: str) -> float:
 
 def _add_bus(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
-    parser.add_argument("--channel", required=True, help="channel of the interface, such as can0 or vcan0")
+    parser.add_argument("--channel", required=True, type=_name, help="channel of the interface, such as can0 or vcan0")
     parser.add_argument("--fd", action="store_true", help="open the bus for CAN FD")
 
 
 def _add_layout(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--layout", type=Path, required=True, metavar="FILE", help="layout (TOML), which names the DBC")
+
+
+def _name(text: str) -> str:
+    if not text.strip():
+        raise argparse.ArgumentTypeError("a name is expected, such as can0, found none")
+    return text
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= _LARGEST_PORT:
+        raise argparse.ArgumentTypeError(f"a TCP port from 1 to {_LARGEST_PORT} is expected, found {text!r}")
+    return int(text)
 
 
 def _add_files(parser: argparse.ArgumentParser) -> None:
@@ -171,6 +185,12 @@ def _load_python_can() -> None:
 def _run(options: argparse.Namespace) -> int:
     from ecu_node.run import RunOptions, run_node  # noqa: PLC0415  # after _load_python_can
 
+    if options.gateway == options.channel:
+        print(
+            f"ecu-node: --gateway {options.gateway} is the bus of the sensors itself; two buses are expected",
+            file=sys.stderr,
+        )
+        return 2
     return run_node(
         RunOptions(
             params=options.params,

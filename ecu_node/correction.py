@@ -66,16 +66,19 @@ class SensorFault:
         o, positive into the junction. [A]
     model : GainBySign, TemperatureDrift or None
         None: the sensor is linear.
+    largest_drift : float
+        Limit of the layout; where the drift at a temperature is beyond it, nothing is corrected. [1]
     """
 
     drift: float = 0.0
     offset_a: float = 0.0
     model: SensorModel | None = None
+    largest_drift: float = 0.99
 
     @property
     def applied(self) -> bool:
         """Whether there is anything to correct."""
-        return self != NO_FAULT
+        return bool(self.drift or self.offset_a) or self.model is not None
 
     def drift_at(self, current_a: float, temperature_c: float | None) -> float | None:
         """Drift at a current, of which only the sign matters, and a temperature; None if that must be known and is not.
@@ -95,7 +98,8 @@ class SensorFault:
             case TemperatureDrift():
                 if temperature_c is None:
                     return None
-                return self.drift + self.model.drift_per_k * (temperature_c - self.model.reference_c)
+                drift = self.drift + self.model.drift_per_k * (temperature_c - self.model.reference_c)
+                return drift if abs(drift) <= self.largest_drift else None
 
     def true_current(self, i_m: float, temperature_c: float | None = None) -> float | None:
         """Invert the sensor model for one current, (25) in [1]_.
@@ -110,7 +114,8 @@ class SensorFault:
         Returns
         -------
         float or None
-            Corrected current [A]; None if the temperature must be known and is not.
+            Corrected current [A]; None if the temperature must be known and is not, or if the drift
+            is beyond its limit.
         """
         drift = self.drift_at(i_m - self.offset_a, temperature_c)
         return None if drift is None else (i_m - self.offset_a) / (1.0 + drift)
@@ -218,9 +223,7 @@ CorrectionPlan = IntegerPlan | SignPlan | TemperaturePlans
 """Any of them."""
 
 
-def correction_plan(
-    signals: Signals, fault: SensorFault, *, temperature: Codes | None = None, largest_drift: float = 1.0
-) -> CorrectionPlan:
+def correction_plan(signals: Signals, fault: SensorFault, *, temperature: Codes | None = None) -> CorrectionPlan:
     """Build the plan of one branch, once at start.
 
     Parameters
@@ -231,8 +234,6 @@ def correction_plan(
         What is corrected; :data:`NO_FAULT` to pass through.
     temperature : Codes or None
         Of the temperature signal, which a fault with temperature needs. [degC]
-    largest_drift : float
-        Limit of the layout; the drift at a temperature may be beyond it. [1]
 
     Returns
     -------
@@ -255,7 +256,7 @@ def correction_plan(
     if isinstance(model, TemperatureDrift):
         assert temperature is not None, "a fault with temperature is not applied without one"
         codes, drift, per_k = temperature, as_written(fault.drift), as_written(model.drift_per_k)
-        reference, limit = as_written(model.reference_c), as_written(largest_drift)
+        reference, limit = as_written(model.reference_c), as_written(fault.largest_drift)
 
         def at(code: int) -> IntegerPlan | None:
             hot = drift + per_k * (codes.scale * code + codes.offset - reference)

@@ -16,7 +16,7 @@ from ecu_node.counters import Counters
 from ecu_node.e2e import Protection
 from ecu_node.frames import FrameKey, Source
 from ecu_node.junction_watch import JunctionWatch
-from ecu_node.status import Quality, Reason, State
+from ecu_node.status import Reason, State
 
 __all__ = ["Corrector", "StatusFields"]
 
@@ -77,6 +77,8 @@ class Corrector:
         self.latched = Reason.NONE
         """Why the node has fallen back to passing through, until the bus has slept or parameters are put in force."""
         self.latched_branches: tuple[str, ...] = ()
+        self.told = (State.STARTING, Reason.NONE)
+        """State and reason as of the last look; for other threads."""
         self.parameter_set = 0
         self.sources: dict[tuple[int, bool], Source] = dict(sources.items())
         """Who takes which frames, by identifier and whether it has 29 bits; no other frame is looked at."""
@@ -104,16 +106,21 @@ class Corrector:
         self.reason, self.parameter_set = reason, parameter_set
         self.watch.restart(predicted_worse_a=predicted_worse_a)
         self._latch(Reason.NONE)
+        self.told = self.state()
 
     def look(self, now_s: float) -> None:
         """Look at the whole junction; to be called at least every 0.1 s."""
+        self._look(now_s)
+        self.told = self.state()
+
+    def _look(self, now_s: float) -> None:
         for auxiliary in self._auxiliaries:
             auxiliary.expire(now_s)
         self._see_whether_asleep(now_s)
         self.watch.look(now_s)
         if self.reason is not Reason.NONE or self.latched is not Reason.NONE or self._silent:
             return
-        if stale := [branch.name for branch in self.branches if branch.is_stale(now_s)]:
+        if stale := [branch.name for branch in self.branches if self._is_missed(branch, now_s)]:
             self._latch(Reason.BRANCH_STALE, stale)
         elif stuck := self.watch.stuck():
             self._latch(Reason.BRANCH_STUCK, [branch.name for branch in stuck])
@@ -134,7 +141,7 @@ class Corrector:
             return State.SHADOW, Reason.NONE
         if any(branch.is_fitted and not branch.seen for branch in self.branches):
             return State.STARTING, Reason.NONE
-        missing = any(branch.quality is not Quality.CORRECTED for branch in applied)
+        missing = any(branch.lacks_input for branch in applied)
         return State.CORRECTING, Reason.INPUT_MISSING if missing else Reason.NONE
 
     def status(self) -> tuple[StatusFields, bytes] | None:
@@ -163,15 +170,21 @@ class Corrector:
 
     def _see_whether_asleep(self, now_s: float) -> None:
         """All branches silent: the vehicle sleeps, which is no fault; what was latched is tried anew after that."""
-        silent = all(now_s - branch.time_s > branch.timeout_s for branch in self.branches)
-        if silent and not self._silent and self.latched is not Reason.NONE:
-            self._latch(Reason.NONE)
+        silent = all(branch.is_old(now_s) for branch in self.branches)
+        if silent and not self._silent:
+            self.watch.forget()
+            if self.latched is not Reason.NONE:
+                self._latch(Reason.NONE)
         if self._silent and not silent:
             self._was_awake = True
             for branch in self.branches:
-                if now_s - branch.time_s > branch.timeout_s:
+                if branch.is_old(now_s):
                     branch.expect(now_s)
         self._silent = silent
+
+    def _is_missed(self, branch: LiveBranch, now_s: float) -> bool:
+        """Whether a branch is stale while others are not: where all fall silent in turn, the vehicle goes to sleep."""
+        return branch.is_stale(now_s) and any(other.time_s > branch.deadline_s for other in self.branches)
 
     def _latch(self, reason: Reason, branches: Sequence[str] = ()) -> None:
         self.latched, self.latched_branches = reason, tuple(branches)

@@ -27,6 +27,8 @@ class Counters:
     """Times that the counter showed a few lost frames."""
     short: int = 0
     """Frames too short for a signal that the layout reads from them."""
+    late: int = 0
+    """Frames of branches that were too old when they were read; nothing was made of them."""
     dropped: int = 0
     """Frames that the kernel dropped because they were not read in time."""
     saturated: int = 0
@@ -42,7 +44,7 @@ class Counters:
     reopened: int = 0
     """Times that the bus was opened again."""
     clock_steps: int = 0
-    """Frames whose time stamp did not fit the steady clock; the time of reading was taken instead."""
+    """Times that the time of day was set; the times of reading are taken for a while after that."""
     reloads: int = 0
     """Parameter files that took the place of the one before."""
     reload_failures: int = 0

@@ -34,6 +34,8 @@ _MODES = {
     "nibble": E2E_P01_DATAID_NIBBLE,
 }
 _NIBBLE = 0x0F
+_LONGEST_CLASSIC, _FD_LENGTHS = 8, (12, 16, 20, 24, 32, 48, 64)
+"""Bytes of payloads."""
 
 
 class Check(Enum):
@@ -156,6 +158,11 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
     entry = database.layout.protection(message.name)
     if entry is None:
         return None
+    if message.length > _LONGEST_CLASSIC and message.length not in _FD_LENGTHS:
+        raise LayoutError(
+            f"{database.layout.path}: [e2e]: message {message.name} has {message.length} bytes in the DBC; CAN FD pads "
+            f"it, so that its CRC cannot be checked; expected {', '.join(map(str, _FD_LENGTHS))}"
+        )
     protection = _made(entry, message, f"{database.layout.path}: [e2e]: message {message.name}")
     if message.length < protection.least_bytes:
         raise LayoutError(

@@ -22,6 +22,9 @@ _REMEMBERED = 1024
 """Frames of a message that are remembered: longer than branches lag each other."""
 
 
+_LEAST_SILENCE_S = 1.0
+"""After a silence of this long, or of a branch's timeout, a message's counter begins anew. [s]"""
+
 _USABLE = frozenset((Check.OK, Check.LOST))
 """With these the content of a frame is new and intact."""
 
@@ -85,7 +88,7 @@ class Target:
             out, quality = branch.out, branch.quality
             if out is None:
                 out, quality = field.not_available, branch.why_no_value()
-            elif branch.is_stale(now_s):
+            elif branch.is_old(now_s):
                 out, quality = field.not_available, Quality.NOT_AVAILABLE
             field.place.put(payload, out)
             if field.quality is not None:
@@ -139,15 +142,20 @@ class Source:
         self._auxiliaries = [(part, signal) for part, signal in readers if isinstance(part, Auxiliary)]
         self._branches = [(part, signal) for part, signal in readers if isinstance(part, LiveBranch)]
         self._counters, self._pass_on_invalid = counters, pass_on_invalid
-        history: deque[tuple[float, bytearray]] = deque(maxlen=_REMEMBERED)
-        self._remember = history.append
-        self._message = Message(length, protection, self._receiver, counters, history.append)
+        self._history: deque[tuple[float, bytearray]] = deque(maxlen=_REMEMBERED)
+        self._silence_s = max([_LEAST_SILENCE_S, *(branch.timeout_s for branch, _ in self._branches)])
+        self._message = Message(length, protection, self._receiver, counters, self._history.append)
         for reader in readers:
-            reader.part.follow(reader.signal, history)
+            reader.part.follow(reader.signal, self._history)
         for branch, _ in self._branches:
             branch.when_changed.append(self._renew)
         self.answer: Answer = self._answer
         self.forward: Forward = self._forward
+
+    @property
+    def timeout_s(self) -> float:
+        """Frames that are older when they are read are of no use; infinity for a message without branches. [s]"""
+        return max((branch.timeout_s for branch, _ in self._branches), default=float("inf"))
 
     def _renew(self) -> None:
         """Put together anew what is quick: a plan has changed."""
@@ -166,7 +174,7 @@ class Source:
     def _answer(self, payload: bytearray, now_s: float) -> Sequence[Target]:
         counters = self._counters
         counters.frames_in += 1
-        if self._checked(payload) in _USABLE:
+        if self._checked(payload, now_s) in _USABLE:
             self._read(payload, now_s)
         elif self._pass_on_invalid:
             for branch, _ in self._branches:
@@ -181,18 +189,22 @@ class Source:
     def _forward(self, payload: bytearray, now_s: float) -> bytearray | None:
         counters = self._counters
         counters.frames_in += 1
-        check = self._checked(payload)
-        if check not in _USABLE:
-            if not self._pass_on_invalid:
-                counters.held_back += 1
-                return None
-            if check is Check.CORRUPT:
-                return payload
-        self._read(payload, now_s)
+        check = self._checked(payload, now_s)
+        if check in _USABLE:
+            self._read(payload, now_s)
+        if not self._branches:
+            return payload  # the node has nothing to write in it
+        if check not in _USABLE and not self._pass_on_invalid:
+            counters.held_back += 1
+            return None
+        if check is Check.CORRUPT:
+            return payload
         rewritten = bytearray(payload)
         for branch, signal in self._branches:
-            if branch.out is not None and signal.code(payload) is not None:
-                signal.place.put(rewritten, branch.out)
+            code = signal.code(payload)
+            if code is not None:
+                out = branch.out if check in _USABLE else branch.fixed(code)
+                signal.place.put(rewritten, code if out is None else out)
         if rewritten == payload:
             return payload
         counters.corrected += 1
@@ -200,11 +212,14 @@ class Source:
             self._protection.seal(rewritten)
         return rewritten
 
-    def _checked(self, payload: bytearray) -> Check:
-        """Check a frame, and count what is wrong with it."""
-        if self._receiver is None:
+    def _checked(self, payload: bytearray, now_s: float) -> Check:
+        """Check a frame, and count what is wrong with it; after a long silence its counter may be any."""
+        receiver, counters = self._receiver, self._counters
+        if receiver is None:
             return Check.OK
-        check, counters = self._receiver.check(payload), self._counters
+        if self._history and now_s - self._history[-1][0] > self._silence_s:
+            receiver.expected = -1
+        check = receiver.check(payload)
         counters.corrupt += check is Check.CORRUPT
         counters.repeated += check is Check.REPEATED
         counters.jumped += check is Check.JUMPED
@@ -213,7 +228,7 @@ class Source:
 
     def _read(self, payload: bytearray, now_s: float) -> None:
         """Let everybody take what is theirs; auxiliary signals first, as plans may depend on them."""
-        self._remember((now_s, payload))
+        self._history.append((now_s, payload))
         for auxiliary, signal in self._auxiliaries:
             code = signal.code(payload)
             if code is not None:

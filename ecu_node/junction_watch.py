@@ -13,6 +13,8 @@ from ecu_node.branch import LiveBranch
 
 __all__ = ["JunctionSums", "JunctionWatch"]
 
+_MOST_MARGINS = 10.0
+"""More than so many margins nobody may expect the corrected sum to be worse."""
 _LEAST_LOOKS = 20
 """Sums that a verdict needs."""
 _STUCK_SHARE = 0.02
@@ -67,9 +69,13 @@ class JunctionWatch:
         ----------
         predicted_worse_a : float
             By how much the calibrator itself expects the corrected sum to be worse, as where an offset hides a load
-            that no sensor sees; added to the margin. [A]
+            that no sensor sees; added to the margin, up to ten times that. [A]
         """
-        self._allowed_a = self._margin_a + max(predicted_worse_a, 0.0)
+        self._allowed_a = self._margin_a * (1.0 + min(max(predicted_worse_a / self._margin_a, 0.0), _MOST_MARGINS))
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin a new window."""
         self._past: deque[tuple[float, JunctionSums, dict[str, int]]] = deque()
         self._instant_s = float("-inf")
         self.sums: JunctionSums | None = None

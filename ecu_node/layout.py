@@ -193,6 +193,8 @@ class Watch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Over this long the sums are compared. [s]"""
     margin_a: _Positive | None = None
     """By how much the corrected sum must be worse (RMS) [A]; 0.25 % of full scale where not given."""
+    start_s: Annotated[float, msgspec.Meta(ge=0.0, le=60.0)] = 3.0
+    """So long after the bus has woken up the first frame of a branch may come, if its timeout is shorter. [s]"""
     input: Name | None = None
     """Input that tells whether all currents of the junction are measured, as they may not be while it is charged."""
     valid: list[float] = []

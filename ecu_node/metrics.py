@@ -36,7 +36,7 @@ def serve_metrics(corrector: Corrector, port: int) -> None:
         def collect(self) -> Iterator[Metric]:
             for name, value in asdict(corrector.counters).items():
                 yield CounterMetricFamily(f"ecu_node_{name}", f"{name.replace('_', ' ')} since the start", value=value)
-            state, reason = corrector.state()
+            state, reason = corrector.told
             yield GaugeMetricFamily("ecu_node_state", "state, as in the status message", value=int(state))
             yield GaugeMetricFamily("ecu_node_reason", "reason, as in the status message", value=int(reason))
             yield GaugeMetricFamily("ecu_node_parameter_set", "number in force", value=corrector.parameter_set)

@@ -101,7 +101,7 @@ def run_monitor(options: MonitorOptions) -> int:
             monitor = BusMonitor(database, time.monotonic())
             view = None
             while view is None or (options.once_s is None and not stop()):
-                listen(bus, monitor, time.monotonic() + period_s, stop, counters)
+                listen(bus, monitor, time.monotonic() + period_s, stop)
                 view = monitor.look(time.monotonic())
                 bus.count_dropped()
                 show(view, _bus_notes(counters))
@@ -113,7 +113,7 @@ def run_monitor(options: MonitorOptions) -> int:
     return 0
 
 
-def listen(bus: SteadyBus, monitor: BusMonitor, until_s: float, stop: Callable[[], bool], counters: Counters) -> None:
+def listen(bus: SteadyBus, monitor: BusMonitor, until_s: float, stop: Callable[[], bool]) -> None:
     """Take what comes until a time of the steady clock.
 
     Parameters
@@ -126,8 +126,6 @@ def listen(bus: SteadyBus, monitor: BusMonitor, until_s: float, stop: Callable[[
         When to return. [s]
     stop : callable
         Whether to return earlier; asked at least every 0.25 s.
-    counters : Counters
-        Where time stamps are counted that cannot be.
     """
     clock, receive, take = time.monotonic, bus.receive, monitor.take
     while (now_s := clock()) < until_s and not stop():
@@ -136,7 +134,7 @@ def listen(bus: SteadyBus, monitor: BusMonitor, until_s: float, stop: Callable[[
         while now_s < turn_end_s and (message := receive(turn_end_s - now_s)) is not None:
             now_s = clock()
             if not message.is_remote_frame:
-                time_s = steady_time_s(message.timestamp, now_s, ahead_s, counters)
+                time_s = steady_time_s(message.timestamp, now_s, ahead_s)
                 take((message.arbitration_id, message.is_extended_id), message.data, time_s)
 
 

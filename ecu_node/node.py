@@ -6,12 +6,12 @@ other: one thread passes frames on from the sensors, and corrects, another one p
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import can
 
-from ecu_node.buses import SteadyBus, connect, steady_time_s
+from ecu_node.buses import SteadyBus, TimeOfDay, connect, steady_time_s
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
@@ -26,6 +26,8 @@ _LOOK_EVERY_S = 0.1
 """The junction is looked at, and the watchdog fed, at least this often, however rare the status is. [s]"""
 _LISTEN_PERIODS, _LONGEST_LISTEN_S = 1.5, 1.5
 """So many status periods, but no longer than this [s], the node listens for another one before it says anything."""
+_LONGEST_DELAY_S = 1.0
+"""A gateway passes a branch's frame on only if it waited no longer than this, or than the branch's timeout. [s]"""
 _STANDARD_MASK = 0x7FF
 _EXTENDED_MASK = 0x1FFFFFFF
 
@@ -88,6 +90,7 @@ class _Ticking:
     def __init__(self, corrector: Corrector, period_s: float, on_tick: Callable[[float], None]) -> None:
         self._corrector, self.period_s, self._on_tick = corrector, period_s, on_tick
         self._due_s = self._status_due_s = float("-inf")
+        self.time_of_day = TimeOfDay(corrector.counters)
 
     def is_due(self, now_s: float) -> bool:
         """Whether there is something else to do than to receive."""
@@ -139,13 +142,13 @@ def _hear(bus: SteadyBus, ticking: _Ticking, take: Callable[[can.Message, float,
     clock = time.monotonic
     message = bus.receive(ticking.wait_s(clock()))
     now_s = clock()
-    ahead_s = time.time() - now_s  # after the wait, in which the clock may have been set
+    ahead_s = ticking.time_of_day.ahead_s(now_s)  # after the wait, in which the clock may have been set
     while message is not None:
         take(message, now_s, ahead_s)
         if ticking.is_due(now_s):
             return steady_time_s(message.timestamp, now_s, ahead_s)
-        message = bus.receive(0.0)
         now_s = clock()
+        message = bus.receive(0.0)
     return now_s
 
 
@@ -179,30 +182,32 @@ class OverlayNode:
         self._own = OwnFrames(transmitted(database, Mode.OVERLAY))
         self._ticking = _Ticking(corrector, period_s, on_tick)
 
-    def run(self, stop: Callable[[], bool]) -> None:
+    def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
         """Correct until told to stop.
 
         Parameters
         ----------
         stop : callable
             Asked at every wake-up; True ends the work.
+        ready : callable
+            Called when the node has listened and is at work; frames before that are not answered.
 
         Raises
         ------
         BusError
             If another node sends this node's messages.
         """
-        early = _listen(self._bus, self._own, stop, self._ticking.period_s)
+        _listen(self._bus, self._own, stop, self._ticking.period_s)
+        ready()
         bus, ticking, clock = self._bus, self._ticking, time.monotonic
-        now_s = heard_s = clock()
-        ahead_s = time.time() - now_s
-        for message in early:
-            self._take(message, now_s, ahead_s)
+        heard_s = clock()
         while not stop():
             ticking.tick(clock(), heard_s, bus.send, self._own)
             heard_s = _hear(bus, ticking, self._take)
 
     def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
+        if message.is_remote_frame:
+            return
         key = (message.arbitration_id, message.is_extended_id)
         corrector, own = self._corrector, self._own
         if key in own:
@@ -210,9 +215,12 @@ class OverlayNode:
             corrector.counters.echoes += 1
             return
         source = corrector.sources.get(key)
-        if source is None or message.is_remote_frame:
+        if source is None:
             return
-        time_s = steady_time_s(message.timestamp, now_s, ahead_s, corrector.counters)
+        time_s = steady_time_s(message.timestamp, now_s, ahead_s)
+        if now_s - time_s > source.timeout_s:
+            corrector.counters.late += 1
+            return
         for target in source.answer(message.data, time_s):
             own.sent(target.key, target.data)
             answer = _message(
@@ -252,12 +260,14 @@ class GatewayNode:
         self._ticking = _Ticking(corrector, period_s, on_tick)
         self._returned = 0
 
-    def run(self, stop: Callable[[], bool]) -> None:
+    def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
         """Correct until told to stop; parameters and errors as for :meth:`OverlayNode.run`."""
-        early = _listen(self._vehicle, self._not_from_vehicle, stop, self._ticking.period_s)
+        _listen(self._vehicle, self._not_from_vehicle, stop, self._ticking.period_s)
+        _discard(self._sensors)
+        ready()
         ended = threading.Event()
         with ThreadPoolExecutor(1, "back") as pool:
-            back = pool.submit(self._pass_back, early, lambda: stop() or ended.is_set())
+            back = pool.submit(self._pass_back, lambda: stop() or ended.is_set())
             try:
                 self._pass_on(lambda: stop() or back.done())
             finally:
@@ -278,12 +288,15 @@ class GatewayNode:
 
     def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
         key = (message.arbitration_id, message.is_extended_id)
-        if key in self._status:
-            raise _another(message, self._sensors)
         corrector = self._corrector
-        source = corrector.sources.get(key)
-        if source is not None and not message.is_remote_frame:
-            time_s = steady_time_s(message.timestamp, now_s, ahead_s, corrector.counters)
+        source = None if message.is_remote_frame else corrector.sources.get(key)
+        if key in self._status and not message.is_remote_frame:
+            raise _another(message, self._sensors)
+        if source is not None:
+            time_s = steady_time_s(message.timestamp, now_s, ahead_s)
+            if now_s - time_s > max(source.timeout_s, _LONGEST_DELAY_S):
+                corrector.counters.late += 1
+                return
             data = source.forward(message.data, time_s)
             if data is None:
                 return
@@ -293,31 +306,35 @@ class GatewayNode:
         else:
             corrector.counters.send_errors += 1
 
-    def _pass_back(self, early: Sequence[can.Message], stop: Callable[[], bool]) -> None:
+    def _pass_back(self, stop: Callable[[], bool]) -> None:
         """Pass on what the vehicle sends to the sensors' bus; a branch's frame from there must not be."""
         vehicle, sensors = self._vehicle, self._sensors
-        for message in early:
-            self._returned += sensors.send(message)
         while not stop():
             received = vehicle.receive(_LONGEST_WAIT_S)
             while received is not None:
-                if (received.arbitration_id, received.is_extended_id) in self._not_from_vehicle:
+                key = (received.arbitration_id, received.is_extended_id)
+                if key in self._not_from_vehicle and not received.is_remote_frame:
                     raise _another(received, vehicle)
                 self._returned += sensors.send(received)
                 received = None if stop() else vehicle.receive(0.0)
 
 
-def _listen(bus: SteadyBus, own: OwnFrames, stop: Callable[[], bool], period_s: float) -> list[can.Message]:
-    """Hear whether anybody else sends what only this node may send; all that was heard."""
-    heard = []
+def _listen(bus: SteadyBus, own: OwnFrames, stop: Callable[[], bool], period_s: float) -> None:
+    """Hear whether anybody else sends what only this node may send; what else comes meanwhile is too old afterwards."""
     end_s = time.monotonic() + min(_LISTEN_PERIODS * period_s, _LONGEST_LISTEN_S)
     while (left_s := end_s - time.monotonic()) > 0.0 and not stop():
         message = bus.receive(min(left_s, _LONGEST_WAIT_S))
-        if message is not None:
-            if (message.arbitration_id, message.is_extended_id) in own:
-                _require_own(message, own, bus)
-            heard.append(message)
-    return heard
+        if message is None or message.is_remote_frame:
+            continue
+        if (message.arbitration_id, message.is_extended_id) in own:
+            _require_own(message, own, bus)
+
+
+def _discard(bus: SteadyBus) -> None:
+    """Forget what has come so far, within a short time: on a full bus more comes meanwhile."""
+    end_s = time.monotonic() + _LONGEST_WAIT_S
+    while time.monotonic() < end_s and bus.receive(0.0) is not None:
+        pass
 
 
 def _require_own(message: can.Message, own: OwnFrames, bus: SteadyBus) -> None:

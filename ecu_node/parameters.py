@@ -37,6 +37,8 @@ __all__ = [
     "write_parameters",
 ]
 
+MAX_DELAY_S = 5.0
+"""Branches of one vehicle do not lag each other by more. [s]"""
 MAX_FILE_BYTES = 1_000_000
 """A parameter file has some kilobytes; a larger one is not one."""
 
@@ -258,6 +260,10 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
             f"apply, calibrate with more drives",
         )
     for name, branch in parameters.branches.items():
+        if abs(branch.delay_s or 0.0) > MAX_DELAY_S:
+            raise UnfitError(
+                Reason.IMPLAUSIBLE_PARAMETERS, f"branch {name}: delay {branch.delay_s:g} s is beyond {MAX_DELAY_S:g} s"
+            )
         if name not in layout.branch_names:
             raise UnfitError(Reason.WRONG_LAYOUT, f"parameters for branch {name!r}, which {layout.path} does not have")
         if not branch.apply:

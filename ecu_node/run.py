@@ -8,6 +8,7 @@ from pathlib import Path
 import can
 
 from ecu_node.buses import SteadyBus
+from ecu_node.check import warnings_of
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.guard import Mode
@@ -15,7 +16,7 @@ from ecu_node.layout import read_layout
 from ecu_node.node import GatewayNode, OverlayNode, open_bus
 from ecu_node.parameter_file import ParameterFile
 from ecu_node.service import Log, Requests, ServiceManager
-from ecu_node.status import Reason
+from ecu_node.status import Reason, State
 from ecu_node.wiring import not_published, wire
 
 __all__ = ["RunOptions", "run_node"]
@@ -96,15 +97,19 @@ def run_node(options: RunOptions, vehicle_hint: str) -> int:
             say(f"passing measured values through: {file.why_not}")
         elif options.vehicle is None:
             say(f"the vehicle is not checked: {vehicle_hint}")
-        _say_what_is_not_done(database, file, mode, say)
+        for text in warnings_of(database, file.in_force, mode, fd=options.fd):
+            say(text)
         what = _what(corrector, database, file, mode)
         where = f"{options.interface} {options.channel}{f' to {options.gateway}' if options.gateway else ''}"
-        say(f"running on {where}{', shadow mode' if options.shadow else ''}, correcting {what or 'nothing'}")
-        manager.ready(f"correcting {what or 'nothing'}")
+
+        def ready() -> None:
+            say(f"running on {where}{', shadow mode' if options.shadow else ''}, correcting {what or 'nothing'}")
+            manager.ready(f"correcting {what or 'nothing'}")
+
         tick = _Tick(corrector=corrector, buses=buses, file=file, requests=requests, manager=manager, say=say)
         period_s = database.layout.status.period_s if database.layout.status is not None else _DEFAULT_PERIOD_S
         try:
-            _node(buses, corrector, database, period_s, tick).run(requests.stop)
+            _node(buses, corrector, database, period_s, tick).run(requests.stop, ready)
         finally:
             manager.stopping()
             say(f"ended: {corrector.counters.text()}")
@@ -169,18 +174,9 @@ class _Tick:
                     "passing measured values through until the bus has slept: the corrected Kirchhoff sum is worse "
                     "than the measured one"
                 )
-        return "correcting again"
+        return "the bus sleeps" if corrector.state()[0] is State.ASLEEP else "correcting again"
 
 
 def _what(corrector: Corrector, database: VehicleDatabase, file: ParameterFile, mode: Mode) -> str:
     hidden = not_published(database, file.in_force) if mode is Mode.OVERLAY else []
     return ", ".join(item.name for item in corrector.branches if item.fault.applied and item.name not in hidden)
-
-
-def _say_what_is_not_done(
-    database: VehicleDatabase, file: ParameterFile, mode: Mode, say: Callable[[str], None]
-) -> None:
-    from ecu_node.check import warnings_of  # noqa: PLC0415  # it builds a node itself
-
-    for text in warnings_of(database, file.in_force, mode):
-        say(text)

@@ -11,7 +11,7 @@ from cantools.database.can import Message, Signal
 
 from ecu_node.bits import BitPlace, PlacedSignal, bit_place, multiplexers
 from ecu_node.branch import AS_IT_IS, Auxiliary, LiveBranch
-from ecu_node.codes import Codes, not_available_code, read_codes, writable_range
+from ecu_node.codes import Codes, as_written, not_available_code, read_codes, writable_range
 from ecu_node.correction import (
     NO_FAULT,
     CorrectionPlan,
@@ -25,6 +25,7 @@ from ecu_node.corrector import Corrector, StatusFields
 from ecu_node.counters import Counters
 from ecu_node.database import AMPERE, CELSIUS, VOLT, WATT, VehicleDatabase
 from ecu_node.e2e import protection_of
+from ecu_node.errors import LayoutError
 from ecu_node.frames import FrameKey, Reader, Source, Target, TargetField
 from ecu_node.guard import PARAMETER_SETS, Mode, check_output, is_fd, key_of, received
 from ecu_node.junction_watch import JunctionWatch
@@ -60,7 +61,12 @@ def sensor_fault(database: VehicleDatabase, in_force: InForce, branch: str) -> S
         return NO_FAULT
     if isinstance(found.sensor_model, TemperatureDrift) and database.layout.temperature is None:
         return NO_FAULT
-    return SensorFault(drift=found.drift, offset_a=found.offset_a, model=found.sensor_model)
+    return SensorFault(
+        drift=found.drift,
+        offset_a=found.offset_a,
+        model=found.sensor_model,
+        largest_drift=database.layout.limits.drift,
+    )
 
 
 def not_published(database: VehicleDatabase, in_force: InForce) -> list[str]:
@@ -135,7 +141,6 @@ def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault, m
         branch_signals(database, branch, mode),
         fault,
         temperature=_temperature_codes(database),
-        largest_drift=database.layout.limits.drift,
     )
 
 
@@ -250,12 +255,12 @@ class _Parts:
     branches: dict[str, LiveBranch]
     signals: list[tuple[SignalName, Auxiliary | LiveBranch]]
     auxiliaries: list[Auxiliary] = field(default_factory=list)
-    whole: tuple[Auxiliary, frozenset[float]] | None = None
-    """The input that tells whether all currents are measured, and its values with which they are."""
+    whole: tuple[Auxiliary, frozenset[int]] | None = None
+    """The input that tells whether all currents are measured, and its codes with which they are."""
 
     def is_whole(self) -> bool:
         """Whether all currents of the junction are measured now."""
-        return self.whole is None or self.whole[0].value() in self.whole[1]
+        return self.whole is None or self.whole[0].code in self.whole[1]
 
 
 def _parts(database: VehicleDatabase) -> _Parts:
@@ -277,7 +282,10 @@ def _parts(database: VehicleDatabase) -> _Parts:
         unit = database.signal(whole_name)[1].unit or ""
         codes = _codes(database, whole_name, {unit: 1.0}, "[watch] input")
         every_code = replace(codes, named={})  # states have names, which are no lack of a value here
-        parts.whole = auxiliary(whole_name, every_code, layout.max_age_s), frozenset(layout.watch.valid)
+        valid = [(as_written(float(value)) - codes.offset) / codes.scale for value in layout.watch.valid]
+        if any(code.denominator != 1 for code in valid):
+            raise LayoutError(f"{layout.path}: [watch] valid: a value that {whole_name} cannot have")
+        parts.whole = auxiliary(whole_name, every_code, layout.max_age_s), frozenset(map(int, valid))
     voltages: dict[SignalName, Auxiliary] = {}
     for branch in layout.branch:
         if branch.voltage is not None and branch.voltage not in voltages:
@@ -291,6 +299,7 @@ def _parts(database: VehicleDatabase) -> _Parts:
             codes=signals.source,
             sign=branch.sign,
             timeout_s=branch.timeout_s,
+            start_s=layout.watch.start_s,
             voltage=voltages[branch.voltage] if branch.voltage is not None else None,
             temperature=temperature,
         )

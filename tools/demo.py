@@ -211,8 +211,11 @@ def node_thread(parameters: Path, vehicle: str, interface: str, channel: str) ->
         say,
     )
     try:
-        node = threading.Thread(target=OverlayNode(bus, corrector, database, period_s=0.1).run, args=(stop.is_set,))
+        at_work = threading.Event()
+        run = OverlayNode(bus, corrector, database, period_s=0.1).run
+        node = threading.Thread(target=run, args=(stop.is_set, at_work.set))
         node.start()
+        at_work.wait()
         try:
             yield
         finally:

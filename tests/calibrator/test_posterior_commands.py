@@ -167,7 +167,7 @@ def test_a_slip_in_the_bench_readings_ends_the_run_before_any_drive_is_read(flee
 def test_a_vehicle_cannot_be_trusted_and_held_out(fleet: Path, tmp_path: Path) -> None:
     both = ("--trusted", "V001", "--hold-out", "V001")
     run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", tmp_path / "result", *both)
-    assert run.returncode == 1
+    assert run.returncode == 2
     assert "vehicle V001 is both held out and trusted" in run.stderr
 
 

@@ -117,6 +117,22 @@ def test_run_does_not_claim_to_correct_what_it_cannot_publish(
     assert lines[1] == "ecu-node: running on virtual c0, correcting battery"
 
 
+@pytest.mark.parametrize("more", [["--channel", ""], ["--channel", "c0", "--gateway", ""]])
+def test_an_empty_name_of_a_bus_is_wrong_use(params: Path, more: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["run", "--params", str(params), "--layout", str(LAYOUT), *more])
+    assert caught.value.code == 2
+    assert "a name is expected, such as can0, found none" in capsys.readouterr().err
+
+
+def test_a_gateway_needs_two_buses(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--interface", "virtual", "--channel", "c0", "--gateway", "c0"]
+    assert main(["run", "--params", str(params), "--layout", str(LAYOUT), *options]) == 2
+    assert (
+        capsys.readouterr().err == "ecu-node: --gateway c0 is the bus of the sensors itself; two buses are expected\n"
+    )
+
+
 def test_unfit_parameters_end_in_1_and_say_why(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(check(params, "--vehicle", "v2", "--json")) == 1
     report = json.loads(capsys.readouterr().out)

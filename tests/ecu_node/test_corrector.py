@@ -15,6 +15,7 @@ from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode
 from ecu_node.parameters import JunctionResidual
+from ecu_node.sensor_models import TemperatureDrift
 from ecu_node.status import Quality, Reason, State
 from ecu_node.wiring import InForce, put_in_force, wire
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, Frame, answers, decoded, parameters_for, protected
@@ -227,6 +228,81 @@ def test_falling_asleep_is_no_fault(database: VehicleDatabase) -> None:
     assert corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
+TWO_SOURCES = (
+    SMALL_LAYOUT.replace("Pair.Motor", "Other.Motor"),
+    SMALL_DBC.replace(' SG_ Motor : 23|16@0- (-0.05,0) [-1600|1600] "A" Node\n', "", 1).replace(
+        "BO_ 258", 'BO_ 257 Other: 2 Node\n SG_ Motor : 7|16@0- (-0.05,0) [-1600|1600] "A" Node\nBO_ 258', 1
+    ),
+)
+
+
+def test_a_value_from_before_the_sleep_is_never_published(make_database: MakeDatabase) -> None:
+    database = make_database(*TWO_SOURCES)
+    corrector = corrector_for(database, battery=(0.5, 3.0), motor=(0.25, 0.0))
+    pair = Frame(PAIR, database.message("Pair").encode({"Battery": 153.0}))
+    answers(corrector, Frame(FrameKey(257, False), database.message("Other").encode({"Motor": 50.0})), 0.0)
+    assert decoded(database, "PairOut", answers(corrector, pair, 0.1)[0].data)["Motor"] == 40.0
+    for now_s in (0.2, 3600.0, 3600.1):
+        corrector.look(now_s)
+    for now_s in (3600.2, 3600.3):
+        (answer,) = answers(corrector, pair, now_s)
+        assert decoded(database, "PairOut", answer.data)["Motor"] == pytest.approx(0.05 * 32768), "no value"
+        corrector.look(now_s)
+    put_in_force(
+        corrector,
+        database,
+        InForce(parameters=parameters_for(database, battery=(0.5, 3.0), motor=(0.25, 0.0))),
+        3600.4,
+        mode=Mode.OVERLAY,
+    )
+    (answer,) = answers(corrector, pair, 3600.4)
+    assert decoded(database, "PairOut", answer.data)["Motor"] == pytest.approx(0.05 * 32768), "no value"
+
+
+def test_branches_that_fall_silent_one_after_the_other_are_no_fault(database: VehicleDatabase) -> None:
+    parameters = parameters_for(database, battery=(0.25, 5.0), dcdc=(0.0, 0.0))
+    corrector = wire(database, InForce(parameters=parameters), start_s=0.0)
+    seen = set()
+    for k in range(100):
+        if k < 50:
+            answers(corrector, battery(database, k % 15), 0.02 * k)
+            data = protected(database, "HV_Dcdc", k % 15, DcdcCurrent=1.0)
+            answers(corrector, Frame(FrameKey(0x140, False), data), 0.02 * k)
+        corrector.look(0.02 * k + 0.01)
+        seen.add(corrector.state())
+    assert {reason for _, reason in seen} == {Reason.NONE}
+    assert corrector.state() == (State.ASLEEP, Reason.NONE)
+
+
+def test_a_stray_frame_of_a_branch_that_the_car_lacks_counts_for_one_drive_only(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
+    drive(database, corrector, 0.0, 1.0)
+    data = protected(database, "HV_Dcdc", 0, DcdcCurrent=1.0)
+    answers(corrector, Frame(FrameKey(0x140, False), data), 1.0)
+    drive(database, corrector, 1.0, 3.0)
+    assert corrector.latched_branches == ("dcdc",)
+    for k in range(60, 100):
+        corrector.look(0.05 * k)
+    drive(database, corrector, 10.0, 12.0)
+    assert corrector.state() == (State.CORRECTING, Reason.NONE)
+
+
+def test_a_temperature_at_which_the_drift_cannot_be_is_no_error(database: VehicleDatabase) -> None:
+    parameters = parameters_for(database, motor=(0.0, 0.0), battery=(0.0, 0.0))
+    model = TemperatureDrift(drift_per_k=0.02, reference_c=25.0)
+    bent = {**parameters.branches, "battery": replace(parameters.branches["battery"], sensor_model=model)}
+    corrector = wire(database, InForce(parameters=replace(parameters, branches=bent)), start_s=0.0)
+    for k, celsius in enumerate((25.0, -25.0, -10.0)):
+        data = protected(database, "HV_Battery", k, BatteryCurrent=100.0, JunctionBoxTemperature=celsius)
+        (answer,) = answers(corrector, Frame(BATTERY, data), 0.01 * k)
+        answers(corrector, motor(database, k), 0.01 * k)
+        corrector.look(0.01 * k)
+        assert decoded(database, "HV_BatteryCorrected", answer.data)["BatteryCurrentCorrected"] == 100.0
+        assert corrector.watch.sums is not None
+        assert corrector.watch.sums.corrected_a == pytest.approx(0.0), "the sum is of what is published"
+        assert corrector.state() == (State.CORRECTING, Reason.NONE if k == 0 else Reason.INPUT_MISSING)
+
+
 def test_waiting_for_a_vehicle_that_is_not_awake_yet_is_no_fault(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
     for k in range(100):
@@ -240,7 +316,9 @@ def test_a_branch_of_the_parameters_that_never_appears_is_stale_after_its_timeou
     corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
     drive(database, corrector, 0.0, 0.1, silent="motor")
     assert corrector.state() == (State.STARTING, Reason.NONE)
-    drive(database, corrector, 0.1, 0.5, silent="motor")
+    drive(database, corrector, 0.1, 2.9, silent="motor")
+    assert corrector.state() == (State.STARTING, Reason.NONE), "control units wake up one after the other"
+    drive(database, corrector, 2.9, 3.3, silent="motor")
     assert corrector.state() == (State.PASSING_THROUGH, Reason.BRANCH_STALE)
 
 

@@ -12,6 +12,7 @@ from ecu_node.errors import LayoutError
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode, transmitted
 from ecu_node.sensor_models import TemperatureDrift
+from ecu_node.status import Reason, State
 from ecu_node.wiring import InForce, wire
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, Frame, decoded, parameters_for, passed_on, protected
 
@@ -129,6 +130,41 @@ def test_a_power_is_written_back_as_a_power(make_database: MakeDatabase) -> None
     assert decoded(database, "Heater", out)["Power"] == round(-current_a * 400)
     corrector.look(0.7)
     assert passed_on(corrector, heater, 0.7) == heater.data, "the voltage is too old"
+
+
+def test_a_power_without_its_voltage_is_told(make_database: MakeDatabase) -> None:
+    database = make_database()
+    corrector = gateway_for(database, heater=(0.25, -2.0))
+    passed_on(corrector, Frame(NET, database.message("Net").encode({"Voltage": 400.0})), 0.0)
+    heater = Frame(HEATER, database.message("Heater").encode({"Power": 4000}))
+    found = []
+    for now_s in (0.0, 0.4, 0.8):
+        passed_on(corrector, heater, now_s)
+        corrector.look(now_s)
+        found.append(corrector.state())
+    assert found == [(State.CORRECTING, Reason.NONE)] * 2 + [(State.CORRECTING, Reason.INPUT_MISSING)]
+
+
+def test_a_message_that_is_only_read_is_never_held_back(make_database: MakeDatabase) -> None:
+    entry = '\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\n'
+    dbc = SMALL_DBC.replace("Net: 2", "Net: 4").replace("0|16@1+ (0.01", "16|16@1+ (0.01")
+    database = make_database(SMALL_LAYOUT + entry, dbc)
+    corrector = gateway_for(database, heater=(0.25, -2.0))
+    damaged = Frame(NET, b"\x00\x01\x40\x9c")
+    assert passed_on(corrector, damaged, 0.0) == damaged.data
+    assert (corrector.counters.corrupt, corrector.counters.held_back) == (1, 0)
+
+
+def test_what_a_repeated_frame_says_is_not_used(make_database: MakeDatabase, database: VehicleDatabase) -> None:
+    layout = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
+    own = make_database('on_bad_frame = "invalid"\n' + layout, database.layout.dbc_path.read_text())
+    corrector = gateway_for(own, battery=(0.25, 5.0))
+    frame = battery(own, 3)
+    for k in range(10):
+        out = passed_on(corrector, frame, 0.05 * k)
+        assert out is not None
+        assert decoded(own, "HV_Battery", out)["BatteryCurrent"] == pytest.approx(76.0)
+    assert corrector.branches[0].time_s == 0.0
 
 
 MULTIPLEXED = SMALL_DBC.replace(

@@ -50,7 +50,10 @@ def gateway(database: VehicleDatabase, name: str, other: str | None = None) -> I
     buses = opened(f"{name} a"), opened(other or f"{name} b")
     stop = threading.Event()
     with ThreadPoolExecutor(1) as pool:
-        running = pool.submit(GatewayNode(*buses, corrector, database, period_s=0.02).run, stop.is_set)
+        ready = threading.Event()
+        running = pool.submit(GatewayNode(*buses, corrector, database, period_s=0.02).run, stop.is_set, ready.set)
+        while not ready.wait(0.01) and not running.done():
+            pass
         try:
             yield corrector, running
         finally:
@@ -62,14 +65,14 @@ def gateway(database: VehicleDatabase, name: str, other: str | None = None) -> I
                     bus.close()
 
 
-def received(bus: can.BusABC, count: int, *, status: bool = False) -> list[can.Message]:
-    """The next frames; those of the status only if asked for, else all others."""
+def received(bus: can.BusABC, count: int, *, status: bool | None = False) -> list[can.Message]:
+    """The next frames; those of the status only if asked for, else all others, or with None all."""
     found: list[can.Message] = []
     give_up = time.monotonic() + LONGEST_WAIT_S
     while len(found) < count:
         message = bus.recv(0.5)
         assert time.monotonic() < give_up, f"{len(found)} of {count} frames came"
-        if message is not None and (message.arbitration_id == 0x5F0) is status:
+        if message is not None and status in {None, message.arbitration_id == 0x5F0}:
             found.append(message)
     return found
 
@@ -132,16 +135,43 @@ def test_frames_of_the_vehicle_reach_the_sensors_bus_unchanged_and_in_order(
     assert list(map(as_sent, found)) == list(map(as_sent, sent))
 
 
-def test_frames_that_come_while_it_listens_are_not_lost(
+def test_frames_that_came_before_it_was_at_work_are_too_old_to_be_passed_on(
     database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
 ) -> None:
     sensors, vehicle = ends
-    sent = [can.Message(arbitration_id=0x300 + k, is_extended_id=False, data=[k]) for k in range(50)]
+    ended = threading.Event()
+
+    def send_early() -> None:
+        while not ended.wait(0.002):
+            for bus in ends:
+                bus.send(can.Message(arbitration_id=0x300, is_extended_id=False, data=[1]))
+
+    sender = threading.Thread(target=send_early)
+    sender.start()
+    time.sleep(0.05)
     with gateway(database, request.node.name):
-        for message in sent:
+        ended.set()
+        sender.join()
+        for bus in ends:
+            bus.send(can.Message(arbitration_id=0x301, is_extended_id=False, data=[2]))
+        for bus in (vehicle, sensors):
+            early = 0
+            while received(bus, 1)[0].arbitration_id != 0x301:
+                early += 1
+            assert early < 10, "those of the listening, more than 10, are not passed on"
+
+
+def test_a_remote_frame_passes_whatever_its_identifier(
+    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+) -> None:
+    sensors, vehicle = ends
+    asked = [
+        can.Message(arbitration_id=key, is_extended_id=False, is_remote_frame=True, dlc=8) for key in (0x110, 0x5F0)
+    ]
+    with gateway(database, request.node.name):
+        for message in asked:
             vehicle.send(message)
-            time.sleep(0.001)
-        assert list(map(as_sent, received(sensors, 50))) == list(map(as_sent, sent))
+        assert list(map(as_sent, received(sensors, 2, status=None))) == list(map(as_sent, asked))
 
 
 def test_the_status_goes_to_the_vehicle_alone(

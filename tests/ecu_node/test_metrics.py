@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from ecu_node.cli import main
 from ecu_node.counters import Counters
 from ecu_node.status import Reason, State
 from tests.ecu_node.vehicles import LAYOUT
@@ -67,12 +68,19 @@ def test_only_this_machine_is_answered(node: int) -> None:
             other.connect(("127.0.0.2", node))  # an address that a node bound to all of them would answer on
 
 
-@pytest.mark.parametrize("port", [None, 70000])
-def test_a_port_that_cannot_be_had_is_one_line(tmp_path: Path, port: int | None) -> None:
+@pytest.mark.parametrize("port", ["70000", "0", "-1", "x"])
+def test_what_is_no_port_is_wrong_use(tmp_path: Path, port: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["run", "--params", "p", "--layout", "l", "--channel", "c", f"--metrics-port={port}"])
+    assert caught.value.code == 2
+    assert "a TCP port from 1 to 65535 is expected" in capsys.readouterr().err
+
+
+def test_a_port_that_cannot_be_had_is_one_line(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        number = taken.getsockname()[1] if port is None else port
+        number = taken.getsockname()[1]
         result = subprocess.run(command(tmp_path, number), capture_output=True, text=True, timeout=60, check=False)
     assert result.returncode == 1
     assert result.stderr.startswith(f"ecu-node: port {number}: cannot answer there: ")

@@ -205,7 +205,7 @@ def test_of_many_frames_none_is_left_out(database: VehicleDatabase) -> None:
             other.send(can.Message(arbitration_id=0x110, is_extended_id=False, is_remote_frame=True))
         start_s = time.monotonic()
         monitor = BusMonitor(database, start_s)
-        listen(bus, monitor, start_s + 5.0, lambda: time.monotonic() > start_s + 1.0, counters)
+        listen(bus, monitor, start_s + 5.0, lambda: time.monotonic() > start_s + 1.0)
         bus.close()
     battery = monitor.look(start_s + 1.0).branches[0]
     assert battery.rate_hz == pytest.approx(5000.0)

@@ -93,8 +93,10 @@ def test_a_power_is_corrected_as_a_current_and_written_back_as_a_power(
 
 def test_each_temperature_has_its_own_plan() -> None:
     signals = Signals(source=current(), target=current(), sign=1)
-    fault = SensorFault(drift=0.05, offset_a=-2.5, model=TemperatureDrift(drift_per_k=0.0013, reference_c=25.0))
-    plans = correction_plan(signals, fault, temperature=TEMPERATURE, largest_drift=0.4)
+    fault = SensorFault(
+        drift=0.05, offset_a=-2.5, model=TemperatureDrift(drift_per_k=0.0013, reference_c=25.0), largest_drift=0.4
+    )
+    plans = correction_plan(signals, fault, temperature=TEMPERATURE)
     assert isinstance(plans, TemperaturePlans)
     for temperature in (0, 40, 65, 66, 140, 250):
         plan = plans.at(temperature)
@@ -107,8 +109,8 @@ def test_each_temperature_has_its_own_plan() -> None:
 
 def test_a_temperature_at_which_the_drift_is_beyond_the_limit_has_no_plan() -> None:
     signals = Signals(source=current(), target=current(), sign=1)
-    fault = SensorFault(model=TemperatureDrift(drift_per_k=0.01, reference_c=20.0))
-    plans = correction_plan(signals, fault, temperature=TEMPERATURE, largest_drift=0.4)
+    fault = SensorFault(model=TemperatureDrift(drift_per_k=0.01, reference_c=20.0), largest_drift=0.4)
+    plans = correction_plan(signals, fault, temperature=TEMPERATURE)
     assert isinstance(plans, TemperaturePlans)
     assert [plans.at(code) is None for code in (40 + 60, 40 + 61, 40 - 20, 40 - 21)] == [False, True, False, True]
 

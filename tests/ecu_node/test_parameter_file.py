@@ -106,3 +106,10 @@ def test_a_new_file_of_the_same_size_and_time_is_noticed(path: Path, database: V
     assert path.stat().st_size == found.st_size
     assert running.file.look(running.corrector, 2.0)
     assert running.drift == 0.15
+
+
+def test_a_file_that_can_be_read_after_all_is_noticed(path: Path, database: VehicleDatabase) -> None:
+    running = Running(path, database)
+    before = path.stat()
+    path.chmod(0o600 if before.st_mode & 0o077 else 0o644)
+    assert running.file.look(running.corrector, 2.0), "its times of content are the same"

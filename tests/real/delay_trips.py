@@ -68,7 +68,7 @@ def import_trips(data: Path, store: Path) -> None:
 def delayed_trips(store: Path, *, branches: int, seed: int = 0) -> Iterator[DelayedTrip]:
     """Every trip whose branches have good samples, each a vehicle of its own."""
     layout = read_layout(LAYOUT)
-    database = read_database(msgspec.structs.replace(layout, e2e=None))  # it takes long to make and plays no part here
+    database = read_database(msgspec.structs.replace(layout, e2e=[]))  # it takes long to make and plays no part here
     for number, drive in enumerate(iterate_drives(store, layout)):
         trip = _ideal_trip(drive, BRANCHES[:branches])
         if trip is not None:

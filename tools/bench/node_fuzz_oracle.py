@@ -276,12 +276,14 @@ class Oracle:
             expected = [frame] if self._gateway else []
             return None if list(sent) == expected else "a frame that is nobody's business was not left alone"
         found = source.state.take(frame.data)
+        codes = source.codes(frame.data)
+        if found == "usable":
+            self._take_auxiliaries(source, codes)
         if found == "usable" or (self._gateway and self._passes_invalid and found == "out of order"):
-            codes = source.codes(frame.data)
-            self._take(source, codes, len(frame.data))
+            self._take_branches(source, codes, len(frame.data))
             return self._rewritten(source, codes, frame, sent) if self._gateway else self._answered(source, sent)
         if self._gateway:
-            expected = [frame] if self._passes_invalid else []
+            expected = [frame] if self._passes_invalid or not self._own(source) else []
             return None if list(sent) == expected else f"a frame that is {found} was not held back or left alone"
         if not self._passes_invalid:
             return f"a frame that is {found} was answered" if sent else None
@@ -292,8 +294,8 @@ class Oracle:
     def _own(self, source: _Source) -> list[_Branch]:
         return [branch for branch in self._branches if branch.branch.message is source.message]
 
-    def _take(self, source: _Source, codes: dict[str, int], size: int) -> None:
-        """Auxiliary signals first, then the branches; one whose bits are beyond the end has no value."""
+    def _take_auxiliaries(self, source: _Source, codes: dict[str, int]) -> None:
+        """Take voltage and temperature; they come before the branches of the same frame."""
         if self._voltage is not None and self._voltage[0] is source.message and self._voltage[1].name in codes:
             code = codes[self._voltage[1].name]
             self._voltage_code = code if _worth(self._voltage[1]).is_value(code) else None
@@ -305,6 +307,9 @@ class Oracle:
                 self._temperature = None
             for branch in self._branches if self._temperature != before else ():
                 branch.at_temperature(self._voltage_code, self._temperature)
+
+    def _take_branches(self, source: _Source, codes: dict[str, int], size: int) -> None:
+        """Take the branches; one whose bits are beyond the end has no value."""
         for branch in self._own(source):
             if size < branch.least_size:
                 branch.spoil()

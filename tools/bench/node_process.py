@@ -1,6 +1,7 @@
 """Start, memory and processor time of a real ``ecu-node run`` on the virtual bus; see :mod:`bench.node_child`."""
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -101,7 +102,9 @@ def watched(vehicle: BenchVehicle, frames: int) -> Seen:
         "created_s": time.monotonic(),
     }
     command = [sys.executable, "-m", "bench.node_child", json.dumps(job)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    tools = Path(__file__).parents[1]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (tools, tools.parent)))}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode or "frames" not in done.stdout:
         raise RuntimeError(f"the node did not run: {done.stdout}{done.stderr}")
     return cast("Seen", json.loads(done.stdout))
