@@ -164,6 +164,11 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
             f"it, so that its CRC cannot be checked; expected {', '.join(map(str, _FD_LENGTHS))}"
         )
     protection = _made(entry, message, f"{database.layout.path}: [e2e]: message {message.name}")
+    if entry.max_delta_counter >= protection.modulus:
+        raise LayoutError(
+            f"{database.layout.path}: [e2e]: {message.name}: max_delta_counter is {entry.max_delta_counter}, but the "
+            f"counter has {protection.modulus} codes only; with it no jump could be noticed"
+        )
     if message.length < protection.least_bytes:
         raise LayoutError(
             f"{database.layout.path}: [e2e]: message {message.name} has {message.length} bytes, too few for the header "
@@ -274,6 +279,10 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> Protectio
     if counter_place.signed or modulus > counter_place.highest + 1:
         raise LayoutError(f"{where}: signal {entry.counter} cannot count from 0 to {modulus - 1}")
     crc8 = _algorithm(entry.algorithm, where)
+    if message.name in entry.data_id and entry.data_id[message.name] >= 1 << 8 * entry.data_id_bytes:
+        raise LayoutError(
+            f"{where}: data_id {entry.data_id[message.name]} does not fit into data_id_bytes = {entry.data_id_bytes}"
+        )
     identity = _data_id(entry.data_id, message).to_bytes(2, "little")[: entry.data_id_bytes]
     before, after = (identity, b"") if entry.data_id_at == "before" else (b"", identity)
     byte = crc_place.first

@@ -296,6 +296,12 @@ def read_layout(path: Path) -> Layout:
         raise LayoutError(f"{path}: not TOML: {error}") from None
     if isinstance(document.get("e2e"), dict):  # one profile: a table will do
         document["e2e"] = [document["e2e"]]
+    known = [kind.__struct_config__.tag for kind in (ProfileP01, ProfileP02, ProfileP05, CounterCrc8)]
+    for entry in document["e2e"] if isinstance(document.get("e2e"), list) else []:
+        if isinstance(entry, dict) and entry.get("profile") not in known:
+            raise LayoutError(
+                f"{path}: [e2e] profile: expected {', '.join(map(str, known))}, found {entry.get('profile')!r}"
+            )
     try:
         layout = msgspec.convert(document, Layout)
     except msgspec.ValidationError as error:

@@ -283,7 +283,8 @@ def _parts(database: VehicleDatabase) -> _Parts:
         codes = _codes(database, whole_name, {unit: 1.0}, "[watch] input")
         every_code = replace(codes, named={})  # states have names, which are no lack of a value here
         valid = [(as_written(float(value)) - codes.offset) / codes.scale for value in layout.watch.valid]
-        if any(code.denominator != 1 for code in valid):
+        lowest, highest = codes.place.lowest, codes.place.highest
+        if any(code.denominator != 1 or not lowest <= code <= highest for code in valid):
             raise LayoutError(f"{layout.path}: [watch] valid: a value that {whole_name} cannot have")
         parts.whole = auxiliary(whole_name, every_code, layout.max_age_s), frozenset(map(int, valid))
     voltages: dict[SignalName, Auxiliary] = {}
@@ -412,6 +413,12 @@ def _codes(
     no_value: list[int] | None = None,
 ) -> Codes:
     codes = read_codes(database.signal(name)[1], units, f"{database.layout.path}: {what}")
+    place = codes.place
+    if impossible := [code for code in no_value or [] if not place.lowest <= code <= place.highest]:
+        raise LayoutError(
+            f"{database.layout.path}: {what}: no_value: {name} has no code {', '.join(map(str, impossible))}; it has "
+            f"{place.lowest} to {place.highest}"
+        )
     extra = dict.fromkeys(no_value or [], "no value")
     return replace(codes, named={**extra, **codes.named}) if extra else codes
 

@@ -355,6 +355,16 @@ def test_sums_are_not_judged_while_the_layout_says_that_a_current_is_not_measure
     assert found == [Reason.NONE, Reason.CORRECTION_WORSE]
 
 
+@pytest.mark.parametrize("valid", ["7", "0.5"])
+def test_a_value_that_the_input_cannot_have_is_refused(
+    make_database: MakeDatabase, database: VehicleDatabase, valid: str
+) -> None:
+    text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
+    text += f'\n[watch]\ninput = "contactor_state"\nvalid = [2, {valid}]\n'
+    with pytest.raises(LayoutError, match=r"\[watch\] valid: a value that HV_Battery\.ContactorState cannot have"):
+        corrector_for(make_database(text, database.layout.dbc_path.read_text()))
+
+
 def test_a_set_of_which_the_calibrator_expects_no_better_sum_is_kept(database: VehicleDatabase) -> None:
     parameters = parameters_for(database, battery=(0.02, 0.0), motor=(0.0, 0.0))
     expected = replace(parameters, junction_residual=JunctionResidual(measured_a=0.0, corrected_a=3.0))

@@ -73,6 +73,14 @@ def test_codes_that_the_layout_calls_no_value_are_passed_on_untouched(make_datab
     assert found == [False, True, True]
 
 
+def test_a_code_that_the_signal_cannot_have_is_refused(make_database: MakeDatabase) -> None:
+    layout = SMALL_LAYOUT.replace('signal = "Pair.Motor"', 'signal = "Pair.Motor", no_value = [32768, -5]')
+    with pytest.raises(
+        LayoutError, match=r"branch motor: no_value: Pair\.Motor has no code 32768; it has -32768 to 32767"
+    ):
+        gateway_for(make_database(layout))
+
+
 def test_other_frames_pass_as_they_are(database: VehicleDatabase) -> None:
     corrector = gateway_for(database, battery=(0.25, 5.0))
     for key in (FrameKey(0x110, True), FrameKey(0x111, False), FrameKey(0x510, False)):
