@@ -27,7 +27,7 @@ test: setup              ## all tests; those of SocketCAN on a kernel that has i
 	$(BIN)/python -m pytest
 	tools/with_vcan --or-skip $(BIN)/python -m pytest tests/vcan
 
-bench: setup             ## how long each step takes, beside its peers; also build/bench.json (an hour)
+bench: setup             ## how long each step takes, beside its peers; also build/bench.json (long)
 	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all
 
 bench-quick: setup       ## the same at small sizes, within five minutes

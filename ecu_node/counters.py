@@ -15,6 +15,10 @@ class Counters:
     """Corrected messages made, or frames rewritten."""
     forwarded: int = 0
     """Frames passed on by a gateway, those that it rewrote included."""
+    returned: int = 0
+    """Frames passed on by a gateway from the vehicle to the sensors' bus."""
+    not_returned: int = 0
+    """Frames of the vehicle that the sensors' bus did not take."""
     held_back: int = 0
     """Frames that failed their check and that a gateway did not pass on."""
     corrupt: int = 0

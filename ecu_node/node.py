@@ -258,7 +258,6 @@ class GatewayNode:
         self._status = OwnFrames(own)
         self._not_from_vehicle = OwnFrames([*own, *rewritten(database)])
         self._ticking = _Ticking(corrector, period_s, on_tick)
-        self._returned = 0
 
     def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
         """Correct until told to stop; parameters and errors as for :meth:`OverlayNode.run`."""
@@ -273,11 +272,6 @@ class GatewayNode:
             finally:
                 ended.set()
         back.result()  # raises what ended it
-
-    @property
-    def returned(self) -> int:
-        """Frames passed on from the vehicle to the sensors."""
-        return self._returned
 
     def _pass_on(self, stop: Callable[[], bool]) -> None:
         vehicle, ticking, clock = self._vehicle, self._ticking, time.monotonic
@@ -308,14 +302,17 @@ class GatewayNode:
 
     def _pass_back(self, stop: Callable[[], bool]) -> None:
         """Pass on what the vehicle sends to the sensors' bus; a branch's frame from there must not be."""
-        vehicle, sensors = self._vehicle, self._sensors
+        vehicle, sensors, counters = self._vehicle, self._sensors, self._corrector.counters
         while not stop():
             received = vehicle.receive(_LONGEST_WAIT_S)
             while received is not None:
                 key = (received.arbitration_id, received.is_extended_id)
                 if key in self._not_from_vehicle and not received.is_remote_frame:
                     raise _another(received, vehicle)
-                self._returned += sensors.send(received)
+                if sensors.send(received):
+                    counters.returned += 1
+                else:
+                    counters.not_returned += 1
                 received = None if stop() else vehicle.receive(0.0)
 
 

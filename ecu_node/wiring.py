@@ -149,7 +149,7 @@ def wire(
     in_force: InForce,
     start_s: float,
     *,
-    mode: Mode | None = None,
+    mode: Mode = Mode.OVERLAY,
     shadow: bool = False,
 ) -> Corrector:
     """Build the node's core.
@@ -162,8 +162,8 @@ def wire(
         Checked parameters, or why there are none.
     start_s : float
         Now; branches that the parameters name are waited for from here. [s]
-    mode : Mode, optional
-        Overlay if not given.
+    mode : Mode
+        Where corrected values go.
     shadow : bool
         Compute and report, change nothing.
 
@@ -177,7 +177,6 @@ def wire(
     LayoutError, DatabaseError
         If the node cannot do its work with this layout and DBC, see :func:`ecu_node.guard.check_output`.
     """
-    mode = mode or Mode.OVERLAY
     check_output(database, mode)
     layout = database.layout
     parts = _parts(database)

@@ -12,16 +12,10 @@ from pathlib import Path
 from random import Random
 
 from bench.node_fuzz_protection import FuzzProtection, draw_protection
+from bench.true_parameters import true_parameters
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
-from ecu_node.parameters import (
-    BranchParameters,
-    FileReference,
-    HardwareFault,
-    JunctionResidual,
-    Provenance,
-    VehicleParameters,
-)
+from ecu_node.parameters import BranchParameters, VehicleParameters
 from ecu_node.sensor_models import GainBySign, SensorModel, TemperatureDrift
 
 __all__ = ["FuzzBranch", "FuzzMessage", "FuzzSignal", "FuzzVehicle", "draw_vehicle"]
@@ -292,25 +286,15 @@ class FuzzVehicle:
         return "\n".join(lines) + "\n"
 
     def _parameters(self, database: VehicleDatabase) -> VehicleParameters:
-        layout = database.layout
-        return VehicleParameters(
-            vehicle="fuzz",
-            number=1,
-            layout=FileReference(name=layout.path.name, sha256=layout.digest),
-            dbc=FileReference(name=layout.dbc, sha256=database.digest),
-            verdict="corrected",
-            branches={
+        known = [item for item in self.branches if item.known]
+        return true_parameters(
+            database,
+            {
                 item.name: BranchParameters(
                     drift=item.drift, offset_a=item.offset_a, apply=item.apply, sensor_model=item.model
                 )
-                for item in self.branches
-                if item.known
+                for item in known
             },
-            hardware_fault=HardwareFault(suspected=False),
-            junction_residual=JunctionResidual(measured_a=1.0, corrected_a=1.0),
-            provenance=Provenance(
-                tool="fuzz", method="truth", created="2026-01-01", fleet="f", fleet_size=1, drives=[], duration_s=1.0
-            ),
         )
 
 

@@ -8,19 +8,13 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from bench.true_parameters import true_parameters
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.e2e import protection_of
 from ecu_node.guard import Mode
 from ecu_node.layout import read_layout
-from ecu_node.parameters import (
-    BranchParameters,
-    FileReference,
-    HardwareFault,
-    JunctionResidual,
-    Provenance,
-    VehicleParameters,
-)
+from ecu_node.parameters import BranchParameters, VehicleParameters
 from ecu_node.wiring import InForce, wire
 
 __all__ = ["FAULTS", "IDENTIFIER", "NUMBERS", "OUT_IDENTIFIER", "BenchVehicle", "make_vehicle"]
@@ -131,7 +125,10 @@ def make_vehicle(folder: Path, *, numbered: bool) -> BenchVehicle:
         payload += (number if numbered else 0).to_bytes(2, "little")
         protection.seal(payload)
         frames.append(payload)
-    return BenchVehicle(database=database, parameters=_parameters(database), frames=frames)
+    faults = {
+        name: BranchParameters(drift=drift, offset_a=offset, apply=True) for name, (drift, offset) in FAULTS.items()
+    }
+    return BenchVehicle(database=database, parameters=true_parameters(database, faults), frames=frames)
 
 
 def _codes(current_a: float) -> list[int]:
@@ -140,22 +137,3 @@ def _codes(current_a: float) -> list[int]:
         round(sign * ((1.0 + FAULTS[name][0]) * sign * current_a + FAULTS[name][1]) / _STEPS_A[name])
         for name, sign in _SIGNS.items()
     ]
-
-
-def _parameters(database: VehicleDatabase) -> VehicleParameters:
-    layout = database.layout
-    return VehicleParameters(
-        vehicle="bench",
-        number=1,
-        layout=FileReference(name=layout.path.name, sha256=layout.digest),
-        dbc=FileReference(name=layout.dbc, sha256=database.digest),
-        verdict="corrected",
-        branches={
-            name: BranchParameters(drift=drift, offset_a=offset, apply=True) for name, (drift, offset) in FAULTS.items()
-        },
-        hardware_fault=HardwareFault(suspected=False),
-        junction_residual=JunctionResidual(measured_a=4.0, corrected_a=0.1),
-        provenance=Provenance(
-            tool="bench", method="truth", created="2026-01-01", fleet="b", fleet_size=1, drives=[], duration_s=1.0
-        ),
-    )
