@@ -7,14 +7,18 @@ import cantools
 from cantools.database.can import Database, Message, Signal
 
 from ecu_node.errors import DatabaseError
-from ecu_node.layout import Layout, file_digest, split_signal
+from ecu_node.layout import Layout, split_signal
+from ecu_node.user_files import UnsuitableFileError, read_user_file, text_digest
 
-__all__ = ["AMPERE", "CELSIUS", "VOLT", "WATT", "VehicleDatabase", "read_database", "unit_factor"]
+__all__ = ["AMPERE", "CELSIUS", "MAX_DBC_BYTES", "VOLT", "WATT", "VehicleDatabase", "read_database", "unit_factor"]
 
 AMPERE: Mapping[str, float] = {"A": 1.0, "mA": 1e-3, "kA": 1e3}
 VOLT: Mapping[str, float] = {"V": 1.0, "mV": 1e-3, "kV": 1e3}
 WATT: Mapping[str, float] = {"W": 1.0, "kW": 1e3, "mW": 1e-3, "MW": 1e6}
 CELSIUS: Mapping[str, float] = dict.fromkeys(("degC", "°C", "C", "deg C", "Celsius"), 1.0)
+
+MAX_DBC_BYTES = 16_000_000
+"""The largest DBCs have some megabytes; to read one takes a hundred times its size in memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,14 +81,14 @@ def read_database(layout: Layout) -> VehicleDatabase:
     """
     path = layout.dbc_path
     try:
-        if not path.read_bytes().strip():
+        content = read_user_file(path, largest_bytes=MAX_DBC_BYTES)
+        if not content.strip():
             raise DatabaseError(f"{path}: the DBC is empty, it has no message; copy it again")
         database = cantools.database.load_file(path, strict=False)
-        digest = file_digest(path)
-    except OSError as error:
+    except (OSError, UnsuitableFileError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
         raise DatabaseError(
-            f'{path}: cannot read the DBC: {error.strerror}; it is named by the line dbc = "{layout.dbc}" of '
-            f"{layout.path}"
+            f'{path}: cannot read the DBC: {why}; it is named by the line dbc = "{layout.dbc}" of {layout.path}'
         ) from None
     except (cantools.Error, ValueError, KeyError, TypeError) as error:
         first_line = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -93,7 +97,7 @@ def read_database(layout: Layout) -> VehicleDatabase:
         raise DatabaseError(f"{path}: a diagnostics database; a CAN database (DBC) is needed")
     if not database.messages:
         raise DatabaseError(f"{path}: the DBC has no message; check that it is the one that {layout.path} needs")
-    vehicle = VehicleDatabase(layout=layout, database=database, digest=digest)
+    vehicle = VehicleDatabase(layout=layout, database=database, digest=text_digest(content))
     _look_everything_up(vehicle)
     return vehicle
 

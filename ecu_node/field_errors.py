@@ -21,6 +21,7 @@ Place = tuple[Step, ...]
 
 _MESSAGE = re.compile(r"(?P<what>.*?)(?: - at `(?P<in_key>key in )?\$?(?P<path>.*)`)?", re.DOTALL)
 _STEP = re.compile(r"\.(?P<key>\w+)|\[(?P<index>\d+)\]|(?P<any>\[\.\.\.\])")
+_LENGTH = re.compile(r" of length (?P<relation>[<>])= (?P<number>\d+)")
 _WORDS = {
     "array": "a list",
     "bool": "true or false",
@@ -166,8 +167,18 @@ def _what(text: str, found: Any, kind: inspect.Type | None) -> str:
         return f"{text}, found {_shown(found)}"
     words = _WORDS.get(expected[1], expected[1])
     if expected[2].startswith(" matching regex"):
-        return f"{_pattern_words(expected[2])} is expected, found {_shown(found)}"
-    return f"{words}{expected[2].replace('length', 'number of entries')} is expected, found {_shown(found)}"
+        words = _pattern_words(expected[2])
+    elif length := _LENGTH.fullmatch(expected[2]):
+        bound = "at least" if length["relation"] == ">" else "at most"
+        words += f" of {bound} {_count_words(int(length['number']), is_text=expected[1] == 'str')}"
+    else:
+        words += expected[2]
+    return f"{words} is expected, found {_shown(found)}"
+
+
+def _count_words(number: int, *, is_text: bool) -> str:
+    one, more = ("character", "characters") if is_text else ("entry", "entries")
+    return f"{number} {one if number == 1 else more}"
 
 
 def _pattern_words(text: str) -> str:

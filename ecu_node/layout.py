@@ -4,7 +4,6 @@ It names the branches of the junction with their sign, the inputs, where correct
 All later steps use the names given here; the DBC's own names appear nowhere else.
 """
 
-import hashlib
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,8 +14,10 @@ import msgspec
 from ecu_node.errors import LayoutError
 from ecu_node.field_errors import field_error, toml_place
 from ecu_node.formula import formula_names, parse_formula
+from ecu_node.user_files import UnsuitableFileError, read_user_file, text_digest
 
 __all__ = [
+    "MAX_LAYOUT_BYTES",
     "Branch",
     "Contactor",
     "CounterCrc8",
@@ -42,6 +43,9 @@ Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 """A name without blanks."""
 SignalName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]*\.[A-Za-z_][A-Za-z0-9_]*$")]
 """``Message.Signal``, as both are called in the DBC."""
+
+MAX_LAYOUT_BYTES = 1_000_000
+"""A layout has some kilobytes; a larger file is not one."""
 
 _Positive = Annotated[float, msgspec.Meta(gt=0.0, le=1e6)]
 
@@ -286,13 +290,14 @@ def read_layout(path: Path) -> Layout:
         If the file cannot be read, is not TOML, or a field is missing, unknown or contradictory.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-        document = tomllib.loads(text)
-    except OSError as error:
-        raise LayoutError(f"{path}: cannot read the layout: {error.strerror}") from None
+        content = read_user_file(path, largest_bytes=MAX_LAYOUT_BYTES)
+        document = tomllib.loads(content.decode())
+    except (OSError, UnsuitableFileError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise LayoutError(f"{path}: cannot read the layout: {why}") from None
     except UnicodeDecodeError:
         raise LayoutError(f"{path}: not a layout: the file is not UTF-8 text") from None
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # not only TOMLDecodeError: numbers and nesting have limits, too
         raise LayoutError(f"{path}: not TOML: {error}") from None
     if isinstance(document.get("e2e"), dict):  # one profile: a table will do
         document["e2e"] = [document["e2e"]]
@@ -307,12 +312,12 @@ def read_layout(path: Path) -> Layout:
     except msgspec.ValidationError as error:
         raise LayoutError(f"{path}: {field_error(error, document, Layout, toml_place)}; see docs/layout.md") from None
     _check(layout, path)
-    return msgspec.structs.replace(layout, path=path, digest=file_digest(path))
+    return msgspec.structs.replace(layout, path=path, digest=text_digest(content))
 
 
 def file_digest(path: Path) -> str:
     """SHA-256 of a text file, the same for LF and CRLF line ends."""
-    return hashlib.sha256(path.read_bytes().replace(b"\r\n", b"\n")).hexdigest()
+    return text_digest(path.read_bytes())
 
 
 def split_signal(name: SignalName) -> tuple[str, str]:
