@@ -20,6 +20,7 @@ from ecu_node.monitor_model import BusMonitor, View
 from ecu_node.monitor_text import COLUMNS, LEFT, as_json, node_line, notes, plain_block, rows
 from ecu_node.node import open_bus
 from ecu_node.service import Log, Requests
+from ecu_node.standard_output import write_output
 
 __all__ = ["MonitorOptions", "listen", "run_monitor"]
 
@@ -157,7 +158,7 @@ def _display(options: MonitorOptions, where: str) -> Iterator[tuple[_Show, float
 
     def show_plainly(view: View, more: list[str]) -> None:
         text = json.dumps(as_json(view), indent=2) if options.as_json else plain_block(view, where, more)
-        print(text if options.once_s is not None else f"{text}\n", flush=True)
+        write_output(text if options.once_s is not None else f"{text}\n")
 
     yield show_plainly, options.once_s or _PLAIN_PERIOD_S
 
@@ -200,4 +201,4 @@ def _live_table(where: str) -> Iterator[_Show]:
 
         yield show
     if last:
-        print(last)  # what was seen last stays on the screen
+        write_output(last)  # what was seen last stays on the screen
