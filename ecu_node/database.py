@@ -30,13 +30,14 @@ class VehicleDatabase:
     digest: str
     """SHA-256 of the DBC file."""
 
-    def message(self, name: str) -> Message:
-        """Return the message of this name, or raise :class:`DatabaseError`."""
+    def message(self, name: str, place: str = "") -> Message:
+        """Return the message of this name, which stands at this place of the layout, or raise DatabaseError."""
         try:
             return self.database.get_message_by_name(name)
         except KeyError:
+            where = f" in {place}" if place else ""
             raise DatabaseError(
-                f"{self.layout.dbc_path}: no message {name!r}, which {self.layout.path} names"
+                f"{self.layout.dbc_path}: no message {name!r}, which {self.layout.path} names{where}"
             ) from None
 
     def signal(self, name: str) -> tuple[Message, Signal]:
@@ -155,6 +156,6 @@ def _look_everything_up(vehicle: VehicleDatabase) -> None:
             signal = getattr(layout.status, field)
             if signal is not None:
                 vehicle.signal(f"{layout.status.message}.{signal}")
-    for entry in layout.e2e:
+    for place, entry in layout.protections:
         for name in entry.messages:
-            vehicle.message(name)
+            vehicle.message(name, place)

@@ -57,7 +57,7 @@ def field_error(error: msgspec.ValidationError, document: Any, schema: Any, plac
     assert match is not None, "the pattern matches every text"
     steps = _steps(match["path"] or "", str(error), document, schema)
     words = place(document, steps)
-    what = _what(match["what"], _found(document, steps), _kind(schema, steps))
+    what = _what(match["what"], _found(document, steps), _kind(schema, document, steps))
     return f"{words}: {what}" if words else what
 
 
@@ -128,12 +128,21 @@ def _found(document: Any, steps: Place) -> Any:
     return document
 
 
-def _kind(schema: Any, steps: Place) -> inspect.Type | None:
+def _kind(schema: Any, document: Any, steps: Place) -> inspect.Type | None:
     """What the schema expects at a place; None if it says nothing of it."""
     kinds = list(_alternatives(inspect.type_info(schema)))
-    for step in steps:
-        kinds = [inner for kind in kinds for inner in _alternatives(_inside(kind, step))]
+    for depth, step in enumerate(steps, start=1):
+        found = _found(document, steps[:depth])
+        inside = (inner for kind in kinds for inner in _alternatives(_inside(kind, step)))
+        kinds = [kind for kind in inside if _may_be(kind, found)]
     return kinds[0] if kinds else None
+
+
+def _may_be(kind: inspect.Type, found: Any) -> bool:
+    """Whether this alternative is meant, by the tag that tells some of them apart."""
+    if not isinstance(kind, inspect.StructType) or kind.tag_field is None or not isinstance(found, Mapping):
+        return True
+    return bool(found.get(kind.tag_field) == kind.tag)
 
 
 def _inside(kind: inspect.Type, step: Step) -> inspect.Type | None:
@@ -189,7 +198,9 @@ def _pattern_words(text: str) -> str:
 
 
 def _unknown_key(key: str, kind: inspect.Type | None) -> str:
-    allowed = [field.encode_name for field in kind.fields] if isinstance(kind, inspect.StructType) else []
+    allowed = []
+    if isinstance(kind, inspect.StructType):
+        allowed = [*([kind.tag_field] if kind.tag_field else []), *(field.encode_name for field in kind.fields)]
     near = difflib.get_close_matches(key, allowed, n=1)
     hint = f"did you mean '{near[0]}'? " if near else ""
     return f"unknown key '{key}'; {hint}allowed are {', '.join(allowed)}"
