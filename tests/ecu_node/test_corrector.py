@@ -361,8 +361,19 @@ def test_a_value_that_the_input_cannot_have_is_refused(
 ) -> None:
     text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
     text += f'\n[watch]\ninput = "contactor_state"\nvalid = [2, {valid}]\n'
-    with pytest.raises(LayoutError, match=r"\[watch\] valid: a value that HV_Battery\.ContactorState cannot have"):
-        corrector_for(make_database(text, database.layout.dbc_path.read_text()))
+    words = rf"small\.toml: \[watch\] valid: {valid} is no value of HV_Battery\.ContactorState, which has 2 bits"
+    with pytest.raises(LayoutError, match=words):
+        make_database(text, database.layout.dbc_path.read_text())
+
+
+@pytest.mark.parametrize("value", ["4", "-1", "0.5"])
+def test_a_contactor_state_that_can_never_be_is_refused(
+    make_database: MakeDatabase, database: VehicleDatabase, value: str
+) -> None:
+    text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
+    words = rf"small\.toml: \[contactor\] open: {value} is no value of HV_Battery\.ContactorState, which has 2 bits"
+    with pytest.raises(LayoutError, match=words):
+        make_database(text.replace("open = [0]", f"open = [0, {value}]"), database.layout.dbc_path.read_text())
 
 
 def test_a_set_of_which_the_calibrator_expects_no_better_sum_is_kept(database: VehicleDatabase) -> None:
@@ -543,6 +554,8 @@ OTHER_SENDER = (
  SG_ Reason : 8|8@1+ (1,0) [0|255] "" Node
 """
 )
+OWN_SUM = OWN_STATUS + 'sum_measured = "Sum"\n'
+WITH_SUM = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Sum : 16|16@1- (0.1,0) [0|0] "A" Node\n'
 STATUS_TABLE = '\n[status]\nmessage = "PairOut"\nstate = "Quality"\nreason = "Battery"\n'
 
 
@@ -562,6 +575,17 @@ STATUS_TABLE = '\n[status]\nmessage = "PairOut"\nstate = "Quality"\nreason = "Ba
             SMALL_LAYOUT,
             SMALL_DBC.replace('512 Motor -32768 "SNA"', '512 Motor 32767 "Max"'),
             "Motor needs a code named SNA",
+        ),
+        (SMALL_LAYOUT + OWN_SUM, WITH_SUM, r"small\.toml: status: signal Sum needs a code named SNA in the DBC"),
+        (
+            SMALL_LAYOUT + OWN_SUM,
+            WITH_SUM + 'VAL_ 600 Sum 3 "SNA";\n',
+            "status: code 3 of signal Sum means 'SNA', so that no result beyond 0.2 could be written",
+        ),
+        (
+            SMALL_LAYOUT,
+            SMALL_DBC.replace('512 Motor -32768 "SNA"', '512 Motor -32768 "SNA" -1 "Init"'),
+            r"small\.toml: branch motor: code -1 of signal Motor means 'Init', .* beyond 0 could be written",
         ),
         (
             SMALL_LAYOUT + STATUS_TABLE,
