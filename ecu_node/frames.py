@@ -183,7 +183,7 @@ class Source:
             return ()
         for target in self._targets:
             target.make(now_s)
-            counters.corrected += 1
+            counters.answers += 1
         return self._targets
 
     def _forward(self, payload: bytearray, now_s: float) -> bytearray | None:
@@ -207,7 +207,7 @@ class Source:
                 signal.place.put(rewritten, code if out is None else out)
         if rewritten == payload:
             return payload
-        counters.corrected += 1
+        counters.rewritten += 1
         if self._protection is not None:
             self._protection.seal(rewritten)
         return rewritten

@@ -69,6 +69,13 @@ def test_a_branch_frame_is_answered_by_its_corrected_frame(database: VehicleData
     assert e2e_p01_check(bytearray(answer.data), 1296)
 
 
+def test_answers_count_whether_or_not_they_are_corrected(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.25, 5.0))
+    for frame in (battery(database, 0), motor(database, 0), battery(database, 1)):
+        answers(corrector, frame, 0.0)
+    assert (corrector.counters.answers, corrector.counters.rewritten) == (3, 0)
+
+
 def test_a_consumer_is_corrected_with_its_offset_into_the_junction(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, motor=(0.25, 5.0))
     (answer,) = answers(corrector, motor(database, 0), 0.0)
@@ -142,7 +149,7 @@ def test_nothing_is_made_of_a_corrupt_frame(database: VehicleDatabase) -> None:
         damaged = (int.from_bytes(good.data, "little") ^ 1 << bit).to_bytes(8, "little")
         assert answers(corrector, Frame(BATTERY, damaged), 0.0) == []
     assert answers(corrector, Frame(BATTERY, b""), 0.0) == []
-    assert (corrector.counters.corrupt, corrector.counters.corrected) == (65, 0)
+    assert (corrector.counters.corrupt, corrector.counters.answers) == (65, 0)
     assert len(answers(corrector, good, 0.0)) == 1
 
 
@@ -618,3 +625,22 @@ def test_a_layout_that_publishes_nothing_is_refused(make_database: MakeDatabase)
     ]
     with pytest.raises(LayoutError, match="nothing to publish"):
         corrector_for(make_database("\n".join(lines)))
+
+
+def test_a_frame_that_leaves_the_current_out_is_answered_with_its_last_value_until_that_is_stale(
+    make_database: MakeDatabase,
+) -> None:
+    multiplexed = SMALL_DBC.replace(
+        " SG_ Battery : 7|16@0-", ' SG_ Page M : 48|8@1+ (1,0) [0|255] "" Node\n SG_ Battery m0 : 7|16@0-', 1
+    )
+    database = make_database(dbc=multiplexed)
+    corrector = corrector_for(database, battery=(0.5, 0.0))
+    with_it = database.message("Pair").encode({"Page": 0, "Battery": 150.0, "Motor": 0.0})
+    without = bytes((0, 0, 0, 0, 0, 0, 1, 0))
+    found = []
+    for time_s, data in ((0.0, with_it), (0.1, without), (0.4, without), (0.6, without)):
+        (answer,) = answers(corrector, Frame(PAIR, data), time_s)
+        values = decoded(database, "PairOut", answer.data)
+        found.append((values["Battery"], values["Quality"]))
+    current = (100.0, Quality.CORRECTED)
+    assert found == [current, current, current, (-3276.8, Quality.NOT_AVAILABLE)]

@@ -43,6 +43,16 @@ def test_only_the_current_and_the_crc_change(database: VehicleDatabase) -> None:
         assert after == before
 
 
+@pytest.mark.parametrize(("faults", "rewritten"), [({"battery": (0.25, 5.0)}, 3), ({"motor": (0.25, 5.0)}, 0)])
+def test_frames_whose_current_is_changed_are_counted_and_no_others(
+    database: VehicleDatabase, faults: dict[str, tuple[float, float]], rewritten: int
+) -> None:
+    corrector = gateway_for(database, **faults)
+    for counter in range(3):
+        passed_on(corrector, battery(database, counter), 0.0)
+    assert (corrector.counters.frames_in, corrector.counters.rewritten, corrector.counters.answers) == (3, rewritten, 0)
+
+
 def test_bits_that_no_signal_covers_survive(make_database: MakeDatabase) -> None:
     database = make_database()
     corrector = gateway_for(database, battery=(0.5, 3.0))
@@ -75,9 +85,7 @@ def test_codes_that_the_layout_calls_no_value_are_passed_on_untouched(make_datab
 
 def test_a_code_amid_the_values_that_the_layout_calls_no_value_is_refused(make_database: MakeDatabase) -> None:
     layout = SMALL_LAYOUT.replace('signal = "Pair.Motor"', 'signal = "Pair.Motor", no_value = [77]')
-    with pytest.raises(
-        DatabaseError, match="branch motor: code 77 of signal Motor means 'no value', so that"
-    ):
+    with pytest.raises(DatabaseError, match="branch motor: code 77 of signal Motor means 'no value', so that"):
         gateway_for(make_database(layout))
 
 
