@@ -9,6 +9,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import can
@@ -18,7 +19,7 @@ from ecu_node.errors import BusError
 from ecu_node.links import Link, OneByOne, is_of
 from ecu_node.socketcan import SocketCanLink
 
-__all__ = ["SteadyBus", "connect"]
+__all__ = ["SteadyBus", "carries_fd", "connect"]
 
 _SEND_ATTEMPTS = 3
 _SEND_PAUSE_S = 0.001
@@ -31,6 +32,9 @@ _RECEIVE_BUFFER_BYTES = 1 << 20
 """Asked of the kernel, which gives what it allows: frames of the time in which the node does something else."""
 _SO_MEMINFO, _DROPS = 55, 8
 """Socket option, and the place of the dropped frames in it (asm-generic/socket.h, linux/sock_diag.h)."""
+_INTERFACES = Path("/sys/class/net")
+_FD_BYTES = 72
+"""Of struct canfd_frame: the largest unit of an interface that carries them."""
 _BUS_OFF = 0x40
 """Class of error frames of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
 
@@ -75,6 +79,16 @@ def connect(
     if opened is not None:
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
     return bus
+
+
+def carries_fd(interface: str, channel: str) -> bool:
+    """Whether an interface of SocketCAN is set up for CAN FD; False where that is not known."""
+    if interface != "socketcan":
+        return False
+    try:
+        return int((_INTERFACES / channel / "mtu").read_text()) >= _FD_BYTES
+    except (OSError, ValueError):
+        return False
 
 
 class SteadyBus:

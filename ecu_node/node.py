@@ -27,6 +27,8 @@ _LOOK_EVERY_S = 0.1
 """The junction is looked at, and the watchdog fed, at least this often, however rare the status is. [s]"""
 _LISTEN_PERIODS, _LONGEST_LISTEN_S = 1.5, 1.5
 """So many status periods, but no longer than this [s], the node listens for another one before it says anything."""
+_LONGEST_TURN_S = 2.0
+"""A gateway's way back is at work if it has looked for frames within this time. [s]"""
 _LONGEST_DELAY_S = 1.0
 """A gateway passes a branch's frame on only if it waited no longer than this, or than the branch's timeout. [s]"""
 _STANDARD_MASK = 0x7FF
@@ -265,13 +267,16 @@ class GatewayNode:
         own = transmitted(database, Mode.GATEWAY)
         self._status = OwnFrames(own)
         self._not_from_vehicle = OwnFrames([*own, *rewritten(database)])
-        self._ticking = _Ticking(corrector, period_s, on_tick)
+        self._on_tick = on_tick
+        self._ticking = _Ticking(corrector, period_s, self._while_both_ways_work)
+        self._back_s = float("-inf")
 
     def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
         """Correct until told to stop; parameters and errors as for :meth:`OverlayNode.run`."""
         _listen(self._vehicle, self._not_from_vehicle, stop, self._ticking.period_s)
         _discard(self._sensors)
         ready()
+        self._back_s = time.monotonic()
         ended = threading.Event()
         with ThreadPoolExecutor(1, "back") as pool:
             back = pool.submit(self._pass_back, lambda: stop() or ended.is_set())
@@ -280,6 +285,11 @@ class GatewayNode:
             finally:
                 ended.set()
         back.result()  # raises what ended it
+
+    def _while_both_ways_work(self, now_s: float) -> None:
+        """Let the watchdog see it if the way back is stuck."""
+        if time.monotonic() - self._back_s < _LONGEST_TURN_S:
+            self._on_tick(now_s)
 
     def _pass_on(self, stop: Callable[[], bool]) -> None:
         sensors, vehicle, ticking = self._sensors, self._vehicle, self._ticking
@@ -315,6 +325,7 @@ class GatewayNode:
         """Pass on what the vehicle sends to the sensors' bus; a branch's frame from there must not be."""
         vehicle, sensors, counters = self._vehicle, self._sensors, self._corrector.counters
         while not stop():
+            self._back_s = time.monotonic()
             received = vehicle.receive(_LONGEST_WAIT_S)
             while received is not None:
                 key = (received.arbitration_id, received.is_extended_id)
@@ -325,9 +336,8 @@ class GatewayNode:
                     sent, not_sent = sensors.flush()
                     counters.returned += sent
                     counters.not_returned += not_sent
-                    received = None if stop() else vehicle.receive(0.0)
-                else:
-                    received = vehicle.receive(0.0)
+                    self._back_s = time.monotonic()
+                received = None if stop() else vehicle.receive(0.0)
 
 
 def _listen(bus: SteadyBus, own: OwnFrames, stop: Callable[[], bool], period_s: float) -> None:

@@ -53,7 +53,7 @@ def fields(message: can.Message) -> tuple[object, ...]:
 
 
 def received(link: SocketCanLink, count: int) -> list[can.Message]:
-    found = []
+    found: list[can.Message] = []
     while len(found) < count and (message := link.receive(1.0)) is not None:
         found.append(message)
     return found
@@ -158,9 +158,14 @@ def test_a_bus_that_takes_no_more_says_how_many_it_took(ends: Ends) -> None:
     link, far = ends
     frames = [can.Message(arbitration_id=number) for number in range(1000)]
     done = 0
-    with pytest.raises(OSError, match="unavailable") as caught:
+
+    def fill() -> None:
+        nonlocal done
         while True:
             done += link.send(frames, done)
+
+    with pytest.raises(OSError, match="unavailable") as caught:
+        fill()
     assert caught.value.errno in {errno.EAGAIN, errno.ENOBUFS}
     numbers = [dissect_can_frame(far.recv(128))[0] & 0x1FFFFFFF for _ in range(done)]
     assert numbers == list(range(done))

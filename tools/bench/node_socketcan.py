@@ -4,8 +4,9 @@
 
 Compared are ``ecu-node run --gateway``, a python-can loop that only receives and sends, the plain version with Notifier
 and cantools, and the kernel's own gateway (cangw), which changes nothing. One raw socket sends, another one receives
-and compares each frame, both many frames at a time, so that what is measured is what is between them. Where this runs on user-mode-linux a system call costs ten times more than on a bare machine,
-and all share one processor: the ratios count there, not the rates.
+and compares each frame, both many frames at a time, so that what is measured is what is between them. Where this runs
+on user-mode-linux a system call costs ten times more than on a bare machine, and all share one processor: the ratios
+count there, not the rates.
 """
 
 import argparse
@@ -138,9 +139,9 @@ class _Line:
 
     def send(self, count: int = 1) -> None:
         """The next frames."""
-        frames, some, done = self._frames, [], 0
-        for number in range(self._sent, self._sent + count):
-            some.append(frames[number % len(frames)])
+        numbers = range(self._sent, self._sent + count)
+        some = [self._frames[number % len(self._frames)] for number in numbers]
+        done = 0
         while done < count:
             done += self._near.send(some, done)
         self._sent += count
