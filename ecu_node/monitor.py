@@ -10,7 +10,8 @@ from pathlib import Path
 
 import can
 
-from ecu_node.buses import SteadyBus, steady_time_s
+from ecu_node.buses import SteadyBus
+from ecu_node.clocks import steady_time_s
 from ecu_node.counters import Counters
 from ecu_node.database import read_database
 from ecu_node.errors import UserError

@@ -362,6 +362,23 @@ def test_sums_are_not_judged_while_the_layout_says_that_a_current_is_not_measure
     assert found == [Reason.NONE, Reason.CORRECTION_WORSE]
 
 
+@pytest.mark.parametrize(("window_s", "fallen_back_s"), [(1.0, 1.5), (10.0, 10.5), (600.0, 600.5)])
+def test_sums_of_any_window_are_judged_at_ten_looks_per_second(
+    make_database: MakeDatabase, database: VehicleDatabase, window_s: float, fallen_back_s: float
+) -> None:
+    text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
+    text += f"\n[watch]\nwindow_s = {window_s}\n"
+    own = make_database(text, database.layout.dbc_path.read_text())
+    corrector = corrector_for(own, battery=(0.2, 0.0), motor=(0.0, 0.0))
+    for k in range(round(10.0 * fallen_back_s)):
+        answers(corrector, battery(own, k % 15), 0.1 * k)
+        answers(corrector, motor(own, k % 15), 0.1 * k)
+        if 0.1 * k < 0.85 * window_s:
+            assert corrector.state()[1] == Reason.NONE
+        corrector.look(0.1 * k + 0.01)
+    assert corrector.state()[1] == Reason.CORRECTION_WORSE
+
+
 @pytest.mark.parametrize("valid", ["7", "0.5"])
 def test_a_value_that_the_input_cannot_have_is_refused(
     make_database: MakeDatabase, database: VehicleDatabase, valid: str

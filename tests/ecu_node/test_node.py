@@ -316,7 +316,7 @@ def test_a_frame_that_comes_after_the_clock_was_set_is_not_taken_for_an_old_one(
 ) -> None:
     bus = SetClockBus(request.node.name)
     bus.clock, bus.frames = SetClock(), []
-    monkeypatch.setattr("ecu_node.buses.time", bus.clock)
+    monkeypatch.setattr("ecu_node.clocks.time", bus.clock)
     with node_on(database, "", lambda: bus) as corrector:
         wait_until(lambda: corrector.state()[0] is State.STARTING)
         bus.frames = [protected(database, "HV_Battery", k) for k in range(8)]
@@ -392,7 +392,8 @@ def test_a_bus_of_which_only_sending_tells_that_it_is_gone_is_opened_again(
 
 def test_a_bus_that_the_other_thread_has_just_closed_is_no_surprise(request: pytest.FixtureRequest) -> None:
     bus = SteadyBus(lambda: ClosedBus(request.node.name), Counters())
-    assert not bus.send(can.Message(arbitration_id=1, is_extended_id=False))
+    bus.send(can.Message(arbitration_id=1, is_extended_id=False))
+    assert bus.flush() == (0, 1)
     bus.close()
 
 
