@@ -116,4 +116,5 @@ def test_a_gateway_that_cannot_see_can_fd_says_so(
 ) -> None:
     with start_node(params, "--vehicle", VEHICLE, "--gateway", OTHER_CHANNEL) as node:
         other_recording.wait_for(int(STATUS, 16), 1)
-    assert f"{CHANNEL} and {OTHER_CHANNEL}: set up for CAN FD, of which nothing is passed on without --fd" in node.messages
+    text = f"{CHANNEL} and {OTHER_CHANNEL}: set up for CAN FD, of which nothing is passed on without --fd"
+    assert text in node.messages
