@@ -7,6 +7,7 @@ import contextlib
 import errno
 import socket
 import struct
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -121,10 +122,13 @@ class SteadyBus:
         self._retry_s, self._pause_s = 0.0, _FIRST_PAUSE_S
         self._queue: list[can.Message] = []
         self._is_full = False
+        self._closing = threading.Lock()
         self.send = self._queue.append
         """Takes a frame to be sent at the next :meth:`flush`."""
         self.asked_s = time.monotonic()
-        """When the bus was asked last: what came before that was received. [s]"""
+        """When the bus was asked last; if it had no more, all that came before was received. [s]"""
+        self.read_s = self.asked_s
+        """When the last frame was read. [s]"""
         self.channel = bus.channel_info
 
     @property
@@ -151,7 +155,7 @@ class SteadyBus:
         except (can.CanError, OSError) as error:
             self._gone(error)
             return None
-        self.asked_s = opened.link.asked_s
+        self.asked_s, self.read_s = opened.link.asked_s, opened.link.read_s
         return message
 
     def flush(self) -> tuple[int, int]:
@@ -160,34 +164,44 @@ class SteadyBus:
         Returns
         -------
         sent, not_sent : int
-            Frames that the bus took, and that it did not take in a few attempts, or in one while it is full.
+            Frames that the bus took, and that it did not: a full one is asked a few times, and once while it stays so.
         """
-        queue, done, lost, attempts = self._queue, 0, 0, 0
+        queue, done, lost = self._queue, 0, 0
         while done < len(queue):
             opened = self._opened
             if opened is None:
                 lost += len(queue) - done
                 break
-            try:
-                done += opened.link.send(queue, done)
-            except (can.CanError, OSError, ValueError) as error:  # ValueError: closed by the other thread just now
-                if _number(error) in _GONE:
-                    # Whoever asks first is told that the bus is gone, and nobody after: receiving need not fail, too.
-                    self._failed = opened, error
-                    lost += len(queue) - done
-                    break
-                attempts += 1
-                if attempts < (1 if self._is_full else _SEND_ATTEMPTS):
-                    time.sleep(_SEND_PAUSE_S)
-                    continue
-                self._is_full = True
-                done, lost = done + 1, lost + 1
-            else:
-                self._is_full = False
-            attempts = 0
+            taken, error = self._given(opened, done)
+            done += taken
+            if error is None:
+                continue
+            if _number(error) in _GONE:
+                # Whoever asks first is told that the bus is gone, and nobody after: receiving need not fail, too.
+                self._failed = opened, error
+            refused = 1 if _is_of_frame(error) else len(queue) - done  # what is full is full for all that follow
+            done, lost = done + refused, lost + refused
         sent = len(queue) - lost
         queue.clear()
         return sent, lost
+
+    def _given(self, opened: "_Opened", done: int) -> tuple[int, Exception | None]:
+        """Give the bus what it takes now: how many frames, and why not the next one after some patience."""
+        for attempt in range(1 if self._is_full else _SEND_ATTEMPTS):
+            if attempt:
+                time.sleep(_SEND_PAUSE_S)
+            try:
+                with self._closing:
+                    taken = opened.link.send(self._queue, done)
+            except (can.CanError, OSError, ValueError) as error:  # ValueError: closed by the other thread just now
+                last = error
+                if _number(error) in _GONE or _is_of_frame(error):
+                    return 0, error
+            else:
+                self._is_full = False
+                return taken, None
+        self._is_full = True
+        return 0, last
 
     def count_dropped(self) -> None:
         """Count the frames that the kernel dropped since the last time, because they were not read in time."""
@@ -199,7 +213,8 @@ class SteadyBus:
         """Close it."""
         opened, self._opened = self._opened, None
         if opened is not None:
-            opened.bus.shutdown()
+            with self._closing:  # else the other thread might send into whatever takes the socket's number
+                opened.bus.shutdown()
 
     def _count_error(self, message: can.Message) -> None:
         self._counters.bus_errors += 1
@@ -268,6 +283,11 @@ def _socket(bus: can.BusABC) -> socket.socket | None:
     """Socket of a bus of SocketCAN."""
     found = getattr(bus, "socket", None) if is_of(bus, "socketcan") else None
     return found if isinstance(found, socket.socket) else None
+
+
+def _is_of_frame(error: Exception) -> bool:
+    """Whether it is this frame that the bus does not take, whatever its state, as one that is too long for it."""
+    return _number(error) in {errno.EINVAL, errno.EMSGSIZE}
 
 
 def _number(error: Exception) -> int | None:

@@ -7,7 +7,7 @@ from ecu_node.counters import Counters
 __all__ = ["TimeOfDay", "steady_time_s"]
 
 _OLDEST_FRAME_S = 10.0
-"""No frame waits for longer: an older time stamp is one of another clock. [s]"""
+"""No frame waits for longer, unless the whole process pauses. [s]"""
 _LARGEST_JITTER_S = 0.05
 """By more than this the time of day changes against the steady clock only if it is set. [s]"""
 
@@ -27,10 +27,11 @@ def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float) -> float:
     Returns
     -------
     float
-        The stamp on the steady clock; now if that would be in the future or very long ago, or the clock was set.
+        The stamp on the steady clock; now if there is none, it would be in the future, or the clock was set.
     """
-    time_s = stamp_s - clock_ahead_s
-    return time_s if now_s - _OLDEST_FRAME_S <= time_s <= now_s else now_s
+    if stamp_s == 0.0 or clock_ahead_s == float("inf"):
+        return now_s
+    return min(stamp_s - clock_ahead_s, now_s)
 
 
 class TimeOfDay:

@@ -150,6 +150,10 @@ def writable_range(codes: Codes, where: str) -> tuple[int, int]:
     return lowest, highest
 
 
+_NEARLY = Fraction(98, 100)
+"""A range that reaches this share of what it could is whole, but for codes beside those with names. [1]"""
+
+
 def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
     """Refuse a signal to write if a name amid its values keeps results of full scale out.
 
@@ -172,7 +176,7 @@ def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
         outermost = extreme
         while outermost in codes.named:  # names at the ends of the range keep no value out
             outermost += inwards
-        if end == outermost or abs(codes.worth(end)) >= largest:
+        if abs(codes.worth(end)) >= min(largest, _NEARLY * abs(codes.worth(outermost))):
             continue
         named = end - inwards
         raise DatabaseError(

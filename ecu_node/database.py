@@ -84,6 +84,8 @@ def read_database(layout: Layout) -> VehicleDatabase:
         if not content.strip():
             raise DatabaseError(f"{path}: the DBC is empty, it has no message; copy it again")
         database = cantools.database.load_file(path, strict=False)
+        if read_user_file(path, largest_bytes=MAX_DBC_BYTES) != content:
+            raise DatabaseError(f"{path}: the DBC was changed while it was read; try again")
     except (OSError, UnsuitableFileError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise DatabaseError(

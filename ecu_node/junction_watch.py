@@ -5,8 +5,9 @@ in between by linear interpolation. The instant is the newest one that all branc
 into the junction. [A]
 """
 
+import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from ecu_node.branch import LiveBranch
@@ -18,7 +19,7 @@ _MOST_MARGINS = 10.0
 _LEAST_LOOKS = 10
 """Sums that a verdict needs."""
 _MOST_LOOKS = 200
-"""Sums that are kept of a window, at equal distances: a long window is to cost no more than a short one."""
+"""Parts of a window, each with the sums of its looks: a long window is to cost no more than a short one."""
 _STUCK_SHARE = 0.02
 """Standard deviation of the measured sum, in shares of full scale, at which a code that never changes is suspicious."""
 _REST_SHARE = 0.005
@@ -78,7 +79,7 @@ class JunctionWatch:
 
     def forget(self) -> None:
         """Begin a new window."""
-        self._past: deque[tuple[float, JunctionSums, dict[str, int]]] = deque()
+        self._past: deque[_Looks] = deque()
         self._instant_s = float("-inf")
         self.sums: JunctionSums | None = None
 
@@ -108,11 +109,13 @@ class JunctionWatch:
         self.sums = JunctionSums(measured_a=sum(pair[0] for pair in known), corrected_a=sum(pair[1] for pair in known))
         if not self._is_whole():
             self._past.clear()
-        elif instant_s > self._instant_s and not self._is_close(now_s):
+        elif instant_s > self._instant_s:
             self._instant_s = instant_s
-            codes = {branch.name: code for branch, (_, code) in zip(fitted, latest, strict=True)}
-            self._past.append((now_s, self.sums, codes))
-        while self._past and now_s - self._past[0][0] > self._window_s:
+            if not self._past or now_s - self._past[-1].time_s >= self._window_s / _MOST_LOOKS:
+                self._past.append(_Looks(now_s))
+            codes = {branch.name: found[1] for branch, found in zip(fitted, latest, strict=True)}
+            self._past[-1].add(self.sums, codes)
+        while self._past and now_s - self._past[0].time_s > self._window_s:
             self._past.popleft()
         return self.sums
 
@@ -120,24 +123,24 @@ class JunctionWatch:
         """Whether the corrected sums of a whole window are worse than the measured ones."""
         if not self._is_full():
             return False
-        measured = [sums.measured_a for _, sums, _ in self._past]
-        corrected = [sums.corrected_a for _, sums, _ in self._past]
-        return _rms(corrected) > _rms(measured) + self._allowed_a
+        count = sum(looks.count for looks in self._past)
+        measured, corrected = (
+            math.sqrt(sum(squares) / count)
+            for squares in zip(*((looks.measured2, looks.corrected2) for looks in self._past), strict=True)
+        )
+        return corrected > measured + self._allowed_a
 
     def stuck(self) -> list[LiveBranch]:
         """Branches whose code never changed in a whole window while the measured sum moved, which it must not."""
         if not self._is_full():
             return []
-        measured = [sums.measured_a for _, sums, _ in self._past]
-        mean = sum(measured) / len(measured)
-        if _rms([value - mean for value in measured]) <= self._stuck_a:
+        count = sum(looks.count for looks in self._past)
+        mean = sum(looks.measured for looks in self._past) / count
+        if sum(looks.measured2 for looks in self._past) / count - mean**2 <= self._stuck_a**2:
             return []
-        seen = {branch.name: {codes.get(branch.name) for _, _, codes in self._past} for branch in self._branches}
-        return [branch for branch in self._branches if len(seen[branch.name]) == 1 and self._flows(branch)]
-
-    def _is_close(self, now_s: float) -> bool:
-        """Whether the last sums that were kept are those of a moment ago."""
-        return bool(self._past) and now_s - self._past[-1][0] < self._window_s / _MOST_LOOKS
+        seen = {branch.name: {looks.codes.get(branch.name) for looks in self._past} for branch in self._branches}
+        still = [branch for branch in self._branches if len(seen[branch.name]) == 1 and seen[branch.name] != {None}]
+        return [branch for branch in still if self._flows(branch)]
 
     def _flows(self, branch: LiveBranch) -> bool:
         currents = branch.currents_at(branch.time_s)
@@ -145,8 +148,22 @@ class JunctionWatch:
 
     def _is_full(self) -> bool:
         past = self._past
-        return len(past) >= _LEAST_LOOKS and past[-1][0] - past[0][0] > 0.9 * self._window_s
+        return len(past) >= _LEAST_LOOKS and past[-1].time_s - past[0].time_s > 0.9 * self._window_s
 
 
-def _rms(values: Sequence[float]) -> float:
-    return float((sum(value * value for value in values) / len(values)) ** 0.5)
+class _Looks:
+    """Sums and codes of some looks at the junction, one after the other."""
+
+    def __init__(self, time_s: float) -> None:
+        self.time_s, self.count = time_s, 0
+        self.measured = self.measured2 = self.corrected2 = 0.0
+        self.codes: dict[str, int | None] = {}
+        """By branch, the code of all of them; None if there were several."""
+
+    def add(self, sums: JunctionSums, codes: Mapping[str, int]) -> None:
+        self.count += 1
+        self.measured += sums.measured_a
+        self.measured2 += sums.measured_a**2
+        self.corrected2 += sums.corrected_a**2
+        before = self.codes
+        self.codes = {name: code if before.get(name, code) == code else None for name, code in codes.items()}

@@ -18,7 +18,9 @@ class Link(Protocol):
     at_hand: bool
     """Whether the next frame is here already, and :meth:`receive` need not ask the bus for it."""
     asked_s: float
-    """When the bus was asked last, on the steady clock: what came before that was received. [s]"""
+    """When the bus was asked last, on the steady clock; if it had no more, all that came before was received. [s]"""
+    read_s: float
+    """When the last frame was read: it came before that. [s]"""
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """Wait for a frame of any kind; None if none came in time.
@@ -79,7 +81,7 @@ class OneByOne:
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
-        self.asked_s = time.monotonic()
+        self.asked_s = self.read_s = time.monotonic()
         self._has_stamps = any(is_of(bus, name) for name in _SYSTEM_CLOCK)
 
     def receive(self, timeout_s: float) -> can.Message | None:
@@ -90,8 +92,10 @@ class OneByOne:
         else:
             self.asked_s = time.monotonic()
             message = self._bus.recv(0.0)
-        if message is not None and not self._has_stamps:
-            message.timestamp = 0.0
+        if message is not None:
+            self.read_s = time.monotonic()
+            if not self._has_stamps:
+                message.timestamp = 0.0
         return message
 
     def send(self, messages: Sequence[can.Message], first: int) -> int:

@@ -65,7 +65,7 @@ def picture(view: View, where: str, more: Sequence[str] = (), *, width: int, hei
         *(line for row in table for line in _told_below(row, left_out, width)),
         *(line for text in texts for line in _wrapped(text, width)),
     ]
-    return _cropped(lines, height)
+    return [Line(line.text[:width], line.style) for line in _cropped(lines, height)]
 
 
 def _arrangement(table: Sequence[Row], width: int) -> tuple[frozenset[str], int]:

@@ -19,7 +19,7 @@ from ecu_node.errors import BusError
 from ecu_node.guard import Mode, needs_fd, received, rewritten, transmitted
 from ecu_node.own_frames import OwnFrames
 
-__all__ = ["GatewayNode", "OverlayNode", "open_bus", "receive_filters"]
+__all__ = ["GatewayNode", "OnTick", "OverlayNode", "open_bus", "receive_filters"]
 
 _LONGEST_WAIT_S = 0.1
 """A wake-up at least this often, so that a request to stop is seen. [s]"""
@@ -33,6 +33,10 @@ _LONGEST_DELAY_S = 1.0
 """A gateway passes a branch's frame on only if it waited no longer than this, or than the branch's timeout. [s]"""
 _STANDARD_MASK = 0x7FF
 _EXTENDED_MASK = 0x1FFFFFFF
+
+
+OnTick = Callable[[float, bool], None]
+"""Takes the steady clock's time [s], and whether the whole node works."""
 
 
 def receive_filters(database: VehicleDatabase) -> list[can.typechecking.CanFilter]:
@@ -86,12 +90,16 @@ class _Ticking:
         The core.
     period_s : float
         Between status messages. [s]
-    on_tick : callable
-        Called with the steady clock's time after each look. [s]
+    on_tick : OnTick
+        Called after each look.
+    works : callable
+        Whether all that works beside this does.
     """
 
-    def __init__(self, corrector: Corrector, period_s: float, on_tick: Callable[[float], None]) -> None:
-        self._corrector, self.period_s, self._on_tick = corrector, period_s, on_tick
+    def __init__(
+        self, corrector: Corrector, period_s: float, on_tick: OnTick, works: Callable[[], bool] = lambda: True
+    ) -> None:
+        self._corrector, self.period_s, self._on_tick, self._works = corrector, period_s, on_tick, works
         self._due_s = self._status_due_s = float("-inf")
         self.time_of_day = TimeOfDay(corrector.counters)
 
@@ -104,7 +112,7 @@ class _Ticking:
         return min(_LONGEST_WAIT_S, max(0.0, self._due_s - now_s))
 
     def tick(self, now_s: float, heard_s: float, bus: SteadyBus, own: OwnFrames) -> None:
-        """Do it if it is due; no branch is stale for what has not been heard yet. The bus is flushed before."""
+        """Do it if it is due; no branch is stale for what has not been heard yet."""
         if now_s < self._due_s:
             return
         self._due_s = _next_s(self._due_s, min(self.period_s, _LOOK_EVERY_S), now_s)
@@ -117,7 +125,7 @@ class _Ticking:
             own.sent(fields.key, data)
             bus.send(_message(fields.key, data, fd=fields.fd))
             corrector.counters.send_errors += bus.flush()[1]
-        self._on_tick(now_s)
+        self._on_tick(now_s, self._works())
 
 
 def _next_s(due_s: float, period_s: float, now_s: float) -> float:
@@ -126,7 +134,11 @@ def _next_s(due_s: float, period_s: float, now_s: float) -> float:
 
 
 def _hear(
-    bus: SteadyBus, ticking: _Ticking, take: Callable[[can.Message, float, float], None], flush: Callable[[], None]
+    bus: SteadyBus,
+    heard_s: float,
+    ticking: _Ticking,
+    take: Callable[[can.Message, float, float], None],
+    flush: Callable[[], None],
 ) -> float:
     """Take what comes until there is something else to do.
 
@@ -134,6 +146,8 @@ def _hear(
     ----------
     bus : SteadyBus
         Where to listen.
+    heard_s : float
+        Up to when it was heard before. [s]
     ticking : _Ticking
         Says when there is something else to do.
     take : callable
@@ -144,19 +158,21 @@ def _hear(
     Returns
     -------
     float
-        Up to when the bus was heard: now, or when the last frame came if there may be more. After a pause of the whole
-        process, frames of all branches wait to be read, and none of these is stale. [s]
+        Up to when the bus was heard: until it was asked last, or, if there may be more, until the last frame came; as
+        before if that is not known. After a pause of the whole process, frames of all branches wait to be read, and
+        none of these is stale. [s]
     """
     message = bus.receive(ticking.wait_s(bus.asked_s))
     ahead_s = ticking.time_of_day.ahead_s()  # after the wait, in which the clock may have been set
     while message is not None:
-        now_s = bus.asked_s
+        now_s = bus.read_s
         take(message, now_s, ahead_s)
         if not bus.at_hand:
             flush()
             if ticking.is_due(now_s):
-                return steady_time_s(message.timestamp, now_s, ahead_s)
+                return steady_time_s(message.timestamp, now_s, ahead_s) if message.timestamp else heard_s
         message = bus.receive(0.0)
+    flush()  # error frames may have ended a batch, or the bus
     return bus.asked_s
 
 
@@ -173,8 +189,8 @@ class OverlayNode:
         Layout and DBC.
     period_s : float
         Between status messages. [s]
-    on_tick : callable
-        Called with the steady clock's time at every status message. [s]
+    on_tick : OnTick
+        Called after each look at the junction.
     """
 
     def __init__(
@@ -184,7 +200,7 @@ class OverlayNode:
         database: VehicleDatabase,
         *,
         period_s: float,
-        on_tick: Callable[[float], None] = lambda _: None,
+        on_tick: OnTick = lambda _, __: None,
     ) -> None:
         self._bus, self._corrector = bus, corrector
         self._own = OwnFrames(transmitted(database, Mode.OVERLAY))
@@ -211,7 +227,7 @@ class OverlayNode:
         heard_s = time.monotonic()
         while not stop():
             ticking.tick(bus.asked_s, heard_s, bus, self._own)
-            heard_s = _hear(bus, ticking, self._take, self._flush)
+            heard_s = _hear(bus, heard_s, ticking, self._take, self._flush)
 
     def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
         if message.is_remote_frame:
@@ -261,14 +277,13 @@ class GatewayNode:
         database: VehicleDatabase,
         *,
         period_s: float,
-        on_tick: Callable[[float], None] = lambda _: None,
+        on_tick: OnTick = lambda _, __: None,
     ) -> None:
         self._sensors, self._vehicle, self._corrector = sensors, vehicle, corrector
         own = transmitted(database, Mode.GATEWAY)
         self._status = OwnFrames(own)
         self._not_from_vehicle = OwnFrames([*own, *rewritten(database)])
-        self._on_tick = on_tick
-        self._ticking = _Ticking(corrector, period_s, self._while_both_ways_work)
+        self._ticking = _Ticking(corrector, period_s, on_tick, self._is_back_at_work)
         self._back_s = float("-inf")
 
     def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
@@ -286,17 +301,15 @@ class GatewayNode:
                 ended.set()
         back.result()  # raises what ended it
 
-    def _while_both_ways_work(self, now_s: float) -> None:
-        """Let the watchdog see it if the way back is stuck."""
-        if time.monotonic() - self._back_s < _LONGEST_TURN_S:
-            self._on_tick(now_s)
+    def _is_back_at_work(self) -> bool:
+        return time.monotonic() - self._back_s < _LONGEST_TURN_S
 
     def _pass_on(self, stop: Callable[[], bool]) -> None:
         sensors, vehicle, ticking = self._sensors, self._vehicle, self._ticking
         heard_s = time.monotonic()
         while not stop():
             ticking.tick(sensors.asked_s, heard_s, vehicle, self._status)
-            heard_s = _hear(sensors, ticking, self._take, self._flush)
+            heard_s = _hear(sensors, heard_s, ticking, self._take, self._flush)
 
     def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
         key = (message.arbitration_id, message.is_extended_id)
@@ -321,11 +334,17 @@ class GatewayNode:
         counters.forwarded += sent
         counters.send_errors += not_sent
 
+    def _flush_back(self) -> None:
+        self._back_s = time.monotonic()
+        counters = self._corrector.counters
+        sent, not_sent = self._sensors.flush()
+        counters.returned += sent
+        counters.not_returned += not_sent
+
     def _pass_back(self, stop: Callable[[], bool]) -> None:
         """Pass on what the vehicle sends to the sensors' bus; a branch's frame from there must not be."""
-        vehicle, sensors, counters = self._vehicle, self._sensors, self._corrector.counters
+        vehicle, sensors = self._vehicle, self._sensors
         while not stop():
-            self._back_s = time.monotonic()
             received = vehicle.receive(_LONGEST_WAIT_S)
             while received is not None:
                 key = (received.arbitration_id, received.is_extended_id)
@@ -333,11 +352,9 @@ class GatewayNode:
                     raise _another(received, vehicle)
                 sensors.send(received)
                 if not vehicle.at_hand:
-                    sent, not_sent = sensors.flush()
-                    counters.returned += sent
-                    counters.not_returned += not_sent
-                    self._back_s = time.monotonic()
+                    self._flush_back()
                 received = None if stop() else vehicle.receive(0.0)
+            self._flush_back()
 
 
 def _listen(bus: SteadyBus, own: OwnFrames, stop: Callable[[], bool], period_s: float) -> None:

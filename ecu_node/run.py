@@ -158,9 +158,10 @@ class _Tick:
         self._manager, self._say = manager, say
         self._before = corrector.latched
 
-    def __call__(self, now_s: float) -> None:
+    def __call__(self, now_s: float, works: bool) -> None:
         corrector = self._corrector
-        self._manager.alive(now_s)
+        if works:
+            self._manager.alive(now_s)
         for bus in self._buses:
             bus.count_dropped()
         if self._file.look(corrector, now_s, asked=self._requests.take_reload()):

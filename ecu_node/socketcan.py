@@ -14,11 +14,12 @@ import time
 from collections.abc import Sequence
 
 import can
+from can.util import CAN_FD_DLC
 
 __all__ = ["MOST_AT_ONCE", "SocketCanLink"]
 
-MOST_AT_ONCE = 64
-"""Frames per system call: a batch takes less than a millisecond to work on."""
+MOST_AT_ONCE = 16
+"""Frames per system call, and so the most that a frame waits for others: they take a fraction of a millisecond."""
 _CLASSIC_BYTES, _FD_BYTES = 16, 72
 """Of struct can_frame and struct canfd_frame."""
 _FRAME = struct.Struct("=IBBxB64s")
@@ -28,10 +29,12 @@ _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
 _IDENTIFIER_29, _IDENTIFIER_11 = 0x1FFFFFFF, 0x7FF
 _BITRATE_SWITCH, _ERROR_STATE, _FD = 0x01, 0x02, 0x04
 _LONGEST_CLASSIC, _LARGEST_DLC = 8, 15
+_FD_LENGTHS = tuple(min(length for length in CAN_FD_DLC if length >= wanted) for wanted in range(CAN_FD_DLC[-1] + 1))
+"""The length that CAN FD has for each number of bytes."""
 _STAMP = struct.Struct("@Niill")
 """Control message with a time stamp: its length, level and type, seconds, nanoseconds."""
-_STAMP_TYPE = 35
-"""SO_TIMESTAMPNS, which python-can sets (asm-generic/socket.h)."""
+_SO_TIMESTAMPNS = 35
+"""Socket option, and type of the control message (asm-generic/socket.h)."""
 _CONTROL_BYTES = 64
 
 
@@ -42,7 +45,7 @@ class _Vector(ctypes.Structure):
 
 
 class _Header(ctypes.Structure):
-    """struct msghdr, and after it the bytes that came: together struct mmsghdr."""
+    """struct msghdr."""
 
     _fields_ = (
         ("name", ctypes.c_void_p),
@@ -56,6 +59,8 @@ class _Header(ctypes.Structure):
 
 
 class _CountedHeader(ctypes.Structure):
+    """struct mmsghdr: a header, and the bytes that came."""
+
     _fields_ = (("header", _Header), ("length", ctypes.c_uint))
 
 
@@ -69,6 +74,7 @@ class _Batch:
     """Room for frames, and the headers that tell the kernel where."""
 
     def __init__(self, control_bytes: int) -> None:
+        self._control_bytes = control_bytes
         self._frames = (ctypes.c_char * (MOST_AT_ONCE * _FD_BYTES))()
         self._control = (ctypes.c_char * (MOST_AT_ONCE * max(control_bytes, 1)))()
         self.vectors = (_Vector * MOST_AT_ONCE)()
@@ -86,8 +92,9 @@ class _Batch:
         self._fresh = bytes(self.headers)
 
     def reset(self, used: int) -> None:
-        """Undo what the kernel wrote into the headers."""
+        """Undo what the kernel wrote into the headers, and forget its time stamps."""
         ctypes.memmove(self.headers, self._fresh, used * _COUNTED_BYTES)
+        ctypes.memset(self._control, 0, used * self._control_bytes)
 
 
 class SocketCanLink:
@@ -96,18 +103,19 @@ class SocketCanLink:
     Parameters
     ----------
     opened : socket.socket
-        Raw CAN socket, as python-can has opened it, with time stamps.
+        Raw CAN socket, as python-can has opened it.
     """
 
     def __init__(self, opened: socket.socket) -> None:
         self._socket = opened
+        opened.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         self._waiting = select.poll()
         self._waiting.register(opened, select.POLLIN)
         self._in, self._out = _Batch(_CONTROL_BYTES), _Batch(0)
         self._next = self._came = 0
         self._had_no_more = False
         self.at_hand = False
-        self.asked_s = time.monotonic()
+        self.asked_s = self.read_s = time.monotonic()
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """Wait for a frame of any kind; None if none came in time, or there were no more when last asked."""
@@ -137,6 +145,7 @@ class SocketCanLink:
             if came < 0:
                 _raise_unless_empty()
             return False
+        self.read_s = time.monotonic()
         self._came, self._had_no_more = came, came < MOST_AT_ONCE
         return True
 
@@ -145,7 +154,7 @@ class SocketCanLink:
         word, length, flags, dlc, data = _FRAME.unpack_from(batch.frames, number * _FD_BYTES)
         _, level, kind, seconds, nanoseconds = _STAMP.unpack_from(batch.control, number * _CONTROL_BYTES)
         is_fd = _LENGTH.unpack_from(batch.lengths, number * _COUNTED_BYTES + _LENGTH_AT)[0] == _FD_BYTES
-        is_stamped = kind == _STAMP_TYPE and level == socket.SOL_SOCKET
+        is_stamped = kind == _SO_TIMESTAMPNS and level == socket.SOL_SOCKET
         extended = bool(word & _EXTENDED)
         return can.Message(
             seconds + 1e-9 * nanoseconds if is_stamped else 0.0,
@@ -184,7 +193,7 @@ def _put(frames: memoryview, at: int, message: can.Message) -> int:
     length = message.dlc
     if message.is_fd:
         flags = _FD | message.bitrate_switch * _BITRATE_SWITCH | message.error_state_indicator * _ERROR_STATE
-        _FRAME.pack_into(frames, at, word, length, flags, 0, message.data)
+        _FRAME.pack_into(frames, at, word, _FD_LENGTHS[length], flags, 0, message.data)
         return _FD_BYTES
     long_dlc = length if _LONGEST_CLASSIC < length <= _LARGEST_DLC else 0
     _FRAME.pack_into(frames, at, word, min(length, _LONGEST_CLASSIC), 0, long_dlc, message.data)

@@ -427,6 +427,19 @@ def test_a_branch_whose_code_never_changes_while_the_sum_moves_is_stuck(database
     assert corrector.latched_branches == ("motor",)
 
 
+def test_a_branch_that_changes_between_the_parts_of_a_long_window_is_not_stuck(
+    make_database: MakeDatabase, database: VehicleDatabase
+) -> None:
+    text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
+    own = make_database(text + "\n[watch]\nwindow_s = 600.0\n", database.layout.dbc_path.read_text())
+    corrector = corrector_for(own, battery=(0.1, 0.0), motor=(0.0, 0.0))
+    for k in range(6100):
+        answers(corrector, battery(own, k % 15, 100.0 + 50.0 * math.sin(0.1 * k)), 0.1 * k)
+        answers(corrector, motor(own, k % 15, 60.0 if k % 30 < 28 else 80.0), 0.1 * k)
+        corrector.look(0.1 * k + 0.01)
+    assert corrector.latched is not Reason.BRANCH_STUCK
+
+
 def test_a_motor_at_rest_is_not_stuck(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(-0.2, 0.0), motor=(0.0, 0.0))
     for k in range(240):

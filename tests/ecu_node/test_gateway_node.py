@@ -1,7 +1,9 @@
 """A gateway on two of python-can's virtual buses: real bus objects, the node in threads of its own."""
 
+import errno
 import queue
 import random
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,14 +12,17 @@ from contextlib import contextmanager
 
 import can
 import pytest
+from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
 from ecu_node.buses import SteadyBus
 from ecu_node.corrector import Corrector
+from ecu_node.counters import Counters
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
 from ecu_node.guard import Mode
 from ecu_node.node import GatewayNode, open_bus
+from ecu_node.socketcan import SocketCanLink
 from ecu_node.status import Reason, State
 from ecu_node.wiring import InForce, wire
 from tests.ecu_node.vehicles import decoded, parameters_for, protected
@@ -137,6 +142,86 @@ def test_frames_of_the_vehicle_reach_the_sensors_bus_unchanged_and_in_order(
     assert list(map(as_sent, found)) == list(map(as_sent, sent))
 
 
+class PairBus(SocketcanBus):
+    """A bus as of SocketCAN, of which the other end is at hand: datagrams between processes are its frames."""
+
+    def __init__(self, end: socket.socket) -> None:
+        self.socket, self.channel_info = end, "a pair of sockets"
+
+    def shutdown(self) -> None:
+        self.socket.close()
+
+
+DATA = can.Message(arbitration_id=0x300, is_extended_id=False, data=b"data")
+ERROR = can.Message(arbitration_id=0x20000004, is_extended_id=False, data=bytes(8))
+"""As an error frame is numbered on SocketCAN."""
+
+
+@pytest.mark.parametrize("to_vehicle", [True, False])
+def test_a_frame_is_passed_on_at_once_when_an_error_frame_came_with_it(
+    database: VehicleDatabase, to_vehicle: bool
+) -> None:
+    corrector = wire(database, InForce(parameters=None), time.monotonic(), mode=Mode.GATEWAY)
+    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(2)]
+    buses = [SteadyBus(lambda near=near: PairBus(near), corrector.counters) for near, _ in pairs]  # type: ignore[misc]
+    source, target = [SocketCanLink(far) for _, far in pairs][:: 1 if to_vehicle else -1]
+    stop, ready = threading.Event(), threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        node = GatewayNode(buses[0], buses[1], corrector, database, period_s=30.0)
+        running = pool.submit(node.run, stop.is_set, ready.set)
+        try:
+            assert ready.wait(LONGEST_WAIT_S)
+            source.send([DATA, ERROR], 0)
+            came = target.receive(5.0)
+            while came is not None and came.arbitration_id == 0x5F0:
+                came = target.receive(5.0)
+        finally:
+            stop.set()
+            running.result(LONGEST_WAIT_S)
+            for bus, (_, far) in zip(buses, pairs, strict=True):
+                bus.close()
+                far.close()
+    assert came is not None
+    assert came.data == DATA.data
+    counters = corrector.counters
+    assert (counters.forwarded if to_vehicle else counters.returned, counters.bus_errors) == (1, 1)
+
+
+def test_a_bus_that_takes_no_more_loses_what_it_does_not_take_and_goes_on() -> None:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    bus, link = SteadyBus(lambda: PairBus(near), Counters()), SocketCanLink(far)
+    for _ in range(2):
+        for number in range(1000):
+            bus.send(can.Message(arbitration_id=number))
+        sent, lost = bus.flush()
+        assert (sent + lost, sent > 0, lost > 0) == (1000, True, True)
+        came = []
+        while (message := link.receive(0.1)) is not None:
+            came.append(message.arbitration_id)
+        assert came == list(range(sent))
+    assert bus.flush() == (0, 0)
+    bus.close()
+    far.close()
+
+
+class ChoosyBus(VirtualBus):
+    """A bus that does not take CAN FD."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if msg.is_fd:
+            raise can.CanOperationError("Invalid argument", errno.EINVAL)
+        super().send(msg, timeout)
+
+
+def test_a_frame_that_a_bus_cannot_carry_costs_no_other(ends: Ends, request: pytest.FixtureRequest) -> None:
+    bus = SteadyBus(lambda: ChoosyBus(f"{request.node.name} a"), Counters())
+    for number in range(6):
+        bus.send(can.Message(arbitration_id=number, is_fd=number % 3 == 1))
+    assert bus.flush() == (4, 2)
+    assert [message.arbitration_id for message in received(ends[0], 4)] == [0, 2, 3, 5]
+    bus.close()
+
+
 class BlockingBus(VirtualBus):
     """A bus on which sending waits until it is let go."""
 
@@ -153,19 +238,24 @@ def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
     monkeypatch.setattr("ecu_node.node._LONGEST_TURN_S", 0.2)
     name = request.node.name
     corrector = wire(database, InForce(parameters=None), time.monotonic(), mode=Mode.GATEWAY)
-    near, stop, ticks = BlockingBus(f"{name} a"), threading.Event(), queue.SimpleQueue[float]()
+    near, stop, fed = BlockingBus(f"{name} a"), threading.Event(), queue.SimpleQueue[float]()
     near.let_go = threading.Event()
+
+    def feed(now_s: float, works: bool) -> None:
+        if works:
+            fed.put(now_s)
+
     sensors = SteadyBus(lambda: near, corrector.counters)
     vehicle = SteadyBus(lambda: VirtualBus(f"{name} b"), corrector.counters)
     with ThreadPoolExecutor(1) as pool:
-        node = GatewayNode(sensors, vehicle, corrector, database, period_s=0.02, on_tick=ticks.put)
+        node = GatewayNode(sensors, vehicle, corrector, database, period_s=0.02, on_tick=feed)
         running = pool.submit(node.run, stop.is_set)
         try:
-            ticks.get(timeout=LONGEST_WAIT_S)
+            fed.get(timeout=LONGEST_WAIT_S)
             ends[1].send(can.Message(arbitration_id=0x300))
-            wait_until(lambda: went_quiet(ticks))
+            wait_until(lambda: went_quiet(fed))
             near.let_go.set()
-            ticks.get(timeout=LONGEST_WAIT_S)
+            fed.get(timeout=LONGEST_WAIT_S)
         finally:
             near.let_go.set()
             stop.set()

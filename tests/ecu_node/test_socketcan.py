@@ -86,6 +86,14 @@ def test_all_kinds_of_frames_are_written_as_python_can_reads_them(ends: Ends) ->
             assert frame.is_remote_frame or data == bytes(frame.data)
 
 
+def test_a_length_that_can_fd_does_not_have_becomes_the_next_one(ends: Ends) -> None:
+    link, far = ends
+    link.send([can.Message(arbitration_id=1, is_fd=True, data=bytes([255]) * 49)], 0)
+    raw = far.recv(128)
+    assert raw[4] == 64
+    assert raw[8:] == bytes([255]) * 49 + bytes(15)
+
+
 def test_no_frame_carries_bytes_of_the_one_before(ends: Ends) -> None:
     link, far = ends
     for data in (bytes([255]) * 64, b"\x01"):
@@ -115,12 +123,25 @@ def test_a_classic_frame_keeps_a_length_code_above_8(ends: Ends) -> None:
 def test_more_frames_than_one_call_takes_come_whole_and_in_order(ends: Ends) -> None:
     link, far = ends
     count = 2 * MOST_AT_ONCE + 5
+    for number in range(count):
+        far.send(build_can_frame(can.Message(arbitration_id=number)))
     came = []
-    for first in range(0, count, 50):
-        for number in range(first, min(first + 50, count)):
-            far.send(build_can_frame(can.Message(arbitration_id=number)))
-        came += [message.arbitration_id for message in received(link, min(50, count - first))]
+    while (message := link.receive(0.0)) is not None:
+        came.append(message.arbitration_id)
     assert came == list(range(count))
+
+
+def test_frames_are_dated_by_the_kernel_and_none_with_the_time_of_another(ends: Ends) -> None:
+    link, far = ends
+    frame, before_s = build_can_frame(can.Message(arbitration_id=1)), time.time()
+    far.send(frame)
+    (dated,) = received(link, 1)
+    assert before_s <= dated.timestamp <= time.time()
+    assert link.asked_s <= link.read_s <= time.monotonic()
+    link._socket.setsockopt(socket.SOL_SOCKET, 35, 0)
+    far.send(frame)
+    (undated,) = received(link, 1)
+    assert undated.timestamp == 0.0
 
 
 def test_frames_at_hand_are_told(ends: Ends) -> None:

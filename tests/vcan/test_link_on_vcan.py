@@ -42,7 +42,7 @@ def test_frames_of_all_kinds_pass_both_ways_with_the_time_of_their_coming(
         assert fields(back) == fields(frame)
 
 
-def test_a_burst_comes_in_one_piece_and_in_order(buses: tuple[can.BusABC, can.BusABC]) -> None:
+def test_a_burst_comes_whole_and_in_order(buses: tuple[can.BusABC, can.BusABC]) -> None:
     near, far = (SocketCanLink(bus.socket) for bus in buses)  # type: ignore[attr-defined]
     frames = [can.Message(arbitration_id=number, is_extended_id=False, data=bytes([number])) for number in range(150)]
     done = 0
@@ -52,4 +52,4 @@ def test_a_burst_comes_in_one_piece_and_in_order(buses: tuple[can.BusABC, can.Bu
     assert [message.arbitration_id for message in came if message is not None] == list(range(150))
     stamps = [message.timestamp for message in came if message is not None]
     assert stamps == sorted(stamps)
-    assert far.receive(0.0) is None
+    assert far.receive(0.05) is None

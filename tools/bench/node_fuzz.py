@@ -206,7 +206,7 @@ def _passed(
     sent: list[list[FuzzFrame]] = []
     script, silent = _ScriptedBus(frames, sent), _ScriptedBus((), sent)
 
-    def begin(_: float) -> None:
+    def begin(_: float, __: bool) -> None:
         script.begun = True
 
     corrector = wire(database, InForce(parameters=parameters), time.monotonic(), mode=mode)
