@@ -13,7 +13,7 @@ import numpy as np
 
 from calibrator.errors import DriveError
 from calibrator.evidence.vehicle_summary import VehicleSummary
-from calibrator.posterior.fleet import FleetTask
+from calibrator.posterior.fleet_task import FleetTask
 from calibrator.results import ChunkResult, Written, encode_chunk
 from calibrator.run.previous import PreviousResult, moved_sensors
 from calibrator.summaries.record import Record, drives_digest, joined_records

@@ -18,12 +18,12 @@ from calibrator.evidence.summary import DriveSummary
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.sensor_models.choice import LEAST_VEHICLES, LINEAR, SensorModelChoice, choose_sensor_models
-from calibrator.sensor_models.linear_part import linear_summary
+from calibrator.sensor_models.modelled import ModelledVehicle, modelled_vehicle, usual_sections
 from calibrator.sensor_models.summary import SensorSummary, summarise_sensors
 from calibrator.vehicles import read_each
 from ecu_node.database import VehicleDatabase
 
-__all__ = ["SensorFindings", "all_linear", "find_sensor_models"]
+__all__ = ["SensorFindings", "all_linear", "find_sensor_models", "findings_of"]
 
 _LINEAR = SensorModelChoice(log_bayes_factor=0.0)
 
@@ -38,12 +38,15 @@ class SensorFindings:
         Linear for vehicles that could not be looked at.
     summaries : sequence of N DriveSummary
         For the linear estimator: of the linear parts where a sensor is not linear, else those of the first pass.
+    modelled : sequence of N ModelledVehicle or None
+        Vehicles with sensors that are not linear; None for the others.
     notices : tuple of str
         What the user should know.
     """
 
     choices: Sequence[Sequence[SensorModelChoice]]
     summaries: Sequence[DriveSummary]
+    modelled: Sequence[ModelledVehicle | None]
     notices: tuple[str, ...] = ()
 
     @property
@@ -60,7 +63,8 @@ class SensorFindings:
 def all_linear(vehicles: Sequence[VehicleSummary]) -> SensorFindings:
     """Findings without a second pass: the first pass as it is."""
     summaries = [vehicle.summary for vehicle in vehicles]
-    return SensorFindings(choices=[[_LINEAR] * summary.branches for summary in summaries], summaries=summaries)
+    choices = [[_LINEAR] * summary.branches for summary in summaries]
+    return SensorFindings(choices=choices, summaries=summaries, modelled=[None] * len(vehicles))
 
 
 def find_sensor_models(
@@ -108,21 +112,48 @@ def find_sensor_models(
     }
     found, errors = read_each(readers, fleet, equipment, database, workers=workers, limit_s=limit_s)
     notices += [f"sensor models: {name} counts as linear: {reason}" for name, reason in errors.items()]
+    findings = findings_of(vehicles, found, learning=learning, trusted=trusted)
+    return replace(findings, notices=(*notices, *findings.notices))
+
+
+def findings_of(
+    vehicles: Sequence[VehicleSummary], found: Mapping[str, SensorSummary], *, learning: Mask, trusted: Mask
+) -> SensorFindings:
+    """Choose the sensor model of every branch from what a second pass has read.
+
+    Parameters
+    ----------
+    vehicles : sequence of N VehicleSummary
+        From the first pass.
+    found : mapping of str to SensorSummary
+        From the second pass, by vehicle; those that are missing count as linear.
+    learning, trusted : ndarray of bool of shape (N,)
+        As for :func:`find_sensor_models`.
+
+    Returns
+    -------
+    SensorFindings
+        In the order of the vehicles.
+    """
     names = [vehicle.vehicle for vehicle in vehicles]
     learners = [name for name, learns in zip(names, learning, strict=True) if learns and name in found]
     if len(learners) < LEAST_VEHICLES:
-        return replace(all_linear(vehicles), notices=(*notices, _too_few(len(learners))))
+        return replace(all_linear(vehicles), notices=(_too_few(len(learners)),))
     chosen = _choose(found, learners)
     linear = all_linear(vehicles).choices
     choices = [
         chosen[name] if name in chosen and not sound else row
         for name, sound, row in zip(names, trusted, linear, strict=True)
     ]
-    summaries = [
-        linear_summary(found[vehicle.vehicle], row) if any(c.model != LINEAR for c in row) else vehicle.summary
-        for vehicle, row in zip(vehicles, choices, strict=True)
+    usual = usual_sections([found[name] for name in learners])
+    modelled = [
+        modelled_vehicle(found[name], row, usual) if name in found else None
+        for name, row in zip(names, choices, strict=True)
     ]
-    return SensorFindings(choices=choices, summaries=summaries, notices=tuple(notices))
+    summaries = [
+        vehicle.summary if it is None else it.linear_parts for vehicle, it in zip(vehicles, modelled, strict=True)
+    ]
+    return SensorFindings(choices=choices, summaries=summaries, modelled=modelled)
 
 
 def _too_few(learners: int) -> str:
@@ -136,7 +167,7 @@ def _temperature(
 ) -> tuple[str | None, list[str]]:
     """Input that is the temperature, if most vehicles have it, and what to say if not."""
     if name is None:
-        return None, []
+        return None, ["sensor models: the layout names no temperature, so no drift with it is looked for"]
     if name in equipment.fleet_inputs:
         return None, [f"sensor models: {name} is a fleet input, so no drift with temperature is looked for"]
     if 2 * sum(name in vehicle.recorded for vehicle in vehicles) <= len(vehicles):

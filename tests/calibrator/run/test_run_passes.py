@@ -16,7 +16,8 @@ from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.faults import Faults
 from calibrator.options import Method
 from calibrator.parameter_files import RunIdentity
-from calibrator.posterior.fleet import FleetTask, learn_fleet
+from calibrator.posterior.fleet import learn_fleet
+from calibrator.posterior.fleet_task import FleetTask
 from calibrator.results import ChunkResult
 from calibrator.run.first_pass import read_sample, take_census
 from calibrator.run.in_order import Workers
