@@ -27,8 +27,7 @@ from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.fleet import learn_fleet
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.sensor_models.families import GainBySign, SensorModel, TemperatureDrift
-from calibrator.sensor_models.fleet import SensorFindings, findings_of
-from calibrator.sensor_models.summary import summarise_sensors
+from calibrator.sensor_models.fleet import SensorFindings, findings_of, summaries_about_zeros
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
 from ecu_node.wiring import InForce, sensor_fault
@@ -208,9 +207,9 @@ def calibrate_sensors(
     def find(vehicles: Sequence[VehicleSummary], zero_a: Array, learning: Mask, trusted: Mask) -> SensorFindings:
         names = _fleet_inputs(fleet) + (() if database.layout.temperature is None else (database.layout.temperature,))
         found = {
-            vehicle.vehicle: summarise_sensors(
+            vehicle.vehicle: summaries_about_zeros(
                 [drive.with_inputs(names)],
-                zero_a=zero_a[j],
+                zero_a[j],
                 period_s=fleet.recorded.period_s,
                 temperature=database.layout.temperature,
             )

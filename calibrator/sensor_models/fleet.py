@@ -2,6 +2,11 @@
 
 The first pass has found delays and, with linear sensors, offsets. Both are used here: the delays are taken out before
 the drives are aligned, and the offsets are what the sensors show at 0 A.
+
+Offsets of several sensors that nearly cancel look like a hardware offset, in which all sensors show 0 at 0 A; and a
+sensor that is not linear leaves a constant in the junction sum, by which linear sensors are taken for the former. So
+such a vehicle is looked at with both zeros. A linear sensor is linear about any zero, one that is not only about its
+own: the zeros about which the nonlinearity is plainer are the right ones.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from calibrator.drive import Array, DriveFile, Mask
-from calibrator.drives.align import align
+from calibrator.drives.align import Samples, align
 from calibrator.drives.delays import without_delays
 from calibrator.drives.fleet_source import Equipment, FleetSource, load_drive
 from calibrator.evidence.summary import DriveSummary
@@ -23,7 +28,10 @@ from calibrator.sensor_models.summary import SensorSummary, summarise_sensors
 from calibrator.vehicles import read_each
 from ecu_node.database import VehicleDatabase
 
-__all__ = ["SensorFindings", "all_linear", "find_sensor_models", "findings_of"]
+__all__ = ["SensorFindings", "all_linear", "find_sensor_models", "findings_of", "summaries_about_zeros"]
+
+Found = Mapping[str, tuple[SensorSummary, ...]]
+"""What a second pass has read, by vehicle: about the offsets found before, and perhaps about 0."""
 
 _LINEAR = SensorModelChoice(log_bayes_factor=0.0)
 
@@ -116,17 +124,15 @@ def find_sensor_models(
     return replace(findings, notices=(*notices, *findings.notices))
 
 
-def findings_of(
-    vehicles: Sequence[VehicleSummary], found: Mapping[str, SensorSummary], *, learning: Mask, trusted: Mask
-) -> SensorFindings:
+def findings_of(vehicles: Sequence[VehicleSummary], found: Found, *, learning: Mask, trusted: Mask) -> SensorFindings:
     """Choose the sensor model of every branch from what a second pass has read.
 
     Parameters
     ----------
     vehicles : sequence of N VehicleSummary
         From the first pass.
-    found : mapping of str to SensorSummary
-        From the second pass, by vehicle; those that are missing count as linear.
+    found : mapping of str to tuple of SensorSummary
+        Of :func:`summaries_about_zeros`, by vehicle; those that are missing count as linear.
     learning, trusted : ndarray of bool of shape (N,)
         As for :func:`find_sensor_models`.
 
@@ -142,12 +148,12 @@ def findings_of(
     chosen = _choose(found, learners)
     linear = all_linear(vehicles).choices
     choices = [
-        chosen[name] if name in chosen and not sound else row
+        chosen[name][1] if name in chosen and not sound else row
         for name, sound, row in zip(names, trusted, linear, strict=True)
     ]
-    usual = usual_sections([found[name] for name in learners])
+    usual = usual_sections([found[name][0] for name in learners])
     modelled = [
-        modelled_vehicle(found[name], row, usual) if name in found else None
+        modelled_vehicle(chosen[name][0], row, usual) if name in chosen else None
         for name, row in zip(names, choices, strict=True)
     ]
     summaries = [
@@ -183,7 +189,7 @@ def _read_sensors(
     delays: Mapping[str, float],
     zero_a: Array,
     temperature: str | None,
-) -> SensorSummary:
+) -> tuple[SensorSummary, ...]:
     """Read the drives of one vehicle and summarise them with the columns of the families."""
     layout = database.layout
     inputs = (*equipment.fleet_inputs, *([temperature] if temperature is not None else []))
@@ -191,13 +197,47 @@ def _read_sensors(
         align(without_delays(load_drive(entry, database), delays), layout, equipment.branches, inputs=inputs)
         for entry in entries
     ]
-    return summarise_sensors(samples, zero_a=zero_a, period_s=layout.period_s, temperature=temperature)
+    return summaries_about_zeros(samples, zero_a, period_s=layout.period_s, temperature=temperature)
 
 
-def _choose(found: Mapping[str, SensorSummary], learners: Sequence[str]) -> dict[str, list[SensorModelChoice]]:
-    """Choices by vehicle; one that is held out is compared with the learners and does not change their choices."""
-    fleet = [found[name] for name in learners]
-    chosen = dict(zip(learners, choose_sensor_models(fleet), strict=True))
+def summaries_about_zeros(
+    drives: Sequence[Samples], zero_a: Array, *, period_s: float, temperature: str | None
+) -> tuple[SensorSummary, ...]:
+    """Summaries of the drives of one vehicle, about each zero that its sensors may have.
+
+    Parameters
+    ----------
+    drives, period_s, temperature
+        As for :func:`~calibrator.sensor_models.summary.summarise_sensors`.
+    zero_a : ndarray of shape (K,)
+        Offsets found with linear sensors. [A]
+
+    Returns
+    -------
+    tuple of SensorSummary
+        About the offsets; where several sensors have one, about 0 as well.
+    """
+    zeros = [zero_a, np.zeros(len(zero_a))] if np.count_nonzero(zero_a) > 1 else [zero_a]
+    return tuple(summarise_sensors(drives, zero_a=zero, period_s=period_s, temperature=temperature) for zero in zeros)
+
+
+def _choose(found: Found, learners: Sequence[str]) -> dict[str, tuple[SensorSummary, list[SensorModelChoice]]]:
+    """Choices by vehicle, with the summary they hold for.
+
+    A vehicle that is held out, and one about another zero, is compared with the learners and does not change their
+    choices.
+    """
+    fleet = [found[name][0] for name in learners]
+    chosen = dict(zip(learners, zip(fleet, choose_sensor_models(fleet), strict=True), strict=True))
     for name in found.keys() - chosen.keys():
-        chosen[name] = choose_sensor_models([*fleet, found[name]])[-1]
+        chosen[name] = found[name][0], choose_sensor_models([*fleet, found[name][0]])[-1]
+    several = [name for name, summaries in found.items() if len(summaries) > 1]
+    others = [found[name][1] for name in several]
+    for name, other, row in zip(several, others, choose_sensor_models([*fleet, *others])[len(fleet) :], strict=True):
+        if _plainest(row) > _plainest(chosen[name][1]):
+            chosen[name] = other, row
     return chosen
+
+
+def _plainest(row: Sequence[SensorModelChoice]) -> float:
+    return max(choice.log_bayes_factor for choice in row)
