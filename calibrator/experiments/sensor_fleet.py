@@ -1,7 +1,6 @@
-"""Fleets some of whose sensors are not linear: drawn, calibrated as the product does, and judged on other drives.
+"""Fleets some of whose sensors are not linear: drawn, and calibrated as the product does.
 
-Each vehicle drives a part of the recorded trips with faults of its own, in another temperature. The corrections are
-those that the node makes of the parameter files.
+Each vehicle drives a part of the recorded trips with faults of its own, at temperatures of its own.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,15 +29,12 @@ from calibrator.sensor_models.families import GainBySign, SensorModel, Temperatu
 from calibrator.sensor_models.fleet import SensorFindings, findings_of, summaries_about_zeros
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
-from ecu_node.wiring import InForce, sensor_fault
 
-__all__ = ["SensorCase", "SensorFleet", "calibrate_sensors", "draw_sensors", "unseen_errors_a"]
+__all__ = ["DrivenTrip", "SensorCase", "SensorFleet", "calibrate_sensors", "draw_sensors"]
 
 START_C, RISE_C = (-5.0, 25.0), (20.0, 40.0)
 """A junction box has the temperature of the day at the start, and warms up by this. [degC], [K]"""
 WARM_UP_S = 500.0
-EVERY = 10
-"""Corrections are judged on every tenth sample: once per second. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +70,18 @@ class SensorCase:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Trip:
-    """Measured currents without noise and true ones, shape (T, K), and the temperature. [A], [degC]"""
+class DrivenTrip:
+    """One drive of one vehicle.
+
+    Attributes
+    ----------
+    ideal : GroundTruth
+        Inputs and ideal currents.
+    true_a, measured_a : ndarray of shape (T, K)
+        True currents, and measured ones without noise. [A]
+    temperature_c : ndarray of shape (T,)
+        As its signal says it, in whole degrees. [degC]
+    """
 
     ideal: GroundTruth
     true_a: Array
@@ -107,8 +113,8 @@ class SensorFleet:
     branches: tuple[str, ...]
     put: Mapping[int, tuple[int, SensorModel]]
     faults: Faults
-    learnt: Sequence[_Trip]
-    unseen: Sequence[_Trip]
+    learnt: Sequence[DrivenTrip]
+    unseen: Sequence[DrivenTrip]
     seed: int
 
     @property
@@ -147,7 +153,7 @@ def draw_sensors(recorded: RecordedFleet, case: SensorCase, seed: int) -> Sensor
     put = {j: (int(rng.integers(case.branches)), _sensor(rng, case, by_sign=n % 2 == 0)) for n, j in enumerate(bent)}
     trips = recorded.with_branches(case.branches)
 
-    def driven(purpose: Purpose) -> list[_Trip]:
+    def driven(purpose: Purpose) -> list[DrivenTrip]:
         ideal = joined_trips(trips, purpose, seed, vehicles=case.vehicles, duration_s=case.duration_s)
         return [_drive(rng, trip, faults.take(j), put.get(j)) for j, trip in enumerate(ideal)]
 
@@ -171,14 +177,16 @@ def _sensor(rng: np.random.Generator, case: SensorCase, *, by_sign: bool) -> Sen
     return TemperatureDrift(drift=drift, drift_per_k=float(sign * rng.uniform(*case.drift_per_k)), reference_c=25.0)
 
 
-def _drive(rng: np.random.Generator, trip: GroundTruth, faults: Faults, put: tuple[int, SensorModel] | None) -> _Trip:
+def _drive(
+    rng: np.random.Generator, trip: GroundTruth, faults: Faults, put: tuple[int, SensorModel] | None
+) -> DrivenTrip:
     temperature_c = rng.uniform(*START_C) + rng.uniform(*RISE_C) * (1.0 - np.exp(-trip.time_s / WARM_UP_S))
     i = true_currents(trip.matrix_a(), faults)
     i_m = measured_currents(i, faults)
     if put is not None:
         k, sensor = put
         i_m[:, k] = sensor.measured(i[:, k], temperature_c) + faults.offset_a[k]
-    return _Trip(ideal=trip, true_a=i, measured_a=i_m, temperature_c=np.rint(temperature_c))
+    return DrivenTrip(ideal=trip, true_a=i, measured_a=i_m, temperature_c=np.rint(temperature_c))
 
 
 def calibrate_sensors(
@@ -263,42 +271,3 @@ def _summary(fleet: SensorFleet, name: str, drive: Samples) -> VehicleSummary:
         zero_current=ZeroCurrent(offset_a=unknown, sd_a=unknown),
         recorded=frozenset(drive.input_names),
     )
-
-
-def unseen_errors_a(
-    fleet: SensorFleet, j: int, parameters: VehicleParameters, database: VehicleDatabase
-) -> tuple[Array, Array]:
-    """Errors of one vehicle's currents on its unseen drive, as measured and as the node corrects them.
-
-    Parameters
-    ----------
-    fleet : SensorFleet
-        The fleet.
-    j : int
-        Number of the vehicle.
-    parameters : VehicleParameters
-        Of the vehicle.
-    database : VehicleDatabase
-        DBC and layout of the node.
-
-    Returns
-    -------
-    measured, corrected : ndarray of shape (K,)
-        Root mean square errors of the branches, noise apart. [A]
-    """
-    trip, in_force = fleet.unseen[j], InForce(parameters=parameters)
-    true_a, measured_a, temperature_c = (
-        values[::EVERY] for values in (trip.true_a, trip.measured_a, trip.temperature_c)
-    )
-    corrected = measured_a.copy()
-    for k, name in enumerate(fleet.branches):
-        fault = sensor_fault(database, in_force, name)
-        if fault.applied:
-            pairs = zip(measured_a[:, k].tolist(), temperature_c.tolist(), strict=True)
-            found = [(i_m, fault.true_current(i_m, at_c)) for i_m, at_c in pairs]
-            corrected[:, k] = [i_m if i is None else i for i_m, i in found]
-    return _rms(measured_a - true_a), _rms(corrected - true_a)
-
-
-def _rms(error_a: Array) -> Array:
-    return np.asarray(np.sqrt(np.mean(error_a**2, axis=0)))

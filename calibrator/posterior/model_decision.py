@@ -27,8 +27,6 @@ class JudgedSensor:
 
     Attributes
     ----------
-    sensor : ModelledSensor
-        The sensor.
     harm : float
         Probability that correcting makes the branch worse, on the vehicle's own drives or the fleet's usual one; that
         the sensor is linear, or of another family, counts as harm. [1]
@@ -41,7 +39,6 @@ class JudgedSensor:
         Largest magnitude of the drift in any section of these drives. [1]
     """
 
-    sensor: ModelledSensor
     harm: float
     drift_sd: float
     offset_sd_a: float
@@ -92,7 +89,6 @@ def judge_sensor(
     found = np.array([drift, offset_a / full_scale_a])
     drift_sd, offset_sd = _deviations(sensor, nodes, states, found)
     return JudgedSensor(
-        sensor=sensor,
         harm=min(_harm(sensor, states, found, full_scale_a) + 1.0 - sensor.choice.probability, 1.0),
         drift_sd=drift_sd,
         offset_sd_a=offset_sd * full_scale_a,
