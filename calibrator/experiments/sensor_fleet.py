@@ -51,6 +51,8 @@ class SensorCase:
         Range of the difference between the gains by sign. [1]
     drift_per_k : tuple of float
         Range of the drift with temperature. [1/K]
+    largest_drift : float
+        Of these sensors, the mean of both gains or at 25 degC. [1]
     sparsity : float
         Of the other faults. [%]
     magnitude : tuple of float
@@ -64,6 +66,7 @@ class SensorCase:
     share: float = 0.3
     difference: tuple[float, float] = (0.05, 0.2)
     drift_per_k: tuple[float, float] = (0.002, 0.006)
+    largest_drift: float = 0.05
     sparsity: float = 80.0
     magnitude: tuple[float, float] = (0.02, 0.1)
     duration_s: float = 1500.0
@@ -170,7 +173,7 @@ def draw_sensors(recorded: RecordedFleet, case: SensorCase, seed: int) -> Sensor
 
 def _sensor(rng: np.random.Generator, case: SensorCase, *, by_sign: bool) -> SensorModel:
     sign = rng.choice([-1.0, 1.0])
-    drift = float(rng.uniform(-0.5, 0.5) * case.magnitude[1])
+    drift = float(rng.uniform(-1.0, 1.0) * case.largest_drift)
     if by_sign:
         half = 0.5 * float(sign * rng.uniform(*case.difference))
         return GainBySign(drift_positive=drift + half, drift_negative=drift - half)
