@@ -30,6 +30,9 @@ def main(
     vehicles: Annotated[int, typer.Option(min=8, help="Vehicles of the fleet.")] = SensorCase().vehicles,
     branches: Annotated[int, typer.Option(min=2, help="Branches of each.")] = SensorCase().branches,
     share: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share with a bent sensor.")] = SensorCase().share,
+    sparsity: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="Of the other faults [%].")
+    ] = SensorCase().sparsity,
     seed: Annotated[int, typer.Option(min=0, help="Of the fleet.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the counts as JSON.")] = False,
 ) -> None:
@@ -37,7 +40,8 @@ def main(
     try:
         database = read_database(read_layout(layout))
         recorded = builtin_fleet(database) if drives is None else read_fleet(drives, database)
-        fleet = draw_sensors(recorded, SensorCase(vehicles=vehicles, branches=branches, share=share), seed)
+        case = SensorCase(vehicles=vehicles, branches=branches, share=share, sparsity=sparsity)
+        fleet = draw_sensors(recorded, case, seed)
         score = score_sensors(fleet, *calibrate_sensors(fleet, database), database)
     except UserError as error:
         sys.exit(f"{Path(sys.argv[0]).name}: {error}")

@@ -14,11 +14,13 @@ from calibrator.drive import Array
 from calibrator.evidence.summary import DriveSummary
 from calibrator.posterior.decision import NORMAL_STEPS
 from calibrator.posterior.estimate import FleetPosterior
+from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.model_harm import EXCESS_NODES, NODE_OF_STEP, model_harm
+from calibrator.posterior.states import States
 from calibrator.sensor_models.modelled import ModelledSensor, ModelledVehicle
 from calibrator.sensor_models.sections import Sections
 
-__all__ = ["JudgedSensor", "judge_sensor"]
+__all__ = ["JudgedSensor", "judge_sensor", "with_free_drift"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,10 +101,40 @@ def judge_sensor(
 def _states(posterior: FleetPosterior, branch: int) -> _States:
     states, k, K = posterior.states, posterior.order.index(branch), posterior.states.branches
     return _States(
-        weight=np.ascontiguousarray(states.weight),
+        weight=with_free_drift(states, posterior.hyperparameters.prior, k),
         mean=np.stack([states.drift[:, :, k], states.offset[:, :, k]], axis=2),
         sd=np.stack([states.relative_sd[:, :, 1 + k], states.constant_sd[:, :, K - 1 + k]], axis=2),
     )
+
+
+def with_free_drift(states: States, prior: FaultPrior, k: int) -> Array:
+    """Weigh states anew for a branch whose drift may be anything.
+
+    The law of the fleet's faults is that of linear sensors, most of which have no drift. A sensor that is not linear is
+    faulty: a drift of its linear part is as likely as none, and counts among no faults of the law. Otherwise a drift
+    that another fault happens to hide would be taken for none.
+
+    Parameters
+    ----------
+    states : States
+        Of Q vehicles, S each.
+    prior : FaultPrior
+        The law they were weighed with.
+    k : int
+        The branch, in the order of the states.
+
+    Returns
+    -------
+    ndarray of shape (Q, S)
+        Weights, with the sum of each vehicle as before. [1]
+    """
+    log_support, free = prior.log_supports(), (states.drift[:, :, k] != 0.0) & (states.weight > 0.0)
+    hardware, sensors = states.hardware_count, states.sensor_count
+    gained = np.zeros(free.shape)
+    gained[free] = (log_support[hardware, np.maximum(sensors - 1, 0)] - log_support[hardware, sensors])[free]
+    told = states.weight.sum(axis=1, keepdims=True)
+    weight = states.weight * np.exp(gained - gained.max(axis=1, keepdims=True))
+    return np.ascontiguousarray(weight * told / weight.sum(axis=1, keepdims=True))
 
 
 def _harm(sensor: ModelledSensor, states: _States, found: Array, full_scale_a: float) -> float:
