@@ -3,11 +3,12 @@
 All that takes time is imported inside a function, so that Ctrl-C and a closed pipe end it the same way at any time.
 """
 
-import os
 import signal
 import sys
 
 from calibrator.interrupts import INTERRUPTED, MESSAGE, ending_at_sigterm, importing
+from ecu_node.errors import UserError
+from ecu_node.standard_output import drop_output, flush_output
 
 __all__ = ["main"]
 
@@ -17,12 +18,14 @@ def main() -> None:
     ending_at_sigterm()
     try:
         code = _run()
-        sys.stdout.flush()
+        flush_output()
     except KeyboardInterrupt:
         code = INTERRUPTED
+    except UserError as error:
+        print(f"calibrator: {error}", file=sys.stderr)
+        code = 1
     except BrokenPipeError:
-        # What is still buffered has no reader; without this the interpreter would try to write it at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        drop_output()
         code = 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done or undone; threads only have to be joined
     if code == INTERRUPTED:

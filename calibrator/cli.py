@@ -68,6 +68,7 @@ from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import UserError
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_atomically
+from ecu_node.standard_output import flush_output, write_output
 
 if TYPE_CHECKING:
     from calibrator.artificial.truth import FleetTruth
@@ -97,10 +98,16 @@ def main() -> int:
     except (UserError, OSError) as error:
         if debug:
             raise
-        text = str(error) if isinstance(error, UserError) else f"{error.filename or 'file'}: {error.strerror or error}"
-        print(f"calibrator: {text}", file=sys.stderr)
+        flush_output()  # if it was standard output that failed, this says so
+        print(f"calibrator: {_words(error)}", file=sys.stderr)
         return 2 if isinstance(error, ContradictionError) else 1
     return 0
+
+
+def _words(error: UserError | OSError) -> str:
+    if isinstance(error, UserError):
+        return str(error)
+    return f"{error.filename or 'file or standard output'}: {error.strerror or error}"
 
 
 def _version(wanted: bool) -> None:
@@ -133,7 +140,7 @@ def import_(
 
     require_possible_folder(out)
     report = import_logs(logs, _database(layout), out, workers=workers, limit_s=time_limit)
-    _print_report(report.as_json() if json else report.as_text())
+    write_output(report.as_json() if json else report.as_text())
     if not report.drives and not report.already_there:
         raise LogError(f"none of the logs could be used; {out} was not changed")
 
@@ -220,7 +227,7 @@ def summarise(
         time_limit_s=time_limit,
         part=numbered_part(part),
     )
-    _print_report(report.as_json() if json else report.as_text())
+    write_output(report.as_json() if json else report.as_text())
 
 
 @app.command()
@@ -255,7 +262,7 @@ def identify(
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, report.bank.to_json())
-    _print_report(report.as_json() if json else report.as_text())
+    write_output(report.as_json() if json else report.as_text())
 
 
 @app.command()
@@ -316,7 +323,7 @@ def calibrate(
     )
     where = Workers(processes=workers, scheduler=scheduler)
     report = calibrate_fleet(fleet, _database(layout), out, settings, workers=where, since=since)
-    _print_report(report.as_json() if json else report.as_text())
+    write_output(report.as_json() if json else report.as_text())
 
 
 @app.command()
@@ -334,7 +341,7 @@ def params(
     out.mkdir(parents=True, exist_ok=True)
     for vehicle, text in texts.items():
         write_atomically(out / f"{vehicle}.json", text)
-    _print_report("\n".join(str(out / f"{vehicle}.json") for vehicle in texts))
+    write_output("\n".join(str(out / f"{vehicle}.json") for vehicle in texts))
 
 
 @app.command()
@@ -348,7 +355,7 @@ def score(
         from calibrator.result_score import score_result
 
     figures = score_result(result, truth)
-    _print_report(figures.as_json() if json else figures.as_text())
+    write_output(figures.as_json() if json else figures.as_text())
 
 
 @app.command()
@@ -381,7 +388,7 @@ def experiment(
     results = run_experiments(names, options, out=out, console=None if json else Console())
     if json:
         texts = [result.to_json().decode().rstrip() for result in results]
-        _print_report(texts[0] if len(texts) == 1 else f"[{','.join(texts)}]")
+        write_output(texts[0] if len(texts) == 1 else f"[{','.join(texts)}]")
 
 
 def _truth_of(fleet: Path, path: Path) -> "FleetTruth":
@@ -404,8 +411,4 @@ def _database(layout: Path) -> VehicleDatabase:
 def _print_fleet(truth: "FleetTruth", out: Path, notices: Sequence[str], *, json: bool) -> None:
     figures = {"vehicles": len(truth.vehicles), "branches": truth.branches, "out": str(out), "notices": notices}
     lines = [f"{out}: {len(truth.vehicles)} vehicles with branches {', '.join(truth.branches)}"]
-    _print_report(dumps(figures) if json else "\n".join([*lines, *(f"notice: {notice}" for notice in notices)]))
-
-
-def _print_report(text: str) -> None:
-    sys.stdout.write(text + "\n")
+    write_output(dumps(figures) if json else "\n".join([*lines, *(f"notice: {notice}" for notice in notices)]))

@@ -9,30 +9,32 @@ import socket
 import struct
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import can
 
 from ecu_node.counters import Counters
 from ecu_node.errors import BusError
+from ecu_node.links import Link, OneByOne, is_of
+from ecu_node.socketcan import SocketCanLink
 
-__all__ = ["SteadyBus", "TimeOfDay", "connect", "steady_time_s"]
+__all__ = ["SteadyBus", "carries_fd", "connect"]
 
 _SEND_ATTEMPTS = 3
 _SEND_PAUSE_S = 0.001
 """A full send queue drains by some frames in this time. [s]"""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 2.0
 """Between attempts to open a bus again. [s]"""
-_OLDEST_FRAME_S = 10.0
-"""No frame waits for longer: an older time stamp is one of another clock. [s]"""
-_LARGEST_JITTER_S = 0.05
-"""By more than this the time of day changes against the steady clock only if it is set. [s]"""
 _GONE = {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF}
 """Errors of sending after which only opening the bus again helps."""
 _RECEIVE_BUFFER_BYTES = 1 << 20
 """Asked of the kernel, which gives what it allows: frames of the time in which the node does something else."""
 _SO_MEMINFO, _DROPS = 55, 8
 """Socket option, and the place of the dropped frames in it (asm-generic/socket.h, linux/sock_diag.h)."""
+_INTERFACES = Path("/sys/class/net")
+_FD_BYTES = 72
+"""Of struct canfd_frame: the largest unit of an interface that carries them."""
 _BUS_OFF = 0x40
 """Class of error frames of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
 
@@ -73,10 +75,20 @@ def connect(
         )
     except (can.CanError, OSError, ValueError, TypeError, NotImplementedError) as error:
         raise BusError(f"{interface} {channel}: cannot open the bus: {_why(error)}") from None
-    queue = _queue(bus)
-    if queue is not None:
-        queue.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+    opened = _socket(bus)
+    if opened is not None:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
     return bus
+
+
+def carries_fd(interface: str, channel: str) -> bool:
+    """Whether an interface of SocketCAN is set up for CAN FD; False where that is not known."""
+    if interface != "socketcan":
+        return False
+    try:
+        return int((_INTERFACES / channel / "mtu").read_text()) >= _FD_BYTES
+    except (OSError, ValueError):
+        return False
 
 
 class SteadyBus:
@@ -103,66 +115,91 @@ class SteadyBus:
         self, open_bus: Callable[[], can.BusABC], counters: Counters, say: Callable[[str], None] = lambda _: None
     ) -> None:
         self._open, self._counters, self._say = open_bus, counters, say
-        self._bus: can.BusABC | None = open_bus()
-        self._failed: tuple[can.BusABC, Exception] | None = None
+        bus = open_bus()
+        self._opened: _Opened | None = _Opened(bus)
+        self._failed: tuple[_Opened, Exception] | None = None
         self._retry_s, self._pause_s = 0.0, _FIRST_PAUSE_S
-        self._dropped, self._is_full = 0, False
-        self.channel = self._bus.channel_info
+        self._queue: list[can.Message] = []
+        self._is_full = False
+        self.send = self._queue.append
+        """Takes a frame to be sent at the next :meth:`flush`."""
+        self.asked_s = time.monotonic()
+        """When the bus was asked last: what came before that was received. [s]"""
+        self.channel = bus.channel_info
+
+    @property
+    def at_hand(self) -> bool:
+        """Whether a frame that came is here already."""
+        opened = self._opened
+        return opened is not None and opened.link.at_hand
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """Wait for a data or remote frame; None if none came in time, or the bus is gone."""
         if self._failed is not None:
             failed, error = self._failed
             self._failed = None
-            if failed is self._bus:
+            if failed is self._opened:
                 self._gone(error)
-        bus = self._bus
-        if bus is None:
+        opened = self._opened
+        if opened is None:
             return self._reopened(timeout_s)
         try:
-            message = bus.recv(timeout_s)
+            message = opened.link.receive(timeout_s)
             while message is not None and message.is_error_frame:
                 self._count_error(message)
-                message = bus.recv(0.0)
+                message = opened.link.receive(0.0)
         except (can.CanError, OSError) as error:
             self._gone(error)
             return None
+        self.asked_s = opened.link.asked_s
         return message
 
-    def send(self, message: can.Message) -> bool:
-        """Send one frame; False if the bus did not take it in a few attempts, or in one while it is full."""
-        for attempt in range(1 if self._is_full else _SEND_ATTEMPTS):
-            bus = self._bus
-            if bus is None:
-                return False
-            if attempt:
-                time.sleep(_SEND_PAUSE_S)
+    def flush(self) -> tuple[int, int]:
+        """Send what was given to :attr:`send`, in order.
+
+        Returns
+        -------
+        sent, not_sent : int
+            Frames that the bus took, and that it did not take in a few attempts, or in one while it is full.
+        """
+        queue, done, lost, attempts = self._queue, 0, 0, 0
+        while done < len(queue):
+            opened = self._opened
+            if opened is None:
+                lost += len(queue) - done
+                break
             try:
-                bus.send(message)
+                done += opened.link.send(queue, done)
             except (can.CanError, OSError, ValueError) as error:  # ValueError: closed by the other thread just now
                 if _number(error) in _GONE:
                     # Whoever asks first is told that the bus is gone, and nobody after: receiving need not fail, too.
-                    self._failed = bus, error
-                    return False
-                continue
-            self._is_full = False
-            return True
-        self._is_full = True
-        return False
+                    self._failed = opened, error
+                    lost += len(queue) - done
+                    break
+                attempts += 1
+                if attempts < (1 if self._is_full else _SEND_ATTEMPTS):
+                    time.sleep(_SEND_PAUSE_S)
+                    continue
+                self._is_full = True
+                done, lost = done + 1, lost + 1
+            else:
+                self._is_full = False
+            attempts = 0
+        sent = len(queue) - lost
+        queue.clear()
+        return sent, lost
 
     def count_dropped(self) -> None:
         """Count the frames that the kernel dropped since the last time, because they were not read in time."""
-        bus = self._bus
-        if bus is not None:
-            dropped = _dropped(bus)
-            self._counters.dropped += max(dropped - self._dropped, 0)
-            self._dropped = dropped
+        opened = self._opened
+        if opened is not None:
+            self._counters.dropped += opened.newly_dropped()
 
     def close(self) -> None:
         """Close it."""
-        bus, self._bus = self._bus, None
-        if bus is not None:
-            bus.shutdown()
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            opened.bus.shutdown()
 
     def _count_error(self, message: can.Message) -> None:
         self._counters.bus_errors += 1
@@ -174,27 +211,28 @@ class SteadyBus:
         try:
             self.close()
         except (can.CanError, OSError):
-            self._bus = None
+            self._opened = None
 
     def _reopened(self, timeout_s: float) -> can.Message | None:
         """Open it again if it is time to, and receive; wait no longer than the timeout."""
-        now_s = time.monotonic()
+        now_s = self.asked_s = time.monotonic()
         if now_s < self._retry_s:
             time.sleep(min(timeout_s, self._retry_s - now_s))
+            self.asked_s = time.monotonic()
             return None
         self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
         self._retry_s = now_s + self._pause_s
         try:
-            bus = self._open()
+            opened = _Opened(self._open())
         except BusError:
             return None
         try:
-            message = bus.recv(0.0)  # an interface that is down can be opened, but not received from
+            message = opened.link.receive(0.0)  # an interface that is down can be opened, but not received from
         except (can.CanError, OSError):
             with contextlib.suppress(can.CanError, OSError):
-                bus.shutdown()
+                opened.bus.shutdown()
             return None
-        self._bus, self._dropped = bus, 0
+        self._opened = opened
         self._counters.reopened += 1
         self._say(f"{self.channel}: the bus is open again")
         if message is not None and message.is_error_frame:
@@ -203,67 +241,33 @@ class SteadyBus:
         return message
 
 
-def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float) -> float:
-    """When a frame came, on the steady clock.
+class _Opened:
+    """An open bus, and what belongs to it alone."""
 
-    Parameters
-    ----------
-    stamp_s : float
-        Its time stamp by the kernel or the adapter; 0 if there is none. [s]
-    now_s : float
-        The steady clock now. [s]
-    clock_ahead_s : float
-        By how much the time of day is ahead of the steady clock; infinity if it was set a short while ago. [s]
+    def __init__(self, bus: can.BusABC) -> None:
+        self.bus = bus
+        self._socket = _socket(bus)
+        self.link: Link = OneByOne(bus) if self._socket is None else SocketCanLink(self._socket)
+        self._dropped = 0
 
-    Returns
-    -------
-    float
-        The stamp on the steady clock; now if that would be in the future or very long ago, or the clock was set.
-    """
-    time_s = stamp_s - clock_ahead_s
-    return time_s if now_s - _OLDEST_FRAME_S <= time_s <= now_s else now_s
-
-
-class TimeOfDay:
-    """By how much the time of day is ahead of the steady clock, and whether it was set.
-
-    Parameters
-    ----------
-    counters : Counters
-        Where it is counted how often it was set.
-    """
-
-    def __init__(self, counters: Counters) -> None:
-        self._counters = counters
-        self._ahead_s = time.time() - time.monotonic()
-        self._set_s = float("-inf")
-
-    def ahead_s(self, now_s: float) -> float:
-        """Now, on the steady clock; infinity while frames may be waiting that were stamped before it was set."""
-        ahead_s = time.time() - now_s
-        if abs(ahead_s - self._ahead_s) > _LARGEST_JITTER_S:
-            self._set_s = now_s
-            self._counters.clock_steps += 1
-        self._ahead_s = ahead_s
-        return ahead_s if now_s - self._set_s > _OLDEST_FRAME_S else float("inf")
+    def newly_dropped(self) -> int:
+        """Frames that the kernel dropped since the last time; 0 where that is not known."""
+        if self._socket is None:
+            return 0
+        try:
+            info = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_DROPS + 1))
+        except OSError:  # closed meanwhile, or a kernel before 4.12
+            return 0
+        if len(info) < 4 * (_DROPS + 1):
+            return 0
+        before, self._dropped = self._dropped, int(struct.unpack(f"={_DROPS + 1}I", info)[_DROPS])
+        return max(self._dropped - before, 0)
 
 
-def _queue(bus: can.BusABC) -> socket.socket | None:
+def _socket(bus: can.BusABC) -> socket.socket | None:
     """Socket of a bus of SocketCAN."""
-    found = getattr(bus, "socket", None)
+    found = getattr(bus, "socket", None) if is_of(bus, "socketcan") else None
     return found if isinstance(found, socket.socket) else None
-
-
-def _dropped(bus: can.BusABC) -> int:
-    """Frames that the kernel has dropped; 0 where that is not known."""
-    queue = _queue(bus)
-    if queue is None:
-        return 0
-    try:
-        info = queue.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_DROPS + 1))
-    except OSError:  # closed meanwhile, or a kernel before 4.12
-        return 0
-    return int(struct.unpack(f"={_DROPS + 1}I", info)[_DROPS]) if len(info) == 4 * (_DROPS + 1) else 0
 
 
 def _number(error: Exception) -> int | None:

@@ -11,11 +11,17 @@ import math
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ecu_node import __version__
 from ecu_node.errors import UserError
-from ecu_node.interrupts import ending_at_interrupt
+from ecu_node.interrupts import ending_at_interrupt, ignoring_hangups
+from ecu_node.standard_output import drop_output, flush_output, write_output
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 __all__ = ["main"]
 
@@ -44,24 +50,34 @@ def main(argv: Sequence[str] | None = None) -> int:
             try:
                 return _main(argv)
             finally:
-                sys.stdout.flush()
+                flush_output()
     except UserError as error:
         _say(str(error))
     except BrokenPipeError:
-        # What is still buffered has no reader; without this the interpreter would try to write it at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        drop_output()
     return 1
 
 
 def _main(argv: Sequence[str] | None) -> int:
     options = _parser().parse_args(argv)
-    logging.getLogger("can").addHandler(logging.NullHandler())
-    _load_python_can()
-    return int(options.command(options))
+    with ignoring_hangups() if options.command is _run else nullcontext():
+        logging.getLogger("can").addHandler(logging.NullHandler())
+        _load_python_can()
+        return int(options.command(options))
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says that help cannot be written, where argparse would end as if it were."""
+
+    def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
+        if file is not None and file is sys.stdout:
+            write_output(message.removesuffix("\n"))
+        else:
+            super()._print_message(message, file)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="ecu-node",
         description="Corrects the high-voltage currents on a CAN bus with the parameters of this vehicle.",
         epilog=_EXIT_CODES,
@@ -108,7 +124,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_monitor(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def _add_monitor(commands: "argparse._SubParsersAction[_Parser]") -> None:
     monitor = commands.add_parser(
         "monitor",
         help="show the branches, their sum and the node, live",
@@ -154,6 +170,12 @@ def _name(text: str) -> str:
     return text
 
 
+def _vehicle(text: str) -> str:
+    if not text.strip():
+        raise argparse.ArgumentTypeError("the identity of this vehicle is expected, found none; or leave it out")
+    return text
+
+
 def _port(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) <= _LARGEST_PORT:
         raise argparse.ArgumentTypeError(f"a TCP port from 1 to {_LARGEST_PORT} is expected, found {text!r}")
@@ -165,6 +187,7 @@ def _add_files(parser: argparse.ArgumentParser) -> None:
     _add_layout(parser)
     parser.add_argument(
         "--vehicle",
+        type=_vehicle,
         default=os.environ.get(_VEHICLE_VARIABLE) or None,
         metavar="ID",
         help=f"this vehicle; parameters of another are refused (default: ${_VEHICLE_VARIABLE}; else not checked)",
@@ -230,14 +253,14 @@ def _check(options: argparse.Namespace) -> int:
 
     mode = Mode.GATEWAY if options.gateway else Mode.OVERLAY
     report = check_report(options.params, options.layout, options.vehicle, mode)
-    print(json.dumps(report, indent=2) if options.json else report_text(report))
+    write_output(json.dumps(report, indent=2) if options.json else report_text(report))
     return 0 if report["fit"] else 1
 
 
 def _schema(options: argparse.Namespace) -> int:  # noqa: ARG001
     from ecu_node.parameters import parameter_schema  # noqa: PLC0415  # after _load_python_can
 
-    print(json.dumps(parameter_schema(), indent=2))
+    write_output(json.dumps(parameter_schema(), indent=2))
     return 0
 
 

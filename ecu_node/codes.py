@@ -6,17 +6,25 @@ value if it lies in the DBC's [minimum|maximum] and has no name in the DBC's val
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
 from cantools.database.can import Signal
 
 from ecu_node.bits import BitPlace, bit_place
-from ecu_node.database import unit_factor
 from ecu_node.errors import DatabaseError
+from ecu_node.units import unit_factor
 
-__all__ = ["Codes", "as_written", "not_available_code", "read_codes", "writable_range"]
+__all__ = [
+    "Codes",
+    "as_written",
+    "impossible_values",
+    "not_available_code",
+    "read_codes",
+    "require_reach",
+    "writable_range",
+]
 
 _NOT_AVAILABLE_NAMES = ("sna", "notavailable", "signalnotavailable", "na", "invalid", "error")
 """Names of the code for "no value", letters only, the best one first."""
@@ -51,6 +59,10 @@ class Codes:
     def is_value(self, code: int) -> bool:
         """Whether a code stands for a number, rather than for a name or outside the DBC's range."""
         return self.lowest <= code <= self.highest and code not in self.named
+
+    def worth(self, code: int) -> Fraction:
+        """Value of a code, whether it has a name or not."""
+        return self.scale * code + self.offset
 
     def nearest(self, value: Fraction) -> int:
         """Code nearest to a value, halves up, inside the width and the DBC's range."""
@@ -136,6 +148,59 @@ def writable_range(codes: Codes, where: str) -> tuple[int, int]:
     lowest = max([codes.lowest, *(code + 1 for code in codes.named if code < zero)])
     highest = min([codes.highest, *(code - 1 for code in codes.named if code > zero)])
     return lowest, highest
+
+
+def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
+    """Refuse a signal to write if a name amid its values keeps results of full scale out.
+
+    Parameters
+    ----------
+    codes : Codes
+        Of the signal to write.
+    largest : Fraction
+        Largest magnitude that must be written, as far as the signal reaches at all. [unit of the codes]
+    where : str
+        What the signal is for, for the message of the error.
+
+    Raises
+    ------
+    DatabaseError
+        If results would be clamped to less, though the signal has values beyond.
+    """
+    ends = writable_range(codes, where)
+    for end, extreme, inwards in zip(ends, (codes.lowest, codes.highest), (1, -1), strict=True):
+        outermost = extreme
+        while outermost in codes.named:  # names at the ends of the range keep no value out
+            outermost += inwards
+        if end == outermost or abs(codes.worth(end)) >= largest:
+            continue
+        named = end - inwards
+        raise DatabaseError(
+            f"{where}: code {named} of signal {codes.name} means {codes.named[named]!r}, so that no result beyond "
+            f"{float(codes.worth(end)):g} could be written, and full scale is {float(largest):g}; names are for codes "
+            f"that are no values"
+        )
+
+
+def impossible_values(signal: Signal, values: Sequence[float]) -> list[float]:
+    """Those of some values that a signal of the DBC can never have; none of a floating-point number's.
+
+    Parameters
+    ----------
+    signal : Signal
+        A signal of the DBC.
+    values : sequence of float
+        In the unit of the DBC.
+    """
+    if signal.is_float or signal.scale == 0:
+        return []
+    place, scale, offset = bit_place(signal), as_written(signal.scale), as_written(signal.offset)
+    codes = [(as_written(float(value)) - offset) / scale for value in values]
+    return [
+        value
+        for value, code in zip(values, codes, strict=True)
+        if code.denominator != 1 or not place.lowest <= code <= place.highest
+    ]
 
 
 def not_available_code(codes: Codes, where: str) -> int:

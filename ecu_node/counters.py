@@ -11,8 +11,10 @@ class Counters:
 
     frames_in: int = 0
     """Frames of branches, their voltages and temperatures received."""
-    corrected: int = 0
-    """Corrected messages made, or frames rewritten."""
+    answers: int = 0
+    """Corrected messages that an overlay node made, those with values passed through or not available included."""
+    rewritten: int = 0
+    """Frames in which a gateway wrote another current than was measured."""
     forwarded: int = 0
     """Frames passed on by a gateway, those that it rewrote included."""
     returned: int = 0

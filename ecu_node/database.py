@@ -1,20 +1,20 @@
 """The DBC as the layout uses it: every named signal found, with its unit turned into A, V or W."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cantools
 from cantools.database.can import Database, Message, Signal
 
-from ecu_node.errors import DatabaseError
-from ecu_node.layout import Layout, file_digest, split_signal
+from ecu_node.codes import impossible_values
+from ecu_node.errors import DatabaseError, LayoutError
+from ecu_node.layout import Layout, split_signal
+from ecu_node.units import AMPERE, CELSIUS, VOLT, WATT, unit_factor
+from ecu_node.user_files import UnsuitableFileError, read_user_file, text_digest
 
-__all__ = ["AMPERE", "CELSIUS", "VOLT", "WATT", "VehicleDatabase", "read_database", "unit_factor"]
+__all__ = ["AMPERE", "CELSIUS", "MAX_DBC_BYTES", "VOLT", "WATT", "VehicleDatabase", "read_database", "unit_factor"]
 
-AMPERE: Mapping[str, float] = {"A": 1.0, "mA": 1e-3, "kA": 1e3}
-VOLT: Mapping[str, float] = {"V": 1.0, "mV": 1e-3, "kV": 1e3}
-WATT: Mapping[str, float] = {"W": 1.0, "kW": 1e3, "mW": 1e-3, "MW": 1e6}
-CELSIUS: Mapping[str, float] = dict.fromkeys(("degC", "°C", "C", "deg C", "Celsius"), 1.0)
+MAX_DBC_BYTES = 16_000_000
+"""The largest DBCs have some megabytes; to read one takes a hundred times its size in memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,13 +26,14 @@ class VehicleDatabase:
     digest: str
     """SHA-256 of the DBC file."""
 
-    def message(self, name: str) -> Message:
-        """Return the message of this name, or raise :class:`DatabaseError`."""
+    def message(self, name: str, place: str = "") -> Message:
+        """Return the message of this name, which stands at this place of the layout, or raise DatabaseError."""
         try:
             return self.database.get_message_by_name(name)
         except KeyError:
+            where = f" in {place}" if place else ""
             raise DatabaseError(
-                f"{self.layout.dbc_path}: no message {name!r}, which {self.layout.path} names"
+                f"{self.layout.dbc_path}: no message {name!r}, which {self.layout.path} names{where}"
             ) from None
 
     def signal(self, name: str) -> tuple[Message, Signal]:
@@ -74,17 +75,19 @@ def read_database(layout: Layout) -> VehicleDatabase:
     ------
     DatabaseError
         If the file cannot be read or parsed, or lacks messages or a signal that the layout names.
+    LayoutError
+        If the layout names a value of an input that its signal can never have.
     """
     path = layout.dbc_path
     try:
-        if not path.read_bytes().strip():
+        content = read_user_file(path, largest_bytes=MAX_DBC_BYTES)
+        if not content.strip():
             raise DatabaseError(f"{path}: the DBC is empty, it has no message; copy it again")
         database = cantools.database.load_file(path, strict=False)
-        digest = file_digest(path)
-    except OSError as error:
+    except (OSError, UnsuitableFileError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
         raise DatabaseError(
-            f'{path}: cannot read the DBC: {error.strerror}; it is named by the line dbc = "{layout.dbc}" of '
-            f"{layout.path}"
+            f'{path}: cannot read the DBC: {why}; it is named by the line dbc = "{layout.dbc}" of {layout.path}'
         ) from None
     except (cantools.Error, ValueError, KeyError, TypeError) as error:
         first_line = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -93,41 +96,9 @@ def read_database(layout: Layout) -> VehicleDatabase:
         raise DatabaseError(f"{path}: a diagnostics database; a CAN database (DBC) is needed")
     if not database.messages:
         raise DatabaseError(f"{path}: the DBC has no message; check that it is the one that {layout.path} needs")
-    vehicle = VehicleDatabase(layout=layout, database=database, digest=digest)
+    vehicle = VehicleDatabase(layout=layout, database=database, digest=text_digest(content))
     _look_everything_up(vehicle)
     return vehicle
-
-
-def unit_factor(signal: Signal, known: Mapping[str, float], where: str) -> float:
-    """Factor that turns the values of a signal into the base unit, such as 1000 for kW into W.
-
-    Parameters
-    ----------
-    signal : Signal
-        A signal of the DBC. A signal without unit counts as being in the base unit.
-    known : mapping of str to float
-        One of :data:`AMPERE`, :data:`VOLT`, :data:`WATT`.
-    where : str
-        What the signal is for, for the message of the error.
-
-    Returns
-    -------
-    float
-        The factor. [base unit / unit of the signal]
-
-    Raises
-    ------
-    DatabaseError
-        If the unit is of another quantity.
-    """
-    if not signal.unit:
-        return 1.0
-    try:
-        return known[signal.unit]
-    except KeyError:
-        raise DatabaseError(
-            f"{where}: signal {signal.name} is in {signal.unit!r}; expected {', '.join(known)}"
-        ) from None
 
 
 def _look_everything_up(vehicle: VehicleDatabase) -> None:
@@ -146,11 +117,30 @@ def _look_everything_up(vehicle: VehicleDatabase) -> None:
             vehicle.signal(branch.quality)
     for item in layout.input:
         vehicle.signal(item.signal)
+    _check_values(vehicle)
     if layout.status is not None:
         for field in ("state", "reason", "parameter_set", "alive_counter", "sum_measured", "sum_corrected"):
             signal = getattr(layout.status, field)
             if signal is not None:
                 vehicle.signal(f"{layout.status.message}.{signal}")
-    for entry in layout.e2e:
+    for place, entry in layout.protections:
         for name in entry.messages:
-            vehicle.message(name)
+            vehicle.message(name, place)
+
+
+def _check_values(vehicle: VehicleDatabase) -> None:
+    """Refuse values of inputs that their signals can never have: what waits for them would wait for ever."""
+    layout = vehicle.layout
+    signals = {item.name: item.signal for item in layout.input}
+    wanted = []
+    if layout.contactor is not None:
+        wanted.append(("[contactor] open", layout.contactor.input, layout.contactor.open))
+    if layout.watch.input is not None:
+        wanted.append(("[watch] valid", layout.watch.input, layout.watch.valid))
+    for key, name, values in wanted:
+        _, signal = vehicle.signal(signals[name])
+        if never := impossible_values(signal, values):
+            raise LayoutError(
+                f"{layout.path}: {key}: {', '.join(f'{value:g}' for value in never)} is no value of {signals[name]}, "
+                f"which has {signal.length} bits, scale {signal.scale:g} and offset {signal.offset:g}"
+            )

@@ -23,7 +23,7 @@ from e2e.p05 import e2e_p05_check, e2e_p05_protect
 from ecu_node.bits import bit_place
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
-from ecu_node.layout import CounterCrc8, EndToEnd, ProfileP01, ProfileP02, ProfileP05
+from ecu_node.layout_e2e import CounterCrc8, EndToEnd, ProfileP01, ProfileP02, ProfileP05
 
 __all__ = ["Check", "Protection", "Receiver", "protection_of"]
 
@@ -155,24 +155,25 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
     LayoutError
         If the message cannot carry its protection.
     """
-    entry = database.layout.protection(message.name)
+    layout = database.layout
+    entry = layout.protection(message.name)
     if entry is None:
         return None
+    where = f"{layout.path}: {layout.protection_place(message.name)}: message {message.name}"
     if message.length > _LONGEST_CLASSIC and message.length not in _FD_LENGTHS:
         raise LayoutError(
-            f"{database.layout.path}: [e2e]: message {message.name} has {message.length} bytes in the DBC; CAN FD pads "
-            f"it, so that its CRC cannot be checked; expected {', '.join(map(str, _FD_LENGTHS))}"
+            f"{where} has {message.length} bytes in the DBC; CAN FD pads it, so that its CRC cannot be checked; "
+            f"expected {', '.join(map(str, _FD_LENGTHS))}"
         )
-    protection = _made(entry, message, f"{database.layout.path}: [e2e]: message {message.name}")
+    protection = _made(entry, message, where)
     if entry.max_delta_counter >= protection.modulus:
         raise LayoutError(
-            f"{database.layout.path}: [e2e]: {message.name}: max_delta_counter is {entry.max_delta_counter}, but the "
-            f"counter has {protection.modulus} codes only; with it no jump could be noticed"
+            f"{where}: max_delta_counter is {entry.max_delta_counter}, but the counter has {protection.modulus} codes "
+            f"only; with it no jump could be noticed"
         )
     if message.length < protection.least_bytes:
         raise LayoutError(
-            f"{database.layout.path}: [e2e]: message {message.name} has {message.length} bytes, too few for the header "
-            f"of {protection.least_bytes} bytes"
+            f"{where} has {message.length} bytes, too few for the header of {protection.least_bytes} bytes"
         )
     return protection
 
@@ -276,6 +277,8 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> Protectio
     modulus = entry.counter_modulus or counter_place.highest + 1
     if counter_place.end - counter_place.first > 1:
         raise LayoutError(f"{where}: signal {entry.counter} must be within one byte to be a counter")
+    if counter_place.mask & crc_place.mask:
+        raise LayoutError(f"{where}: signals {entry.counter} and {entry.crc} overlap; each needs bits of its own")
     if counter_place.signed or modulus > counter_place.highest + 1:
         raise LayoutError(f"{where}: signal {entry.counter} cannot count from 0 to {modulus - 1}")
     crc8 = _algorithm(entry.algorithm, where)

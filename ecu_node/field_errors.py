@@ -21,6 +21,7 @@ Place = tuple[Step, ...]
 
 _MESSAGE = re.compile(r"(?P<what>.*?)(?: - at `(?P<in_key>key in )?\$?(?P<path>.*)`)?", re.DOTALL)
 _STEP = re.compile(r"\.(?P<key>\w+)|\[(?P<index>\d+)\]|(?P<any>\[\.\.\.\])")
+_LENGTH = re.compile(r" of length (?P<relation>[<>])= (?P<number>\d+)")
 _WORDS = {
     "array": "a list",
     "bool": "true or false",
@@ -56,7 +57,7 @@ def field_error(error: msgspec.ValidationError, document: Any, schema: Any, plac
     assert match is not None, "the pattern matches every text"
     steps = _steps(match["path"] or "", str(error), document, schema)
     words = place(document, steps)
-    what = _what(match["what"], _found(document, steps), _kind(schema, steps))
+    what = _what(match["what"], _found(document, steps), _kind(schema, document, steps))
     return f"{words}: {what}" if words else what
 
 
@@ -127,12 +128,21 @@ def _found(document: Any, steps: Place) -> Any:
     return document
 
 
-def _kind(schema: Any, steps: Place) -> inspect.Type | None:
+def _kind(schema: Any, document: Any, steps: Place) -> inspect.Type | None:
     """What the schema expects at a place; None if it says nothing of it."""
     kinds = list(_alternatives(inspect.type_info(schema)))
-    for step in steps:
-        kinds = [inner for kind in kinds for inner in _alternatives(_inside(kind, step))]
+    for depth, step in enumerate(steps, start=1):
+        found = _found(document, steps[:depth])
+        inside = (inner for kind in kinds for inner in _alternatives(_inside(kind, step)))
+        kinds = [kind for kind in inside if _may_be(kind, found)]
     return kinds[0] if kinds else None
+
+
+def _may_be(kind: inspect.Type, found: Any) -> bool:
+    """Whether this alternative is meant, by the tag that tells some of them apart."""
+    if not isinstance(kind, inspect.StructType) or kind.tag_field is None or not isinstance(found, Mapping):
+        return True
+    return bool(found.get(kind.tag_field) == kind.tag)
 
 
 def _inside(kind: inspect.Type, step: Step) -> inspect.Type | None:
@@ -166,8 +176,18 @@ def _what(text: str, found: Any, kind: inspect.Type | None) -> str:
         return f"{text}, found {_shown(found)}"
     words = _WORDS.get(expected[1], expected[1])
     if expected[2].startswith(" matching regex"):
-        return f"{_pattern_words(expected[2])} is expected, found {_shown(found)}"
-    return f"{words}{expected[2].replace('length', 'number of entries')} is expected, found {_shown(found)}"
+        words = _pattern_words(expected[2])
+    elif length := _LENGTH.fullmatch(expected[2]):
+        bound = "at least" if length["relation"] == ">" else "at most"
+        words += f" of {bound} {_count_words(int(length['number']), is_text=expected[1] == 'str')}"
+    else:
+        words += expected[2]
+    return f"{words} is expected, found {_shown(found)}"
+
+
+def _count_words(number: int, *, is_text: bool) -> str:
+    one, more = ("character", "characters") if is_text else ("entry", "entries")
+    return f"{number} {one if number == 1 else more}"
 
 
 def _pattern_words(text: str) -> str:
@@ -178,7 +198,9 @@ def _pattern_words(text: str) -> str:
 
 
 def _unknown_key(key: str, kind: inspect.Type | None) -> str:
-    allowed = [field.encode_name for field in kind.fields] if isinstance(kind, inspect.StructType) else []
+    allowed = []
+    if isinstance(kind, inspect.StructType):
+        allowed = [*([kind.tag_field] if kind.tag_field else []), *(field.encode_name for field in kind.fields)]
     near = difflib.get_close_matches(key, allowed, n=1)
     hint = f"did you mean '{near[0]}'? " if near else ""
     return f"unknown key '{key}'; {hint}allowed are {', '.join(allowed)}"

@@ -124,6 +124,8 @@ class Source:
     forward : callable
         Gateway: takes a frame, and writes what the branches make of it in the place of what was measured. Of the same,
         the payload to send on, protected with the counter that the frame came with; None if it is held back.
+    timeout_s : float
+        Frames that are older when they are read are of no use; infinity for a message without branches. [s]
     """
 
     def __init__(
@@ -145,17 +147,13 @@ class Source:
         self._history: deque[tuple[float, bytearray]] = deque(maxlen=_REMEMBERED)
         self._silence_s = max([_LEAST_SILENCE_S, *(branch.timeout_s for branch, _ in self._branches)])
         self._message = Message(length, protection, self._receiver, counters, self._history.append)
+        self.timeout_s = max((branch.timeout_s for branch, _ in self._branches), default=float("inf"))
         for reader in readers:
             reader.part.follow(reader.signal, self._history)
         for branch, _ in self._branches:
             branch.when_changed.append(self._renew)
         self.answer: Answer = self._answer
         self.forward: Forward = self._forward
-
-    @property
-    def timeout_s(self) -> float:
-        """Frames that are older when they are read are of no use; infinity for a message without branches. [s]"""
-        return max((branch.timeout_s for branch, _ in self._branches), default=float("inf"))
 
     def _renew(self) -> None:
         """Put together anew what is quick: a plan has changed."""
@@ -183,7 +181,7 @@ class Source:
             return ()
         for target in self._targets:
             target.make(now_s)
-            counters.corrected += 1
+            counters.answers += 1
         return self._targets
 
     def _forward(self, payload: bytearray, now_s: float) -> bytearray | None:
@@ -207,7 +205,7 @@ class Source:
                 signal.place.put(rewritten, code if out is None else out)
         if rewritten == payload:
             return payload
-        counters.corrected += 1
+        counters.rewritten += 1
         if self._protection is not None:
             self._protection.seal(rewritten)
         return rewritten

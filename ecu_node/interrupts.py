@@ -1,7 +1,8 @@
-"""Ctrl-C while nothing is open yet.
+"""Signals that come while nothing is open yet.
 
 Libraries swallow KeyboardInterrupt in their own imports, or print it; so until the node is at work, SIGINT ends the
-process at once. What the node does at work is for :mod:`ecu_node.cli` to say.
+process at once. SIGHUP asks for parameters that are about to be read anyway. What the node does at work is for
+:mod:`ecu_node.cli` to say.
 """
 
 import os
@@ -11,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["INTERRUPTED", "ending_at_interrupt"]
+__all__ = ["INTERRUPTED", "ending_at_interrupt", "ignoring_hangups"]
 
 INTERRUPTED = 130
 """Exit code that shells give to a program ended by SIGINT."""
@@ -34,3 +35,13 @@ def ending_at_interrupt(message: str) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def ignoring_hangups() -> Iterator[None]:
+    """Within the block SIGHUP, which would end the process, does nothing until somebody else handles it."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, before)

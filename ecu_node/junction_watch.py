@@ -15,8 +15,10 @@ __all__ = ["JunctionSums", "JunctionWatch"]
 
 _MOST_MARGINS = 10.0
 """More than so many margins nobody may expect the corrected sum to be worse."""
-_LEAST_LOOKS = 20
+_LEAST_LOOKS = 10
 """Sums that a verdict needs."""
+_MOST_LOOKS = 200
+"""Sums that are kept of a window, at equal distances: a long window is to cost no more than a short one."""
 _STUCK_SHARE = 0.02
 """Standard deviation of the measured sum, in shares of full scale, at which a code that never changes is suspicious."""
 _REST_SHARE = 0.005
@@ -106,7 +108,7 @@ class JunctionWatch:
         self.sums = JunctionSums(measured_a=sum(pair[0] for pair in known), corrected_a=sum(pair[1] for pair in known))
         if not self._is_whole():
             self._past.clear()
-        elif instant_s > self._instant_s:
+        elif instant_s > self._instant_s and not self._is_close(now_s):
             self._instant_s = instant_s
             codes = {branch.name: code for branch, (_, code) in zip(fitted, latest, strict=True)}
             self._past.append((now_s, self.sums, codes))
@@ -132,6 +134,10 @@ class JunctionWatch:
             return []
         seen = {branch.name: {codes.get(branch.name) for _, _, codes in self._past} for branch in self._branches}
         return [branch for branch in self._branches if len(seen[branch.name]) == 1 and self._flows(branch)]
+
+    def _is_close(self, now_s: float) -> bool:
+        """Whether the last sums that were kept are those of a moment ago."""
+        return bool(self._past) and now_s - self._past[-1][0] < self._window_s / _MOST_LOOKS
 
     def _flows(self, branch: LiveBranch) -> bool:
         currents = branch.currents_at(branch.time_s)

@@ -4,31 +4,29 @@ It names the branches of the junction with their sign, the inputs, where correct
 All later steps use the names given here; the DBC's own names appear nowhere else.
 """
 
-import hashlib
 import tomllib
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import Annotated, Any, Literal
 
 import msgspec
 
 from ecu_node.errors import LayoutError
 from ecu_node.field_errors import field_error, toml_place
-from ecu_node.formula import formula_names, parse_formula
+from ecu_node.layout_checks import check_layout
+from ecu_node.layout_e2e import PROFILES, EndToEnd
+from ecu_node.signal_names import Name, SignalName, split_signal
+from ecu_node.user_files import UnsuitableFileError, read_user_file, text_digest
 
 __all__ = [
+    "MAX_LAYOUT_BYTES",
     "Branch",
     "Contactor",
-    "CounterCrc8",
     "Derived",
-    "EndToEnd",
     "Input",
     "Layout",
+    "LayoutKeys",
     "Limits",
     "Name",
-    "ProfileP01",
-    "ProfileP02",
-    "ProfileP05",
     "SignalName",
     "StatusMessage",
     "UnmeasuredLoad",
@@ -38,10 +36,8 @@ __all__ = [
     "split_signal",
 ]
 
-Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
-"""A name without blanks."""
-SignalName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]*\.[A-Za-z_][A-Za-z0-9_]*$")]
-"""``Message.Signal``, as both are called in the DBC."""
+MAX_LAYOUT_BYTES = 1_000_000
+"""A layout has some kilobytes; a larger file is not one."""
 
 _Positive = Annotated[float, msgspec.Meta(gt=0.0, le=1e6)]
 
@@ -126,66 +122,6 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     sum_corrected: Name | None = None
 
 
-_DataId = Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)]
-_Offset = Annotated[int, msgspec.Meta(ge=0, le=60)]
-
-
-class _Protected(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    messages: list[Name]
-    max_delta_counter: Annotated[int, msgspec.Meta(ge=1, le=255)] = 3
-    """Largest step of the counter between two frames that is used: one more than the frames that may be lost."""
-
-
-class ProfileP01(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P01"):
-    """AUTOSAR E2E profile 1: CRC-8 and a counter of 4 bits."""
-
-    data_id: dict[str, _DataId] = {}
-    """Data identifier per message; the message's own identifier where not given."""
-    data_id_mode: Literal["both", "alternating", "low", "nibble"] = "both"
-    """Which bytes of the data identifier the CRC covers: profile 1A, 1B, the low one only, 1C."""
-    offset: _Offset = 0
-    """First byte of the header."""
-
-
-class ProfileP02(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P02"):
-    """AUTOSAR E2E profile 2: CRC-8 and a counter of 4 bits that selects one of 16 data identifiers."""
-
-    data_id_list: dict[
-        str, Annotated[list[Annotated[int, msgspec.Meta(ge=0, le=255)]], msgspec.Meta(min_length=16, max_length=16)]
-    ]
-    """Data identifiers per message."""
-
-
-class ProfileP05(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P05"):
-    """AUTOSAR E2E profile 5: CRC-16 and a counter of 8 bits."""
-
-    data_id: dict[str, _DataId] = {}
-    """Data identifier per message; the message's own identifier where not given."""
-    offset: _Offset = 0
-    """First byte of the header."""
-
-
-class CounterCrc8(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="counter CRC8"):
-    """A counter and a CRC-8 as signals of the DBC; the CRC covers all bytes but its own."""
-
-    counter: Name
-    crc: Name
-    algorithm: str = "sae_j1850"
-    """As fastcrc names it."""
-    counter_modulus: Annotated[int, msgspec.Meta(ge=2, le=65536)] | None = None
-    """Number of codes of the counter, which runs from 0; all that fit the signal where not given."""
-    data_id: dict[str, _DataId] = {}
-    """Data identifier per message; the message's own identifier where not given."""
-    data_id_bytes: Literal[0, 1, 2] = 0
-    """How many of its bytes the CRC covers too, the low one first."""
-    data_id_at: Literal["before", "after"] = "before"
-    """Whether they come before or after the payload."""
-
-
-EndToEnd = ProfileP01 | ProfileP02 | ProfileP05 | CounterCrc8
-"""How some messages are protected."""
-
-
 class Watch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """When the node holds its own corrections for wrong."""
 
@@ -201,8 +137,8 @@ class Watch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Its values with which they are; the sums of other times are not judged."""
 
 
-class Layout(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A whole layout file, checked."""
+class LayoutKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a layout file may say."""
 
     schema: Literal[1]
     name: Name
@@ -226,24 +162,16 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """If it is known; where not given, it is estimated from the fleet."""
     limits: Limits = Limits()
     status: StatusMessage | None = None
-    e2e: list[EndToEnd] = []
+    e2e: EndToEnd | list[EndToEnd] = []
+    """One profile is a table, several are a list of tables."""
     on_bad_frame: Literal["hold", "invalid"] = "hold"
     """What the node makes of a frame that fails its check: nothing, or one that is seen to be invalid."""
     watch: Watch = Watch()
-    path: Path = Path()
-    """Where the layout was read from; set by :func:`read_layout`."""
-    digest: str = ""
-    """SHA-256 of the file; set by :func:`read_layout`."""
 
     @property
     def branch_names(self) -> tuple[str, ...]:
         """Names of the branches in the order of the file."""
         return tuple(branch.name for branch in self.branch)
-
-    @property
-    def dbc_path(self) -> Path:
-        """Path of the DBC file."""
-        return self.path.parent / self.dbc
 
     @property
     def offset_limit_a(self) -> float:
@@ -255,9 +183,34 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """By how much the corrected sum must be worse than the measured one. [A]"""
         return self.watch.margin_a if self.watch.margin_a is not None else 0.0025 * self.full_scale_a
 
+    @property
+    def protections(self) -> list[tuple[str, EndToEnd]]:
+        """All entries of how messages are protected, each with its place in the file."""
+        if not isinstance(self.e2e, list):
+            return [("[e2e]", self.e2e)]
+        return [(f"[[e2e]] entry number {number}", entry) for number, entry in enumerate(self.e2e, start=1)]
+
     def protection(self, message: str) -> EndToEnd | None:
         """How a message is protected; None if it is not."""
-        return next((entry for entry in self.e2e if message in entry.messages), None)
+        return next((entry for _, entry in self.protections if message in entry.messages), None)
+
+    def protection_place(self, message: str) -> str:
+        """Where the file says how a message is protected, which it does."""
+        return next(place for place, entry in self.protections if message in entry.messages)
+
+
+class Layout(LayoutKeys, frozen=True, kw_only=True):
+    """A whole layout file, checked."""
+
+    path: Path
+    """Where it was read from."""
+    digest: str
+    """SHA-256 of the file."""
+
+    @property
+    def dbc_path(self) -> Path:
+        """Path of the DBC file."""
+        return self.path.parent / self.dbc
 
     def find_branch(self, name: str) -> Branch:
         """Return the branch of this name; LayoutError lists the known ones if there is none."""
@@ -286,125 +239,38 @@ def read_layout(path: Path) -> Layout:
         If the file cannot be read, is not TOML, or a field is missing, unknown or contradictory.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-        document = tomllib.loads(text)
-    except OSError as error:
-        raise LayoutError(f"{path}: cannot read the layout: {error.strerror}") from None
+        content = read_user_file(path, largest_bytes=MAX_LAYOUT_BYTES)
+        document = tomllib.loads(content.decode())
+    except (OSError, UnsuitableFileError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise LayoutError(f"{path}: cannot read the layout: {why}") from None
     except UnicodeDecodeError:
         raise LayoutError(f"{path}: not a layout: the file is not UTF-8 text") from None
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # not only TOMLDecodeError: numbers and nesting have limits, too
         raise LayoutError(f"{path}: not TOML: {error}") from None
-    if isinstance(document.get("e2e"), dict):  # one profile: a table will do
-        document["e2e"] = [document["e2e"]]
-    known = [kind.__struct_config__.tag for kind in (ProfileP01, ProfileP02, ProfileP05, CounterCrc8)]
-    for entry in document["e2e"] if isinstance(document.get("e2e"), list) else []:
-        if isinstance(entry, dict) and entry.get("profile") not in known:
-            raise LayoutError(
-                f"{path}: [e2e] profile: expected {', '.join(map(str, known))}, found {entry.get('profile')!r}"
-            )
+    _require_profiles(document, path)
     try:
-        layout = msgspec.convert(document, Layout)
+        keys = msgspec.convert(document, LayoutKeys)
     except msgspec.ValidationError as error:
-        raise LayoutError(f"{path}: {field_error(error, document, Layout, toml_place)}; see docs/layout.md") from None
-    _check(layout, path)
-    return msgspec.structs.replace(layout, path=path, digest=file_digest(path))
+        why = field_error(error, document, LayoutKeys, toml_place)
+        raise LayoutError(f"{path}: {why}; see docs/layout.md") from None
+    check_layout(keys, path)
+    return Layout(**msgspec.structs.asdict(keys), path=path, digest=text_digest(content))
 
 
 def file_digest(path: Path) -> str:
     """SHA-256 of a text file, the same for LF and CRLF line ends."""
-    return hashlib.sha256(path.read_bytes().replace(b"\r\n", b"\n")).hexdigest()
+    return text_digest(path.read_bytes())
 
 
-def split_signal(name: SignalName) -> tuple[str, str]:
-    """Split ``Message.Signal`` into its two names."""
-    message, _, signal = name.partition(".")
-    return message, signal
-
-
-def _check(layout: Layout, path: Path) -> None:
-    """Refuse what types alone cannot express."""
-
-    def refuse(text: str) -> NoReturn:
-        raise LayoutError(f"{path}: {text}")
-
-    names = [*layout.branch_names, *(item.name for item in layout.input), *(item.name for item in layout.derived)]
-    twice = _repeated(names)
-    if twice:
-        refuse(f"{', '.join(twice)} is named twice; branches, inputs and derived inputs need different names")
-    for branch in layout.branch:
-        _check_branch(branch, refuse)
-    if sum(branch.balance for branch in layout.branch) > 1:
-        refuse("more than one branch has 'balance = true'; at most one can take what the others leave")
-    _check_signals(layout, refuse)
-    _check_inputs(layout, refuse)
-    _check_protection(layout, refuse)
-
-
-def _check_protection(layout: Layout, refuse: Callable[[str], NoReturn]) -> None:
-    for name in _repeated([name for entry in layout.e2e for name in entry.messages]):
-        refuse(f"[e2e] messages: {name} is named twice; a message has one protection")
-    for entry in layout.e2e:
-        given = entry.data_id_list if isinstance(entry, ProfileP02) else entry.data_id
-        unknown = [name for name in given if name not in entry.messages]
-        if unknown:
-            refuse(f"[e2e] data_id: {', '.join(unknown)} is not in 'messages'; add it there, or leave its data_id out")
-        if isinstance(entry, ProfileP02):
-            missing = [name for name in entry.messages if name not in entry.data_id_list]
-            if missing:
-                refuse(f"[e2e] data_id_list: {', '.join(missing)} has none; profile P02 needs 16 numbers per message")
-
-
-def _repeated(names: Sequence[str]) -> list[str]:
-    return sorted({name for name in names if names.count(name) > 1})
-
-
-def _check_signals(layout: Layout, refuse: Callable[[str], NoReturn]) -> None:
-    """Refuse one signal for two branches, for two outputs, or for both reading and writing."""
-    for name in _repeated([branch.source for branch in layout.branch]):
-        sharing = " and ".join(branch.name for branch in layout.branch if branch.source == name)
-        refuse(f"branches {sharing}: both read {name}; each branch needs a signal of its own")
-    outputs = [name for branch in layout.branch for name in (branch.corrected, branch.quality) if name is not None]
-    for name in _repeated(outputs):
-        writing = " and ".join(branch.name for branch in layout.branch if name in (branch.corrected, branch.quality))
-        refuse(f"branch {writing}: {name} is written twice; each 'corrected' and 'quality' needs a signal of its own")
-    read = {name for branch in layout.branch for name in (branch.signal, branch.power, branch.voltage)}
-    read |= {item.signal for item in layout.input}
-    for branch in layout.branch:
-        for output in (branch.corrected, branch.quality):
-            if output is not None and output in read:
-                refuse(f"branch {branch.name}: {output} is both read and written; give the output a signal of its own")
-
-
-def _check_inputs(layout: Layout, refuse: Callable[[str], NoReturn]) -> None:
-    known = {item.name for item in layout.input}
-    for item in layout.derived:
-        try:
-            names = formula_names(parse_formula(item.formula))
-        except LayoutError as error:
-            refuse(f"derived input {item.name}: {error}")
-        unknown = [name for name in names if name not in known]
-        if unknown:
-            refuse(f"derived input {item.name}: {', '.join(unknown)} is no input or derived input declared above it")
-        known.add(item.name)
-    if layout.contactor is not None and layout.contactor.input not in {item.name for item in layout.input}:
-        refuse(f"[contactor] input: {layout.contactor.input!r} is no [[input]]; declare the signal as one")
-    if layout.temperature is not None and layout.temperature not in {item.name for item in layout.input}:
-        refuse(f"temperature: {layout.temperature!r} is no [[input]]; declare the signal as one, or leave the key out")
-    watch = layout.watch
-    if watch.input is not None and watch.input not in {item.name for item in layout.input}:
-        refuse(f"[watch] input: {watch.input!r} is no [[input]]; declare the signal as one")
-    if (watch.input is None) != (not watch.valid):
-        refuse("[watch]: give both 'input' and 'valid', or neither")
-    for key, names in (("model_inputs", layout.model_inputs), ("fleet_inputs", layout.fleet_inputs)):
-        unknown = [name for name in names if name not in known]
-        if unknown:
-            refuse(f"{key}: {', '.join(unknown)} is no [[input]] or [[derived]]")
-
-
-def _check_branch(branch: Branch, refuse: Callable[[str], NoReturn]) -> None:
-    if (branch.signal is None) == (branch.power is None) or (branch.power is None) != (branch.voltage is None):
-        refuse(f"branch {branch.name}: give either 'signal' (a current), or 'power' and 'voltage'")
-    if branch.quality is not None and branch.corrected is None:
-        refuse(f"branch {branch.name}: 'quality' without 'corrected'")
-    if branch.quality and branch.corrected and split_signal(branch.quality)[0] != split_signal(branch.corrected)[0]:
-        refuse(f"branch {branch.name}: 'quality' and 'corrected' must be signals of one message")
+def _require_profiles(document: dict[str, Any], path: Path) -> None:
+    """Refuse an unknown profile: what else an entry may say depends on it."""
+    found = document.get("e2e", [])
+    places = [("e2e", number) for number in range(len(found))] if isinstance(found, list) else [("e2e",)]
+    for steps, entry in zip(places, found if isinstance(found, list) else [found], strict=True):
+        if isinstance(entry, dict) and entry.get("profile") not in PROFILES:
+            what = f"found {entry['profile']!r}" if "profile" in entry else "it is missing"
+            raise LayoutError(
+                f"{path}: {toml_place(document, steps)}, profile: one of {', '.join(PROFILES)} is expected, {what}; "
+                f"see docs/layout.md"
+            )

@@ -10,16 +10,19 @@ from pathlib import Path
 
 import can
 
-from ecu_node.buses import SteadyBus, steady_time_s
+from ecu_node.buses import SteadyBus
+from ecu_node.clocks import steady_time_s
 from ecu_node.counters import Counters
 from ecu_node.database import read_database
 from ecu_node.errors import UserError
 from ecu_node.guard import Mode
 from ecu_node.layout import read_layout
 from ecu_node.monitor_model import BusMonitor, View
-from ecu_node.monitor_text import COLUMNS, LEFT, as_json, node_line, notes, plain_block, rows
+from ecu_node.monitor_table import picture
+from ecu_node.monitor_text import as_json, plain_block
 from ecu_node.node import open_bus
 from ecu_node.service import Log, Requests
+from ecu_node.standard_output import write_output
 
 __all__ = ["MonitorOptions", "listen", "run_monitor"]
 
@@ -27,9 +30,6 @@ _LIVE_PERIOD_S, _PLAIN_PERIOD_S = 0.25, 1.0
 """Between two pictures. [s]"""
 _LONGEST_WAIT_S = 0.25
 """A wake-up at least this often, so that a request to stop is seen. [s]"""
-
-_LEAST_WORDS, _LONGEST_NUMBER, _WIDE = 7, "+999.99", 100
-"""Of the live table: width of its columns of words, what its numbers need, and a terminal with room for gaps."""
 
 _Show = Callable[[View, list[str]], None]
 """Takes what is to be shown, and further lines."""
@@ -157,7 +157,7 @@ def _display(options: MonitorOptions, where: str) -> Iterator[tuple[_Show, float
 
     def show_plainly(view: View, more: list[str]) -> None:
         text = json.dumps(as_json(view), indent=2) if options.as_json else plain_block(view, where, more)
-        print(text if options.once_s is not None else f"{text}\n", flush=True)
+        write_output(text if options.once_s is not None else f"{text}\n")
 
     yield show_plainly, options.once_s or _PLAIN_PERIOD_S
 
@@ -165,10 +165,8 @@ def _display(options: MonitorOptions, where: str) -> Iterator[tuple[_Show, float
 @contextmanager
 def _live_table(where: str) -> Iterator[_Show]:
     try:
-        from rich.box import SIMPLE_HEAD  # noqa: PLC0415  # optional
-        from rich.console import Group  # noqa: PLC0415
+        from rich.console import Group  # noqa: PLC0415  # optional
         from rich.live import Live  # noqa: PLC0415
-        from rich.table import Table  # noqa: PLC0415
         from rich.text import Text  # noqa: PLC0415
     except ImportError:
         raise UserError(
@@ -176,28 +174,16 @@ def _live_table(where: str) -> Iterator[_Show]:
             "or give --once SECONDS"
         ) from None
 
-    def table_of(view: View, gap: int) -> Table:
-        table = Table(box=SIMPLE_HEAD, padding=(0, gap, 0, 0), pad_edge=False)
-        for name in COLUMNS:
-            if name in LEFT:  # a narrow terminal wraps words, and never cuts a number
-                table.add_column(name, min_width=_LEAST_WORDS, no_wrap=name == COLUMNS[0])
-            else:
-                table.add_column(Text(name), justify="right", width=max(map(len, (*name.split(), _LONGEST_NUMBER))))
-        for position, row in enumerate(rows(view), start=1):
-            style = "yellow" if row.is_faulty else "" if row.is_seen else "dim"
-            table.add_row(*map(Text, row.cells), style=style, end_section=position == len(view.branches))
-        return table
-
     last = ""
     with Live(auto_refresh=False, screen=True) as live:
 
         def show(view: View, more: list[str]) -> None:
             nonlocal last
             last = plain_block(view, where, more)
-            head = Text(f"{where}: {node_line(view)}", style="bold")
-            gap = int(live.console.width >= _WIDE)
-            live.update(Group(head, table_of(view, gap), *map(Text, [*notes(view), *more])), refresh=True)
+            lines = picture(view, where, more, width=live.console.width, height=live.console.height)
+            drawn = [Text(line.text, style=line.style, no_wrap=True, overflow="crop") for line in lines]
+            live.update(Group(*drawn), refresh=True)
 
         yield show
     if last:
-        print(last)  # what was seen last stays on the screen
+        write_output(last)  # what was seen last stays on the screen

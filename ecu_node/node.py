@@ -11,7 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import can
 
-from ecu_node.buses import SteadyBus, TimeOfDay, connect, steady_time_s
+from ecu_node.buses import SteadyBus, connect
+from ecu_node.clocks import TimeOfDay, steady_time_s
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
@@ -26,6 +27,8 @@ _LOOK_EVERY_S = 0.1
 """The junction is looked at, and the watchdog fed, at least this often, however rare the status is. [s]"""
 _LISTEN_PERIODS, _LONGEST_LISTEN_S = 1.5, 1.5
 """So many status periods, but no longer than this [s], the node listens for another one before it says anything."""
+_LONGEST_TURN_S = 2.0
+"""A gateway's way back is at work if it has looked for frames within this time. [s]"""
 _LONGEST_DELAY_S = 1.0
 """A gateway passes a branch's frame on only if it waited no longer than this, or than the branch's timeout. [s]"""
 _STANDARD_MASK = 0x7FF
@@ -100,8 +103,8 @@ class _Ticking:
         """How long there is nothing to do but to receive; 0 if it is time. [s]"""
         return min(_LONGEST_WAIT_S, max(0.0, self._due_s - now_s))
 
-    def tick(self, now_s: float, heard_s: float, send: Callable[[can.Message], bool], own: OwnFrames) -> None:
-        """Do it if it is due; no branch is stale for what has not been heard yet."""
+    def tick(self, now_s: float, heard_s: float, bus: SteadyBus, own: OwnFrames) -> None:
+        """Do it if it is due; no branch is stale for what has not been heard yet. The bus is flushed before."""
         if now_s < self._due_s:
             return
         self._due_s = _next_s(self._due_s, min(self.period_s, _LOOK_EVERY_S), now_s)
@@ -112,7 +115,8 @@ class _Ticking:
             self._status_due_s = _next_s(self._status_due_s, self.period_s, now_s)
             fields, data = status
             own.sent(fields.key, data)
-            corrector.counters.send_errors += not send(_message(fields.key, data, fd=fields.fd))
+            bus.send(_message(fields.key, data, fd=fields.fd))
+            corrector.counters.send_errors += bus.flush()[1]
         self._on_tick(now_s)
 
 
@@ -121,7 +125,9 @@ def _next_s(due_s: float, period_s: float, now_s: float) -> float:
     return due_s + period_s if due_s + period_s > now_s else now_s + period_s
 
 
-def _hear(bus: SteadyBus, ticking: _Ticking, take: Callable[[can.Message, float, float], None]) -> float:
+def _hear(
+    bus: SteadyBus, ticking: _Ticking, take: Callable[[can.Message, float, float], None], flush: Callable[[], None]
+) -> float:
     """Take what comes until there is something else to do.
 
     Parameters
@@ -132,6 +138,8 @@ def _hear(bus: SteadyBus, ticking: _Ticking, take: Callable[[can.Message, float,
         Says when there is something else to do.
     take : callable
         Takes a frame, the steady clock [s], and by how much the time of day is ahead of it [s].
+    flush : callable
+        Sends what was made of the frames; called before this waits for more, and at the end.
 
     Returns
     -------
@@ -139,17 +147,17 @@ def _hear(bus: SteadyBus, ticking: _Ticking, take: Callable[[can.Message, float,
         Up to when the bus was heard: now, or when the last frame came if there may be more. After a pause of the whole
         process, frames of all branches wait to be read, and none of these is stale. [s]
     """
-    clock = time.monotonic
-    message = bus.receive(ticking.wait_s(clock()))
-    now_s = clock()
-    ahead_s = ticking.time_of_day.ahead_s(now_s)  # after the wait, in which the clock may have been set
+    message = bus.receive(ticking.wait_s(bus.asked_s))
+    ahead_s = ticking.time_of_day.ahead_s()  # after the wait, in which the clock may have been set
     while message is not None:
+        now_s = bus.asked_s
         take(message, now_s, ahead_s)
-        if ticking.is_due(now_s):
-            return steady_time_s(message.timestamp, now_s, ahead_s)
-        now_s = clock()
+        if not bus.at_hand:
+            flush()
+            if ticking.is_due(now_s):
+                return steady_time_s(message.timestamp, now_s, ahead_s)
         message = bus.receive(0.0)
-    return now_s
+    return bus.asked_s
 
 
 class OverlayNode:
@@ -199,11 +207,11 @@ class OverlayNode:
         """
         _listen(self._bus, self._own, stop, self._ticking.period_s)
         ready()
-        bus, ticking, clock = self._bus, self._ticking, time.monotonic
-        heard_s = clock()
+        bus, ticking = self._bus, self._ticking
+        heard_s = time.monotonic()
         while not stop():
-            ticking.tick(clock(), heard_s, bus.send, self._own)
-            heard_s = _hear(bus, ticking, self._take)
+            ticking.tick(bus.asked_s, heard_s, bus, self._own)
+            heard_s = _hear(bus, ticking, self._take, self._flush)
 
     def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
         if message.is_remote_frame:
@@ -226,8 +234,10 @@ class OverlayNode:
             answer = _message(
                 target.key, target.data, fd=target.fd or message.is_fd, bitrate_switch=message.bitrate_switch
             )
-            if not self._bus.send(answer):
-                corrector.counters.send_errors += 1
+            self._bus.send(answer)
+
+    def _flush(self) -> None:
+        self._corrector.counters.send_errors += self._bus.flush()[1]
 
 
 class GatewayNode:
@@ -257,13 +267,16 @@ class GatewayNode:
         own = transmitted(database, Mode.GATEWAY)
         self._status = OwnFrames(own)
         self._not_from_vehicle = OwnFrames([*own, *rewritten(database)])
-        self._ticking = _Ticking(corrector, period_s, on_tick)
+        self._on_tick = on_tick
+        self._ticking = _Ticking(corrector, period_s, self._while_both_ways_work)
+        self._back_s = float("-inf")
 
     def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
         """Correct until told to stop; parameters and errors as for :meth:`OverlayNode.run`."""
         _listen(self._vehicle, self._not_from_vehicle, stop, self._ticking.period_s)
         _discard(self._sensors)
         ready()
+        self._back_s = time.monotonic()
         ended = threading.Event()
         with ThreadPoolExecutor(1, "back") as pool:
             back = pool.submit(self._pass_back, lambda: stop() or ended.is_set())
@@ -273,12 +286,17 @@ class GatewayNode:
                 ended.set()
         back.result()  # raises what ended it
 
+    def _while_both_ways_work(self, now_s: float) -> None:
+        """Let the watchdog see it if the way back is stuck."""
+        if time.monotonic() - self._back_s < _LONGEST_TURN_S:
+            self._on_tick(now_s)
+
     def _pass_on(self, stop: Callable[[], bool]) -> None:
-        vehicle, ticking, clock = self._vehicle, self._ticking, time.monotonic
-        heard_s = clock()
+        sensors, vehicle, ticking = self._sensors, self._vehicle, self._ticking
+        heard_s = time.monotonic()
         while not stop():
-            ticking.tick(clock(), heard_s, vehicle.send, self._status)
-            heard_s = _hear(self._sensors, ticking, self._take)
+            ticking.tick(sensors.asked_s, heard_s, vehicle, self._status)
+            heard_s = _hear(sensors, ticking, self._take, self._flush)
 
     def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
         key = (message.arbitration_id, message.is_extended_id)
@@ -295,24 +313,30 @@ class GatewayNode:
             if data is None:
                 return
             message.data = data
-        if self._vehicle.send(message):
-            corrector.counters.forwarded += 1
-        else:
-            corrector.counters.send_errors += 1
+        self._vehicle.send(message)
+
+    def _flush(self) -> None:
+        counters = self._corrector.counters
+        sent, not_sent = self._vehicle.flush()
+        counters.forwarded += sent
+        counters.send_errors += not_sent
 
     def _pass_back(self, stop: Callable[[], bool]) -> None:
         """Pass on what the vehicle sends to the sensors' bus; a branch's frame from there must not be."""
         vehicle, sensors, counters = self._vehicle, self._sensors, self._corrector.counters
         while not stop():
+            self._back_s = time.monotonic()
             received = vehicle.receive(_LONGEST_WAIT_S)
             while received is not None:
                 key = (received.arbitration_id, received.is_extended_id)
                 if key in self._not_from_vehicle and not received.is_remote_frame:
                     raise _another(received, vehicle)
-                if sensors.send(received):
-                    counters.returned += 1
-                else:
-                    counters.not_returned += 1
+                sensors.send(received)
+                if not vehicle.at_hand:
+                    sent, not_sent = sensors.flush()
+                    counters.returned += sent
+                    counters.not_returned += not_sent
+                    self._back_s = time.monotonic()
                 received = None if stop() else vehicle.receive(0.0)
 
 

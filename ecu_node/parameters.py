@@ -16,6 +16,7 @@ from ecu_node.errors import ParameterError
 from ecu_node.field_errors import field_error, quoted_place
 from ecu_node.sensor_models import GainBySign, SensorModel
 from ecu_node.status import Reason
+from ecu_node.user_files import UnsuitableFileError, read_user_file
 
 __all__ = [
     "BranchParameters",
@@ -182,18 +183,16 @@ def read_parameters(path: Path) -> VehicleParameters:
     Raises
     ------
     UnfitError
-        With reason NO_PARAMETERS if there is no such file, else MALFORMED_PARAMETERS.
+        With reason NO_PARAMETERS if there is no such file or it may not be read, else MALFORMED_PARAMETERS.
     """
     try:
-        if not path.is_file():
-            raise UnfitError(Reason.NO_PARAMETERS, f"{path}: no such parameter file")
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise UnfitError(
-                Reason.MALFORMED_PARAMETERS, f"{path}: larger than {MAX_FILE_BYTES} bytes; not a parameter file"
-            )
-        content = path.read_bytes()
+        content = read_user_file(path, largest_bytes=MAX_FILE_BYTES)
+    except FileNotFoundError:
+        raise UnfitError(Reason.NO_PARAMETERS, f"{path}: no such parameter file") from None
     except OSError as error:
         raise UnfitError(Reason.NO_PARAMETERS, f"{path}: cannot read the parameter file: {error.strerror}") from None
+    except UnsuitableFileError as error:
+        raise UnfitError(Reason.MALFORMED_PARAMETERS, f"{path}: not a parameter file: {error}") from None
     return decode_parameters(content, str(path))
 
 

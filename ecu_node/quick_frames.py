@@ -158,7 +158,7 @@ def quick_forward(signals: QuickSignals, message: Message, otherwise: Forward) -
         rewritten = bytearray((word ^ signs).to_bytes(length, order))
         if rewritten == payload:
             return payload
-        counters.corrected += 1
+        counters.rewritten += 1
         if seal is not None:
             seal(rewritten)
         return rewritten
@@ -209,7 +209,7 @@ def quick_answer(signals: QuickSignals, message: Message, target: "Target", othe
         if not is_next(payload):
             return otherwise(payload, now_s)
         counters.frames_in += 1
-        counters.corrected += 1
+        counters.answers += 1
         counters.saturated += saturated
         remember((now_s, payload))
         made = bytearray(new.to_bytes(target_length, target_order))

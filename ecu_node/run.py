@@ -7,7 +7,7 @@ from pathlib import Path
 
 import can
 
-from ecu_node.buses import SteadyBus
+from ecu_node.buses import SteadyBus, carries_fd
 from ecu_node.check import warnings_of
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase, read_database
@@ -97,7 +97,7 @@ def run_node(options: RunOptions, vehicle_hint: str) -> int:
             say(f"passing measured values through: {file.why_not}")
         elif options.vehicle is None:
             say(f"the vehicle is not checked: {vehicle_hint}")
-        for text in warnings_of(database, file.in_force, mode, fd=options.fd):
+        for text in (*warnings_of(database, file.in_force, mode, fd=options.fd), *_unseen(options)):
             say(text)
         what = _what(corrector, database, file, mode)
         where = f"{options.interface} {options.channel}{f' to {options.gateway}' if options.gateway else ''}"
@@ -121,6 +121,16 @@ def run_node(options: RunOptions, vehicle_hint: str) -> int:
 
 def _opener(database: VehicleDatabase, options: RunOptions, channel: str, mode: Mode) -> Callable[[], can.BusABC]:
     return lambda: open_bus(database, interface=options.interface, channel=channel, fd=options.fd, mode=mode)
+
+
+def _unseen(options: RunOptions) -> list[str]:
+    """What a gateway would not pass on, as the kernel does not show it CAN FD frames."""
+    if options.gateway is None or options.fd:
+        return []
+    names = [name for name in (options.channel, options.gateway) if carries_fd(options.interface, name)]
+    if not names:
+        return []
+    return [f"{' and '.join(names)}: set up for CAN FD, of which nothing is passed on without --fd"]
 
 
 def _node(

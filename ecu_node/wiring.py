@@ -11,7 +11,7 @@ from cantools.database.can import Message, Signal
 
 from ecu_node.bits import BitPlace, PlacedSignal, bit_place, multiplexers
 from ecu_node.branch import AS_IT_IS, Auxiliary, LiveBranch
-from ecu_node.codes import Codes, as_written, not_available_code, read_codes, writable_range
+from ecu_node.codes import Codes, as_written, not_available_code, read_codes, require_reach, writable_range
 from ecu_node.correction import (
     NO_FAULT,
     CorrectionPlan,
@@ -178,6 +178,7 @@ def wire(
         If the node cannot do its work with this layout and DBC, see :func:`ecu_node.guard.check_output`.
     """
     check_output(database, mode)
+    _require_reach(database, mode)
     layout = database.layout
     parts = _parts(database)
     targets = _targets(database, parts) if mode is Mode.OVERLAY else {}
@@ -247,6 +248,21 @@ def put_in_force(
     )
 
 
+def _require_reach(database: VehicleDatabase, mode: Mode) -> None:
+    """Refuse to write signals in which full scale cannot be written for a name amid their values."""
+    layout = database.layout
+    for branch in layout.branch:
+        if mode is Mode.OVERLAY and branch.corrected is None:
+            continue
+        signals = branch_signals(database, branch, mode)
+        largest = as_written(layout.full_scale_a)
+        if signals.voltage is not None:
+            largest *= max(
+                abs(signals.voltage.worth(code)) for code in (signals.voltage.lowest, signals.voltage.highest)
+            )
+        require_reach(signals.target, largest, f"{layout.path}: branch {branch.name}")
+
+
 @dataclass(kw_only=True)
 class _Parts:
     """Branches and auxiliary signals, and by which signal each is read."""
@@ -282,9 +298,6 @@ def _parts(database: VehicleDatabase) -> _Parts:
         codes = _codes(database, whole_name, {unit: 1.0}, "[watch] input")
         every_code = replace(codes, named={})  # states have names, which are no lack of a value here
         valid = [(as_written(float(value)) - codes.offset) / codes.scale for value in layout.watch.valid]
-        lowest, highest = codes.place.lowest, codes.place.highest
-        if any(code.denominator != 1 or not lowest <= code <= highest for code in valid):
-            raise LayoutError(f"{layout.path}: [watch] valid: a value that {whole_name} cannot have")
         parts.whole = auxiliary(whole_name, every_code, layout.max_age_s), frozenset(map(int, valid))
     voltages: dict[SignalName, Auxiliary] = {}
     for branch in layout.branch:
@@ -387,6 +400,7 @@ def _status_fields(database: VehicleDatabase) -> StatusFields | None:
         if name is None:
             return None
         codes = read_codes(database.signal(f"{message.name}.{name}")[1], AMPERE, where)
+        require_reach(codes, as_written(database.layout.full_scale_a), where)
         lowest, highest = writable_range(codes, where)
         return replace(codes, lowest=lowest, highest=highest), not_available_code(codes, where)
 

@@ -90,4 +90,5 @@ def _shown(drive: Drive, branch: str, layout: Layout) -> Iterator[Channel]:
 
 
 def _is_open(state: Channel, contactor: Contactor) -> Array:
-    return np.asarray(state.good & np.isin(state.value, contactor.open))
+    is_open = np.isclose(state.value[:, None], np.array(contactor.open)[None, :], rtol=1e-9, atol=1e-9).any(axis=1)
+    return np.asarray(state.good & is_open)

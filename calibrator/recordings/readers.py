@@ -22,7 +22,8 @@ from calibrator.recordings.log_time import CLOCK_GAP_S, repaired_time
 from calibrator.report.notices import Notice
 from ecu_node.database import AMPERE, VOLT, WATT, VehicleDatabase, unit_factor
 from ecu_node.e2e import protection_of
-from ecu_node.layout import Branch, ProfileP01
+from ecu_node.layout import Branch
+from ecu_node.layout_e2e import ProfileP01
 
 __all__ = ["ChannelReport", "Recording", "RecordingReport", "drive_from_frames", "read_drive", "read_recording"]
 

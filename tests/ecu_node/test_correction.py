@@ -9,7 +9,7 @@ from cantools.database.conversion import BaseConversion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ecu_node.codes import Codes, not_available_code, read_codes, writable_range
+from ecu_node.codes import Codes, not_available_code, read_codes, require_reach, writable_range
 from ecu_node.correction import LARGEST_ERROR, IntegerPlan, SensorFault, Signals, correction_plan
 from ecu_node.database import AMPERE
 from ecu_node.errors import DatabaseError
@@ -199,6 +199,32 @@ def test_a_target_without_a_code_for_no_value_is_refused() -> None:
 def test_a_name_on_the_code_of_zero_is_refused() -> None:
     with pytest.raises(DatabaseError, match="the code of 0 of signal I is named 'Off'"):
         writable_range(current(names={0: "Off"}), "test")
+
+
+@pytest.mark.parametrize(
+    ("names", "largest"),
+    [
+        ({}, 1000),
+        ({-32768: "SNA", 32767: "Error", 32766: "Init"}, 1000),  # the signal reaches no further anyway
+        ({-32768: "SNA", 20001: "Limit"}, 400),
+        ({-20001: "Limit"}, 400),
+    ],
+)
+def test_names_that_keep_nothing_out_up_to_full_scale_are_accepted(names: dict[int, str], largest: int) -> None:
+    require_reach(current(names=names), Fraction(largest), "test")
+
+
+@pytest.mark.parametrize("scale", [0.02, -0.02])
+@pytest.mark.parametrize("code", [1, 19999, -1, -20000])
+def test_a_name_amid_the_values_is_refused(scale: float, code: int) -> None:
+    codes = current(scale, names={-32768: "SNA", code: "Odd"})
+    with pytest.raises(DatabaseError, match=f"test: code {code} of signal I means 'Odd', .* and full scale is 400"):
+        require_reach(codes, Fraction(400), "test")
+
+
+@pytest.mark.parametrize("names", [{1: "On"}, {32767: "SNA", 1: "On"}])
+def test_a_range_that_ends_at_a_name_has_no_hole(names: dict[int, str]) -> None:
+    require_reach(current(limits=(-650.0, 0.0), names=names), Fraction(400), "test")
 
 
 def test_a_scale_of_zero_is_refused() -> None:

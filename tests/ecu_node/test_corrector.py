@@ -69,6 +69,13 @@ def test_a_branch_frame_is_answered_by_its_corrected_frame(database: VehicleData
     assert e2e_p01_check(bytearray(answer.data), 1296)
 
 
+def test_answers_count_whether_or_not_they_are_corrected(database: VehicleDatabase) -> None:
+    corrector = corrector_for(database, battery=(0.25, 5.0))
+    for frame in (battery(database, 0), motor(database, 0), battery(database, 1)):
+        answers(corrector, frame, 0.0)
+    assert (corrector.counters.answers, corrector.counters.rewritten) == (3, 0)
+
+
 def test_a_consumer_is_corrected_with_its_offset_into_the_junction(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, motor=(0.25, 5.0))
     (answer,) = answers(corrector, motor(database, 0), 0.0)
@@ -142,7 +149,7 @@ def test_nothing_is_made_of_a_corrupt_frame(database: VehicleDatabase) -> None:
         damaged = (int.from_bytes(good.data, "little") ^ 1 << bit).to_bytes(8, "little")
         assert answers(corrector, Frame(BATTERY, damaged), 0.0) == []
     assert answers(corrector, Frame(BATTERY, b""), 0.0) == []
-    assert (corrector.counters.corrupt, corrector.counters.corrected) == (65, 0)
+    assert (corrector.counters.corrupt, corrector.counters.answers) == (65, 0)
     assert len(answers(corrector, good, 0.0)) == 1
 
 
@@ -355,14 +362,42 @@ def test_sums_are_not_judged_while_the_layout_says_that_a_current_is_not_measure
     assert found == [Reason.NONE, Reason.CORRECTION_WORSE]
 
 
+@pytest.mark.parametrize(("window_s", "fallen_back_s"), [(1.0, 1.5), (10.0, 10.5), (600.0, 600.5)])
+def test_sums_of_any_window_are_judged_at_ten_looks_per_second(
+    make_database: MakeDatabase, database: VehicleDatabase, window_s: float, fallen_back_s: float
+) -> None:
+    text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
+    text += f"\n[watch]\nwindow_s = {window_s}\n"
+    own = make_database(text, database.layout.dbc_path.read_text())
+    corrector = corrector_for(own, battery=(0.2, 0.0), motor=(0.0, 0.0))
+    for k in range(round(10.0 * fallen_back_s)):
+        answers(corrector, battery(own, k % 15), 0.1 * k)
+        answers(corrector, motor(own, k % 15), 0.1 * k)
+        if 0.1 * k < 0.85 * window_s:
+            assert corrector.state()[1] == Reason.NONE
+        corrector.look(0.1 * k + 0.01)
+    assert corrector.state()[1] == Reason.CORRECTION_WORSE
+
+
 @pytest.mark.parametrize("valid", ["7", "0.5"])
 def test_a_value_that_the_input_cannot_have_is_refused(
     make_database: MakeDatabase, database: VehicleDatabase, valid: str
 ) -> None:
     text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
     text += f'\n[watch]\ninput = "contactor_state"\nvalid = [2, {valid}]\n'
-    with pytest.raises(LayoutError, match=r"\[watch\] valid: a value that HV_Battery\.ContactorState cannot have"):
-        corrector_for(make_database(text, database.layout.dbc_path.read_text()))
+    words = rf"small\.toml: \[watch\] valid: {valid} is no value of HV_Battery\.ContactorState, which has 2 bits"
+    with pytest.raises(LayoutError, match=words):
+        make_database(text, database.layout.dbc_path.read_text())
+
+
+@pytest.mark.parametrize("value", ["4", "-1", "0.5"])
+def test_a_contactor_state_that_can_never_be_is_refused(
+    make_database: MakeDatabase, database: VehicleDatabase, value: str
+) -> None:
+    text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
+    words = rf"small\.toml: \[contactor\] open: {value} is no value of HV_Battery\.ContactorState, which has 2 bits"
+    with pytest.raises(LayoutError, match=words):
+        make_database(text.replace("open = [0]", f"open = [0, {value}]"), database.layout.dbc_path.read_text())
 
 
 def test_a_set_of_which_the_calibrator_expects_no_better_sum_is_kept(database: VehicleDatabase) -> None:
@@ -543,6 +578,8 @@ OTHER_SENDER = (
  SG_ Reason : 8|8@1+ (1,0) [0|255] "" Node
 """
 )
+OWN_SUM = OWN_STATUS + 'sum_measured = "Sum"\n'
+WITH_SUM = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Sum : 16|16@1- (0.1,0) [0|0] "A" Node\n'
 STATUS_TABLE = '\n[status]\nmessage = "PairOut"\nstate = "Quality"\nreason = "Battery"\n'
 
 
@@ -562,6 +599,17 @@ STATUS_TABLE = '\n[status]\nmessage = "PairOut"\nstate = "Quality"\nreason = "Ba
             SMALL_LAYOUT,
             SMALL_DBC.replace('512 Motor -32768 "SNA"', '512 Motor 32767 "Max"'),
             "Motor needs a code named SNA",
+        ),
+        (SMALL_LAYOUT + OWN_SUM, WITH_SUM, r"small\.toml: status: signal Sum needs a code named SNA in the DBC"),
+        (
+            SMALL_LAYOUT + OWN_SUM,
+            WITH_SUM + 'VAL_ 600 Sum 3 "SNA";\n',
+            "status: code 3 of signal Sum means 'SNA', so that no result beyond 0.2 could be written",
+        ),
+        (
+            SMALL_LAYOUT,
+            SMALL_DBC.replace('512 Motor -32768 "SNA"', '512 Motor -32768 "SNA" -1 "Init"'),
+            r"small\.toml: branch motor: code -1 of signal Motor means 'Init', .* beyond 0 could be written",
         ),
         (
             SMALL_LAYOUT + STATUS_TABLE,
@@ -594,3 +642,22 @@ def test_a_layout_that_publishes_nothing_is_refused(make_database: MakeDatabase)
     ]
     with pytest.raises(LayoutError, match="nothing to publish"):
         corrector_for(make_database("\n".join(lines)))
+
+
+def test_a_frame_that_leaves_the_current_out_is_answered_with_its_last_value_until_that_is_stale(
+    make_database: MakeDatabase,
+) -> None:
+    multiplexed = SMALL_DBC.replace(
+        " SG_ Battery : 7|16@0-", ' SG_ Page M : 48|8@1+ (1,0) [0|255] "" Node\n SG_ Battery m0 : 7|16@0-', 1
+    )
+    database = make_database(dbc=multiplexed)
+    corrector = corrector_for(database, battery=(0.5, 0.0))
+    with_it = database.message("Pair").encode({"Page": 0, "Battery": 150.0, "Motor": 0.0})
+    without = bytes((0, 0, 0, 0, 0, 0, 1, 0))
+    found = []
+    for time_s, data in ((0.0, with_it), (0.1, without), (0.4, without), (0.6, without)):
+        (answer,) = answers(corrector, Frame(PAIR, data), time_s)
+        values = decoded(database, "PairOut", answer.data)
+        found.append((values["Battery"], values["Quality"]))
+    current = (100.0, Quality.CORRECTED)
+    assert found == [current, current, current, (-3276.8, Quality.NOT_AVAILABLE)]

@@ -9,7 +9,7 @@ from e2e.p05 import e2e_p05_check
 
 from ecu_node.database import VehicleDatabase
 from ecu_node.e2e import Check, Protection, Receiver, protection_of
-from ecu_node.errors import LayoutError
+from ecu_node.errors import DatabaseError, LayoutError
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT
 
 MakeDatabase = Callable[..., VehicleDatabase]
@@ -188,7 +188,7 @@ OEM = ENTRIES["OEM"]
         (OEM.replace("data_id_bytes = 2", "data_id = { Room = 5 }"), "data_id 5 does not fit into data_id_bytes = 0"),
         (ENTRIES["P02"].replace("Room = [", "Net = ["), "Net is not in 'messages'"),
         ('profile = "P02"\nmessages = ["Room"]\ndata_id_list = {}', "data_id_list: Room has none"),
-        ('profile = "P99"\nmessages = ["Room"]', "expected P01, P02, P05, counter CRC8, found 'P99'"),
+        ('profile = "P99"\nmessages = ["Room"]', "one of P01, P02, P05, counter CRC8 is expected, found 'P99'"),
     ],
 )
 def test_protection_that_cannot_be_is_one_line(make_database: MakeDatabase, entry: str, words: str) -> None:
@@ -202,7 +202,8 @@ def test_protection_that_cannot_be_is_one_line(make_database: MakeDatabase, entr
 
 def test_a_message_has_one_protection(make_database: MakeDatabase) -> None:
     twice = "".join(f"\n[[e2e]]\n{ENTRIES[kind]}\n" for kind in ("P01", "P05"))
-    with pytest.raises(LayoutError, match="messages: Room is named twice"):
+    words = r"\[\[e2e\]\] entry number 2, messages: Room stands in \[\[e2e\]\] entry number 1 too"
+    with pytest.raises(LayoutError, match=words):
         make_database(SMALL_LAYOUT + twice, SMALL_DBC.replace("VAL_", ROOM + "VAL_", 1))
 
 
@@ -211,3 +212,49 @@ def test_messages_may_be_protected_in_different_ways(make_database: MakeDatabase
     database = make_database(SMALL_LAYOUT + entries, SMALL_DBC.replace("VAL_", ROOM + "VAL_", 1))
     found = {name: protection_of(database, database.message(name)) for name in ("Room", "Net", "Pair")}
     assert {name: item and item.modulus for name, item in found.items()} == {"Room": 256, "Net": 15, "Pair": None}
+
+
+WRONG = [
+    ('profile = "P99"\nmessages = ["Room"]', ", profile: one of P01, P02, P05, counter CRC8 is expected, found 'P99'"),
+    ('messages = ["Room"]', ", profile: one of P01, P02, P05, counter CRC8 is expected, it is missing"),
+    ('profile = "P01"', ": 'messages' is missing"),
+    ('profile = "P01"\nmessages = []', ", messages: a list of at least 1 entry is expected, found a list of 0"),
+    ('profile = "P01"\nmessages = ["Room", "Room"]', ", messages: Room is named twice"),
+    ('profile = "P01"\nmessages = [1]', ", messages, entry number 1: a text is expected, found 1"),
+    ('profile = "P01"\nmessages = ["Room"]\ndata_id = 3', ", data_id: a table is expected, found 3"),
+    ('profile = "P01"\nmessages = ["Room"]\ndata_id = { Hall = 3 }', ", data_id: Hall is not in 'messages'"),
+    (
+        'profile = "P02"\nmessages = ["Room"]\ndata_id_list = { Room = [1] }',
+        ", data_id_list, Room: a list of at least",
+    ),
+    ('profile = "P02"\nmessages = ["Room"]\ndata_id_list = {}', ", data_id_list: Room has none"),
+    (
+        'profile = "P05"\nmessages = ["Room"]\ncrc = "C"',
+        ": unknown key 'crc'; allowed are profile, messages",
+    ),
+    ('profile = "counter CRC8"\nmessages = ["Room"]\ncounter = "C"', ": 'crc' is missing"),
+    ('profile = "P01"\nmessages = ["Room"]\nmax_delta_counter = 15', ": message Room: max_delta_counter is 15"),
+    (OEM.replace('"Count"', '"Sum"'), ": message Room: signals Sum and Sum overlap"),
+]
+HEADS = [("[e2e]", "[e2e]"), ('[[e2e]]\nprofile = "P01"\nmessages = ["Net"]\n[[e2e]]', "[[e2e]] entry number 2")]
+
+
+@pytest.mark.parametrize(("entry", "words"), WRONG)
+@pytest.mark.parametrize(("head", "place"), HEADS)
+def test_a_wrong_entry_is_named_by_its_place_as_it_was_written(
+    make_database: MakeDatabase, head: str, place: str, entry: str, words: str
+) -> None:
+    with pytest.raises(LayoutError, match=r"small\.toml: ") as caught:  # noqa: PT012  # either of the two may find it
+        database = make_database(f"{SMALL_LAYOUT}\n{head}\n{entry}\n", SMALL_DBC.replace("VAL_", ROOM + "VAL_", 1))
+        protection_of(database, database.message("Room"))
+    assert f"{place}{words}" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("head", "place"), HEADS)
+def test_a_protected_message_that_the_dbc_lacks_is_named_with_its_place(
+    make_database: MakeDatabase, head: str, place: str
+) -> None:
+    with pytest.raises(DatabaseError, match="no message 'Nobody', which") as caught:
+        make_database(f'{SMALL_LAYOUT}\n{head}\nprofile = "P01"\nmessages = ["Nobody"]\n')
+    assert str(caught.value).endswith(f"small.toml names in {place}")

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import LayoutError
+from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode, transmitted
 from ecu_node.sensor_models import TemperatureDrift
@@ -43,6 +43,16 @@ def test_only_the_current_and_the_crc_change(database: VehicleDatabase) -> None:
         assert after == before
 
 
+@pytest.mark.parametrize(("offset_a", "rewritten"), [(5.0, 3), (0.0, 0)])
+def test_frames_whose_current_is_changed_are_counted_and_no_others(
+    database: VehicleDatabase, offset_a: float, rewritten: int
+) -> None:
+    corrector = gateway_for(database, battery=(0.0, offset_a))
+    for counter in range(3):
+        passed_on(corrector, battery(database, counter), 0.0)
+    assert (corrector.counters.frames_in, corrector.counters.rewritten, corrector.counters.answers) == (3, rewritten, 0)
+
+
 def test_bits_that_no_signal_covers_survive(make_database: MakeDatabase) -> None:
     database = make_database()
     corrector = gateway_for(database, battery=(0.5, 3.0))
@@ -62,15 +72,21 @@ def test_codes_that_are_no_values_are_passed_on_untouched(database: VehicleDatab
 
 
 def test_codes_that_the_layout_calls_no_value_are_passed_on_untouched(make_database: MakeDatabase) -> None:
-    layout = SMALL_LAYOUT.replace('signal = "Pair.Motor"', 'signal = "Pair.Motor", no_value = [77, -300]')
+    layout = SMALL_LAYOUT.replace('signal = "Pair.Motor"', 'signal = "Pair.Motor", no_value = [32000, -8500]')
     database = make_database(layout)
     corrector = gateway_for(database, motor=(0.5, 3.0))
     found = []
-    for code in (76, 77, -300):
+    for code in (31999, 32000, -8500):
         data = database.message("Pair").encode({"Battery": 0, "Motor": code}, scaling=False)
         out = passed_on(corrector, Frame(PAIR, data), 0.0)
         found.append(out == data)
     assert found == [False, True, True]
+
+
+def test_a_code_amid_the_values_that_the_layout_calls_no_value_is_refused(make_database: MakeDatabase) -> None:
+    layout = SMALL_LAYOUT.replace('signal = "Pair.Motor"', 'signal = "Pair.Motor", no_value = [77]')
+    with pytest.raises(DatabaseError, match="branch motor: code 77 of signal Motor means 'no value', so that"):
+        gateway_for(make_database(layout))
 
 
 def test_a_code_that_the_signal_cannot_have_is_refused(make_database: MakeDatabase) -> None:
@@ -238,3 +254,12 @@ def test_a_branch_that_overlaps_the_header_is_refused(make_database: MakeDatabas
     layout = SMALL_LAYOUT + '\n[e2e]\nprofile = "P01"\nmessages = ["Pair"]\n'
     with pytest.raises(LayoutError, match=r"branch battery: Pair\.Battery is written twice, or overlaps"):
         gateway_for(make_database(layout))
+
+
+def test_a_name_amid_the_values_of_a_branch_is_refused_where_it_is_written_back(make_database: MakeDatabase) -> None:
+    database = make_database(dbc=SMALL_DBC + 'VAL_ 2147484160 Power 100 "Limit";\n')
+    in_force = InForce(parameters=parameters_for(database, battery=(0.1, 0.0)))
+    wire(database, in_force, start_s=0.0, mode=Mode.OVERLAY)
+    words = r"branch heater: code 100 of signal Power means 'Limit', .* beyond 99 could be .* full scale is 260000"
+    with pytest.raises(DatabaseError, match=words):
+        wire(database, in_force, start_s=0.0, mode=Mode.GATEWAY)

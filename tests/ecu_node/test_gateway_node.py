@@ -1,14 +1,16 @@
 """A gateway on two of python-can's virtual buses: real bus objects, the node in threads of its own."""
 
+import queue
 import random
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 
 import can
 import pytest
+from can.interfaces.virtual import VirtualBus
 
 from ecu_node.buses import SteadyBus
 from ecu_node.corrector import Corrector
@@ -133,6 +135,58 @@ def test_frames_of_the_vehicle_reach_the_sensors_bus_unchanged_and_in_order(
             vehicle.send(message)
         found = received(sensors, len(sent))
     assert list(map(as_sent, found)) == list(map(as_sent, sent))
+
+
+class BlockingBus(VirtualBus):
+    """A bus on which sending waits until it is let go."""
+
+    let_go: threading.Event
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        assert self.let_go.wait(LONGEST_WAIT_S)
+        super().send(msg, timeout)
+
+
+def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
+    database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    monkeypatch.setattr("ecu_node.node._LONGEST_TURN_S", 0.2)
+    name = request.node.name
+    corrector = wire(database, InForce(parameters=None), time.monotonic(), mode=Mode.GATEWAY)
+    near, stop, ticks = BlockingBus(f"{name} a"), threading.Event(), queue.SimpleQueue[float]()
+    near.let_go = threading.Event()
+    sensors = SteadyBus(lambda: near, corrector.counters)
+    vehicle = SteadyBus(lambda: VirtualBus(f"{name} b"), corrector.counters)
+    with ThreadPoolExecutor(1) as pool:
+        node = GatewayNode(sensors, vehicle, corrector, database, period_s=0.02, on_tick=ticks.put)
+        running = pool.submit(node.run, stop.is_set)
+        try:
+            ticks.get(timeout=LONGEST_WAIT_S)
+            ends[1].send(can.Message(arbitration_id=0x300))
+            wait_until(lambda: went_quiet(ticks))
+            near.let_go.set()
+            ticks.get(timeout=LONGEST_WAIT_S)
+        finally:
+            near.let_go.set()
+            stop.set()
+            running.result(LONGEST_WAIT_S)
+            sensors.close()
+            vehicle.close()
+
+
+def went_quiet(ticks: queue.SimpleQueue[float]) -> bool:
+    """Whether nothing ticks for half a second, many times the period."""
+    try:
+        ticks.get(timeout=0.5)
+    except queue.Empty:
+        return True
+    return False
+
+
+def wait_until(done: Callable[[], bool]) -> None:
+    give_up = time.monotonic() + LONGEST_WAIT_S
+    while not done():
+        assert time.monotonic() < give_up, "waited in vain"
 
 
 def test_frames_that_came_before_it_was_at_work_are_too_old_to_be_passed_on(

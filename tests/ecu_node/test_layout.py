@@ -47,6 +47,10 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
     [
         ("schema = 1", "schema = 2", "schema"),
         ('name = "small"', 'name = "small"\nextra = 1', "unknown key 'extra'; allowed are schema, name"),
+        ('name = "small"', 'name = "small"\npath = "x"', "unknown key 'path'"),
+        ('name = "small"', 'name = "small"\ndigest = "x"', "unknown key 'digest'"),
+        ("schema = 1", f"schema = {'9' * 5000}", "not TOML"),
+        ("schema = 1", f"schema = {'[' * 9000}", "not TOML"),
         ("full_scale_a = 400.0", "full_scale_a = -1.0", "full_scale_a"),
         ("full_scale_a = 400.0", "", "'full_scale_a' is missing"),
         ("full_scale_a = 400.0", "full_scale_a = 4 00", "not TOML"),
@@ -69,7 +73,7 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
         (
             "\n]\n",
             '\n]\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\ndata_id = { Pair = 1 }\n',
-            "data_id: Pair is not in",
+            "e2e\\], data_id: Pair is not in",
         ),
         ("full_scale_a", 'model_inputs = ["speed"]\nfull_scale_a', "model_inputs: speed is no"),
         ("full_scale_a", 'derived = [{ name = "d", formula = "speed * 2" }]\nfull_scale_a', "speed is no input"),

@@ -200,10 +200,9 @@ def test_numbers_beyond_all_bounds_are_refused(database: VehicleDatabase, tmp_pa
         read_parameters(tmp_path / "p.json")
 
 
-@pytest.mark.parametrize("name", ["missing.json", "."])
-def test_a_file_that_is_not_there_is_no_parameters(tmp_path: Path, name: str) -> None:
+def test_a_file_that_is_not_there_is_no_parameters(tmp_path: Path) -> None:
     with pytest.raises(UnfitError, match="no such parameter file") as caught:
-        read_parameters(tmp_path / name)
+        read_parameters(tmp_path / "missing.json")
     assert caught.value.reason is Reason.NO_PARAMETERS
 
 
@@ -258,6 +257,9 @@ def test_a_file_must_say_of_each_branch_whether_it_is_applied(database: VehicleD
         (("hardware_fault", "offset_a"), {"b": 1, "c": True}, "'offset_a', 'c': a number is expected, found true"),
         (("verdict",), "fine", "'verdict': 'cannot tell' or .* is expected, found \"fine\""),
         (("provenance", "drives"), [1], "'provenance', 'drives', entry number 1: a text is expected, found 1"),
+        (("vehicle",), "", "'vehicle': a text of at least 1 character is expected, found \"\""),
+        (("vehicle",), 65 * "v", "'vehicle': a text of at most 64 characters is expected, found"),
+        (("branches",), {}, "'branches': a table of at least 1 entry is expected, found a table"),
         (("dbc", "sha256"), "abc", "'dbc', 'sha256': a text of 64 digits 0-9 and a-f is expected, found \"abc\""),
     ],
 )

@@ -137,7 +137,7 @@ def test_error_frames_are_counted_and_not_passed_on(
         send_branches(database, 0)
         other_recording.wait_for(BATTERY, 1)
         assert node.stop() == 0
-    assert "frames in 3, corrected 3, forwarded 3, bus errors 2, bus off 1" in node.messages
+    assert "frames in 3, rewritten 3, forwarded 3, bus errors 2, bus off 1" in node.messages
     assert {item.identifier for item in other_recording.frames} == {"110", "120", "130", "5F0"}
 
 

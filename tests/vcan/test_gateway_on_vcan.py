@@ -109,3 +109,12 @@ def test_in_shadow_mode_a_gateway_changes_nothing(
         wait_until(lambda: len(drive_of(other_recording.frames)) >= len(intact), "all frames on the other bus")
         assert node.stop() == 0
     assert drive_of(other_recording.frames) == intact
+
+
+def test_a_gateway_that_cannot_see_can_fd_says_so(
+    params: Path, start_node: StartNode, other_recording: Recording
+) -> None:
+    with start_node(params, "--vehicle", VEHICLE, "--gateway", OTHER_CHANNEL) as node:
+        other_recording.wait_for(int(STATUS, 16), 1)
+    text = f"{CHANNEL} and {OTHER_CHANNEL}: set up for CAN FD, of which nothing is passed on without --fd"
+    assert text in node.messages

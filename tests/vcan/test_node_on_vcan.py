@@ -72,7 +72,7 @@ def test_a_drive_is_corrected_bit_by_bit_and_everything_else_left_alone(
     assert state_and_reason(database, status[-1]) == (State.CORRECTING, Reason.NONE)
     assert [data[1] & 15 for data in status] == [k % 15 for k in range(len(status))]
     made, damaged = 3 * INSTANTS, INSTANTS // 10
-    counted = f"frames in {made + damaged}, corrected {made}, corrupt {damaged}"
+    counted = f"frames in {made + damaged}, answers {made}, corrupt {damaged}"
     assert node.messages.endswith(f"ecu-node: ended: {counted}\n")
     before, after = (kirchhoff_rmse(database, recording, corrected=which) for which in (False, True))
     assert before >= 10.0 * after

@@ -27,6 +27,9 @@ _SIZES = (1, 2, 3, 4, 6, 7, 8, 8, 8, 8, 8, 12, 16, 24, 32, 48, 64)
 _TRIES = 50
 _LONGEST_WITH_RANGE = 24
 """Longer ranges have more digits than a floating-point number. [bit]"""
+_FULL_SCALE_A = 1e-9
+"""So small that every vehicle reaches it, wherever its signals have names. [A]"""
+_OFFSET_LIMIT_A = 160.0
 _FOREVER_S = 1e6
 
 
@@ -257,13 +260,13 @@ class FuzzVehicle:
 
     def _layout(self) -> str:
         lines = [
-            'schema = 1\nname = "fuzz"\ndbc = "fuzz.dbc"\nfull_scale_a = 400.0',
+            f'schema = 1\nname = "fuzz"\ndbc = "fuzz.dbc"\nfull_scale_a = {_FULL_SCALE_A}',
             f'max_age_s = {_FOREVER_S}\non_bad_frame = "{self.on_bad_frame}"',
         ]
         if self.temperature is not None:
             lines.append('temperature = "heat"')
         lines.append(f"watch = {{ window_s = 3600.0, margin_a = {_FOREVER_S} }}")
-        lines.append(f"limits = {{ drift = {self.drift_limit} }}")
+        lines.append(f"limits = {{ drift = {self.drift_limit}, offset_a = {_OFFSET_LIMIT_A} }}")
         if self.temperature is not None:
             message, signal = self.temperature
             lines.append(f'[[input]]\nname = "heat"\nsignal = "{message.name}.{signal.name}"')
@@ -392,18 +395,19 @@ def _draw_codes(rng: Random, signal: FuzzSignal, units: Sequence[str]) -> None:
 
 
 def _draw_names(rng: Random, signal: FuzzSignal) -> None:
-    """Name some codes, but not that of zero, and none where too few would be left."""
+    """Name some codes, but not that of zero or beside it, and none where too few would be left."""
     zero = zero_code(signal)
+    spared = range(zero - 1, zero + 2)
     lowest, highest = signal.width_range
     if len(signal.bits) < 3:
         return
     for number in range(rng.randint(0, 3)):
         code = rng.choice((lowest, highest, rng.randint(lowest, highest), highest - rng.randint(0, 3)))
-        if code != zero and code not in signal.named:
+        if code not in spared and code not in signal.named:
             signal.named[code] = f"Name{number}"
     if rng.random() < 0.3:
         code = rng.randint(lowest, highest)
-        if code != zero:
+        if code not in spared:
             signal.unnamed.append(code)
 
 

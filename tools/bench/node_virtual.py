@@ -278,12 +278,14 @@ class _Harness:
         receive, clock, sent_s, room = self._receiving.recv, time.perf_counter, self._sent_s, self._room
         received = wrong = most_underway = 0
         latencies_s: list[float] = []
+        last_s = clock()
         while received < self._frames:
             message = receive(PATIENCE_S)
-            if message is None:
-                break
-            if message.arbitration_id != identifier:
+            if message is None or message.arbitration_id != identifier:
+                if clock() - last_s > PATIENCE_S:
+                    break
                 continue
+            last_s = clock()
             number = received % NUMBERS
             if message.data != expected[number]:
                 wrong += 1

@@ -10,7 +10,7 @@ import pytest
 from calibrator.drive import Array, Channel, Drive
 from calibrator.evidence.zero_current import zero_current_offsets
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.layout import read_layout
+from ecu_node.layout import Contactor, read_layout
 
 DATABASE = read_database(read_layout(Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"))
 OFFSETS_A = {"battery": 12.5, "motor": -3.0}
@@ -45,6 +45,19 @@ def test_offsets_are_read_with_their_uncertainty() -> None:
     error = found.offset_a - np.array(list(OFFSETS_A.values()))
     assert (np.abs(error) < 4.0 * found.sd_a).all()
     assert (found.sd_a < 0.1).all()
+
+
+def test_a_state_in_steps_that_are_no_binary_fractions_is_known_as_open() -> None:
+    plain = drive()
+    state = plain.inputs["contactor_state"]
+    scaled = replace(plain, inputs={"contactor_state": replace(state, value=3.0 * 0.1 * (state.value == 0.0))})
+    contactor = Contactor(input="contactor_state", open=[0.3])
+    database = replace(DATABASE, layout=msgspec.structs.replace(DATABASE.layout, contactor=contactor))
+    found, same = (
+        zero_current_offsets([drives], tuple(OFFSETS_A), vehicle)
+        for drives, vehicle in ((scaled, database), (plain, DATABASE))
+    )
+    np.testing.assert_array_equal(found.offset_a, same.offset_a)
 
 
 def test_windows_of_several_drives_add_up() -> None:

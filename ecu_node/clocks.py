@@ -1,0 +1,58 @@
+"""Times of frames on the steady clock, which nobody sets, from time stamps by the time of day, which may be set."""
+
+import time
+
+from ecu_node.counters import Counters
+
+__all__ = ["TimeOfDay", "steady_time_s"]
+
+_OLDEST_FRAME_S = 10.0
+"""No frame waits for longer: an older time stamp is one of another clock. [s]"""
+_LARGEST_JITTER_S = 0.05
+"""By more than this the time of day changes against the steady clock only if it is set. [s]"""
+
+
+def steady_time_s(stamp_s: float, now_s: float, clock_ahead_s: float) -> float:
+    """When a frame came, on the steady clock.
+
+    Parameters
+    ----------
+    stamp_s : float
+        Its time stamp by the kernel or the adapter; 0 if there is none. [s]
+    now_s : float
+        The steady clock now. [s]
+    clock_ahead_s : float
+        By how much the time of day is ahead of the steady clock; infinity if it was set a short while ago. [s]
+
+    Returns
+    -------
+    float
+        The stamp on the steady clock; now if that would be in the future or very long ago, or the clock was set.
+    """
+    time_s = stamp_s - clock_ahead_s
+    return time_s if now_s - _OLDEST_FRAME_S <= time_s <= now_s else now_s
+
+
+class TimeOfDay:
+    """By how much the time of day is ahead of the steady clock, and whether it was set.
+
+    Parameters
+    ----------
+    counters : Counters
+        Where it is counted how often it was set.
+    """
+
+    def __init__(self, counters: Counters) -> None:
+        self._counters = counters
+        self._ahead_s = time.time() - time.monotonic()
+        self._set_s = float("-inf")
+
+    def ahead_s(self) -> float:
+        """By how much it is ahead now [s]; infinity while frames may be waiting that were stamped before it was set."""
+        now_s = time.monotonic()
+        ahead_s = time.time() - now_s
+        if abs(ahead_s - self._ahead_s) > _LARGEST_JITTER_S:
+            self._set_s = now_s
+            self._counters.clock_steps += 1
+        self._ahead_s = ahead_s
+        return ahead_s if now_s - self._set_s > _OLDEST_FRAME_S else float("inf")

@@ -1,0 +1,68 @@
+"""Files that a user names: regular ones of a bearable size, and nothing else is opened.
+
+A pipe would keep the reader waiting, a device would never end.
+"""
+
+import hashlib
+import stat
+from pathlib import Path
+
+from ecu_node.errors import UserError
+
+__all__ = ["UnsuitableFileError", "read_user_file", "require_user_file", "text_digest"]
+
+_KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+class UnsuitableFileError(UserError):
+    """What a name leads to is no regular file, or too large; the message says what it is."""
+
+
+def require_user_file(path: Path, *, largest_bytes: int) -> None:
+    """Refuse what is no regular file, or too large, without opening it.
+
+    Parameters
+    ----------
+    path : Path
+        As the user wrote it.
+    largest_bytes : int
+        Size that is still accepted. [byte]
+
+    Raises
+    ------
+    UnsuitableFileError
+        If it is something else, or larger; its text is to stand behind the name of the file.
+    OSError
+        If there is no such file.
+    """
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        kind = next((name for is_kind, name in _KINDS if is_kind(found.st_mode)), "no regular file")
+        raise UnsuitableFileError(f"it is {kind}; a file is expected")
+    if found.st_size > largest_bytes:
+        raise _too_large(largest_bytes)
+
+
+def read_user_file(path: Path, *, largest_bytes: int) -> bytes:
+    """Content of a file; parameters and errors as for :func:`require_user_file`, and OSError if it cannot be read."""
+    require_user_file(path, largest_bytes=largest_bytes)
+    with path.open("rb") as file:
+        content = file.read(largest_bytes + 1)  # the kernel's own files have no size
+    if len(content) > largest_bytes:
+        raise _too_large(largest_bytes)
+    return content
+
+
+def text_digest(content: bytes) -> str:
+    """SHA-256 of a text, the same for LF and CRLF line ends."""
+    return hashlib.sha256(content.replace(b"\r\n", b"\n")).hexdigest()
+
+
+def _too_large(largest_bytes: int) -> UnsuitableFileError:
+    return UnsuitableFileError(f"it is larger than {largest_bytes} bytes, which no such file is")

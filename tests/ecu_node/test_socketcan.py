@@ -1,0 +1,184 @@
+"""Many frames per system call: what python-can writes is read, and what is written python-can reads."""
+
+import errno
+import random
+import socket
+import struct
+import time
+from collections.abc import Iterator
+
+import can
+import pytest
+from can.interfaces.socketcan.socketcan import build_can_frame, dissect_can_frame
+
+from ecu_node.socketcan import MOST_AT_ONCE, SocketCanLink
+
+CLASSIC_BYTES, FD_BYTES = 16, 72
+FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+Ends = tuple[SocketCanLink, socket.socket]
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    """A link, and the other end; datagrams between processes are to the system calls what frames are."""
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    far.settimeout(1.0)
+    with near, far:
+        yield SocketCanLink(near), far
+
+
+def random_frame(rng: random.Random) -> can.Message:
+    """Any data or remote frame."""
+    extended, is_fd = rng.random() < 0.5, rng.random() < 0.5
+    remote = not is_fd and rng.random() < 0.2
+    length = rng.choice(FD_LENGTHS if is_fd else range(9))
+    return can.Message(
+        arbitration_id=rng.randrange(1 << (29 if extended else 11)),
+        is_extended_id=extended,
+        is_remote_frame=remote,
+        is_fd=is_fd,
+        bitrate_switch=is_fd and rng.random() < 0.5,
+        error_state_indicator=is_fd and rng.random() < 0.5,
+        dlc=length,
+        data=None if remote else rng.randbytes(length),
+    )
+
+
+def fields(message: can.Message) -> tuple[object, ...]:
+    """All that a frame is."""
+    return (
+        *(message.arbitration_id, message.is_extended_id, message.is_remote_frame, message.is_error_frame),
+        *(message.is_fd, message.bitrate_switch, message.error_state_indicator, message.dlc, bytes(message.data)),
+    )
+
+
+def received(link: SocketCanLink, count: int) -> list[can.Message]:
+    found: list[can.Message] = []
+    while len(found) < count and (message := link.receive(1.0)) is not None:
+        found.append(message)
+    return found
+
+
+def test_all_kinds_of_frames_are_read_as_they_were_written(ends: Ends) -> None:
+    link, far = ends
+    rng = random.Random(0)
+    for _ in range(50):
+        frames = [random_frame(rng) for _ in range(20)]
+        for frame in frames:
+            far.send(build_can_frame(frame))
+        assert [fields(message) for message in received(link, 20)] == [fields(frame) for frame in frames]
+
+
+def test_all_kinds_of_frames_are_written_as_python_can_reads_them(ends: Ends) -> None:
+    link, far = ends
+    rng = random.Random(1)
+    for _ in range(50):
+        frames = [random_frame(rng) for _ in range(20)]
+        done = 0
+        while done < len(frames):
+            done += link.send(frames, done)
+        for frame in frames:
+            raw = far.recv(128)
+            assert len(raw) == (FD_BYTES if frame.is_fd else CLASSIC_BYTES)
+            identifier, length, flags, data = dissect_can_frame(raw)
+            told = dissect_can_frame(build_can_frame(frame))
+            assert (identifier, length, flags) == told[:3]
+            assert frame.is_remote_frame or data == bytes(frame.data)
+
+
+def test_no_frame_carries_bytes_of_the_one_before(ends: Ends) -> None:
+    link, far = ends
+    for data in (bytes([255]) * 64, b"\x01"):
+        link.send([can.Message(arbitration_id=1, is_fd=True, data=data)], 0)
+    assert far.recv(128)[8:] == bytes([255]) * 64
+    assert far.recv(128)[8:] == b"\x01" + bytes(63)
+
+
+def test_an_error_frame_is_told_as_one(ends: Ends) -> None:
+    link, far = ends
+    far.send(struct.pack("=IB3x8s", 0x20000040, 8, bytes(8)))
+    (message,) = received(link, 1)
+    assert message.is_error_frame
+    assert message.arbitration_id == 0x40
+
+
+def test_a_classic_frame_keeps_a_length_code_above_8(ends: Ends) -> None:
+    link, far = ends
+    raw = struct.pack("=IB2xB8s", 0x123, 8, 13, b"12345678")
+    far.send(raw)
+    (message,) = received(link, 1)
+    assert (message.dlc, bytes(message.data)) == (13, b"12345678")
+    link.send([message], 0)
+    assert far.recv(128) == raw
+
+
+def test_more_frames_than_one_call_takes_come_whole_and_in_order(ends: Ends) -> None:
+    link, far = ends
+    count = 2 * MOST_AT_ONCE + 5
+    came = []
+    for first in range(0, count, 50):
+        for number in range(first, min(first + 50, count)):
+            far.send(build_can_frame(can.Message(arbitration_id=number)))
+        came += [message.arbitration_id for message in received(link, min(50, count - first))]
+    assert came == list(range(count))
+
+
+def test_frames_at_hand_are_told(ends: Ends) -> None:
+    link, far = ends
+    for number in range(3):
+        far.send(build_can_frame(can.Message(arbitration_id=number)))
+    seen = []
+    while link.receive(0.0) is not None:
+        seen.append(link.at_hand)
+    assert seen == [True, True, False]
+
+
+def test_what_came_after_the_bus_was_asked_is_found_when_it_is_asked_again(ends: Ends) -> None:
+    link, far = ends
+    frame = build_can_frame(can.Message(arbitration_id=7))
+    far.send(frame)
+    assert link.receive(0.0) is not None
+    asked_s = link.asked_s
+    far.send(frame)
+    assert link.receive(0.0) is None
+    assert link.asked_s == asked_s, "the bus was not asked, so this is still the time up to which it was heard"
+    assert link.receive(0.0) is not None
+    assert link.asked_s > asked_s
+
+
+def test_waiting_ends_in_time(ends: Ends) -> None:
+    link, _ = ends
+    start_s = time.monotonic()
+    assert link.receive(0.02) is None
+    assert time.monotonic() - start_s >= 0.02
+    assert link.asked_s >= start_s + 0.02
+
+
+def test_a_bus_that_takes_no_more_says_how_many_it_took(ends: Ends) -> None:
+    link, far = ends
+    frames = [can.Message(arbitration_id=number) for number in range(1000)]
+    done = 0
+
+    def fill() -> None:
+        nonlocal done
+        while True:
+            done += link.send(frames, done)
+
+    with pytest.raises(OSError, match="unavailable") as caught:
+        fill()
+    assert caught.value.errno in {errno.EAGAIN, errno.ENOBUFS}
+    numbers = [dissect_can_frame(far.recv(128))[0] & 0x1FFFFFFF for _ in range(done)]
+    assert numbers == list(range(done))
+    assert link.send(frames, done) >= 1
+
+
+def test_a_closed_bus_is_an_error_for_both_directions() -> None:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    link = SocketCanLink(near)
+    far.close()
+    with pytest.raises(ConnectionError):
+        link.send([can.Message()], 0)
+    near.close()
+    for use in (lambda: link.send([can.Message()], 0), lambda: link.receive(0.0), lambda: link.receive(0.01)):
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            use()

@@ -1,0 +1,60 @@
+"""Results that cannot be written: one line and exit code 1, in the node's commands and in the calibrator's."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.ecu_node.vehicles import LAYOUT
+
+FULL = "import resource, runpy, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
+"""No file that is written may have a single byte, as on a full disk."""
+MONITOR = ["monitor", "--layout", str(LAYOUT), "--interface", "virtual", "--channel", "full", "--once", "0.1"]
+LINE = ": standard output: cannot write the result: File too large; give it somewhere else to go\n"
+
+
+def written_nowhere(
+    tmp_path: Path, program: str, *arguments: str, unbuffered: str = ""
+) -> subprocess.CompletedProcess[str]:
+    code = f"{FULL} sys.argv = [{program!r}, *{arguments!r}]; runpy.run_module({program!r}, run_name='__main__')"
+    with (tmp_path / "full").open("w") as full:
+        return subprocess.run(
+            [sys.executable, "-c", code],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            check=False,
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        )
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize(
+    "arguments", [["check", "--params", "p", "--layout", str(LAYOUT)], ["schema"], ["--help"], ["--version"], MONITOR]
+)
+def test_a_result_that_cannot_be_written_is_one_line_and_1(
+    tmp_path: Path, arguments: list[str], unbuffered: str
+) -> None:
+    done = written_nowhere(tmp_path, "ecu_node", *arguments, unbuffered=unbuffered)
+    assert (done.returncode, done.stderr) == (1, f"ecu-node{LINE}")
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["simulate", "--help"]])
+def test_the_calibrator_says_it_the_same_way(tmp_path: Path, arguments: list[str]) -> None:
+    done = written_nowhere(tmp_path, "calibrator", *arguments)
+    assert (done.returncode, done.stderr) == (1, f"calibrator{LINE}")
+
+
+@pytest.mark.parametrize("program", ["ecu_node", "calibrator"])
+def test_where_standard_output_is_closed_nothing_is_said(program: str) -> None:
+    done = subprocess.run(
+        ["/bin/sh", "-c", f'"$0" -m {program} --version >&-', sys.executable],
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stderr.removeprefix("ecu-node 0.1.0\n")) == (0, "")

@@ -1,0 +1,57 @@
+"""Signals that come while the node starts: at the very moment when it opens its layout, or begins to import a library.
+
+Python's audit events tell the moment: the process signals itself there, and the rest is as it always is.
+"""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.ecu_node.vehicles import LAYOUT
+
+AT = """
+import signal, sys
+def hook(event, arguments):
+    if event == {event!r} and str(arguments[0]) == {what!r}:
+        signal.raise_signal({number})
+sys.addaudithook(hook)
+from ecu_node.cli import main
+sys.exit(main({arguments!r}))
+"""
+MOMENTS = [("import", "can"), ("open", str(LAYOUT))]
+
+
+def program(event: str, what: str, number: int, arguments: list[str]) -> list[str]:
+    return [sys.executable, "-c", AT.format(event=event, what=what, number=int(number), arguments=arguments)]
+
+
+def files(tmp_path: Path) -> list[str]:
+    return ["--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT)]
+
+
+@pytest.mark.parametrize(("event", "what"), MOMENTS)
+def test_ctrl_c_at_start_is_one_line_and_130(tmp_path: Path, event: str, what: str) -> None:
+    command = program(event, what, signal.SIGINT, ["check", *files(tmp_path)])
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "ecu-node: interrupted\n")
+
+
+@pytest.mark.parametrize(("event", "what"), MOMENTS)
+def test_sighup_at_start_does_not_end_a_node(tmp_path: Path, event: str, what: str) -> None:
+    bus = ["--interface", "virtual", "--channel", "hangup"]
+    command = program(event, what, signal.SIGHUP, ["run", *files(tmp_path), *bus])
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        lines = iter(process.stderr.readline, "")
+        assert any("running on virtual hangup" in line for line in lines), f"ended with {process.wait(timeout=60)}"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=60) == 0
+
+
+def test_sighup_ends_a_command_that_is_no_node(tmp_path: Path) -> None:
+    command = program("open", str(LAYOUT), signal.SIGHUP, ["check", *files(tmp_path)])
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == -signal.SIGHUP

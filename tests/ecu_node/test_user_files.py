@@ -1,0 +1,101 @@
+"""Files that a user names: what is no regular file, or too large, is refused before anybody waits for its end."""
+
+import os
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ecu_node.database import MAX_DBC_BYTES, read_database
+from ecu_node.errors import DatabaseError
+from ecu_node.layout import MAX_LAYOUT_BYTES, read_layout
+from ecu_node.parameters import MAX_FILE_BYTES, UnfitError, read_parameters
+from ecu_node.status import Reason
+from ecu_node.user_files import UnsuitableFileError, read_user_file
+from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def endless(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def huge(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 1 << 40)  # sparse: no disk is filled
+
+
+KINDS = [(pipe, "it is a pipe; a file is expected"), (endless, "it is a device; a file is expected"),
+         (Path.mkdir, "it is a folder; a file is expected"), (huge, "it is larger than [0-9]+ bytes")]  # fmt: skip
+
+
+def checked(params: Path, layout: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "ecu_node", "check", "--params", str(params), "--layout", str(layout)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.parametrize(("make", "words"), KINDS)
+@pytest.mark.parametrize("role", ["layout", "dbc"])
+def test_a_layout_or_dbc_that_is_no_file_is_one_line(
+    tmp_path: Path, make: Callable[[Path], None], words: str, role: str
+) -> None:
+    (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
+    name = "small.dbc" if role == "dbc" else "other.toml"
+    make(tmp_path / name)
+    done = checked(tmp_path / "p.json", tmp_path / ("small.toml" if role == "dbc" else name))
+    what = {"dbc": "DBC", "layout": "layout"}[role]
+    assert re.match(rf"ecu-node: .*{name}: cannot read the {what}: {words}", done.stderr)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+
+
+@pytest.mark.parametrize(("make", "words"), KINDS)
+def test_a_parameter_file_that_is_none_is_malformed(tmp_path: Path, make: Callable[[Path], None], words: str) -> None:
+    make(tmp_path / "p.json")
+    done = checked(tmp_path / "p.json", LAYOUT)
+    assert re.match(rf"NOT FIT \(MALFORMED_PARAMETERS\): .*p\.json: not a parameter file: {words}", done.stdout)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
+def test_the_calibrator_refuses_such_a_layout_too(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "other.toml")
+    command = ["import", "--layout", str(tmp_path / "other.toml"), "--out", str(tmp_path / "store"), "log.blf"]
+    done = subprocess.run(
+        [sys.executable, "-m", "calibrator", *command], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr.endswith("other.toml: cannot read the layout: it is a pipe; a file is expected\n")
+    assert done.stderr.count("\n") == 1
+
+
+def test_files_of_the_largest_size_are_read(tmp_path: Path) -> None:
+    filled = SMALL_LAYOUT + "#" * (MAX_LAYOUT_BYTES - len(SMALL_LAYOUT))
+    (tmp_path / "small.toml").write_text(filled)
+    layout = read_layout(tmp_path / "small.toml")
+    (tmp_path / "small.dbc").write_bytes(b"\n" * MAX_DBC_BYTES)
+    with pytest.raises(DatabaseError, match="the DBC is empty"):
+        read_database(layout)
+    (tmp_path / "p.json").write_bytes(b" " * MAX_FILE_BYTES)
+    with pytest.raises(UnfitError, match="truncated"):
+        read_parameters(tmp_path / "p.json")
+
+
+def test_a_file_that_grows_while_it_is_read_is_not_followed(tmp_path: Path) -> None:
+    """The kernel's own files tell no size before they are read."""
+    with pytest.raises(UnsuitableFileError, match="larger than 10 bytes"):
+        read_user_file(Path("/proc/self/status"), largest_bytes=10)
+
+
+def test_a_socket_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # names of sockets are short
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind("p.json")
+        with pytest.raises(UnfitError, match="it is a socket") as caught:
+            read_parameters(Path("p.json"))
+    assert caught.value.reason is Reason.MALFORMED_PARAMETERS
