@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrator.drive import Array
+from calibrator.evidence.summary import DriveSummary
 from calibrator.options import Method
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import FileReference, Provenance
 
-__all__ = ["RunIdentity", "by_branch", "junction_rms_a"]
+__all__ = ["RunIdentity", "by_branch", "junction_rms_a", "junction_rms_of_blocks_a"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,3 +88,27 @@ def junction_rms_a(mean_a: Array, product_a2: Array, *, drift: Array, offset_a: 
     constant = float(weight @ offset_a)
     mean_square = weight @ product_a2 @ weight - 2.0 * constant * float(weight @ mean_a) + constant**2
     return float(np.sqrt(max(float(mean_square), 0.0)))
+
+
+def junction_rms_of_blocks_a(summary: DriveSummary, *, gain: Array, offset_a: Array) -> float:
+    """Root mean square of the Kirchhoff sum where the gains of the sensors differ between the blocks of the drives.
+
+    Parameters
+    ----------
+    summary : DriveSummary
+        Of B blocks.
+    gain : ndarray of shape (B, K)
+        What each current is divided by. [1]
+    offset_a : ndarray of shape (K,)
+        What is taken from it before. [A]
+
+    Returns
+    -------
+    float
+        RMS of sum_k (i_m,k - o_k) / gain_k over all valid samples. [A]
+    """
+    weight = 1.0 / gain
+    combined = np.column_stack([weight, -weight @ offset_a])
+    moments = summary.moments[:, summary.inputs :, summary.inputs :]
+    square = np.einsum("bk,bkl,bl->", combined, moments, combined)
+    return float(np.sqrt(max(float(square) / float(summary.total[-1, -1]), 0.0)))

@@ -47,7 +47,9 @@ Verdict = Literal["no sensor fault", "corrected", "cannot tell", "not enough dat
 _UNDECIDED: tuple[Verdict, ...] = ("cannot tell", "not enough data")
 """Verdicts with which nothing was found that could be applied."""
 
-HeldBack = Literal["beyond the limits", "not linear", "reference in doubt", "moved too little", "harm limit"]
+HeldBack = Literal[
+    "beyond the limits", "not linear", "no temperature", "reference in doubt", "moved too little", "harm limit"
+]
 """Why a branch in which a fault was found is passed through."""
 
 _Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$", description="SHA-256, line ends counted as LF")]

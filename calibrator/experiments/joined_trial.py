@@ -11,7 +11,7 @@ from calibrator.experiments.recorded_trial import RecordedCase, recorded_trial
 from calibrator.experiments.trial import Trial
 from calibrator.random_streams import Purpose, random_stream
 
-__all__ = ["joined_trial"]
+__all__ = ["joined_trial", "joined_trips"]
 
 
 def joined_trial(fleet: RecordedFleet, case: RecordedCase, seed: int, *, vehicles: int, duration_s: float) -> Trial:
@@ -38,12 +38,35 @@ def joined_trial(fleet: RecordedFleet, case: RecordedCase, seed: int, *, vehicle
     Trial
         Of N vehicles.
     """
-    samples = int(duration_s / fleet.period_s)
-    trips = [
-        _run(random_stream(Purpose.CALIBRATION_TRIP, seed, j), fleet.trips, samples, f"run-{j}")
-        for j in range(vehicles)
-    ]
+    trips = joined_trips(fleet.trips, Purpose.CALIBRATION_TRIP, seed, vehicles=vehicles, duration_s=duration_s)
     return recorded_trial(replace(fleet, trips=tuple(trips)), case, seed)
+
+
+def joined_trips(
+    trips: Sequence[GroundTruth], purpose: Purpose, seed: int, *, vehicles: int, duration_s: float
+) -> list[GroundTruth]:
+    """Trips of many vehicles, each from a random start on.
+
+    Parameters
+    ----------
+    trips : sequence of GroundTruth
+        The recorded ones; after the last comes the first.
+    purpose : Purpose
+        What they are for.
+    seed : int
+        Of this repetition.
+    vehicles : int
+        Number of vehicles N.
+    duration_s : float
+        Driving of each. [s]
+
+    Returns
+    -------
+    list of N GroundTruth
+        All of this duration.
+    """
+    samples = int(duration_s / trips[0].period_s)
+    return [_run(random_stream(purpose, seed, j), trips, samples, f"run-{j}") for j in range(vehicles)]
 
 
 def _run(rng: np.random.Generator, trips: Sequence[GroundTruth], samples: int, name: str) -> GroundTruth:

@@ -22,11 +22,11 @@ from scipy.stats import norm, qmc
 from calibrator.compiled import in_place, inner
 from calibrator.drive import Array
 from calibrator.posterior.slab import NEVER
-from calibrator.posterior.small_matrices import normal_mass
+from calibrator.posterior.small_matrices import positive_quadratic
 from calibrator.posterior.states import States
 from calibrator.score import TOLERANCE
 
-__all__ = ["best_estimate", "harm_probability"]
+__all__ = ["NORMAL_STEPS", "best_estimate", "harm_probability"]
 
 POINTS_PER_STATE = 64
 """Points by which the spread of one state is told; a power of two for the quasi-random rule."""
@@ -37,8 +37,8 @@ EQUALLY_GOOD = 0.01
 CANDIDATES = 48
 """States that are tried as estimates, the most probable ones."""
 _DEVIATIONS = np.linspace(-FARTHEST, FARTHEST, STEPS + 1)
-_STEPS = np.column_stack([_DEVIATIONS, np.exp(-0.5 * _DEVIATIONS**2) / np.exp(-0.5 * _DEVIATIONS**2).sum()])
-"""Deviations of the parameter that matters less, and the share of each; shape (STEPS + 1, 2). [1]"""
+NORMAL_STEPS = np.column_stack([_DEVIATIONS, np.exp(-0.5 * _DEVIATIONS**2) / np.exp(-0.5 * _DEVIATIONS**2).sum()])
+"""Deviations of a standard normal parameter, and the share of each; shape (STEPS + 1, 2). [1]"""
 
 
 def best_estimate(states: States, *, least: tuple[float, float]) -> tuple[NDArray[np.int64], Array]:
@@ -165,7 +165,7 @@ def harm_probability(states: States, drift: Array, offset: Array, *, mean: Array
     """
     harm = np.zeros(drift.shape)
     estimate, moments = np.stack([drift, offset], axis=2), np.stack([mean, mean_square], axis=3)
-    _sum_harm(*_spread_states(states), estimate, moments, _STEPS, harm)
+    _sum_harm(*_spread_states(states), estimate, moments, NORMAL_STEPS, harm)
     kept = np.cumsum(states.weight, axis=1)[:, -1]  # one after the other: states of weight zero change no digit
     dropped = np.maximum(1.0 - kept, 0.0)[:, None]
     changed = (drift != 0.0) | (offset != 0.0)
@@ -246,30 +246,9 @@ def _worse(d: float, o: float, in_drift: bool, d_sd: float, o_sd: float, estimat
         square = (1.0 / unit**2 - 1.0) * s
         linear = 2.0 * (away * m / unit - d_hat * s / unit**2 - o * m)
         constant = (d_hat / unit) ** 2 * s - 2.0 * d_hat / unit * away * m + away**2 - o**2
-        return _positive_quadratic(square, linear, constant, d, d_sd)
+        return positive_quadratic(square, linear, constant, d, d_sd)
     away = (d - d_hat) / unit
     square = 1.0 / unit**2 - 1.0
     linear = 2.0 * (away * m / unit - o_hat / unit**2 - d * m)
     constant = (away**2 - d**2) * s - 2.0 * away * m * o_hat / unit + (o_hat / unit) ** 2
-    return _positive_quadratic(square, linear, constant, o, o_sd)
-
-
-@inner
-def _positive_quadratic(square: float, linear: float, constant: float, mean: float, sd: float) -> float:
-    """Probability that square x^2 + linear x + constant is positive for x ~ N(mean, sd^2), which may be 0."""
-    a, b = (square * mean + linear) * mean + constant, 2.0 * square * mean + linear
-    # In t = x - mean: square t^2 + b t + a. Roots by the form that does not cancel.
-    if sd == 0.0 or (square == 0.0 and b == 0.0):
-        return 1.0 if a > 0.0 else 0.0
-    if square == 0.0:
-        return normal_mass(-a / b / sd, np.inf) if b > 0.0 else normal_mass(-np.inf, -a / b / sd)
-    discriminant = b * b - 4.0 * square * a
-    if discriminant <= 0.0:
-        return 1.0 if square > 0.0 else 0.0
-    q = -0.5 * (b + math.copysign(math.sqrt(discriminant), b))
-    first = q / square
-    second = a / q if q != 0.0 else 0.0
-    lower, upper = min(first, second) / sd, max(first, second) / sd
-    if square > 0.0:
-        return normal_mass(-np.inf, lower) + normal_mass(upper, np.inf)
-    return normal_mass(lower, upper)
+    return positive_quadratic(square, linear, constant, o, o_sd)

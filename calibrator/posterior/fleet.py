@@ -1,11 +1,11 @@
-"""The default method on a fleet: its reference from some vehicles, then the parameters of any others, a few at a time.
+"""The default method on a fleet: its reference from some vehicles, with which any others are calibrated.
 
 If asked to, the drives are read a second time to find sensors that are not linear; if there are any, the reference is
 learnt anew from the linear parts of all sensors.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -19,110 +19,16 @@ from calibrator.parameter_files import RunIdentity, by_branch
 from calibrator.posterior.bench import contradicted_readings, merge_readings, trust_notices, window_notices
 from calibrator.posterior.bench_table import BenchReadings
 from calibrator.posterior.calibration import FleetReference, estimate_summaries, learn_reference
-from calibrator.posterior.estimate import FleetPosterior
-from calibrator.posterior.second_pass import finding_notices, tell_sensors, without_sensor_models
-from calibrator.posterior.vehicle_parameters import impossible_vehicles, vehicle_parameters
-from calibrator.posterior.verdict import decide
+from calibrator.posterior.fleet_task import FleetTask
+from calibrator.posterior.model_parameters import finding_notices
 from calibrator.sensor_models.choice import SensorModelChoice
 from calibrator.sensor_models.fleet import SensorFindings, all_linear
-from ecu_node.parameters import VehicleParameters
+from calibrator.sensor_models.modelled import ModelledVehicle
 
-__all__ = ["FindModels", "FleetTask", "Learnt", "learn_fleet"]
+__all__ = ["FindModels", "Learnt", "learn_fleet"]
 
 FindModels = Callable[[Sequence[VehicleSummary], Array, Mask, Mask], SensorFindings]
 """Second pass: vehicles, offsets found with linear sensors (N, K) [A], learning and trusted ones -> findings."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FleetTask:
-    """All that it takes to calibrate vehicles of a fleet whose reference is known.
-
-    Attributes
-    ----------
-    reference : FleetReference
-        Of the fleet.
-    identity : RunIdentity
-        For the parameter files.
-    branches : tuple of str
-        Names of the K branches.
-    harm_limit : float
-        Largest probability of harm with which a branch is corrected. [1]
-    bench : mapping
-        Bench readings that are used.
-    believed : frozenset of str
-        Trusted vehicles that do not break the junction law.
-    fleet_size : int
-        Vehicles of the fleet that can be used.
-    not_linear : mapping of str to (sequence of SensorModelChoice, DriveSummary)
-        Of the vehicles that have sensors that are not linear, or may have: models and linear parts.
-    """
-
-    reference: FleetReference
-    identity: RunIdentity
-    branches: tuple[str, ...]
-    harm_limit: float
-    bench: BenchReadings
-    believed: frozenset[str]
-    fleet_size: int
-    not_linear: Mapping[str, tuple[Sequence[SensorModelChoice], DriveSummary]] = field(default_factory=dict)
-
-    def calibrate(self, vehicles: Sequence[VehicleSummary]) -> tuple[list[VehicleParameters], dict[str, str]]:
-        """Calibrate some vehicles; what comes out does not depend on which others are among them.
-
-        Parameters
-        ----------
-        vehicles : sequence of VehicleSummary
-            N of them.
-
-        Returns
-        -------
-        parameters : list of VehicleParameters
-            Of those whose currents a sensor can show.
-        left_out : dict of str to str
-            Why the others have none.
-        """
-        if not vehicles:
-            return [], {}
-        findings, posterior = self._findings(vehicles), self.estimate(vehicles)
-        layout, health = self.identity.database.layout, self.reference.health
-        decision = decide(posterior, layout, harm_limit=self.harm_limit, doubtful=health.doubtful)
-        deployment = without_sensor_models(decision, findings)
-        impossible = impossible_vehicles(posterior, self.branches)
-        parameters = [
-            tell_sensors(
-                vehicle_parameters(
-                    vehicle,
-                    posterior,
-                    deployment,
-                    position=j,
-                    branches=self.branches,
-                    identity=self.identity,
-                    fleet_size=self.fleet_size,
-                ),
-                findings.choices[j],
-            )
-            for j, vehicle in enumerate(vehicles)
-            if j not in impossible
-        ]
-        return parameters, {vehicles[j].vehicle: why for j, why in impossible.items()}
-
-    def estimate(self, vehicles: Sequence[VehicleSummary]) -> FleetPosterior:
-        """Posterior of some vehicles, at least one, in their order."""
-        readings, _ = merge_readings(vehicles, self.bench, self.branches)
-        return estimate_summaries(
-            self._findings(vehicles).summaries,
-            self.reference,
-            readings=readings,
-            believed=np.array([vehicle.vehicle in self.believed for vehicle in vehicles]),
-        )
-
-    def _findings(self, vehicles: Sequence[VehicleSummary]) -> SensorFindings:
-        linear = all_linear(vehicles)
-        found = [self.not_linear.get(vehicle.vehicle) for vehicle in vehicles]
-        return SensorFindings(
-            choices=[row if it is None else it[0] for it, row in zip(found, linear.choices, strict=True)],
-            summaries=[part if it is None else it[1] for it, part in zip(found, linear.summaries, strict=True)],
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,10 +170,10 @@ def _with_readings(
 
 def _not_linear(
     names: Sequence[str], findings: SensorFindings
-) -> dict[str, tuple[Sequence[SensorModelChoice], DriveSummary]]:
-    """Models and linear parts of the vehicles that have sensors that are not linear, or may have."""
+) -> dict[str, tuple[Sequence[SensorModelChoice], ModelledVehicle | None]]:
+    """What is known of the vehicles that have sensors that are not linear, or may have."""
     told = findings.not_linear.any(axis=1) | findings.undecided.any(axis=1)
-    return {names[j]: (findings.choices[j], findings.summaries[j]) for j in np.flatnonzero(told).tolist()}
+    return {names[j]: (findings.choices[j], findings.modelled[j]) for j in np.flatnonzero(told).tolist()}
 
 
 def _learn(

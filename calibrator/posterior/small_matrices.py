@@ -1,4 +1,4 @@
-"""Gaussian algebra on matrices of a few rows, and the mass of a normal distribution under the slab; compiled."""
+"""Gaussian algebra on matrices of a few rows, and masses of a normal distribution; compiled."""
 
 import math
 
@@ -15,6 +15,8 @@ __all__ = [
     "inverse",
     "log_mass",
     "normal_form",
+    "normal_mass",
+    "positive_quadratic",
     "quadratic",
     "solution",
     "sort_falling",
@@ -170,3 +172,24 @@ def log_mass(mean: float, sd: float, low: float, high: float) -> float:
     if spread * NEVER > low + magnitude:
         mass += normal_mass((low + magnitude) / spread, (high + magnitude) / spread)
     return math.log(max(mass, _LEAST_MASS) * 0.5 / (high - low))
+
+
+@inner
+def positive_quadratic(square: float, linear: float, constant: float, mean: float, sd: float) -> float:
+    """Probability that square x^2 + linear x + constant is positive for x ~ N(mean, sd^2), which may be 0."""
+    a, b = (square * mean + linear) * mean + constant, 2.0 * square * mean + linear
+    # In t = x - mean: square t^2 + b t + a. Roots by the form that does not cancel.
+    if sd == 0.0 or (square == 0.0 and b == 0.0):
+        return 1.0 if a > 0.0 else 0.0
+    if square == 0.0:
+        return normal_mass(-a / b / sd, np.inf) if b > 0.0 else normal_mass(-np.inf, -a / b / sd)
+    discriminant = b * b - 4.0 * square * a
+    if discriminant <= 0.0:
+        return 1.0 if square > 0.0 else 0.0
+    q = -0.5 * (b + math.copysign(math.sqrt(discriminant), b))
+    first = q / square
+    second = a / q if q != 0.0 else 0.0
+    lower, upper = min(first, second) / sd, max(first, second) / sd
+    if square > 0.0:
+        return normal_mass(-np.inf, lower) + normal_mass(upper, np.inf)
+    return normal_mass(lower, upper)

@@ -2,7 +2,8 @@
 
 If there is an earlier result, vehicles that have not driven since keep its parameters. Of the others it is looked at
 whether their new drives alone tell other faults: a sensor that has moved is calibrated from the new drives, any other
-from all of them.
+from all of them. Summaries do not tell sensors that are not linear; vehicles that have such sensors, or may have, keep
+their earlier parameters.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ import numpy as np
 
 from calibrator.errors import DriveError
 from calibrator.evidence.vehicle_summary import VehicleSummary
-from calibrator.posterior.fleet import FleetTask
+from calibrator.posterior.fleet_task import FleetTask
 from calibrator.results import ChunkResult, Written, encode_chunk
 from calibrator.run.previous import PreviousResult, moved_sensors
 from calibrator.summaries.record import Record, drives_digest, joined_records
@@ -66,7 +67,7 @@ def calibrate_bucket(
     todo: list[VehicleSummary] = []
     for name, items in records.items():
         earlier = _earlier(name, before.get(name))
-        if earlier is not None and before[name].drives == digests[name]:
+        if earlier is not None and (before[name].drives == digests[name] or _not_linear(earlier)):
             found.parameters.append(earlier)
             continue
         try:
@@ -80,6 +81,11 @@ def calibrate_bucket(
 
 def _earlier(name: str, written: Written | None) -> VehicleParameters | None:
     return None if written is None else decode_parameters(written.text, f"earlier parameters of {name}")
+
+
+def _not_linear(earlier: VehicleParameters) -> bool:
+    branches = earlier.branches.values()
+    return any(branch.sensor_model is not None or branch.held_back == "not linear" for branch in branches)
 
 
 def _what_holds(

@@ -9,11 +9,11 @@ with k to those without it: it is large only if neither linear sensors nor anoth
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import expit, logsumexp
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
@@ -57,6 +57,8 @@ class SensorModelChoice:
         Of the linear part, see :meth:`Family.linear_reference`.
     log_bayes_factor : float
         Natural logarithm of the Bayes factor of the likeliest family against everything else for this branch.
+    rival_log_bayes_factor : float
+        The same of the likeliest of the other families.
     undecided : bool
         Whether the vehicle has a sensor that is not linear, and this branch may be it, but others may be as well.
     """
@@ -66,7 +68,14 @@ class SensorModelChoice:
     excess_sd: float = 0.0
     reference: float = 0.0
     log_bayes_factor: float
+    rival_log_bayes_factor: float = -np.inf
     undecided: bool = False
+
+    @property
+    def probability(self) -> float:
+        """Posterior probability of the likeliest family, against the linear sensor and the other families. [1]"""
+        log_odds = np.logaddexp(self.rival_log_bayes_factor, np.log1p(-PRIOR_SHARE) - np.log(PRIOR_SHARE))
+        return float(expit(self.log_bayes_factor - log_odds))
 
 
 def choose_sensor_models(vehicles: Sequence[SensorSummary]) -> list[list[SensorModelChoice]]:
@@ -93,10 +102,13 @@ def choose_sensor_models(vehicles: Sequence[SensorSummary]) -> list[list[SensorM
         return [[SensorModelChoice(log_bayes_factor=0.0)] * v.summary.branches for v in vehicles]
     read_out = fit_fleet_model(stack_summaries([vehicle.summary for vehicle in vehicles])).read_out
     found = [_of_family(family, excess_rows(vehicles, read_out, family)) for family in vehicles[0].families]
-    return [
-        [max(branch, key=lambda choice: choice.log_bayes_factor) for branch in zip(*vehicle, strict=True)]
-        for vehicle in zip(*found, strict=True)
-    ]
+    return [[_likeliest(branch) for branch in zip(*vehicle, strict=True)] for vehicle in zip(*found, strict=True)]
+
+
+def _likeliest(families: Sequence[SensorModelChoice]) -> SensorModelChoice:
+    """Of the choices between the linear sensor and each of the families."""
+    *others, best = sorted(families, key=lambda choice: choice.log_bayes_factor)
+    return replace(best, rival_log_bayes_factor=others[-1].log_bayes_factor) if others else best
 
 
 def _of_family(family: Family, rows: Sequence[ExcessRows]) -> list[list[SensorModelChoice]]:

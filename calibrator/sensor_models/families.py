@@ -22,6 +22,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from calibrator.drive import Array
+from calibrator.sensor_models.sections import ColumnMoments, Sections
 
 __all__ = ["FAMILIES", "Family", "GainBySign", "SensorModel", "TemperatureDrift"]
 
@@ -113,6 +114,18 @@ class Family(Protocol):
         """Build the sensor of which the linear part has this drift. [1]"""
         ...
 
+    def sections(self, moments: ColumnMoments) -> Sections:
+        """Sections of a drive, for a linear part of reference 0."""
+        ...
+
+    def gain(self, excess: Array, at: Array) -> Array:
+        """Gain in a section over that of the linear part, of the broadcast shape. [1]"""
+        ...
+
+    def left_in_linear_part(self, excess: float, at: Array) -> Array:
+        """What the linear part shows over a linear sensor, for currents at these sections. [1]"""
+        ...
+
 
 @dataclass(frozen=True)
 class GainBySignFamily:
@@ -134,6 +147,26 @@ class GainBySignFamily:
         """Build the sensor that has this drift for negative currents."""
         return GainBySign(drift_positive=(1.0 + drift) / (1.0 - excess) - 1.0, drift_negative=drift)
 
+    def sections(self, moments: ColumnMoments) -> Sections:
+        """Currents into the junction, and out of it.
+
+        How many samples each has is not among the moments. It lies between what the mean and the mean square of each
+        allow; the middle is taken, as the share only weighs the offset's error over gains that hardly differ.
+        """
+        sum_a = np.array([moments.h, moments.x - moments.h])
+        sum_a2 = np.maximum([moments.hh, moments.xx - moments.hh], 0.0)
+        least = sum_a**2 / np.maximum(sum_a2, np.finfo(float).tiny)
+        positive = float(np.clip(0.5 * (least[0] + 1.0 - least[1]), 0.0, 1.0))
+        return Sections(at=np.array([1.0, 0.0]), share=np.array([positive, 1.0 - positive]), sum_a=sum_a, sum_a2=sum_a2)
+
+    def gain(self, excess: Array, at: Array) -> Array:
+        """Gain at positive currents (at = 1) and at negative ones (at = 0)."""
+        return np.asarray(1.0 / (1.0 - excess * at))
+
+    def left_in_linear_part(self, excess: float, at: Array) -> Array:  # noqa: ARG002
+        """The linear part is a linear sensor."""
+        return np.ones(at.shape)
+
 
 @dataclass(frozen=True)
 class TemperatureFamily:
@@ -154,6 +187,22 @@ class TemperatureFamily:
     def fitted(self, excess: float, reference: float, drift: float) -> TemperatureDrift:
         """Build the sensor that has this drift at the reference temperature."""
         return TemperatureDrift(drift=drift, drift_per_k=excess * (1.0 + drift), reference_c=DATA_SHEET_C + reference)
+
+    def sections(self, moments: ColumnMoments) -> Sections:
+        """Temperatures above that of data sheets; half of the current flows at each. [K]"""
+        mean, sd = moments.ratio
+        half = np.full(2, 0.5)
+        return Sections(
+            at=np.array([mean - sd, mean + sd]), share=half, sum_a=half * moments.x, sum_a2=half * moments.xx
+        )
+
+    def gain(self, excess: Array, at: Array) -> Array:
+        """Gain at temperatures above the reference. [K]"""
+        return np.asarray(1.0 + excess * at)
+
+    def left_in_linear_part(self, excess: float, at: Array) -> Array:
+        """The linear part is one to first order."""
+        return np.asarray(1.0 - (excess * at) ** 2)
 
 
 FAMILIES: tuple[Family, ...] = (GainBySignFamily(), TemperatureFamily())

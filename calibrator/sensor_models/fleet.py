@@ -2,6 +2,11 @@
 
 The first pass has found delays and, with linear sensors, offsets. Both are used here: the delays are taken out before
 the drives are aligned, and the offsets are what the sensors show at 0 A.
+
+Offsets of several sensors that nearly cancel look like a hardware offset, in which all sensors show 0 at 0 A; and a
+sensor that is not linear leaves a constant in the junction sum, by which linear sensors are taken for the former. So
+such a vehicle is looked at with both zeros. A linear sensor is linear about any zero, one that is not only about its
+own: the zeros about which the nonlinearity is plainer are the right ones.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,19 +16,22 @@ from functools import partial
 import numpy as np
 
 from calibrator.drive import Array, DriveFile, Mask
-from calibrator.drives.align import align
+from calibrator.drives.align import Samples, align
 from calibrator.drives.delays import without_delays
 from calibrator.drives.fleet_source import Equipment, FleetSource, load_drive
 from calibrator.evidence.summary import DriveSummary
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.sensor_models.choice import LEAST_VEHICLES, LINEAR, SensorModelChoice, choose_sensor_models
-from calibrator.sensor_models.linear_part import linear_summary
+from calibrator.sensor_models.modelled import ModelledVehicle, modelled_vehicle, usual_sections
 from calibrator.sensor_models.summary import SensorSummary, summarise_sensors
 from calibrator.vehicles import read_each
 from ecu_node.database import VehicleDatabase
 
-__all__ = ["SensorFindings", "all_linear", "find_sensor_models"]
+__all__ = ["SensorFindings", "all_linear", "find_sensor_models", "findings_of", "summaries_about_zeros"]
+
+Found = Mapping[str, tuple[SensorSummary, ...]]
+"""What a second pass has read, by vehicle: about the offsets found before, and perhaps about 0."""
 
 _LINEAR = SensorModelChoice(log_bayes_factor=0.0)
 
@@ -38,12 +46,15 @@ class SensorFindings:
         Linear for vehicles that could not be looked at.
     summaries : sequence of N DriveSummary
         For the linear estimator: of the linear parts where a sensor is not linear, else those of the first pass.
+    modelled : sequence of N ModelledVehicle or None
+        Vehicles with sensors that are not linear; None for the others.
     notices : tuple of str
         What the user should know.
     """
 
     choices: Sequence[Sequence[SensorModelChoice]]
     summaries: Sequence[DriveSummary]
+    modelled: Sequence[ModelledVehicle | None]
     notices: tuple[str, ...] = ()
 
     @property
@@ -60,7 +71,8 @@ class SensorFindings:
 def all_linear(vehicles: Sequence[VehicleSummary]) -> SensorFindings:
     """Findings without a second pass: the first pass as it is."""
     summaries = [vehicle.summary for vehicle in vehicles]
-    return SensorFindings(choices=[[_LINEAR] * summary.branches for summary in summaries], summaries=summaries)
+    choices = [[_LINEAR] * summary.branches for summary in summaries]
+    return SensorFindings(choices=choices, summaries=summaries, modelled=[None] * len(vehicles))
 
 
 def find_sensor_models(
@@ -108,21 +120,46 @@ def find_sensor_models(
     }
     found, errors = read_each(readers, fleet, equipment, database, workers=workers, limit_s=limit_s)
     notices += [f"sensor models: {name} counts as linear: {reason}" for name, reason in errors.items()]
+    findings = findings_of(vehicles, found, learning=learning, trusted=trusted)
+    return replace(findings, notices=(*notices, *findings.notices))
+
+
+def findings_of(vehicles: Sequence[VehicleSummary], found: Found, *, learning: Mask, trusted: Mask) -> SensorFindings:
+    """Choose the sensor model of every branch from what a second pass has read.
+
+    Parameters
+    ----------
+    vehicles : sequence of N VehicleSummary
+        From the first pass.
+    found : mapping of str to tuple of SensorSummary
+        Of :func:`summaries_about_zeros`, by vehicle; those that are missing count as linear.
+    learning, trusted : ndarray of bool of shape (N,)
+        As for :func:`find_sensor_models`.
+
+    Returns
+    -------
+    SensorFindings
+        In the order of the vehicles.
+    """
     names = [vehicle.vehicle for vehicle in vehicles]
     learners = [name for name, learns in zip(names, learning, strict=True) if learns and name in found]
     if len(learners) < LEAST_VEHICLES:
-        return replace(all_linear(vehicles), notices=(*notices, _too_few(len(learners))))
+        return replace(all_linear(vehicles), notices=(_too_few(len(learners)),))
     chosen = _choose(found, learners)
     linear = all_linear(vehicles).choices
     choices = [
-        chosen[name] if name in chosen and not sound else row
+        chosen[name][1] if name in chosen and not sound else row
         for name, sound, row in zip(names, trusted, linear, strict=True)
     ]
-    summaries = [
-        linear_summary(found[vehicle.vehicle], row) if any(c.model != LINEAR for c in row) else vehicle.summary
-        for vehicle, row in zip(vehicles, choices, strict=True)
+    usual = usual_sections([found[name][0] for name in learners])
+    modelled = [
+        modelled_vehicle(chosen[name][0], row, usual) if name in chosen else None
+        for name, row in zip(names, choices, strict=True)
     ]
-    return SensorFindings(choices=choices, summaries=summaries, notices=tuple(notices))
+    summaries = [
+        vehicle.summary if it is None else it.linear_parts for vehicle, it in zip(vehicles, modelled, strict=True)
+    ]
+    return SensorFindings(choices=choices, summaries=summaries, modelled=modelled)
 
 
 def _too_few(learners: int) -> str:
@@ -136,7 +173,7 @@ def _temperature(
 ) -> tuple[str | None, list[str]]:
     """Input that is the temperature, if most vehicles have it, and what to say if not."""
     if name is None:
-        return None, []
+        return None, ["sensor models: the layout names no temperature, so no drift with it is looked for"]
     if name in equipment.fleet_inputs:
         return None, [f"sensor models: {name} is a fleet input, so no drift with temperature is looked for"]
     if 2 * sum(name in vehicle.recorded for vehicle in vehicles) <= len(vehicles):
@@ -152,7 +189,7 @@ def _read_sensors(
     delays: Mapping[str, float],
     zero_a: Array,
     temperature: str | None,
-) -> SensorSummary:
+) -> tuple[SensorSummary, ...]:
     """Read the drives of one vehicle and summarise them with the columns of the families."""
     layout = database.layout
     inputs = (*equipment.fleet_inputs, *([temperature] if temperature is not None else []))
@@ -160,13 +197,47 @@ def _read_sensors(
         align(without_delays(load_drive(entry, database), delays), layout, equipment.branches, inputs=inputs)
         for entry in entries
     ]
-    return summarise_sensors(samples, zero_a=zero_a, period_s=layout.period_s, temperature=temperature)
+    return summaries_about_zeros(samples, zero_a, period_s=layout.period_s, temperature=temperature)
 
 
-def _choose(found: Mapping[str, SensorSummary], learners: Sequence[str]) -> dict[str, list[SensorModelChoice]]:
-    """Choices by vehicle; one that is held out is compared with the learners and does not change their choices."""
-    fleet = [found[name] for name in learners]
-    chosen = dict(zip(learners, choose_sensor_models(fleet), strict=True))
+def summaries_about_zeros(
+    drives: Sequence[Samples], zero_a: Array, *, period_s: float, temperature: str | None
+) -> tuple[SensorSummary, ...]:
+    """Summaries of the drives of one vehicle, about each zero that its sensors may have.
+
+    Parameters
+    ----------
+    drives, period_s, temperature
+        As for :func:`~calibrator.sensor_models.summary.summarise_sensors`.
+    zero_a : ndarray of shape (K,)
+        Offsets found with linear sensors. [A]
+
+    Returns
+    -------
+    tuple of SensorSummary
+        About the offsets; where several sensors have one, about 0 as well.
+    """
+    zeros = [zero_a, np.zeros(len(zero_a))] if np.count_nonzero(zero_a) > 1 else [zero_a]
+    return tuple(summarise_sensors(drives, zero_a=zero, period_s=period_s, temperature=temperature) for zero in zeros)
+
+
+def _choose(found: Found, learners: Sequence[str]) -> dict[str, tuple[SensorSummary, list[SensorModelChoice]]]:
+    """Choices by vehicle, with the summary they hold for.
+
+    A vehicle that is held out, and one about another zero, is compared with the learners and does not change their
+    choices.
+    """
+    fleet = [found[name][0] for name in learners]
+    chosen = dict(zip(learners, zip(fleet, choose_sensor_models(fleet), strict=True), strict=True))
     for name in found.keys() - chosen.keys():
-        chosen[name] = choose_sensor_models([*fleet, found[name]])[-1]
+        chosen[name] = found[name][0], choose_sensor_models([*fleet, found[name][0]])[-1]
+    several = [name for name, summaries in found.items() if len(summaries) > 1]
+    others = [found[name][1] for name in several]
+    for name, other, row in zip(several, others, choose_sensor_models([*fleet, *others])[len(fleet) :], strict=True):
+        if _plainest(row) > _plainest(chosen[name][1]):
+            chosen[name] = other, row
     return chosen
+
+
+def _plainest(row: Sequence[SensorModelChoice]) -> float:
+    return max(choice.log_bayes_factor for choice in row)

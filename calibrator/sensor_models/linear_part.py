@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calibrator.drive import Array
 from calibrator.evidence.summary import DriveSummary
 from calibrator.sensor_models.choice import LINEAR, SensorModelChoice
 from calibrator.sensor_models.families import FAMILIES, Family, GainBySign, SensorModel, TemperatureDrift
@@ -16,7 +17,7 @@ from ecu_node.sensor_models import GainBySign as GainBySignParameters
 from ecu_node.sensor_models import SensorModel as SensorModelParameters
 from ecu_node.sensor_models import TemperatureDrift as TemperatureDriftParameters
 
-__all__ = ["chosen_sensor", "linear_summary", "sensor_parameters"]
+__all__ = ["chosen_sensor", "excess_column", "family_of", "linear_columns", "linear_summary", "sensor_parameters"]
 
 
 def linear_summary(vehicle: SensorSummary, choices: Sequence[SensorModelChoice]) -> DriveSummary:
@@ -34,22 +35,34 @@ def linear_summary(vehicle: SensorSummary, choices: Sequence[SensorModelChoice])
     DriveSummary
         For the linear estimator; where all sensors are linear, the same moments as before.
     """
-    summary = vehicle.summary
-    M, K = summary.inputs, summary.branches
-    columns = np.eye(vehicle.products.shape[1])[:, : M + K + 1]
-    for k, choice in enumerate(choices):
-        if choice.model != LINEAR:
-            beyond_zero = columns[:, M + k] - vehicle.zero_a[k] * columns[:, M + K]
-            column = np.zeros(len(columns))
-            column[vehicle.current_columns(_family(choice.model))[k]] = 1.0
-            columns[:, M + k] -= choice.excess * (column - choice.reference * beyond_zero)
+    summary, columns = vehicle.summary, linear_columns(vehicle, choices)
     return DriveSummary(
         moments=columns.T @ vehicle.products @ columns,
         noise_a2=summary.noise_a2,
-        branches=K,
+        branches=summary.branches,
         period_s=summary.period_s,
         bank=summary.bank,
     )
+
+
+def linear_columns(vehicle: SensorSummary, choices: Sequence[SensorModelChoice]) -> Array:
+    """Inputs, linear parts and 1 as combinations of the columns of :attr:`SensorSummary.products`, (Q, M + K + 1)."""
+    M, K = vehicle.summary.inputs, vehicle.summary.branches
+    columns = np.eye(vehicle.products.shape[1])[:, : M + K + 1]
+    for k, choice in enumerate(choices):
+        if choice.model != LINEAR:
+            columns[:, M + k] -= choice.excess * excess_column(vehicle, k, choice)
+    return columns
+
+
+def excess_column(vehicle: SensorSummary, k: int, choice: SensorModelChoice) -> Array:
+    """What an excess of 1 adds to a branch, h - reference * (i_m - Z), as a combination of the same columns, (Q,)."""
+    M, K = vehicle.summary.inputs, vehicle.summary.branches
+    column = np.zeros(vehicle.products.shape[1])
+    column[vehicle.current_columns(family_of(choice.model))[k]] = 1.0
+    column[M + k] -= choice.reference
+    column[M + K] += choice.reference * vehicle.zero_a[k]
+    return column
 
 
 def chosen_sensor(choice: SensorModelChoice, drift: float) -> SensorModel | None:
@@ -69,10 +82,10 @@ def chosen_sensor(choice: SensorModelChoice, drift: float) -> SensorModel | None
     """
     if choice.model == LINEAR:
         return None
-    return _family(choice.model).fitted(choice.excess, choice.reference, drift)
+    return family_of(choice.model).fitted(choice.excess, choice.reference, drift)
 
 
-def sensor_parameters(choice: SensorModelChoice, drift: float) -> tuple[float, SensorModelParameters | None]:
+def sensor_parameters(choice: SensorModelChoice, drift: float) -> tuple[float, SensorModelParameters | None] | None:
     """Say a choice as the parameter file does.
 
     Parameters
@@ -88,22 +101,25 @@ def sensor_parameters(choice: SensorModelChoice, drift: float) -> tuple[float, S
         The branch's drift [1]: of a gain by sign the mean of both, of a temperature drift that at its reference.
     sensor_model : GainBySign, TemperatureDrift or None
         As :mod:`ecu_node.sensor_models` has them; None if the sensor is linear.
+
+    Nothing of it, None, if a parameter file cannot say it: gain errors of 100 % and more.
     """
     sensor = chosen_sensor(choice, drift)
     if isinstance(sensor, GainBySign):
-        return 0.5 * (sensor.drift_positive + sensor.drift_negative), GainBySignParameters(
-            drift_positive=sensor.drift_positive,
-            drift_negative=sensor.drift_negative,
-            difference_sd=choice.excess_sd * (1.0 + sensor.drift_positive),
-        )
+        both = (sensor.drift_positive, sensor.drift_negative)
+        sd = choice.excess_sd * (1.0 + sensor.drift_positive)
+        model = GainBySignParameters(drift_positive=both[0], drift_negative=both[1], difference_sd=sd)
+        return (0.5 * sum(both), model) if max(map(abs, both)) < 1.0 else None
     if isinstance(sensor, TemperatureDrift):
-        return drift, TemperatureDriftParameters(
+        told = TemperatureDriftParameters(
             drift_per_k=sensor.drift_per_k,
             reference_c=sensor.reference_c,
             drift_per_k_sd=choice.excess_sd * (1.0 + drift),
         )
+        return (drift, told) if max(abs(drift), abs(sensor.drift_per_k)) < 1.0 else None
     return drift, None
 
 
-def _family(name: str) -> Family:
+def family_of(name: str) -> Family:
+    """Return the family of this name, one of :data:`FAMILIES`."""
     return next(family for family in FAMILIES if family.name == name)

@@ -12,7 +12,7 @@ import pytest
 from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.artificial.ground_truth import GroundTruth, with_branches
 from calibrator.artificial.random_fleet import draw_faults
-from calibrator.calibration_settings import CalibrationSettings
+from calibrator.calibration_settings import HARM_LIMIT, CalibrationSettings
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.store import write_drive
 from calibrator.faults import measured_currents, true_currents
@@ -25,6 +25,7 @@ from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
 from ecu_node.sensor_models import GainBySign
+from ecu_node.wiring import InForce, wire
 
 pytest.importorskip("fastsim")
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
@@ -133,12 +134,27 @@ def test_no_other_branch_gets_a_sensor_model(with_flag: Calibrated) -> None:
     assert found == [(name(BENT), BENT_BRANCH)]
 
 
-def test_a_branch_with_a_sensor_model_is_not_applied_and_every_file_fits(with_flag: Calibrated) -> None:
+def test_a_branch_with_a_sensor_model_is_applied_if_harm_is_improbable_and_every_file_fits(
+    with_flag: Calibrated,
+) -> None:
     database = read_database(read_layout(LAYOUT))
     for vehicle, item in with_flag.items():
         check_fit(item, database, vehicle)
-    assert not with_flag[name(BENT)].branches[BENT_BRANCH].apply
-    assert with_flag[name(BENT)].verdict != "no sensor fault"
+        wire(database, InForce(parameters=item), start_s=0.0)
+    branch = with_flag[name(BENT)].branches[BENT_BRANCH]
+    assert branch.harm_probability is not None
+    assert branch.apply == (branch.harm_probability < HARM_LIMIT)
+    assert branch.held_back == (None if branch.apply else "harm limit")
+    assert with_flag[name(BENT)].verdict == ("corrected" if branch.apply else "cannot tell")
+
+
+def test_the_node_shows_what_it_does_with_the_model(bent_store: Path, with_flag: Calibrated) -> None:
+    path = bent_store.parent / "with" / "params" / f"{name(BENT)}.json"
+    command = [sys.executable, "-m", "ecu_node", "check", "--params", path, "--layout", LAYOUT, "--vehicle", name(BENT)]
+    run = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False, timeout=60)
+    assert run.returncode == 0, run.stderr
+    shown = "sensor model 'gain by sign', positive currents" in run.stdout
+    assert shown == with_flag[name(BENT)].branches[BENT_BRANCH].apply
 
 
 def test_the_notices_name_vehicle_branch_and_model(bent_store: Path, with_flag: Calibrated) -> None:

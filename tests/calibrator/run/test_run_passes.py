@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -16,8 +17,9 @@ from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.faults import Faults
 from calibrator.options import Method
 from calibrator.parameter_files import RunIdentity
-from calibrator.posterior.fleet import FleetTask, learn_fleet
-from calibrator.results import ChunkResult
+from calibrator.posterior.fleet import learn_fleet
+from calibrator.posterior.fleet_task import FleetTask
+from calibrator.results import ChunkResult, encode_chunk
 from calibrator.run.first_pass import read_sample, take_census
 from calibrator.run.in_order import Workers
 from calibrator.run.previous import PreviousResult
@@ -26,6 +28,8 @@ from calibrator.storage import open_storage
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import decode_parameters
+from ecu_node.sensor_models import GainBySign
 from tests.calibrator.evidence.simulated_drives import Conditions, summaries_of
 from tests.calibrator.summaries.small_stores import BRANCHES, random_faults, record_of, small_store
 
@@ -224,6 +228,21 @@ def test_a_drive_that_was_changed_is_heeded_though_its_name_is_known(
     chunk = calibrate_bucket(bucket, store=other, task=task, previous=previous)
     (battery,) = [row for row in rows(chunk) if row["vehicle"] == name and row["branch"] == "battery"]
     assert battery["drift"] == pytest.approx(0.08, abs=0.005)
+
+
+def test_a_sensor_that_is_not_linear_keeps_its_earlier_model_as_summaries_do_not_tell_it(
+    store: SummaryStore, task: FleetTask, tmp_path: Path
+) -> None:
+    bucket = fullest(store)
+    first = texts(calibrate_bucket(bucket, store=store, task=task))
+    name = min(first)
+    earlier = decode_parameters(first[name], name)
+    model = GainBySign(drift_positive=0.1, drift_negative=-0.1)
+    battery = msgspec.structs.replace(earlier.branches["battery"], sensor_model=model)
+    bent = msgspec.structs.replace(earlier, branches={**earlier.branches, "battery": battery})
+    previous = previous_of(tmp_path / "r", encode_chunk([bent], {}, drives={name: "other drives"}), bucket)
+    found = texts(calibrate_bucket(bucket, store=store, task=task, previous=previous))
+    assert decode_parameters(found[name], name) == bent
 
 
 def test_an_earlier_vehicle_that_the_store_lacks_is_told(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:

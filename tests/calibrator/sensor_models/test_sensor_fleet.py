@@ -11,10 +11,11 @@ from calibrator.drives.store import write_drive
 from calibrator.evidence.vehicle_summary import VehicleSummary, read_vehicle_summary
 from calibrator.sensor_models.choice import LINEAR
 from calibrator.sensor_models.families import GainBySign
-from calibrator.sensor_models.fleet import SensorFindings, find_sensor_models
+from calibrator.sensor_models.fleet import SensorFindings, find_sensor_models, findings_of, summaries_about_zeros
 from calibrator.vehicles import read_vehicles
 from ecu_node.database import VehicleDatabase
-from tests.calibrator.sensor_models.sensor_fleets import PERIOD_S, SensorFleet, make_fleet
+from tests.calibrator.sensor_models.sensor_fleets import PERIOD_S, TEMPERATURE, SensorFleet, make_fleet
+from tests.calibrator.summaries.small_stores import record_of
 
 VEHICLES, BENT = 12, 3
 VOLTAGE, SPEED = 400.0, 100.0
@@ -119,3 +120,28 @@ def test_too_few_vehicles_all_count_as_linear_and_it_is_said(first_pass: Pass, d
     )
     assert found(findings) == set()
     assert "6 vehicles to learn from, at least 8 are needed" in findings.notices[0]
+
+
+def test_offsets_that_a_nonlinearity_feigned_are_told_by_the_zeros_about_which_it_is_plainer() -> None:
+    sensor = GainBySign(drift_positive=0.05, drift_negative=-0.1)
+    fleet = make_fleet(vehicles=VEHICLES, put={(BENT, 0): sensor}, sparsity=100.0, seed=1)
+    feigned_a = np.zeros((VEHICLES, 2))
+    feigned_a[BENT] = 25.0, -25.0
+    summaries = [
+        summaries_about_zeros([drive], zero_a, period_s=PERIOD_S, temperature=TEMPERATURE)
+        for drive, zero_a in zip(fleet.samples, feigned_a, strict=True)
+    ]
+    assert [len(each) for each in summaries] == [1 + (j == BENT) for j in range(VEHICLES)]
+    vehicles = [record_of(f"V{j:02d}", each[0].summary).found for j, each in enumerate(summaries)]
+    assert all(vehicle is not None for vehicle in vehicles)
+    findings = findings_of(
+        [vehicle for vehicle in vehicles if vehicle is not None],
+        {f"V{j:02d}": each for j, each in enumerate(summaries)},
+        learning=np.ones(VEHICLES, bool),
+        trusted=np.zeros(VEHICLES, bool),
+    )
+    assert found(findings) == {(BENT, 0)}
+    modelled, choice = findings.modelled[BENT], findings.choices[BENT][0]
+    assert modelled is not None
+    assert [each.zero_a for each in modelled.sensors] == [0.0]
+    assert choice.excess == pytest.approx(1.0 - 0.9 / 1.05, abs=4.0 * choice.excess_sd)

@@ -16,7 +16,9 @@ LINEAR = SensorModelChoice(log_bayes_factor=-3.0)
 
 
 def test_a_gain_by_sign_is_said_with_both_drifts() -> None:
-    drift, found = sensor_parameters(SIGN, -0.1)
+    said = sensor_parameters(SIGN, -0.1)
+    assert said is not None
+    drift, found = said
     assert isinstance(found, GainBySignParameters)
     assert (found.drift_positive, found.drift_negative) == pytest.approx((0.0, -0.1))
     assert drift == pytest.approx(-0.05)
@@ -27,7 +29,9 @@ def test_a_gain_by_sign_is_said_with_both_drifts() -> None:
 
 
 def test_a_temperature_drift_is_said_at_its_reference() -> None:
-    drift, found = sensor_parameters(TEMPERATURE, 0.05)
+    said = sensor_parameters(TEMPERATURE, 0.05)
+    assert said is not None
+    drift, found = said
     assert isinstance(found, TemperatureDriftParameters)
     assert (drift, found.reference_c) == (0.05, 37.0)
     assert found.drift_per_k == pytest.approx(0.0021)
@@ -40,3 +44,7 @@ def test_a_temperature_drift_is_said_at_its_reference() -> None:
 def test_a_linear_sensor_has_no_sensor_model() -> None:
     assert sensor_parameters(LINEAR, 0.07) == (0.07, None)
     assert chosen_sensor(LINEAR, 0.07) is None
+
+
+def test_what_a_parameter_file_cannot_say_is_not_said() -> None:
+    assert sensor_parameters(SIGN, 0.9) is None
