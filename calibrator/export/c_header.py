@@ -77,7 +77,7 @@ def c_string(text: str) -> str:
 
 def _provenance(program: CProgram) -> Iterator[str]:
     for name, value in program.checked.provenance.items():
-        yield f"#define HV_{name.upper()} {f'{value}UL' if name == 'parameter_set' else c_string(value)}"
+        yield f"#define HV_{name.upper()} {f'{value}ULL' if name == 'parameter_set' else c_string(value)}"
 
 
 def _message(item: CMessage) -> Iterator[str]:

@@ -155,7 +155,7 @@ def c_program(checked: Checked) -> CProgram:
         for message in rewritten(database).values()
     )
     program = CProgram(checked=checked, branches=branches, messages=messages)
-    _require_own_names(program.inputs)
+    _require_own_names([item for branch in branches for item in branch.inputs])
     return program
 
 

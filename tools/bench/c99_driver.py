@@ -131,7 +131,7 @@ class CompiledExport:
         return subprocess.run([self.executable, *arguments], input=given, stdout=subprocess.PIPE, check=True).stdout
 
 
-def compile_export(checked: Checked, folder: Path, *, optimisation: str = "-O2") -> CompiledExport:
+def compile_export(checked: Checked, folder: Path, *, flags: Sequence[str] = ("-O2",)) -> CompiledExport:
     """Export a parameter file as C and compile it with all warnings as errors.
 
     Parameters
@@ -140,8 +140,8 @@ def compile_export(checked: Checked, folder: Path, *, optimisation: str = "-O2")
         The parameter file.
     folder : Path
         For everything.
-    optimisation : str
-        Of the compiler.
+    flags : sequence of str
+        Of the compiler, beside :data:`FLAGS`.
 
     Returns
     -------
@@ -157,7 +157,7 @@ def compile_export(checked: Checked, folder: Path, *, optimisation: str = "-O2")
     for name, text in c99_files(checked).items():
         (folder / name).write_text(text)
     (folder / "main.c").write_text(_driver(program))
-    compiler = [shutil.which(COMPILER) or COMPILER, *FLAGS, optimisation, "-g"]
+    compiler = [shutil.which(COMPILER) or COMPILER, *FLAGS, *flags, "-g"]
     object_file, executable = folder / "hv_correction.o", folder / "driver"
     subprocess.run([*compiler, "-c", folder / "hv_correction.c", "-o", object_file], check=True)
     subprocess.run([*compiler, folder / "main.c", object_file, "-o", executable], check=True)
@@ -165,8 +165,8 @@ def compile_export(checked: Checked, folder: Path, *, optimisation: str = "-O2")
 
 
 def _messages(program: CProgram) -> list[Message]:
-    found = {item.message.name: item.message for item in (*program.messages, *program.inputs)}
-    return list(found.values())
+    found = [item.message for item in program.messages] + [item.message for item in program.inputs]
+    return list({message.name: message for message in found}.values())
 
 
 def _driver(program: CProgram) -> str:

@@ -49,9 +49,11 @@ def unprotected(folder: Path) -> VehicleDatabase:
     return read_database(read_layout(folder / "hv_powertrain.toml"))
 
 
-def compiled(database: VehicleDatabase, parameters: VehicleParameters, folder: Path) -> CompiledExport:
+def compiled(
+    database: VehicleDatabase, parameters: VehicleParameters, folder: Path, *, flags: Sequence[str] = ("-O2",)
+) -> CompiledExport:
     """The export of these parameters, compiled."""
-    return compile_export(checked_with(database, parameters, folder), folder)
+    return compile_export(checked_with(database, parameters, folder), folder, flags=flags)
 
 
 def gateway(database: VehicleDatabase, parameters: VehicleParameters) -> Corrector:

@@ -161,7 +161,7 @@ def test_currents_of_32_bits_are_exact(make_database: MakeDatabase, tmp_path: Pa
 
 
 def drawn(seed: int) -> FuzzVehicle:
-    """A random vehicle without protection: signals of 1 to 64 bits anywhere, multiplexed, named, of any sensor model."""
+    """A random vehicle without protection: signals of 1 to 64 bits anywhere, multiplexed, named, with any fault."""
     vehicle = draw_vehicle(Random(seed))
     for message in (*vehicle.sources, *vehicle.targets):
         message.protection = None
