@@ -160,6 +160,14 @@ def test_currents_of_32_bits_are_exact(make_database: MakeDatabase, tmp_path: Pa
     assert assert_same(compiled(database, parameters, tmp_path), frames) > 100_000
 
 
+def test_currents_of_48_bits_are_exact(make_database: MakeDatabase, tmp_path: Path) -> None:
+    dbc = SMALL_DBC.replace("7|16@0- (0.1,0) [-3000|3000]", "7|48@0- (0.00001,0) [0|0]").replace("23|16@0-", "55|16@0-")
+    database, rng = make_database(dbc=dbc), Random(7)
+    frames = [("Pair", rng.randbytes(8)) for _ in range(50_000)]
+    export = compiled(database, parameters_for(database, battery=(0.0517, -2.3456789), motor=(0.0, 0.0)), tmp_path)
+    assert assert_same(export, frames) > 45_000
+
+
 def drawn(seed: int) -> FuzzVehicle:
     """A random vehicle without protection: signals of 1 to 64 bits anywhere, multiplexed, named, with any fault."""
     vehicle = draw_vehicle(Random(seed))
