@@ -57,6 +57,7 @@ from calibrator.command_options import (
     require_truth_where_used,
 )
 from calibrator.errors import ContradictionError, LogError
+from calibrator.export.command import export
 from calibrator.folders import require_new_folder, require_possible_file, require_possible_folder
 from calibrator.interrupts import importing
 from calibrator.options import Classifier, ExperimentName, Method
@@ -342,6 +343,9 @@ def params(
     for vehicle, text in texts.items():
         write_atomically(out / f"{vehicle}.json", text)
     write_output("\n".join(str(out / f"{vehicle}.json") for vehicle in texts))
+
+
+app.command()(export)
 
 
 @app.command()

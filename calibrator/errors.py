@@ -2,7 +2,7 @@
 
 from ecu_node.errors import UserError
 
-__all__ = ["ContradictionError", "DriveError", "FleetError", "LogError"]
+__all__ = ["ContradictionError", "DriveError", "ExportError", "FleetError", "LogError"]
 
 
 class LogError(UserError):
@@ -19,3 +19,7 @@ class FleetError(UserError):
 
 class ContradictionError(UserError):
     """Options contradict each other: wrong use, whatever is in the files."""
+
+
+class ExportError(UserError):
+    """Parameters cannot be taken into another format (too wide for its arithmetic, texts that it cannot hold)."""

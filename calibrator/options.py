@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 
-__all__ = ["Classifier", "ExperimentName", "Method"]
+__all__ = ["Classifier", "ExperimentName", "ExportFormat", "Method"]
 
 
 class Method(StrEnum):
@@ -34,3 +34,12 @@ class ExperimentName(StrEnum):
     PHASE = "phase"
     CALIBRATION = "calibration"
     ALL = "all"
+
+
+class ExportFormat(StrEnum):
+    """Formats that parameters are taken to."""
+
+    DCM = "dcm"
+    CDFX = "cdfx"
+    CSV = "csv"
+    C99 = "c99"

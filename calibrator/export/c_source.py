@@ -1,0 +1,193 @@
+"""The source file of the C export: one function per branch, per message, and per voltage or temperature."""
+
+from collections.abc import Iterator, Mapping
+
+from calibrator.export import c_helpers
+from calibrator.export.c_arithmetic import Arithmetic, arithmetic_of, is_no_value, outcome, rule_test
+from calibrator.export.c_bits import literal, presence_function, put_function, reading_function
+from calibrator.export.c_header import branch_prototype, input_prototype, message_prototype
+from calibrator.export.c_model import CBranch, CInput, CMessage, CProgram, SignRule
+from ecu_node.bits import BitPlace
+
+__all__ = ["source_body"]
+
+_LONGEST_CODE = 64
+"""[bit]"""
+
+
+def source_body(program: CProgram) -> str:
+    """Write the functions.
+
+    Parameters
+    ----------
+    program : CProgram
+        What they do.
+
+    Returns
+    -------
+    str
+        What follows the includes.
+
+    Raises
+    ------
+    ExportError
+        If a signal is too wide for exact arithmetic, naming it.
+    """
+    corrected = {branch.name: arithmetic_of(branch) for branch in program.branches if branch.plans}
+    blocks = [text.rstrip() for text in _helpers(program, corrected)]
+    for branch in program.branches:
+        if branch.plans:
+            blocks += _bit_functions(branch)
+        blocks.append("\n".join(_branch_function(branch, corrected.get(branch.name))))
+    blocks += ["\n".join(_message_function(message)) for message in program.messages]
+    for item in program.inputs:
+        blocks.append("\n".join(reading_function(f"input_{item.name}", item.placed.place)))
+        blocks.append("\n".join(presence_function(f"present_input_{item.name}", item.placed)))
+        blocks.append("\n".join(_input_function(item)))
+    return "\n\n".join(blocks) + "\n"
+
+
+def _helpers(program: CProgram, corrected: Mapping[str, Arithmetic]) -> Iterator[str]:
+    wide = any(item.wide for item in corrected.values())
+    if wide or any(place.length == _LONGEST_CODE for place in _places_read(program)):
+        yield c_helpers.AS_SIGNED
+    if corrected:
+        yield c_helpers.CLAMP
+    if not all(item.wide for item in corrected.values()):
+        yield c_helpers.FLOOR_SHIFT
+    if any(isinstance(branch.rule, int) for branch in program.branches):
+        yield c_helpers.PLAN
+    if wide:
+        yield c_helpers.WIDE
+
+
+def _places_read(program: CProgram) -> Iterator[BitPlace]:
+    signals = [branch.placed for branch in program.branches if branch.plans] + [item.placed for item in program.inputs]
+    for signal in signals:
+        yield signal.place
+        yield from (item.place for item in signal.above)
+
+
+def _bit_functions(branch: CBranch) -> Iterator[str]:
+    place = branch.placed.place
+    yield "\n".join(presence_function(f"present_{branch.name}", branch.placed))
+    yield "\n".join(reading_function(f"measured_{branch.name}", place))
+    yield "\n".join(put_function(f"put_{branch.name}", place))
+    if isinstance(branch.rule, int):
+        yield "\n".join(_table(branch))
+
+
+def _table(branch: CBranch) -> Iterator[str]:
+    yield f"static const struct plan plans_{branch.name}[{len(branch.plans)}] = {{"
+    for plan in branch.plans:
+        if plan is None:
+            yield "    { 0, 0, 0, 0U },"
+        else:
+            bias = plan.bias + (1 << (plan.shift - 1))
+            yield f"    {{ {literal(plan.gain)}, {literal(plan.voltage_gain)}, {literal(bias)}, {plan.shift}U }},"
+    yield "};"
+
+
+def _branch_function(branch: CBranch, arithmetic: Arithmetic | None) -> Iterator[str]:
+    yield branch_prototype(branch)
+    yield "{"
+    if arithmetic is None:
+        yield from (f"    (void){name};" for name in _argument_names(branch))
+        yield "    return code;"
+    elif isinstance(branch.rule, int):
+        yield from _by_temperature(branch, branch.rule, arithmetic)
+    else:
+        if branch.voltage is not None and not branch.needs_voltage:
+            yield "    (void)voltage_code;"
+        yield from _return_unless_value("code", is_no_value("code", branch.codes))
+        if branch.voltage is not None and branch.needs_voltage:
+            yield from _return_unless_value("voltage_code", is_no_value("voltage_code", branch.voltage.codes))
+        yield from _by_plan(branch, arithmetic)
+    yield "}"
+
+
+def _argument_names(branch: CBranch) -> Iterator[str]:
+    if branch.voltage is not None:
+        yield "voltage_code"
+    if branch.temperature is not None:
+        yield "temperature_code"
+
+
+def _return_unless_value(name: str, condition: str) -> Iterator[str]:
+    yield f"    if ({condition}) {{"
+    yield f"        return code; /* {name} is no value */"
+    yield "    }"
+
+
+def _by_plan(branch: CBranch, arithmetic: Arithmetic) -> Iterator[str]:
+    """The only plan, or one of two by the sign of the current."""
+    texts = [
+        _clamped(outcome(plan, wide=arithmetic.wide, with_voltage=branch.voltage is not None), arithmetic)
+        for plan in branch.plans
+        if plan is not None
+    ]
+    if isinstance(branch.rule, SignRule):
+        yield f"    if ({rule_test(branch.rule)}) {{"
+        yield f"        return {texts[0]};"
+        yield "    }"
+    yield f"    return {texts[-1]};"
+
+
+def _by_temperature(branch: CBranch, first: int, arithmetic: Arithmetic) -> Iterator[str]:
+    last = first + len(branch.plans) - 1
+    yield "    const struct plan *plan;"
+    yield ""
+    yield from _return_unless_value("code", is_no_value("code", branch.codes))
+    outside = f"temperature_code < {literal(first)} || temperature_code > {literal(last)}"
+    yield from _return_unless_value("temperature_code", outside)
+    yield f"    plan = &plans_{branch.name}[temperature_code - {literal(first)}];"
+    yield "    if (plan->shift == 0U) {"
+    yield "        return code;"
+    yield "    }"
+    total = "code * plan->gain + plan->bias"
+    if branch.voltage is not None:
+        no_value = is_no_value("voltage_code", branch.voltage.codes)
+        yield from _return_unless_value("voltage_code", f"plan->voltage_gain != 0 && ({no_value})")
+        total = "code * plan->gain + voltage_code * plan->voltage_gain + plan->bias"
+    yield f"    return {_clamped(f'floor_shift({total}, plan->shift)', arithmetic)};"
+
+
+def _clamped(text: str, arithmetic: Arithmetic) -> str:
+    return f"clamp({text},\n        {literal(arithmetic.lowest)}, {literal(arithmetic.highest)})"
+
+
+def _message_function(item: CMessage) -> Iterator[str]:
+    corrected = [branch for branch in item.branches if branch.plans]
+    used = {other.name for branch in corrected for other in branch.inputs}
+    yield message_prototype(item)
+    yield "{"
+    if corrected:
+        yield "    bool changed = false;"
+    else:
+        yield "    (void)payload;"
+        yield "    (void)length;"
+    for branch in corrected:
+        name, more = branch.name, "".join(f", {other.name}_code" for other in branch.inputs)
+        yield f"    const bool there_{name} = present_{name}(payload, length);"
+        yield f"    const int64_t from_{name} = there_{name} ? measured_{name}(payload) : 0;"
+        yield f"    const int64_t to_{name} = there_{name} ? hv_correct_{name}(from_{name}{more}) : 0;"
+    yield ""
+    yield from (f"    (void){other.name}_code;" for other in item.inputs if other.name not in used)
+    for branch in corrected:
+        yield f"    if (to_{branch.name} != from_{branch.name}) {{"
+        yield f"        put_{branch.name}(payload, to_{branch.name});"
+        yield "        changed = true;"
+        yield "    }"
+    yield f"    return {'changed' if corrected else 'false'};"
+    yield "}"
+
+
+def _input_function(item: CInput) -> Iterator[str]:
+    yield input_prototype(item)
+    yield "{"
+    yield f"    if (!present_input_{item.name}(payload, length)) {{"
+    yield "        return false;"
+    yield "    }"
+    yield f"    *code = input_{item.name}(payload);"
+    yield "    return true;"
+    yield "}"

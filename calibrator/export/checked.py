@@ -1,0 +1,101 @@
+"""One parameter file to be exported, checked as the node checks it before it corrects anything."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ecu_node.check import warnings_of
+from ecu_node.correction import NO_FAULT, SensorFault
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import ParameterError
+from ecu_node.guard import Mode
+from ecu_node.layout import file_digest
+from ecu_node.parameter_file import choose_parameters
+from ecu_node.parameters import VehicleParameters
+from ecu_node.wiring import InForce, sensor_fault
+
+__all__ = ["Checked", "read_checked"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checked:
+    """Parameters that fit, and what they fit.
+
+    Attributes
+    ----------
+    name : str
+        Name of the parameter file.
+    digest : str
+        Its SHA-256, line ends counted as LF.
+    parameters : VehicleParameters
+        What it says.
+    database : VehicleDatabase
+        Layout and DBC that it was made for.
+    """
+
+    name: str
+    digest: str
+    parameters: VehicleParameters
+    database: VehicleDatabase
+
+    @property
+    def in_force(self) -> InForce:
+        """The same as the node takes it."""
+        return InForce(parameters=self.parameters)
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """Where it comes from, by short names that are the same in all formats."""
+        parameters = self.parameters
+        return {
+            "vehicle": parameters.vehicle,
+            "parameter_set": str(parameters.number),
+            "verdict": parameters.verdict,
+            "tool": parameters.provenance.tool,
+            "method": parameters.provenance.method,
+            "created": parameters.provenance.created,
+            "fleet": parameters.provenance.fleet,
+            "parameters_sha256": self.digest,
+            "layout_sha256": parameters.layout.sha256,
+            "dbc_sha256": parameters.dbc.sha256,
+        }
+
+    def fault(self, branch: str) -> SensorFault:
+        """What the node corrects on a branch; :data:`NO_FAULT` where it passes it through."""
+        return sensor_fault(self.database, self.in_force, branch)
+
+    def is_applied(self, branch: str) -> bool:
+        """Whether the node corrects a branch."""
+        return self.fault(branch) is not NO_FAULT
+
+    def notices(self) -> list[str]:
+        """What of the parameters a node does not do, one line each."""
+        texts = warnings_of(self.database, self.in_force, Mode.GATEWAY, fd=True)
+        return [f"{self.name}: {text}" for text in texts]
+
+
+def read_checked(path: Path, database: VehicleDatabase, vehicle: str | None) -> Checked:
+    """Read a parameter file, and refuse what the node would not apply.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    database : VehicleDatabase
+        Layout and DBC in use.
+    vehicle : str or None
+        Identity of the vehicle; None: not checked.
+
+    Returns
+    -------
+    Checked
+        Parameters that fit.
+
+    Raises
+    ------
+    ParameterError
+        If the file cannot be read, or its parameters are for another vehicle, layout or DBC, or implausible.
+    """
+    in_force, why_not = choose_parameters(path, database, vehicle)
+    if in_force.parameters is None:
+        raise ParameterError(why_not)
+    return Checked(name=path.name, digest=file_digest(path), parameters=in_force.parameters, database=database)

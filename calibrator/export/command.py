@@ -1,0 +1,102 @@
+"""``calibrator export``: from parameter files to files of other formats, each written whole or not at all."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibrator.command_options import LayoutOption
+from calibrator.errors import ContradictionError, ExportError
+from calibrator.export.c99 import c99_files
+from calibrator.export.cdfx import cdfx_document
+from calibrator.export.checked import Checked, read_checked
+from calibrator.export.csv_table import csv_text
+from calibrator.export.dcm import dcm_text
+from calibrator.folders import require_possible_file, require_possible_folder
+from calibrator.options import ExportFormat
+from ecu_node.database import read_database
+from ecu_node.layout import read_layout
+from ecu_node.parameters import write_atomically
+
+__all__ = ["export", "exported_files"]
+
+
+def export(
+    params: Annotated[list[Path], typer.Argument(help="Parameter file; of several vehicles for csv.")],
+    layout: LayoutOption,
+    format_: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
+    output: Annotated[Path, typer.Option("--output", "--out", help="File to write; for c99 a folder.")],
+    vehicle: Annotated[str | None, typer.Option("--vehicle", help="Refuse parameters of another vehicle.")] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace files that exist.")] = False,
+) -> None:
+    """Take parameters to other tools, and to control units without Python.
+
+    dcm (DCM 2.0) and cdfx (ASAM CDF 2.0) are for calibration tools, csv is one row per branch, and c99 a header and a
+    source that correct as 'ecu-node run' does as a gateway. Parameters that the node would not apply are refused.
+    """
+    database = read_database(read_layout(layout))
+    tables = [read_checked(path, database, vehicle) for path in params]
+    files = exported_files(tables, format_, output)
+    _require_possible(list(files), output, is_folder=format_ is ExportFormat.C99, replace=replace)
+    for path, content in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, content)
+    for text in (text for checked in tables for text in checked.notices()):
+        print(f"notice: {text}", file=sys.stderr)
+    sys.stdout.write("".join(f"{path}\n" for path in files))
+
+
+def exported_files(tables: Sequence[Checked], format_: ExportFormat, output: Path) -> dict[Path, bytes]:
+    """Make the files of one export.
+
+    Parameters
+    ----------
+    tables : sequence of Checked
+        Parameter files.
+    format_ : ExportFormat
+        What to make of them.
+    output : Path
+        File to write; the folder for C99.
+
+    Returns
+    -------
+    dict of Path to bytes
+        Contents by file.
+
+    Raises
+    ------
+    ContradictionError
+        If a format of one vehicle is given several.
+    ExportError
+        If the parameters cannot be written in the format.
+    LayoutError, DatabaseError
+        If the node refuses layout or DBC as a gateway; C99 alone.
+    """
+    if format_ is ExportFormat.CSV:
+        return {output: csv_text(tables).encode()}
+    if len(tables) != 1:
+        raise ContradictionError(
+            f"{len(tables)} parameter files: {format_.value} holds one vehicle; call it for each, or use --format csv"
+        )
+    (checked,) = tables
+    match format_:
+        case ExportFormat.DCM:
+            return {output: dcm_text(checked).encode()}
+        case ExportFormat.CDFX:
+            return {output: cdfx_document(checked)}
+        case ExportFormat.C99:
+            return {output / name: text.encode() for name, text in c99_files(checked).items()}
+
+
+def _require_possible(files: Sequence[Path], output: Path, *, is_folder: bool, replace: bool) -> None:
+    """Refuse, before anything is written, files that exist or cannot be made."""
+    for path in files:
+        if path.exists() and not path.is_dir() and not replace:
+            raise ExportError(f"{path}: exists; choose another --output, or replace it with --replace")
+    if is_folder:
+        require_possible_folder(output)
+    for path in files:
+        if not is_folder or path.is_dir():
+            require_possible_file(path)

@@ -1,0 +1,113 @@
+"""CSV (RFC 4180): one row per branch, of one vehicle or many in one table."""
+
+import csv
+import io
+from collections.abc import Sequence
+
+from calibrator.export.checked import Checked
+from ecu_node.parameters import BranchParameters
+from ecu_node.sensor_models import GainBySign, TemperatureDrift
+
+__all__ = ["COLUMNS", "csv_text"]
+
+COLUMNS = (
+    "vehicle",
+    "parameter_set",
+    "branch",
+    "signal",
+    "signal_unit",
+    "drift",
+    "drift_sd",
+    "offset_a",
+    "offset_sd_a",
+    "applied",
+    "held_back",
+    "sensor_model",
+    "drift_positive",
+    "drift_negative",
+    "drift_per_k",
+    "reference_c",
+    "delay_s",
+    "delay_sd_s",
+    "fault_probability",
+    "harm_probability",
+    "identifiable",
+    "verdict",
+    "confidence",
+    "tool",
+    "method",
+    "created",
+    "fleet",
+    "parameters_sha256",
+    "layout_sha256",
+    "dbc_sha256",
+)
+"""Drifts are pure numbers, currents are in A, positive into the junction; empty: not known, or does not apply."""
+
+_Cell = str | float | bool | None
+
+
+def csv_text(tables: Sequence[Checked]) -> str:
+    """Write parameter files as one table.
+
+    Parameters
+    ----------
+    tables : sequence of Checked
+        The parameter files.
+
+    Returns
+    -------
+    str
+        The table with its header, lines ended by CR LF; drifts and offsets are those that were found, corrected or not.
+    """
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, COLUMNS, restval="", lineterminator="\r\n")
+    writer.writeheader()
+    for checked in tables:
+        for name, found in checked.parameters.branches.items():
+            writer.writerow({column: _cell(value) for column, value in _row(checked, name, found).items()})
+    return text.getvalue()
+
+
+def _cell(value: _Cell) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return "" if value is None else str(value)
+
+
+def _row(checked: Checked, name: str, found: BranchParameters) -> dict[str, _Cell]:
+    branch = checked.database.layout.find_branch(name)
+    _, signal = checked.database.signal(branch.source)
+    return {
+        **checked.provenance,
+        "confidence": checked.parameters.confidence,
+        "branch": name,
+        "signal": branch.source,
+        "signal_unit": signal.unit,
+        "drift": found.drift,
+        "drift_sd": found.drift_sd,
+        "offset_a": found.offset_a,
+        "offset_sd_a": found.offset_sd_a,
+        "applied": checked.is_applied(name),
+        "held_back": found.held_back,
+        **_model(found),
+        "delay_s": found.delay_s,
+        "delay_sd_s": found.delay_sd_s,
+        "fault_probability": found.fault_probability,
+        "harm_probability": found.harm_probability,
+        "identifiable": found.identifiable,
+    }
+
+
+def _model(found: BranchParameters) -> dict[str, _Cell]:
+    match found.sensor_model:
+        case GainBySign() as model:
+            numbers: dict[str, _Cell] = {
+                "drift_positive": model.drift_positive,
+                "drift_negative": model.drift_negative,
+            }
+        case TemperatureDrift() as model:
+            numbers = {"drift_per_k": model.drift_per_k, "reference_c": model.reference_c}
+        case None:
+            return {"sensor_model": "linear"}
+    return {"sensor_model": type(model).__struct_config__.tag, **numbers}

@@ -1,0 +1,120 @@
+"""``calibrator export``: files written whole or not at all, and what is refused with one line."""
+
+import csv
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+from typer.testing import CliRunner, Result
+
+from calibrator.cli import app
+from calibrator.errors import ContradictionError, ExportError, FleetError
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import ParameterError, UserError
+from ecu_node.parameters import write_parameters
+from ecu_node.sensor_models import TemperatureDrift
+from tests.calibrator.export.exports import MakeDatabase, parameters_for, with_branch
+from tests.ecu_node.vehicles import LAYOUT
+
+NAMES = {"dcm": ["v1.dcm"], "cdfx": ["v1.cdfx"], "csv": ["v1.csv"], "c99": ["hv_correction.c", "hv_correction.h"]}
+
+
+@pytest.fixture
+def params(database: VehicleDatabase, tmp_path: Path) -> Path:
+    """The parameter file of a vehicle."""
+    path = tmp_path / "v1.json"
+    write_parameters(parameters_for(database, battery=(0.05, 2.3)), path)
+    return path
+
+
+def export(*arguments: object, layout: Path = LAYOUT) -> Result:
+    return CliRunner().invoke(app, ["export", *map(str, arguments), "--layout", str(layout)])
+
+
+def refused(*arguments: object, layout: Path = LAYOUT) -> UserError:
+    error = export(*arguments, layout=layout).exception
+    assert isinstance(error, UserError)
+    assert "\n" not in str(error)
+    return error
+
+
+@pytest.mark.parametrize("form", NAMES)
+def test_every_format_is_written_where_asked(form: str, params: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new" / ("folder" if form == "c99" else f"v1.{form}")
+    run = export(params, "--format", form, "--output", out)
+    folder = out if form == "c99" else out.parent
+    assert (run.exit_code, run.stderr) == (0, "")
+    assert sorted(path.name for path in folder.iterdir()) == NAMES[form]
+    assert sorted(run.stdout.splitlines()) == sorted(str(folder / name) for name in NAMES[form])
+
+
+@pytest.mark.parametrize("form", NAMES)
+def test_files_that_exist_are_replaced_only_if_asked(form: str, params: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    there, other = folder / NAMES[form][-1], folder / "other.h"
+    there.write_text("mine")
+    other.write_text("mine")
+    arguments = (params, "--format", form, "--output", folder if form == "c99" else there)
+    with pytest.raises(ExportError, match="exists; choose another --output, or replace it with --replace"):
+        raise refused(*arguments)
+    assert [path.read_text() for path in sorted(folder.iterdir())] == ["mine", "mine"]
+    assert export(*arguments, "--replace").exit_code == 0
+    assert there.read_text() != "mine"
+    assert other.read_text() == "mine"
+
+
+def test_a_folder_is_no_file_and_a_file_is_no_folder(params: Path, tmp_path: Path) -> None:
+    with pytest.raises(FleetError, match="is a folder; name a file in it"):
+        raise refused(params, "--format", "dcm", "--output", tmp_path)
+    with pytest.raises(FleetError, match=r"v1\.json is a file"):
+        raise refused(params, "--format", "c99", "--output", params)
+
+
+def test_several_vehicles_are_one_table(database: VehicleDatabase, params: Path, tmp_path: Path) -> None:
+    write_parameters(replace(parameters_for(database, motor=(0.1, 0.0)), vehicle="v2"), tmp_path / "v2.json")
+    assert export(params, tmp_path / "v2.json", "--format", "csv", "--output", tmp_path / "all.csv").exit_code == 0
+    with (tmp_path / "all.csv").open(newline="") as file:
+        assert [(row["vehicle"], row["branch"]) for row in csv.DictReader(file)] == [("v1", "battery"), ("v2", "motor")]
+
+
+@pytest.mark.parametrize("form", ["dcm", "cdfx", "c99"])
+def test_several_vehicles_are_refused_where_one_belongs(form: str, params: Path, tmp_path: Path) -> None:
+    with pytest.raises(ContradictionError, match=f"2 parameter files: {form} holds one vehicle; .* --format csv"):
+        raise refused(params, params, "--format", form, "--output", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("form", NAMES)
+def test_parameters_of_another_vehicle_are_refused(form: str, params: Path, tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match=r"v1\.json: parameters are for vehicle 'v1', this is 'v7'"):
+        raise refused(params, "--format", form, "--output", tmp_path / "out", "--vehicle", "v7")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("form", NAMES)
+def test_parameters_of_another_layout_are_refused(
+    form: str, params: Path, tmp_path: Path, make_database: MakeDatabase
+) -> None:
+    layout = make_database().layout.path
+    with pytest.raises(
+        ParameterError, match=r"parameters were made with layout hv_powertrain\.toml .*, this is .*small"
+    ):
+        raise refused(params, "--format", form, "--output", tmp_path / "out", layout=layout)
+
+
+def test_no_parameter_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match=r"none\.json: no such parameter file"):
+        raise refused(tmp_path / "none.json", "--format", "dcm", "--output", tmp_path / "out")
+
+
+def test_what_is_not_corrected_is_told(make_database: MakeDatabase, tmp_path: Path) -> None:
+    database = make_database()
+    model = TemperatureDrift(drift_per_k=0.001, reference_c=25.0)
+    parameters = with_branch(parameters_for(database, battery=(0.05, 2.3)), "battery", model)
+    write_parameters(parameters, tmp_path / "v1.json")
+    run = export(tmp_path / "v1.json", "--format", "csv", "--output", tmp_path / "out.csv", layout=database.layout.path)
+    assert run.exit_code == 0
+    assert run.stderr.startswith(
+        "notice: v1.json: branch battery is passed through: its fault depends on the temperature"
+    )

@@ -1,0 +1,60 @@
+"""CSV: one row per branch, of one vehicle or many, that any reader of RFC 4180 understands."""
+
+import csv
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from calibrator.export.csv_table import COLUMNS, csv_text
+from ecu_node.database import VehicleDatabase
+from ecu_node.sensor_models import TemperatureDrift
+from tests.calibrator.export.exports import checked_with, held_back, parameters_for, with_branch
+
+
+def rows(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(text.splitlines(keepends=True)))
+
+
+def test_each_branch_is_a_row_with_what_was_found(database: VehicleDatabase, tmp_path: Path) -> None:
+    checked = checked_with(database, held_back(parameters_for(database, battery=(0.05, -1.5)), "motor"), tmp_path)
+    battery, motor = rows(csv_text([checked]))
+    assert {name: battery[name] for name in ("branch", "signal", "signal_unit", "drift", "offset_a", "applied")} == {
+        "branch": "battery",
+        "signal": "HV_Battery.BatteryCurrent",
+        "signal_unit": "A",
+        "drift": "0.05",
+        "offset_a": "-1.5",
+        "applied": "true",
+    }
+    assert [motor[name] for name in ("drift", "drift_sd", "offset_sd_a", "applied", "held_back", "sensor_model")] == [
+        "0.2",
+        "0.01",
+        "",
+        "false",
+        "harm limit",
+        "linear",
+    ]
+
+
+def test_vehicles_stand_below_each_other_under_one_header(database: VehicleDatabase, tmp_path: Path) -> None:
+    parameters = parameters_for(database, battery=(0.05, -1.5), motor=(0.0, 0.0))
+    tables = [checked_with(database, replace(parameters, vehicle=name), tmp_path) for name in ("a", 'b, "c"\nd')]
+    text = csv_text(tables)
+    found = [(row["vehicle"], row["branch"]) for row in rows(text)]
+    assert found == [("a", "battery"), ("a", "motor"), ('b, "c"\nd', "battery"), ('b, "c"\nd', "motor")]
+    assert text.startswith(",".join(COLUMNS) + "\r\n")
+    assert text.count("\r\n") == 5
+
+
+def test_where_it_comes_from_stands_in_every_row(database: VehicleDatabase, tmp_path: Path) -> None:
+    checked = checked_with(database, parameters_for(database, battery=(0.05, -1.5), motor=(0.0, 0.0)), tmp_path)
+    for row in rows(csv_text([checked])):
+        assert {name: row[name] for name in checked.provenance} == checked.provenance
+
+
+def test_a_sensor_that_is_not_linear_has_its_columns(database: VehicleDatabase, tmp_path: Path) -> None:
+    model = TemperatureDrift(drift_per_k=0.001, reference_c=25.0)
+    parameters = with_branch(parameters_for(database, battery=(0.05, -1.5)), "battery", model)
+    (row,) = rows(csv_text([checked_with(database, parameters, tmp_path)]))
+    found = [row[name] for name in ("sensor_model", "drift_per_k", "reference_c", "drift_positive")]
+    assert found == ["temperature", "0.001", "25.0", ""]
