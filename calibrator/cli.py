@@ -64,6 +64,7 @@ from calibrator.options import Classifier, ExperimentName, Method
 from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.report.progress import progress_bar
 from calibrator.report.text import dumps
+from calibrator.signing.command import keys, revoke, sign
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import UserError
@@ -124,6 +125,11 @@ def _root(
     ] = False,
 ) -> None:
     """Learn from recorded drives what each vehicle's high-voltage current sensors do wrong."""
+
+
+app.add_typer(keys, name="keys")
+app.command()(sign)
+app.command()(revoke)
 
 
 @app.command("import")

@@ -2,7 +2,7 @@
 
 from ecu_node.errors import UserError
 
-__all__ = ["ContradictionError", "DriveError", "ExportError", "FleetError", "LogError"]
+__all__ = ["ContradictionError", "DriveError", "ExportError", "FleetError", "LogError", "SigningError"]
 
 
 class LogError(UserError):
@@ -19,6 +19,10 @@ class FleetError(UserError):
 
 class ContradictionError(UserError):
     """Options contradict each other: wrong use, whatever is in the files."""
+
+
+class SigningError(UserError):
+    """Something cannot be signed (no key, another passphrase, a file that is no statement)."""
 
 
 class ExportError(UserError):

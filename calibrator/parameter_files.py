@@ -12,7 +12,13 @@ from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import FileReference, Provenance
 
-__all__ = ["RunIdentity", "by_branch", "junction_rms_a", "junction_rms_of_blocks_a"]
+__all__ = [
+    "RunIdentity",
+    "by_branch",
+    "correction_rms_a",
+    "junction_rms_a",
+    "junction_rms_of_blocks_a",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +93,25 @@ def junction_rms_a(mean_a: Array, product_a2: Array, *, drift: Array, offset_a: 
     weight = 1.0 / (1.0 + drift)
     constant = float(weight @ offset_a)
     mean_square = weight @ product_a2 @ weight - 2.0 * constant * float(weight @ mean_a) + constant**2
+    return float(np.sqrt(max(float(mean_square), 0.0)))
+
+
+def correction_rms_a(mean_a: Array, product_a2: Array, *, drift: Array, offset_a: Array) -> float:
+    """Root mean square of what the correction takes from the Kirchhoff sum.
+
+    Parameters
+    ----------
+    mean_a, product_a2, drift, offset_a :
+        As for :func:`junction_rms_a`.
+
+    Returns
+    -------
+    float
+        RMS of sum_k i_m,k - (i_m,k - o_k) / (1 + d_k) over all valid samples. [A]
+    """
+    weight = 1.0 / (1.0 + drift)
+    change, constant = 1.0 - weight, float(weight @ offset_a)
+    mean_square = change @ product_a2 @ change + 2.0 * constant * float(change @ mean_a) + constant**2
     return float(np.sqrt(max(float(mean_square), 0.0)))
 
 

@@ -22,6 +22,7 @@ from ecu_node.standard_output import drop_output, flush_output, write_output
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
+from ecu_node.trust.commands import add_trust_commands
 
 __all__ = ["main"]
 
@@ -93,7 +94,12 @@ def _parser() -> argparse.ArgumentParser:
         "read the parameters again.",
         epilog=_EXIT_CODES,
     )
-    _add_files(run)
+    source = run.add_mutually_exclusive_group(required=True)
+    source.add_argument("--state", type=Path, metavar="FOLDER", help="state of this vehicle, with signed parameters")
+    source.add_argument("--params", type=Path, metavar="FILE", help="parameter file that nobody signed; --unsigned")
+    run.add_argument("--unsigned", action="store_true", help="use parameters that nobody signed, as on a test bench")
+    _add_layout(run)
+    _add_vehicle(run)
     _add_bus(run)
     run.add_argument(
         "--gateway",
@@ -108,6 +114,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.set_defaults(command=_run)
     _add_monitor(commands)
+    add_trust_commands(commands)
     check = commands.add_parser(
         "check",
         help="would these parameters be applied?",
@@ -185,6 +192,10 @@ def _port(text: str) -> int:
 def _add_files(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--params", type=Path, required=True, metavar="FILE", help="parameter file of this vehicle")
     _add_layout(parser)
+    _add_vehicle(parser)
+
+
+def _add_vehicle(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--vehicle",
         type=_vehicle,
@@ -214,9 +225,17 @@ def _run(options: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return 2
+    if (options.params is not None) != options.unsigned:
+        _say(
+            "--state holds signed parameters; leave --unsigned out"
+            if options.unsigned
+            else "--params names a file that nobody signed: give --state with signed parameters, or --unsigned as well"
+        )
+        return 2
     return run_node(
         RunOptions(
             params=options.params,
+            state=options.state,
             layout=options.layout,
             vehicle=options.vehicle,
             interface=options.interface,

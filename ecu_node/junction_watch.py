@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from ecu_node.branch import LiveBranch
 
-__all__ = ["JunctionSums", "JunctionWatch"]
+__all__ = ["JunctionSums", "JunctionWatch", "aligned_currents"]
 
 _MOST_MARGINS = 10.0
 """More than so many margins nobody may expect the corrected sum to be worse."""
@@ -32,6 +32,41 @@ class JunctionSums:
 
     measured_a: float
     corrected_a: float
+
+
+def aligned_currents(
+    branches: Sequence[LiveBranch], delays_s: Mapping[str, float], now_s: float
+) -> tuple[float, dict[str, tuple[float, float]]] | None:
+    """Currents of all fitted branches in the last instant of which all are known.
+
+    Parameters
+    ----------
+    branches : sequence of LiveBranch
+        All branches of the layout.
+    delays_s : mapping of str to float
+        How much later than the junction each is seen; 0 where not named. [s]
+    now_s : float
+        Now. [s]
+
+    Returns
+    -------
+    instant_s : float
+        When, at the junction. [s]
+    currents : dict of str to (float, float)
+        Measured, and as the parameters that are in force make it; positive into the junction. [A]
+        None, instead of both, while a fitted branch is stale or has no value.
+    """
+    fitted = [branch for branch in branches if branch.is_fitted]
+    latest = [found for branch in fitted if not branch.is_stale(now_s) and (found := branch.latest()) is not None]
+    if not fitted or len(latest) < len(fitted):
+        return None
+    delays = [delays_s.get(branch.name, 0.0) for branch in fitted]
+    instant_s = min(seen_s - delay_s for delay_s, (seen_s, _) in zip(delays, latest, strict=True))
+    currents = {
+        branch.name: branch.currents_at(instant_s + delay_s) for branch, delay_s in zip(fitted, delays, strict=True)
+    }
+    known = {name: pair for name, pair in currents.items() if pair is not None}
+    return (instant_s, known) if len(known) == len(fitted) else None
 
 
 class JunctionWatch:
@@ -60,7 +95,7 @@ class JunctionWatch:
         full_scale_a: float,
         is_whole: Callable[[], bool] = lambda: True,
     ) -> None:
-        self._branches, self._is_whole = branches, is_whole
+        self._branches, self.is_whole = branches, is_whole
         self._window_s, self._margin_a = window_s, margin_a
         self._stuck_a, self._rest_a = _STUCK_SHARE * full_scale_a, _REST_SHARE * full_scale_a
         self.restart()
@@ -96,25 +131,23 @@ class JunctionWatch:
         JunctionSums or None
             None while a fitted branch is stale or has no value.
         """
-        fitted = [branch for branch in self._branches if branch.is_fitted]
         self.sums = None
-        latest = [found for branch in fitted if not branch.is_stale(now_s) and (found := branch.latest()) is not None]
-        if not fitted or len(latest) < len(fitted):
+        found = aligned_currents(self._branches, {branch.name: branch.delay_s for branch in self._branches}, now_s)
+        if found is None:
             return None
-        instant_s = min(seen_s - branch.delay_s for branch, (seen_s, _) in zip(fitted, latest, strict=True))
-        currents = [branch.currents_at(instant_s + branch.delay_s) for branch in fitted]
-        known = [pair for pair in currents if pair is not None]
-        if len(known) < len(fitted):
-            return None
-        self.sums = JunctionSums(measured_a=sum(pair[0] for pair in known), corrected_a=sum(pair[1] for pair in known))
-        if not self._is_whole():
+        instant_s, currents = found
+        self.sums = JunctionSums(
+            measured_a=sum(pair[0] for pair in currents.values()),
+            corrected_a=sum(pair[1] for pair in currents.values()),
+        )
+        if not self.is_whole():
             self._past.clear()
         elif instant_s > self._instant_s:
             self._instant_s = instant_s
             if not self._past or now_s - self._past[-1].time_s >= self._window_s / _MOST_LOOKS:
                 self._past.append(_Looks(now_s))
-            codes = {branch.name: found[1] for branch, found in zip(fitted, latest, strict=True)}
-            self._past[-1].add(self.sums, codes)
+            latest = {branch.name: branch.latest() for branch in self._branches if branch.name in currents}
+            self._past[-1].add(self.sums, {name: found[1] for name, found in latest.items() if found is not None})
         while self._past and now_s - self._past[0].time_s > self._window_s:
             self._past.popleft()
         return self.sums

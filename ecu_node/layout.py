@@ -137,6 +137,19 @@ class Watch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Its values with which they are; the sums of other times are not judged."""
 
 
+class Activation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What it takes until signed parameters are in force."""
+
+    trial_s: Annotated[float, msgspec.Meta(ge=1.0, le=86400.0)] = 300.0
+    """So long the Kirchhoff sum is watched, while currents flow. [s]"""
+    tolerance: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5
+    """By so much the share of the corrections that were errors may be below what the calibrator saw. [1]"""
+    step_drift: Annotated[float, msgspec.Meta(gt=0.0, le=2.0)] = 0.2
+    """Largest difference from the drift that is in force. [1]"""
+    step_offset_a: _Positive | None = None
+    """Largest difference from the offset that is in force [A]; 20 % of full scale where not given."""
+
+
 class LayoutKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a layout file may say."""
 
@@ -167,6 +180,7 @@ class LayoutKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     on_bad_frame: Literal["hold", "invalid"] = "hold"
     """What the node makes of a frame that fails its check: nothing, or one that is seen to be invalid."""
     watch: Watch = Watch()
+    activation: Activation = Activation()
 
     @property
     def branch_names(self) -> tuple[str, ...]:
@@ -177,6 +191,12 @@ class LayoutKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     def offset_limit_a(self) -> float:
         """Largest magnitude of an offset that the node accepts. [A]"""
         return self.limits.offset_a if self.limits.offset_a is not None else 0.4 * self.full_scale_a
+
+    @property
+    def step_offset_a(self) -> float:
+        """Largest difference of an offset from the one that is in force. [A]"""
+        given = self.activation.step_offset_a
+        return given if given is not None else 0.2 * self.full_scale_a
 
     @property
     def watch_margin_a(self) -> float:

@@ -2,15 +2,19 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import UserError
+from ecu_node.errors import UnfitError, UserError
 from ecu_node.guard import Mode
-from ecu_node.parameters import UnfitError, check_fit, read_parameters
+from ecu_node.parameters import check_fit, read_parameters
 from ecu_node.wiring import InForce, put_in_force
 
-__all__ = ["ParameterFile", "choose_parameters"]
+__all__ = ["FileSignature", "ParameterFile", "ParameterSource", "choose_parameters", "signature"]
+
+FileSignature = tuple[int, int, int, int]
+"""Times of change, size and number of a file."""
 
 _LOOK_EVERY_S = 1.0
 """Between looks whether the file has changed. [s]"""
@@ -46,6 +50,27 @@ def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None
     return InForce(parameters=parameters), None
 
 
+def signature(path: Path) -> FileSignature | None:
+    """What is another one if a file was changed; None if there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_ctime_ns, found.st_size, found.st_ino
+
+
+class ParameterSource(Protocol):
+    """Where a running node has its parameters from."""
+
+    in_force: InForce
+    """What the node works with."""
+    why_not: str | None
+    """Why it passes measured values through; None if it has parameters."""
+
+    def look(self, corrector: Corrector, now_s: float, *, asked: bool = False) -> bool:
+        """See whether other parameters are to be in force from now on, and put them; to be called now and then."""
+
+
 class ParameterFile:
     """Keeps the parameters of a running node up to date: new ones only if they fit, else the ones before stay.
 
@@ -68,7 +93,7 @@ class ParameterFile:
     ) -> None:
         self._path, self._database, self._vehicle = path, database, vehicle
         self._mode, self._say = mode, say
-        self._seen = self._signature()
+        self._seen = signature(path)
         self._due_s = float("-inf")
         self.in_force, self.why_not = choose_parameters(path, database, vehicle)
 
@@ -92,7 +117,7 @@ class ParameterFile:
         if not asked and now_s < self._due_s:
             return False
         self._due_s = now_s + _LOOK_EVERY_S
-        seen = self._signature()
+        seen = signature(self._path)
         if not asked and seen == self._seen:
             return False
         self._seen = seen
@@ -111,10 +136,3 @@ class ParameterFile:
         assert in_force.parameters is not None
         self._say(f"parameter set {in_force.parameters.number} of vehicle {in_force.parameters.vehicle} is in force")
         return True
-
-    def _signature(self) -> tuple[int, ...] | None:
-        try:
-            found = self._path.stat()
-        except OSError:
-            return None
-        return found.st_mtime_ns, found.st_ctime_ns, found.st_size, found.st_ino

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import ParameterError
+from ecu_node.errors import ParameterError, UnfitError
 from ecu_node.field_errors import field_error, quoted_place
 from ecu_node.sensor_models import GainBySign, SensorModel
 from ecu_node.status import Reason
@@ -26,7 +26,6 @@ __all__ = [
     "HeldBack",
     "JunctionResidual",
     "Provenance",
-    "UnfitError",
     "VehicleParameters",
     "Verdict",
     "check_fit",
@@ -110,6 +109,9 @@ class JunctionResidual(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
     measured_a: Annotated[_NotNegative, msgspec.Meta(description="from measured currents [A]")]
     corrected_a: Annotated[_NotNegative, msgspec.Meta(description="from corrected currents [A]")]
+    correction_a: Annotated[
+        _NotNegative | None, msgspec.Meta(description="of the difference of the two; null: not known [A]")
+    ] = None
 
 
 class FileReference(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -153,18 +155,6 @@ class VehicleParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     ] = ""
     junction_residual: JunctionResidual
     provenance: Provenance
-
-
-class UnfitError(ParameterError):
-    """Parameters that must not be applied here, with the reason as the node publishes it."""
-
-    def __init__(self, reason: Reason, text: str) -> None:
-        super().__init__(text)
-        self.reason = reason
-
-    def __reduce__(self) -> tuple[type["UnfitError"], tuple[Reason, str]]:
-        """Let it travel between processes."""
-        return type(self), (self.reason, str(self))
 
 
 def read_parameters(path: Path) -> VehicleParameters:

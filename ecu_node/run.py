@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import can
@@ -14,7 +15,7 @@ from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.guard import Mode
 from ecu_node.layout import read_layout
 from ecu_node.node import GatewayNode, OverlayNode, open_bus
-from ecu_node.parameter_file import ParameterFile
+from ecu_node.parameter_file import ParameterFile, ParameterSource
 from ecu_node.service import Log, Requests, ServiceManager
 from ecu_node.status import Reason, State
 from ecu_node.wiring import not_published, wire
@@ -30,10 +31,14 @@ class RunOptions:
 
     Attributes
     ----------
-    params, layout : Path
-        Parameter file and layout.
+    params : Path or None
+        Parameter file that nobody signed.
+    state : Path or None
+        State of the vehicle, with signed parameters; one of the two is given.
+    layout : Path
+        Layout.
     vehicle : str or None
-        Identity of the vehicle; None: not checked.
+        Identity of the vehicle; None: not checked, or as the state says.
     interface, channel : str
         Bus of the sensors, as python-can names it.
     gateway : str or None
@@ -46,7 +51,8 @@ class RunOptions:
         Port on which Prometheus may ask.
     """
 
-    params: Path
+    params: Path | None
+    state: Path | None
     layout: Path
     vehicle: str | None
     interface: str
@@ -80,7 +86,7 @@ def run_node(options: RunOptions, vehicle_hint: str) -> int:
     say, manager = Log().say, ServiceManager()
     mode = Mode.OVERLAY if options.gateway is None else Mode.GATEWAY
     database = read_database(read_layout(options.layout))
-    file = ParameterFile(options.params, database, options.vehicle, mode=mode, say=say)
+    file = _source(options, database, mode, say)
     corrector = wire(database, file.in_force, time.monotonic(), mode=mode, shadow=options.shadow)
     buses = []
     try:
@@ -93,9 +99,11 @@ def run_node(options: RunOptions, vehicle_hint: str) -> int:
             from ecu_node.metrics import serve_metrics  # noqa: PLC0415  # prometheus_client is optional
 
             serve_metrics(corrector, options.metrics_port)
+        if options.params is not None:
+            say("parameters are used that nobody signed (--unsigned)")
         if file.why_not is not None:
             say(f"passing measured values through: {file.why_not}")
-        elif options.vehicle is None:
+        elif options.params is not None and options.vehicle is None:
             say(f"the vehicle is not checked: {vehicle_hint}")
         for text in (*warnings_of(database, file.in_force, mode, fd=options.fd), *_unseen(options)):
             say(text)
@@ -121,6 +129,17 @@ def run_node(options: RunOptions, vehicle_hint: str) -> int:
 
 def _opener(database: VehicleDatabase, options: RunOptions, channel: str, mode: Mode) -> Callable[[], can.BusABC]:
     return lambda: open_bus(database, interface=options.interface, channel=channel, fd=options.fd, mode=mode)
+
+
+def _source(options: RunOptions, database: VehicleDatabase, mode: Mode, say: Callable[[str], None]) -> ParameterSource:
+    if options.params is not None:
+        return ParameterFile(options.params, database, options.vehicle, mode=mode, say=say)
+    from ecu_node.trust.parameter_store import ParameterStore  # noqa: PLC0415  # cryptography takes time to import
+
+    assert options.state is not None
+    return ParameterStore(
+        options.state, database, mode=mode, say=say, now=lambda: datetime.now(UTC), vehicle=options.vehicle
+    )
 
 
 def _unseen(options: RunOptions) -> list[str]:
@@ -149,7 +168,7 @@ class _Tick:
         *,
         corrector: Corrector,
         buses: Sequence[SteadyBus],
-        file: ParameterFile,
+        file: ParameterSource,
         requests: Requests,
         manager: ServiceManager,
         say: Callable[[str], None],
@@ -188,6 +207,6 @@ class _Tick:
         return "the bus sleeps" if corrector.state()[0] is State.ASLEEP else "correcting again"
 
 
-def _what(corrector: Corrector, database: VehicleDatabase, file: ParameterFile, mode: Mode) -> str:
+def _what(corrector: Corrector, database: VehicleDatabase, file: ParameterSource, mode: Mode) -> str:
     hidden = not_published(database, file.in_force) if mode is Mode.OVERLAY else []
     return ", ".join(item.name for item in corrector.branches if item.fault.applied and item.name not in hidden)

@@ -29,6 +29,11 @@ class Reason(IntEnum):
     CORRECTION_WORSE = 8
     BRANCH_STUCK = 9
     INPUT_MISSING = 10
+    NOT_SIGNED = 11
+    NOT_VALID_NOW = 12
+    REPLAYED = 13
+    REVOKED = 14
+    ON_TRIAL = 15
 
 
 class Quality(IntEnum):

@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 
 from calibrator.evidence.vehicle_summary import VehicleSummary
-from calibrator.parameter_files import RunIdentity, by_branch, junction_rms_a
+from calibrator.parameter_files import RunIdentity, by_branch, correction_rms_a, junction_rms_a
 from calibrator.posterior.advice import advise
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.explain import explanations
@@ -112,6 +112,7 @@ def vehicle_parameters(
         junction_residual=JunctionResidual(
             measured_a=junction_rms_a(*moments, drift=zeros, offset_a=zeros),
             corrected_a=junction_rms_a(*moments, **deployed),
+            correction_a=correction_rms_a(*moments, **deployed),
         ),
         provenance=identity.provenance(
             fleet_size=fleet_size, drives=vehicle.drives, duration_s=vehicle.summary.duration_s

@@ -14,7 +14,7 @@ from calibrator.drive import Array
 from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
 from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_model
-from calibrator.parameter_files import RunIdentity, by_branch, junction_rms_a
+from calibrator.parameter_files import RunIdentity, by_branch, correction_rms_a, junction_rms_a
 from calibrator.published.calibration import ExpectedFaults, calibrate_published
 from calibrator.published.recovery import Recovery
 from calibrator.vehicles import read_vehicles
@@ -196,6 +196,7 @@ def _parameters(
     residual = JunctionResidual(
         measured_a=junction_rms_a(*moments, drift=zeros, offset_a=zeros),
         corrected_a=junction_rms_a(*moments, drift=faults.drift, offset_a=faults.offset_a),
+        correction_a=correction_rms_a(*moments, drift=faults.drift, offset_a=faults.offset_a),
     )
     helps = residual.corrected_a <= residual.measured_a
     sensor = bool(recovery.classification.sensor[position])

@@ -83,6 +83,7 @@ def test_it_may_do_next_to_nothing(analyze: str, unit: Path) -> None:
         ("ExecReload", ["kill -HUP $MAINPID"]),
         ("EnvironmentFile", ["/etc/ecu-node/%i.env"]),
         ("DynamicUser", ["yes"]),
+        ("StateDirectory", ["ecu-node/%i"]),
         ("CapabilityBoundingSet", [""]),
         ("AmbientCapabilities", [""]),
         ("NoNewPrivileges", ["yes"]),

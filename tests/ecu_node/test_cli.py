@@ -73,7 +73,7 @@ WITHOUT_SNA = SMALL_DBC.replace('VAL_ 512 Motor -32768 "SNA";\n', "")
 
 def test_check_refuses_what_run_refuses(small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]) -> None:
     options = small(WITHOUT_SNA)
-    run = ["run", *options, "--interface", "virtual", "--channel", "c0"]
+    run = ["run", "--unsigned", *options, "--interface", "virtual", "--channel", "c0"]
     assert [main(["check", *options]), main(run)] == [1, 1]
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -107,7 +107,7 @@ def test_run_does_not_claim_to_correct_what_it_cannot_publish(
     monkeypatch.setattr("ecu_node.service.Requests.stop", lambda self: True)
     handlers = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)]
     try:
-        assert main(["run", *small(), "--interface", "virtual", "--channel", "c0"]) == 0
+        assert main(["run", "--unsigned", *small(), "--interface", "virtual", "--channel", "c0"]) == 0
     finally:
         signal.signal(signal.SIGTERM, handlers[0])
         signal.signal(signal.SIGHUP, handlers[2])
@@ -120,7 +120,7 @@ def test_run_does_not_claim_to_correct_what_it_cannot_publish(
 @pytest.mark.parametrize("more", [["--channel", ""], ["--channel", "c0", "--gateway", ""]])
 def test_an_empty_name_of_a_bus_is_wrong_use(params: Path, more: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        main(["run", "--params", str(params), "--layout", str(LAYOUT), *more])
+        main(["run", "--unsigned", "--params", str(params), "--layout", str(LAYOUT), *more])
     assert caught.value.code == 2
     assert "a name is expected, such as can0, found none" in capsys.readouterr().err
 
@@ -139,7 +139,7 @@ def test_an_empty_vehicle_is_wrong_use(
 
 def test_a_gateway_needs_two_buses(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--interface", "virtual", "--channel", "c0", "--gateway", "c0"]
-    assert main(["run", "--params", str(params), "--layout", str(LAYOUT), *options]) == 2
+    assert main(["run", "--unsigned", "--params", str(params), "--layout", str(LAYOUT), *options]) == 2
     assert (
         capsys.readouterr().err == "ecu-node: --gateway c0 is the bus of the sensors itself; two buses are expected\n"
     )
@@ -211,7 +211,16 @@ def run_node(*arguments: str, **environment: str) -> subprocess.CompletedProcess
 )
 def test_what_keeps_the_node_from_running_is_one_line(params: Path, layout: str, interface: str, words: str) -> None:
     result = run_node(
-        "run", "--params", str(params), "--layout", layout, "--interface", interface, "--channel", "nobus0"
+        "run",
+        "--unsigned",
+        "--params",
+        str(params),
+        "--layout",
+        layout,
+        "--interface",
+        interface,
+        "--channel",
+        "nobus0",
     )
     assert result.returncode == 1
     assert result.stdout == ""

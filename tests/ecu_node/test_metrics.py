@@ -19,7 +19,7 @@ from tests.ecu_node.vehicles import LAYOUT
 
 
 def command(tmp_path: Path, port: int) -> list[str]:
-    files = ["--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT)]
+    files = ["--unsigned", "--params", str(tmp_path / "none.json"), "--layout", str(LAYOUT)]
     return [
         *(sys.executable, "-m", "ecu_node", "run", *files, "--interface", "virtual", "--channel", "metrics"),
         *("--metrics-port", str(port)),
@@ -71,7 +71,7 @@ def test_only_this_machine_is_answered(node: int) -> None:
 @pytest.mark.parametrize("port", ["70000", "0", "-1", "x"])
 def test_what_is_no_port_is_wrong_use(tmp_path: Path, port: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        main(["run", "--params", "p", "--layout", "l", "--channel", "c", f"--metrics-port={port}"])
+        main(["run", "--unsigned", "--params", "p", "--layout", "l", "--channel", "c", f"--metrics-port={port}"])
     assert caught.value.code == 2
     assert "a TCP port from 1 to 65535 is expected" in capsys.readouterr().err
 

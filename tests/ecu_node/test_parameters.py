@@ -14,13 +14,12 @@ from msgspec.structs import replace
 
 import ecu_node
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import ParameterError
+from ecu_node.errors import ParameterError, UnfitError
 from ecu_node.parameters import (
     MAX_FILE_BYTES,
     BranchParameters,
     HardwareFault,
     JunctionResidual,
-    UnfitError,
     Verdict,
     check_fit,
     parameter_schema,

@@ -11,10 +11,9 @@ from msgspec.structs import replace
 
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import LayoutError
+from ecu_node.errors import LayoutError, UnfitError
 from ecu_node.layout import read_layout
 from ecu_node.parameters import (
-    UnfitError,
     VehicleParameters,
     check_fit,
     parameter_schema,

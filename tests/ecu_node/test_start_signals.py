@@ -42,7 +42,7 @@ def test_ctrl_c_at_start_is_one_line_and_130(tmp_path: Path, event: str, what: s
 @pytest.mark.parametrize(("event", "what"), MOMENTS)
 def test_sighup_at_start_does_not_end_a_node(tmp_path: Path, event: str, what: str) -> None:
     bus = ["--interface", "virtual", "--channel", "hangup"]
-    command = program(event, what, signal.SIGHUP, ["run", *files(tmp_path), *bus])
+    command = program(event, what, signal.SIGHUP, ["run", "--unsigned", *files(tmp_path), *bus])
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         lines = iter(process.stderr.readline, "")

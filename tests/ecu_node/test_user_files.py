@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from ecu_node.database import MAX_DBC_BYTES, read_database
-from ecu_node.errors import DatabaseError
+from ecu_node.errors import DatabaseError, UnfitError
 from ecu_node.layout import MAX_LAYOUT_BYTES, read_layout
-from ecu_node.parameters import MAX_FILE_BYTES, UnfitError, read_parameters
+from ecu_node.parameters import MAX_FILE_BYTES, read_parameters
 from ecu_node.status import Reason
 from ecu_node.user_files import UnsuitableFileError, read_user_file
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT

@@ -77,7 +77,9 @@ def start_node(database: VehicleDatabase, tmp_path: Path) -> StartNode:
     logs = (tmp_path / name for name in ("node.err", "node2.err"))
 
     def start(params: Path, *options: str) -> AbstractContextManager[NodeProcess]:
-        return running_node(next(logs), "--params", str(params), "--layout", str(database.layout.path), *options)
+        return running_node(
+            next(logs), "--unsigned", "--params", str(params), "--layout", str(database.layout.path), *options
+        )
 
     return start
 

@@ -68,7 +68,7 @@ def test_the_monitor_shows_branches_sums_and_node(patient: VehicleDatabase, tmp_
     write_parameters(true_parameters(patient), tmp_path / "params.json")
     files = ["--layout", str(patient.layout.path), "--channel", CHANNEL]
     command = [*ECU_NODE, "monitor", *files, "--once", "4", "--json"]
-    with running_node(tmp_path / "node.err", "--params", str(tmp_path / "params.json"), *files) as node:
+    with running_node(tmp_path / "node.err", "--unsigned", "--params", str(tmp_path / "params.json"), *files) as node:
         before = filters()
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as monitor:
             wait_until(lambda: filters() > before, "the monitor to listen")
@@ -102,7 +102,17 @@ def test_the_node_needs_no_capability(
 ) -> None:
     """As in deploy/ecu-node@.service: an empty bounding set, no ambient capabilities, no new privileges."""
     write_drive(tmp_path / "drive.log", database, 20)
-    options = ["--params", str(params), "--layout", str(LAYOUT), "--vehicle", VEHICLE, "--channel", CHANNEL]
+    options = [
+        "--unsigned",
+        "--params",
+        str(params),
+        "--layout",
+        str(LAYOUT),
+        "--vehicle",
+        VEHICLE,
+        "--channel",
+        CHANNEL,
+    ]
     log = tmp_path / "node.err"
     with log.open("wb") as file, subprocess.Popen([*UNPRIVILEGED, *ECU_NODE, "run", *options], stderr=file) as process:
         try:

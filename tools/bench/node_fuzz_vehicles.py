@@ -442,6 +442,6 @@ def _draw_target(
     zero = zero_code(signal)
     signal.named[lowest if zero != lowest else highest] = "SNA"
     code = highest - rng.randint(0, 2)
-    if code not in {zero, *signal.named}:
+    if code not in {zero - 1, zero, zero + 1, *signal.named}:
         signal.named[code] = "Error"
     return message, signal, message.draw_signal(rng, f"Quality{branch.name}", rng.randint(2, 4))

@@ -9,7 +9,7 @@ from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError
 from calibrator.faults import corrected_currents
 from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_model
-from calibrator.parameter_files import junction_rms_a
+from calibrator.parameter_files import correction_rms_a, junction_rms_a
 from ecu_node.database import VehicleDatabase
 
 INPUTS = ("driving_current", "heater_current")
@@ -101,6 +101,11 @@ def test_junction_rms_from_moments_equals_that_of_the_samples(database: VehicleD
     drift, offset_a = np.array([0.1, -0.05]), np.array([2.0, -1.0])
     expected = np.sqrt(np.mean(corrected_currents(measured, drift=drift, offset_a=offset_a).sum(axis=1) ** 2))
     assert junction_rms_a(vehicle.mean_a, vehicle.moment_a2, drift=drift, offset_a=offset_a) == pytest.approx(
+        float(expected), rel=1e-3
+    )
+    change = measured - corrected_currents(measured, drift=drift, offset_a=offset_a)
+    expected = np.sqrt(np.mean(change.sum(axis=1) ** 2))
+    assert correction_rms_a(vehicle.mean_a, vehicle.moment_a2, drift=drift, offset_a=offset_a) == pytest.approx(
         float(expected), rel=1e-3
     )
     raw = np.sqrt(np.mean(measured.sum(axis=1) ** 2))

@@ -1,0 +1,164 @@
+"""Files of a signer's key: NAME.key, private (PEM, PKCS #8, mode 0600), and NAME.pub, public (canonical JSON)."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    KeySerializationEncryption,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+)
+from securesystemslib.signer import CryptoSigner, SSlibKey
+
+from calibrator.errors import SigningError
+from ecu_node.errors import TrustError
+from ecu_node.parameters import write_atomically
+from ecu_node.trust.canonical import canonical_bytes, read_bytes, read_canonical
+from ecu_node.trust.key_set import PublicKey
+from ecu_node.user_files import UnsuitableFileError, read_user_file
+
+__all__ = ["PASSPHRASE_VARIABLE", "NamedKey", "new_key", "read_public_key", "read_signer"]
+
+PASSPHRASE_VARIABLE = "CALIBRATOR_KEY_PASSPHRASE"  # noqa: S105  # its name
+"""Environment variable with the passphrase of private keys."""
+_LARGEST_KEY_BYTES = 100_000
+
+
+class NamedKey(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Content of a public key's file."""
+
+    keyid: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$", description="as securesystemslib names the key")]
+    key: PublicKey
+
+
+def new_key(name: str, folder: Path, passphrase: str | None) -> tuple[Path, Path]:
+    """Make a key of a signer.
+
+    Parameters
+    ----------
+    name : str
+        Of the signer; names the files too.
+    folder : Path
+        Where; must exist.
+    passphrase : str or None
+        Encrypts the private key; None: it is not encrypted.
+
+    Returns
+    -------
+    private, public : Path
+        The two files.
+
+    Raises
+    ------
+    SigningError
+        If there are such files already, or they cannot be written.
+    """
+    private, public = folder / f"{name}.key", folder / f"{name}.pub"
+    for path in (private, public):
+        if path.exists():
+            raise SigningError(f"{path}: there is a key already; take another name, it cannot be made again")
+    signer = CryptoSigner.generate_ed25519()
+    key = load_pem_private_key(signer.private_bytes, None)
+    text = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, _encryption(passphrase))
+    try:
+        handle = os.open(private, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except OSError as error:
+        raise _not_written(folder, error) from None
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(handle)
+        write_atomically(public, canonical_bytes(_named(name, signer.public_key)) + b"\n")
+    except BaseException as error:
+        private.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise _not_written(folder, error) from None
+        raise
+    return private, public
+
+
+def _encryption(passphrase: str | None) -> KeySerializationEncryption:
+    if passphrase is None:
+        return NoEncryption()
+    try:
+        return BestAvailableEncryption(os.fsencode(passphrase))
+    except ValueError as error:
+        raise SigningError(f"${PASSPHRASE_VARIABLE}: no passphrase: {error}") from None
+
+
+def _not_written(folder: Path, error: OSError) -> SigningError:
+    return SigningError(f"{folder}: no key can be written there: {error.strerror}")
+
+
+def _named(name: str, key: SSlibKey) -> NamedKey:
+    return NamedKey(keyid=key.keyid, key=PublicKey(name=name, ed25519=key.keyval["public"]))
+
+
+def read_public_key(path: Path) -> NamedKey:
+    """Read a public key's file.
+
+    Parameters
+    ----------
+    path : Path
+        From :func:`new_key`.
+
+    Returns
+    -------
+    NamedKey
+        Key and name of the signer.
+
+    Raises
+    ------
+    SigningError
+        If it is none.
+    """
+    try:
+        return read_canonical(read_bytes(path).removesuffix(b"\n"), NamedKey, str(path))
+    except TrustError:
+        raise SigningError(f"{path}: not a public key; one from 'calibrator keys new' is expected") from None
+
+
+def read_signer(path: Path, passphrase: str | None) -> CryptoSigner:
+    """Read a private key.
+
+    Parameters
+    ----------
+    path : Path
+        PEM, PKCS #8, Ed25519.
+    passphrase : str or None
+        With which it is encrypted.
+
+    Returns
+    -------
+    CryptoSigner
+        Signs in the name of the key's owner.
+
+    Raises
+    ------
+    SigningError
+        If it is none, or the passphrase is another one.
+    """
+    try:
+        content = read_user_file(path, largest_bytes=_LARGEST_KEY_BYTES)
+    except UnsuitableFileError as error:
+        raise SigningError(f"{path}: not a private key: {error}") from None
+    except OSError as error:
+        raise SigningError(f"{path}: cannot read the private key: {error.strerror}") from None
+    try:
+        key = load_pem_private_key(content, os.fsencode(passphrase) if passphrase is not None else None)
+    except TypeError:
+        need = "it is encrypted" if passphrase is None else "it is not encrypted, and yet a passphrase is given"
+        raise SigningError(f"{path}: {need}; see ${PASSPHRASE_VARIABLE}") from None
+    except (ValueError, UnsupportedAlgorithm):
+        raise SigningError(f"{path}: no private key (PEM), or another passphrase (${PASSPHRASE_VARIABLE})") from None
+    if not isinstance(key, Ed25519PrivateKey):
+        raise SigningError(f"{path}: a private key, but not of kind Ed25519; make one with 'calibrator keys new'")
+    return CryptoSigner(key)

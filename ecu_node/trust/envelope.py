@@ -1,0 +1,157 @@
+"""Signed bytes: a DSSE envelope with Ed25519 signatures of several signers.
+
+What is signed is PAE(type, payload) = "DSSEv1" SP len(type) SP type SP len(payload) SP payload [1]_, so that a
+statement of one kind is never taken for one of another. Every signature in a file must be right and of a known signer,
+not only as many as the threshold asks for: no byte of a file that is accepted could be another one.
+
+.. [1] Dead Simple Signing Envelope, protocol version 1.0.
+"""
+
+import base64
+import binascii
+from typing import Annotated
+
+import msgspec
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+from ecu_node.errors import TrustError
+from ecu_node.status import Reason
+from ecu_node.trust.canonical import canonical_bytes, malformed, printable, read_canonical
+from ecu_node.trust.key_set import KeySet
+
+__all__ = ["Envelope", "Signature", "pae", "read_envelope", "signers", "write_envelope"]
+
+_Base64 = Annotated[str, msgspec.Meta(pattern="^[A-Za-z0-9+/]*={0,2}$")]
+
+
+class Signature(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Of one signer."""
+
+    keyid: Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
+    sig: _Base64
+
+
+class Envelope(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A payload and who signed it; names of the fields are those of DSSE."""
+
+    payload: _Base64
+    payloadType: Annotated[str, msgspec.Meta(min_length=1, max_length=128)]  # noqa: N815
+    signatures: Annotated[list[Signature], msgspec.Meta(min_length=1, max_length=16)]
+
+    @property
+    def content(self) -> bytes:
+        """What is signed."""
+        return base64.b64decode(self.payload)
+
+
+def pae(payload_type: str, payload: bytes) -> bytes:
+    """Pre-authentication encoding of DSSE: the bytes over which the signatures are."""
+    kind = payload_type.encode()
+    return b"DSSEv1 %d %b %d %b" % (len(kind), kind, len(payload), payload)
+
+
+def write_envelope(payload_type: str, payload: bytes, signatures: dict[str, bytes]) -> bytes:
+    """Text of a signed file.
+
+    Parameters
+    ----------
+    payload_type : str
+        Kind of the statement.
+    payload : bytes
+        The statement.
+    signatures : dict of str to bytes
+        By the identity of the signer's key: 64 bytes.
+
+    Returns
+    -------
+    bytes
+        Canonical JSON, and the end of the line.
+    """
+    envelope = Envelope(
+        payload=base64.b64encode(payload).decode(),
+        payloadType=payload_type,
+        signatures=[
+            Signature(keyid=keyid, sig=base64.b64encode(signatures[keyid]).decode()) for keyid in sorted(signatures)
+        ],
+    )
+    return canonical_bytes(envelope) + b"\n"
+
+
+def read_envelope(content: bytes, where: str) -> Envelope:
+    """Read a signed file; nothing is verified yet.
+
+    Parameters
+    ----------
+    content : bytes
+        Text of the file.
+    where : str
+        Where it is from, for messages.
+
+    Returns
+    -------
+    Envelope
+        Of which there is one text only.
+
+    Raises
+    ------
+    TrustError
+        With reason MALFORMED_PARAMETERS if it is not an envelope as :func:`write_envelope` writes it.
+    """
+    if not content.endswith(b"\n"):
+        raise malformed(where, "its end is missing")
+    envelope = read_canonical(content[:-1], Envelope, where)
+    try:
+        texts = [envelope.payload, *(signature.sig for signature in envelope.signatures)]
+        if any(base64.b64encode(base64.b64decode(text, validate=True)).decode() != text for text in texts):
+            raise malformed(where, "base64 with bits that mean nothing")
+    except binascii.Error:
+        raise malformed(where, "not base64") from None
+    keyids = [signature.keyid for signature in envelope.signatures]
+    if keyids != sorted(set(keyids)):
+        raise malformed(where, "signatures are repeated or out of order")
+    return envelope
+
+
+def signers(envelope: Envelope, keys: KeySet, where: str) -> list[str]:
+    """Who vouches for an envelope.
+
+    Parameters
+    ----------
+    envelope : Envelope
+        From :func:`read_envelope`.
+    keys : KeySet
+        Signers that are trusted, and how many of them it takes.
+    where : str
+        Where it is from, for messages.
+
+    Returns
+    -------
+    list of str
+        Names of the signers.
+
+    Raises
+    ------
+    TrustError
+        With reason NOT_SIGNED if a signature is wrong or of an unknown key, or there are fewer than the threshold.
+    """
+    signed = pae(envelope.payloadType, envelope.content)
+    names = []
+    for signature in envelope.signatures:
+        key = keys.keys.get(signature.keyid)
+        if key is None:
+            raise _not_signed(where, f"signed with key {printable(signature.keyid[:12])}, which is not trusted here")
+        try:
+            Ed25519PublicKey.from_public_bytes(bytes.fromhex(key.ed25519)).verify(
+                base64.b64decode(signature.sig), signed
+            )
+        except (InvalidSignature, ValueError):
+            raise _not_signed(where, f"the signature of {key.name} is wrong: the file was changed") from None
+        names.append(key.name)
+    if len(names) < keys.threshold:
+        raise _not_signed(where, f"signed by {', '.join(names)}; {keys.threshold} signers are needed")
+    return names
+
+
+def _not_signed(where: str, why: str) -> TrustError:
+    return TrustError(Reason.NOT_SIGNED, f"{where}: {why}")

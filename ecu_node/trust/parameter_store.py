@@ -1,0 +1,226 @@
+"""Signed parameters of a running node: those in force, those on trial, and the way from one to the other."""
+
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+from ecu_node.corrector import Corrector
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import TrustError, UnfitError, UserError
+from ecu_node.guard import Mode
+from ecu_node.parameter_file import FileSignature, signature
+from ecu_node.parameters import check_fit
+from ecu_node.status import Reason
+from ecu_node.trust.activation import conclude, require_time, signed_parameters
+from ecu_node.trust.state import Slot, SlotName, TrustState, read_state, slot_path, state_path
+from ecu_node.trust.statements import SignedParameters
+from ecu_node.trust.trial import Trial, TrialResult, TrialRules
+from ecu_node.wiring import InForce, put_in_force, sensor_fault
+
+__all__ = ["ParameterStore"]
+
+_LOOK_EVERY_S = 1.0
+"""Between looks whether the state has changed, or what is in force has expired. [s]"""
+_CONCLUDE_EVERY_S = 60.0
+"""Between attempts to keep how a trial ended, on a disk that is full or broken. [s]"""
+_LEAST_CURRENT_SHARE = 0.02
+"""A trial counts while a branch carries this share of full scale. [1]"""
+
+
+class ParameterStore:
+    """Keeps the parameters of a running node as the state of its vehicle says.
+
+    Parameters
+    ----------
+    folder : Path
+        State of the vehicle.
+    database : VehicleDatabase
+        Layout and DBC in use.
+    mode : Mode
+        Where corrected values go.
+    say : callable
+        Takes one line for the log.
+    now : callable
+        The time of day.
+    vehicle : str or None
+        Identity of the vehicle, where it is known besides; the state of another one is not used.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        database: VehicleDatabase,
+        *,
+        mode: Mode,
+        say: Callable[[str], None],
+        now: Callable[[], datetime],
+        vehicle: str | None = None,
+    ) -> None:
+        self._folder, self._database, self._mode, self._say, self._now = folder, database, mode, say, now
+        self._vehicle = vehicle
+        self._due_s = self._conclude_due_s = float("-inf")
+        self._trial: Trial | None = None
+        self._result: TrialResult | None = None
+        self._tried: int | None = None
+        self._read: tuple[Slot, FileSignature | None, SignedParameters] | None = None
+        self._seen = signature(state_path(folder))
+        self._state: TrustState | None = None
+        self.in_force: InForce
+        self.why_not: str | None
+        try:
+            self._state = read_state(folder)
+        except TrustError as error:
+            self.in_force, self.why_not = InForce(parameters=None, reason=error.reason), str(error)
+        else:
+            self.in_force, self.why_not = self._in_force(self._state)
+
+    def look(self, corrector: Corrector, now_s: float, *, asked: bool = False) -> bool:
+        """See whether a trial has ended, the state was changed, or time has passed; to be called now and then.
+
+        Parameters
+        ----------
+        corrector : Corrector
+            Where new parameters are put in force.
+        now_s : float
+            Now. [s]
+        asked : bool
+            Read the state whether it was changed or not.
+
+        Returns
+        -------
+        bool
+            Whether other parameters are in force than before, or none.
+        """
+        self._try(corrector, now_s)
+        if not asked and now_s < self._due_s:
+            return False
+        self._due_s = now_s + _LOOK_EVERY_S
+        seen = signature(state_path(self._folder))
+        if asked or seen != self._seen:
+            self._seen = seen
+            try:
+                self._state = read_state(self._folder)
+            except UserError as error:
+                self._say(f"the state of the vehicle is not read, what was in force stays: {error}")
+                return False
+        return self._state is not None and self._put_in_force(corrector, self._state, now_s)
+
+    def _put_in_force(self, corrector: Corrector, state: TrustState, now_s: float) -> bool:
+        in_force, why_not = self._in_force(state)
+        if in_force == self.in_force:
+            return False
+        try:
+            put_in_force(corrector, self._database, in_force, now_s, mode=self._mode)
+        except UserError as error:
+            corrector.counters.reload_failures += 1
+            self._say(f"new parameters are not used, those before stay in force: {error}")
+            return False
+        self.in_force, self.why_not = in_force, why_not
+        corrector.counters.reloads += 1
+        found = in_force.parameters
+        self._say(
+            f"parameter set {found.number} of vehicle {found.vehicle} is in force"
+            if found is not None
+            else f"passing measured values through: {why_not}"
+        )
+        return True
+
+    def _in_force(self, state: TrustState) -> tuple[InForce, str | None]:
+        """What the state says, and why there are no parameters."""
+        if state.in_force is None:
+            reason, text = _why_nothing(state)
+            return InForce(parameters=None, reason=reason), f"{self._folder}: {text}"
+        try:
+            signed = self._signed(state, state.in_force)
+            require_time(state, signed, str(self._folder), self._now())
+        except UnfitError as error:
+            return InForce(parameters=None, reason=error.reason), str(error)
+        return InForce(parameters=signed.parameters), None
+
+    def _signed(self, state: TrustState, name: SlotName) -> SignedParameters:
+        """What stands in a slot; read again only if its file was changed, as the bus waits meanwhile."""
+        slot, seen = state.slots[name], signature(slot_path(self._folder, name))
+        if self._read is None or self._read[:2] != (slot, seen):
+            signed = signed_parameters(self._folder, state, name)
+            check_fit(signed.parameters, self._database, self._vehicle or state.vehicle)
+            self._read = slot, seen, signed
+        return self._read[2]
+
+    def _fitting(self, state: TrustState, name: SlotName) -> SignedParameters:
+        """What stands in a slot, if it may be used here and now."""
+        signed = signed_parameters(self._folder, state, name)
+        require_time(state, signed, str(self._folder), self._now())
+        check_fit(signed.parameters, self._database, self._vehicle or state.vehicle)
+        return signed
+
+    def _try(self, corrector: Corrector, now_s: float) -> None:
+        """Go on with a trial; at its end what was tried is in force, or gone."""
+        number = self._number_on_trial()
+        if number != self._tried:
+            self._tried, self._result = number, None
+            self._trial = self._begin(corrector) if number is not None else None
+        if number is not None and self._result is not None:
+            self._conclude(number, self._result, now_s)
+        elif self._trial is not None and corrector.watch.is_whole():
+            self._result = self._trial.look(now_s)
+
+    def _conclude(self, number: int, result: TrialResult, now_s: float) -> None:
+        """Keep how a trial ended; try again later if that cannot be written, as what was in force stays meanwhile."""
+        if now_s < self._conclude_due_s:
+            return
+        try:
+            self._state = conclude(self._folder, number, passed=result.passed, text=result.text, now=self._now())
+        except UserError as error:
+            self._conclude_due_s = now_s + _CONCLUDE_EVERY_S
+            self._say(f"how the trial of number {number} ended cannot be kept, what was in force stays: {error}")
+            return
+        self._result, self._due_s = None, float("-inf")
+        self._say(f"number {number} {'has passed' if result.passed else 'has failed'} its trial: {result.text}")
+
+    def _number_on_trial(self) -> int | None:
+        if self._state is None or self._state.on_trial is None:
+            return None
+        return self._state.slots[self._state.on_trial].sequence
+
+    def _begin(self, corrector: Corrector) -> Trial | None:
+        assert self._state is not None
+        assert self._state.on_trial is not None
+        try:
+            signed = self._fitting(self._state, self._state.on_trial)
+        except UnfitError as error:
+            self._say(f"no trial: {error}")
+            return None
+        self._say(f"number {signed.sequence} is on trial: parameter set {signed.parameters.number}")
+        return self._trial_of(signed, corrector)
+
+    def _trial_of(self, signed: SignedParameters, corrector: Corrector) -> Trial:
+        layout, parameters = self._database.layout, signed.parameters
+        faults = {
+            name: sensor_fault(self._database, InForce(parameters=parameters), name) for name in layout.branch_names
+        }
+        return Trial(
+            corrector.branches,
+            {name: fault for name, fault in faults.items() if fault.applied},
+            {name: branch.delay_s or 0.0 for name, branch in parameters.branches.items()},
+            parameters.junction_residual,
+            TrialRules(
+                duration_s=layout.activation.trial_s,
+                tolerance=layout.activation.tolerance,
+                margin_a=layout.watch_margin_a,
+                least_current_a=_LEAST_CURRENT_SHARE * layout.full_scale_a,
+            ),
+        )
+
+
+def _why_nothing(state: TrustState) -> tuple[Reason, str]:
+    if state.on_trial is not None:
+        return (
+            Reason.ON_TRIAL,
+            f"number {state.slots[state.on_trial].sequence} is on trial, and nothing is in force yet",
+        )
+    if state.revoked:
+        return (
+            Reason.REVOKED,
+            f"number {state.revoked[-1]} was revoked, and nothing else is in force; activate new ones",
+        )
+    return Reason.NO_PARAMETERS, "nothing was activated yet; see 'ecu-node activate'"
