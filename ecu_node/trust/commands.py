@@ -172,7 +172,7 @@ def _signers(keys: "object") -> str:
     from ecu_node.trust.key_set import KeySet  # noqa: PLC0415
 
     assert isinstance(keys, KeySet)
-    return f"{keys.threshold} of {', '.join(key.name for key in keys.keys.values())}"
+    return f"{keys.threshold} of {', '.join(sorted(key.name for key in keys.keys.values()))}"
 
 
 def _now() -> datetime:

@@ -148,6 +148,7 @@ def signers(envelope: Envelope, keys: KeySet, where: str) -> list[str]:
         except (InvalidSignature, ValueError):
             raise _not_signed(where, f"the signature of {key.name} is wrong: the file was changed") from None
         names.append(key.name)
+    names.sort()
     if len(names) < keys.threshold:
         raise _not_signed(where, f"signed by {', '.join(names)}; {keys.threshold} signers are needed")
     return names
