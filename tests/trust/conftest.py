@@ -1,15 +1,17 @@
 """Signers, a vehicle, and its state."""
 
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
+from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import VehicleParameters
-from ecu_node.trust.activation import provision
+from ecu_node.trust.activation import accept, conclude, provision
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
-from tests.trust.signing import NOW, VEHICLE, Signers, make_signers
+from tests.trust.signing import NOW, VEHICLE, Run, Signers, make_signers
 
 
 @pytest.fixture(scope="session")
@@ -34,3 +36,40 @@ def state(tmp_path: Path, signers: Signers) -> Path:
     folder = tmp_path / "state"
     provision(folder, VEHICLE, signers.keys(), NOW)
     return folder
+
+
+@pytest.fixture
+def two_slots(tmp_path: Path, signers: Signers, parameters: VehicleParameters, database: VehicleDatabase) -> Path:
+    """State of a vehicle with numbers 5 and 6, the latter in force in slot b."""
+    folder, now = tmp_path / "state", datetime.now(UTC)
+    provision(folder, VEHICLE, signers.keys(), now)
+    for number in (5, 6):
+        accept(folder, signers.parameters(parameters, number, not_before=now - timedelta(days=1)), "f", database, now)
+        conclude(folder, number, passed=True, text="seen", now=now)
+    return folder
+
+
+@pytest.fixture
+def now() -> datetime:
+    return datetime.now(UTC)
+
+
+@pytest.fixture
+def in_force(tmp_path: Path, signers: Signers, parameters: VehicleParameters, database: VehicleDatabase) -> Path:
+    """State of a vehicle with number 5 in force."""
+    folder, now = tmp_path / "state", datetime.now(UTC)
+    provision(folder, VEHICLE, signers.keys(), now)
+    accept(folder, signers.parameters(parameters, 5, not_before=now - timedelta(days=1)), "f", database, now)
+    conclude(folder, 5, passed=True, text="seen", now=now)
+    return folder
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """The command line in this process: exit code, output, errors."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        code = main([str(argument) for argument in arguments])
+        return code, *capsys.readouterr()
+
+    return run

@@ -1,6 +1,6 @@
 """Signers, and what they sign, for the tests of trust."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -12,9 +12,12 @@ from calibrator.signing.statements import signed_statement
 from ecu_node.parameters import VehicleParameters
 from ecu_node.trust.key_set import KeySet
 from ecu_node.trust.statements import Revocation, SignedParameters
+from tests.ecu_node.vehicles import LAYOUT
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 VEHICLE = "v1"
+Run = Callable[..., tuple[int, str, str]]
+"""A command line, and what comes of it: exit code, output, errors."""
 
 
 def time_text(when: datetime) -> str:
@@ -71,3 +74,8 @@ def make_signers(folder: Path) -> Signers:
         signers={name: read_signer(private, None) for name, (private, _) in paths.items()},
         public={name: read_public_key(public) for name, (_, public) in paths.items()},
     )
+
+
+def on(state: Path) -> list[object]:
+    """Options of a command for a vehicle."""
+    return ["--state", state, "--layout", LAYOUT]
