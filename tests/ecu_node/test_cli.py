@@ -113,8 +113,9 @@ def test_run_does_not_claim_to_correct_what_it_cannot_publish(
         signal.signal(signal.SIGHUP, handlers[2])
     assert signal.getsignal(signal.SIGINT) == handlers[1]
     lines = capsys.readouterr().err.splitlines()
-    assert lines[0].startswith("ecu-node: branch heater is not published: ")
-    assert lines[1] == "ecu-node: running on virtual c0, correcting battery"
+    assert lines[0] == "ecu-node: parameters are used that nobody signed (--unsigned)"
+    assert lines[1].startswith("ecu-node: branch heater is not published: ")
+    assert lines[2] == "ecu-node: running on virtual c0, correcting battery"
 
 
 @pytest.mark.parametrize("more", [["--channel", ""], ["--channel", "c0", "--gateway", ""]])

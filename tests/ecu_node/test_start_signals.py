@@ -14,6 +14,7 @@ from tests.ecu_node.vehicles import LAYOUT
 
 AT = """
 import signal, sys
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whatever the tests were started with
 def hook(event, arguments):
     if event == {event!r} and str(arguments[0]) == {what!r}:
         signal.raise_signal({number})

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 WRITING = ("openat", "write", "fsync", "rename", "unlink", "fchown")
 """System calls with which the state of a vehicle is changed."""
 LONGEST_RUN_S = 60.0
-_LINE = re.compile(r"\d+ (?P<name>\w+)\((?P<arguments>.*)\) += (?P<result>-?\d+)")
+_LINE = re.compile(r"\d+ +(?P<name>\w+)\((?P<arguments>.*)\) += (?P<result>-?\d+)")
 _PATH = re.compile(r'(?:<|")(/[^">]*)(?:>|")')
 
 
