@@ -78,7 +78,7 @@ def test_a_power_takes_every_voltage(make_database: MakeDatabase, tmp_path: Path
 @needs_compiler
 def test_no_code_is_undefined_behaviour(make_database: MakeDatabase, tmp_path: Path) -> None:
     wide = SMALL_DBC.replace("7|16@0- (0.1,0) [-3000|3000]", "7|32@0- (0.001,0) [0|0]").replace("23|16@0-", "39|16@0-")
-    database = make_database(dbc=wide)
+    database = make_database(dbc=wide.replace("VAL_ 256 Battery -32768", f"VAL_ 256 Battery {-1 << 31}"))
     parameters = with_branch(
         parameters_for(database, **SMALL_FAULTS), "motor", GainBySign(drift_positive=0.02, drift_negative=-0.03)
     )

@@ -162,7 +162,7 @@ def test_currents_of_32_bits_are_exact(make_database: MakeDatabase, tmp_path: Pa
 
 def test_currents_of_48_bits_are_exact(make_database: MakeDatabase, tmp_path: Path) -> None:
     dbc = SMALL_DBC.replace("7|16@0- (0.1,0) [-3000|3000]", "7|48@0- (0.00001,0) [0|0]").replace("23|16@0-", "55|16@0-")
-    database, rng = make_database(dbc=dbc), Random(7)
+    database, rng = make_database(dbc=dbc.replace("VAL_ 256 Battery -32768", f"VAL_ 256 Battery {-1 << 47}")), Random(7)
     frames = [("Pair", rng.randbytes(8)) for _ in range(50_000)]
     export = compiled(database, parameters_for(database, battery=(0.0517, -2.3456789), motor=(0.0, 0.0)), tmp_path)
     assert assert_same(export, frames) > 45_000
