@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from securesystemslib.signer import CryptoSigner
 
 from calibrator.errors import ContradictionError, SigningError
 from calibrator.folders import require_possible_folder
@@ -15,15 +16,15 @@ from calibrator.signing.key_files import PASSPHRASE_VARIABLE, new_key, read_publ
 from calibrator.signing.statements import signed_anew, signed_statement
 from ecu_node.errors import TrustError
 from ecu_node.parameters import read_parameters, write_atomically
-from ecu_node.trust.canonical import canonical_bytes, read_bytes, read_canonical
-from ecu_node.trust.key_set import KeySet, check_key_set
+from ecu_node.trust.canonical import Expected, canonical_bytes, read_bytes, read_canonical
+from ecu_node.trust.key_set import SIGNER_NAME, KeySet, check_key_set
 from ecu_node.trust.statements import Revocation, SignedParameters, open_statement
 
 __all__ = ["keys", "revoke", "sign"]
 
 _TIME = "%Y-%m-%dT%H:%M:%SZ"
 _DAYS, _LONGEST_DAYS = 365, 3650
-_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
+_REVOCATION = Expected(what="a revocation that a vehicle would take", advice="change the options")
 
 keys = typer.Typer(help="Keys of signers, and the set of them that vehicles trust.", no_args_is_help=True)
 
@@ -57,7 +58,7 @@ def new(
         raise ContradictionError(
             f"give either a passphrase for the private key (${PASSPHRASE_VARIABLE}) or --no-passphrase"
         )
-    if not re.fullmatch(_NAME, name):
+    if not re.match(SIGNER_NAME, name):
         raise SigningError(f"{name!r}: a name of letters, digits, '.', '_' and '-' is expected")
     require_possible_folder(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -120,7 +121,7 @@ def sign(
                 allow_large_step=allow_large_step,
                 parameters=read_parameters(path),
             )
-            files[out / path.name] = signed_statement(statement, signers)
+            files[out / path.name] = _signed(statement, signers, path)
         else:
             files[out / path.name] = signed_anew(open_statement(content, str(path))[0], signers)
     if len(files) < len(params):
@@ -146,8 +147,18 @@ def revoke(
         revokes=sorted(set(number)),
         why=why,
     )
-    read_canonical(canonical_bytes(statement), Revocation, "revocation")
+    read_canonical(canonical_bytes(statement), Revocation, "revocation", _REVOCATION)
     _write({out: signed_statement(statement, [read_signer(path, _passphrase()) for path in key])}, replace=False)
+
+
+def _signed(statement: SignedParameters, signers: list[CryptoSigner], path: Path) -> bytes:
+    """A signed file that can be read again."""
+    try:
+        content = signed_statement(statement, signers)
+        open_statement(content, "signed")
+    except TrustError as error:
+        raise SigningError(f"{path}: no vehicle could read this signed: {error}") from None
+    return content
 
 
 def _signed_before(path: Path) -> bytes | None:

@@ -29,6 +29,8 @@ __all__ = ["PASSPHRASE_VARIABLE", "NamedKey", "new_key", "read_public_key", "rea
 PASSPHRASE_VARIABLE = "CALIBRATOR_KEY_PASSPHRASE"  # noqa: S105  # its name
 """Environment variable with the passphrase of private keys."""
 _LARGEST_KEY_BYTES = 100_000
+_LONGEST_PASSPHRASE_BYTES = 1023
+"""OpenSSL takes no longer one."""
 
 
 class NamedKey(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -58,7 +60,7 @@ def new_key(name: str, folder: Path, passphrase: str | None) -> tuple[Path, Path
     Raises
     ------
     SigningError
-        If there are such files already, or they cannot be written.
+        If there are such files already, they cannot be written, or the passphrase is too long.
     """
     private, public = folder / f"{name}.key", folder / f"{name}.pub"
     for path in (private, public):
@@ -88,10 +90,12 @@ def new_key(name: str, folder: Path, passphrase: str | None) -> tuple[Path, Path
 def _encryption(passphrase: str | None) -> KeySerializationEncryption:
     if passphrase is None:
         return NoEncryption()
-    try:
-        return BestAvailableEncryption(os.fsencode(passphrase))
-    except ValueError as error:
-        raise SigningError(f"${PASSPHRASE_VARIABLE}: no passphrase: {error}") from None
+    if len(os.fsencode(passphrase)) > _LONGEST_PASSPHRASE_BYTES:
+        raise SigningError(
+            f"${PASSPHRASE_VARIABLE}: longer than {_LONGEST_PASSPHRASE_BYTES} bytes, which no key can be encrypted "
+            f"with; take a shorter one"
+        )
+    return BestAvailableEncryption(os.fsencode(passphrase))
 
 
 def _not_written(folder: Path, error: OSError) -> SigningError:

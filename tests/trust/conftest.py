@@ -1,14 +1,17 @@
 """Signers, a vehicle, and its state."""
 
+import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
+from calibrator.cli import main as calibrator_main
+from calibrator.signing.key_files import PASSPHRASE_VARIABLE
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
-from ecu_node.parameters import VehicleParameters
+from ecu_node.parameters import VehicleParameters, write_parameters
 from ecu_node.trust.activation import accept, conclude, provision
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
 from tests.trust.signing import NOW, VEHICLE, Run, Signers, make_signers
@@ -73,3 +76,34 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
         return code, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture
+def calibrator(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+    """The command line in this process: exit code, output, errors; without a passphrase in the environment."""
+    monkeypatch.delenv(PASSPHRASE_VARIABLE, raising=False)
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["calibrator", *map(str, arguments)])
+        code = calibrator_main()
+        return code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def keys(calibrator: Run, tmp_path: Path) -> Path:
+    """Folder with keys of a, b and c, not encrypted, and the set of them."""
+    folder = tmp_path / "keys"
+    for name in "abc":
+        assert calibrator("keys", "new", name, "--no-passphrase", "--out", folder)[0] == 0
+    public = [folder / f"{name}.pub" for name in "abc"]
+    assert calibrator("keys", "set", *public, "--threshold", 2, "--out", folder / "set.json")[0] == 0
+    return folder
+
+
+@pytest.fixture
+def params(parameters: VehicleParameters, tmp_path: Path) -> Path:
+    path = tmp_path / "v1.json"
+    write_parameters(parameters, path)
+    return path

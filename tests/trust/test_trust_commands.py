@@ -107,7 +107,7 @@ def resigned(signers: Signers, file: bytes, old: bytes, new: bytes) -> bytes:
         ("zeros", lambda file: bytes(5000), "its end is missing"),
         ("line in a name", lambda file: b'{"a\\nb\\u001b[2J":1}\n', "unknown field `a\\nb\\x1b[2J`"),
         ("long name", lambda file: b'{"' + b"a" * 100_000 + b'":1}\n', "unknown field `aaaa"),
-        ("line in a key", lambda file: _keyid(file, "a\nb"), "signed with key a\\nb, which is not trusted here"),
+        ("line in a key", lambda file: _keyid(file, "\nb"), "signed with key \\nb, which is not trusted here"),
         ("other signature", lambda file: _keyid(file, ""), "not a signed file"),
     ],
 )

@@ -1,0 +1,180 @@
+"""``calibrator keys``: what goes wrong is one line, and private keys stay private."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, generate_private_key
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+
+from calibrator.signing.key_files import PASSPHRASE_VARIABLE
+from ecu_node.trust.statements import verify
+from tests.trust.signing import Run
+from tests.trust.signing_steps import by, full_disk, key_set, require_one_line
+
+PASSPHRASE = "correct horse battery staple"
+
+
+def test_a_private_key_is_for_its_owner_alone_and_never_printed(calibrator: Run, tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        code, out, err = calibrator("keys", "new", "a", "--no-passphrase", "--out", tmp_path)
+    finally:
+        os.umask(before)
+    assert (code, out, err) == (0, f"{tmp_path}/a.key\n{tmp_path}/a.pub\n", "")
+    assert (tmp_path / "a.key").stat().st_mode & 0o777 == 0o600
+    secret = (tmp_path / "a.key").read_text().splitlines()[1]
+    assert secret not in (tmp_path / "a.pub").read_text()
+
+
+def test_an_encrypted_key_signs_with_its_passphrase_alone(
+    calibrator: Run, params: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(PASSPHRASE_VARIABLE, PASSPHRASE)
+    assert calibrator("keys", "new", "a", "--out", tmp_path)[0] == 0
+    assert "ENCRYPTED" in (tmp_path / "a.key").read_text()
+    sign = ["sign", params, "--key", tmp_path / "a.key", "--out", tmp_path / "signed"]
+    monkeypatch.setenv(PASSPHRASE_VARIABLE, "another")
+    require_one_line(calibrator(*sign), "or another passphrase")
+    monkeypatch.setenv(PASSPHRASE_VARIABLE, PASSPHRASE)
+    code, out, err = calibrator(*sign)
+    assert (code, err) == (0, "")
+    assert PASSPHRASE not in out
+    monkeypatch.delenv(PASSPHRASE_VARIABLE)
+    require_one_line(calibrator(*sign, "--replace"), "it is encrypted; see $")
+
+
+def test_a_passphrase_for_a_key_that_is_not_encrypted_is_refused(
+    calibrator: Run, keys: Path, params: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(PASSPHRASE_VARIABLE, PASSPHRASE)
+    done = calibrator("sign", params, *by(keys, "a"), "--out", tmp_path / "signed")
+    require_one_line(done, "it is not encrypted, and yet a passphrase is given")
+
+
+@pytest.mark.parametrize(
+    ("passphrase", "options", "words", "code"),
+    [
+        (None, [], "give either a passphrase", 2),
+        (PASSPHRASE, ["--no-passphrase"], "give either a passphrase", 2),
+        ("x" * 2000, [], "longer than 1023 bytes", 1),
+    ],
+)
+def test_a_key_needs_a_passphrase_or_the_word_that_it_has_none(
+    passphrase: str | None,
+    options: list[str],
+    words: str,
+    code: int,
+    calibrator: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if passphrase is not None:
+        monkeypatch.setenv(PASSPHRASE_VARIABLE, passphrase)
+    require_one_line(calibrator("keys", "new", "a", "--out", tmp_path / "k", *options), words, code)
+    assert not list(tmp_path.rglob("*.key"))
+
+
+def test_a_passphrase_that_is_no_text_is_one_all_the_same(
+    calibrator: Run, params: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(PASSPHRASE_VARIABLE, "\udcff\udcfe")
+    assert calibrator("keys", "new", "a", "--out", tmp_path)[0] == 0
+    assert calibrator("sign", params, "--key", tmp_path / "a.key", "--out", tmp_path / "signed")[0] == 0
+
+
+@pytest.mark.parametrize("name", ["", ".", "../a", "a b", "a/b", "a\n", "x" * 65, "-"])
+def test_a_signers_name_is_one_that_files_can_have(name: str, calibrator: Run, tmp_path: Path) -> None:
+    done = calibrator("keys", "new", "--no-passphrase", "--out", tmp_path, "--", name)
+    require_one_line(done, "a name of letters, digits, '.', '_' and '-' is expected")
+
+
+def test_a_key_that_exists_is_never_replaced(calibrator: Run, keys: Path) -> None:
+    before = (keys / "a.key").read_bytes()
+    require_one_line(calibrator("keys", "new", "a", "--no-passphrase", "--out", keys), "there is a key already")
+    (keys / "a.key").rename(keys / "kept")
+    require_one_line(calibrator("keys", "new", "a", "--no-passphrase", "--out", keys), "there is a key already")
+    assert (keys / "kept").read_bytes() == before
+
+
+def foreign(path: Path) -> None:
+    """A private key of another kind."""
+    key = generate_private_key(SECP256R1())
+    path.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+
+
+def public(path: Path) -> None:
+    path.write_bytes(path.with_name("a.pub").read_bytes())
+
+
+def torn(path: Path) -> None:
+    path.write_bytes(path.with_name("a.key").read_bytes()[:60])
+
+
+def huge(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 1 << 30)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (foreign, "a private key, but not of kind Ed25519"),
+        (public, "no private key (PEM)"),
+        (torn, "no private key (PEM)"),
+        (lambda path: path.write_bytes(b"\xff\x00"), "no private key (PEM)"),
+        (huge, "not a private key: it is larger than"),
+        (Path.mkdir, "not a private key: it is a folder"),
+        (os.mkfifo, "not a private key: it is a pipe"),
+        (lambda path: None, "cannot read the private key: No such file"),
+    ],
+)
+def test_what_is_no_private_key_is_refused(
+    make: Callable[[Path], object], words: str, calibrator: Run, keys: Path, params: Path, tmp_path: Path
+) -> None:
+    make(keys / "x.key")
+    done = calibrator("sign", params, *by(keys, "ax"), "--out", tmp_path / "signed")
+    require_one_line(done, f"{keys}/x.key: ")
+    assert words in done[2]
+    assert not (tmp_path / "signed").exists()
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "words"),
+    [
+        ("aa", ["--threshold", "2"], "one key is given twice"),
+        ("ab", ["--threshold", "3"], "3 signers are needed, and 2 keys are there"),
+    ],
+)
+def test_a_key_set_that_cannot_work_is_refused(
+    names: str, options: list[str], words: str, calibrator: Run, keys: Path, tmp_path: Path
+) -> None:
+    files = [keys / f"{name}.pub" for name in names]
+    require_one_line(calibrator("keys", "set", *files, *options, "--out", tmp_path / "s"), words)
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_key_set_is_made_of_public_keys_alone(calibrator: Run, keys: Path, tmp_path: Path) -> None:
+    (keys / "cut.pub").write_bytes((keys / "a.pub").read_bytes()[:50])
+    for name in ("a.key", "cut.pub", "set.json", "none.pub"):
+        done = calibrator("keys", "set", keys / name, "--threshold", 1, "--out", tmp_path / "s")
+        require_one_line(done, f"{keys / name}: not a public key")
+
+
+def test_only_a_later_key_set_is_signed(calibrator: Run, keys: Path, tmp_path: Path) -> None:
+    make = ["keys", "set", keys / "a.pub", "--threshold", 1, "--out", tmp_path / "s"]
+    require_one_line(calibrator(*make, *by(keys, "a")), "the first key set is not signed", 2)
+    require_one_line(calibrator(*make, "--version", 2), "every later one is", 2)
+    assert calibrator(*make, "--version", 2, *by(keys, "ab"))[0] == 0
+    assert verify((tmp_path / "s").read_bytes(), key_set(keys), "f").signers == ["a", "b"]
+    require_one_line(calibrator(*make, "--version", 2, *by(keys, "ab")), "there is a file already")
+
+
+@pytest.mark.parametrize("free_bytes", [0, 60, 150])
+def test_a_key_on_a_full_disk_leaves_nothing(free_bytes: int, calibrator: Run, tmp_path: Path) -> None:
+    """The private key has 119 bytes, the public one more."""
+    with full_disk(free_bytes):
+        done = calibrator("keys", "new", "a", "--no-passphrase", "--out", tmp_path)
+    require_one_line(done, f"{tmp_path}: no key can be written there: File too large")
+    assert list(tmp_path.iterdir()) == []
