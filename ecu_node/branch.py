@@ -216,8 +216,8 @@ class LiveBranch:
         self.plan = self._correcting if corrects and self._correcting is not None else self._passing
         self.quality = Quality.CORRECTED if corrects else Quality.PASSED_THROUGH
         self._fix = _fixer(self.codes, self.plan, self.voltage, self.counters)
-        latest = self.latest() if self.out is not None else None
-        if latest is not None:  # what is still published is to be of the quality that is told of it
+        latest = None if self._spoilt else self.latest()
+        if latest is not None:  # what is published of the last code is to be of the quality that is told of it
             self.out = self._fix(latest[1])
         for react in self.when_changed:
             react()

@@ -288,10 +288,6 @@ def _parts(database: VehicleDatabase) -> _Parts:
         parts.signals.append((name, item))
         return item
 
-    temperature_name, temperature_codes = _input_signal(database, layout.temperature), _temperature_codes(database)
-    temperature = None
-    if temperature_name is not None and temperature_codes is not None:
-        temperature = auxiliary(temperature_name, temperature_codes, layout.max_age_s)
     whole_name = _input_signal(database, layout.watch.input)
     if whole_name is not None:
         unit = database.signal(whole_name)[1].unit or ""
@@ -305,6 +301,10 @@ def _parts(database: VehicleDatabase) -> _Parts:
             codes = _codes(database, branch.voltage, VOLT, f"branch {branch.name}")
             timeout_s = max(item.timeout_s for item in layout.branch if item.voltage == branch.voltage)
             voltages[branch.voltage] = auxiliary(branch.voltage, codes, timeout_s)
+    temperature_name, temperature_codes = _input_signal(database, layout.temperature), _temperature_codes(database)
+    temperature = None  # after the voltages, as a new temperature makes values anew, with the voltage of its frame
+    if temperature_name is not None and temperature_codes is not None:
+        temperature = auxiliary(temperature_name, temperature_codes, layout.max_age_s)
     for branch in layout.branch:
         signals = branch_signals(database, branch, Mode.GATEWAY)
         live = LiveBranch(

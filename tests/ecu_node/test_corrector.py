@@ -467,6 +467,50 @@ def test_what_is_still_published_is_of_the_quality_that_is_told_of_it(make_datab
         assert decoded(database, "PairOut", answer.data)["Motor"] == motor_a
 
 
+def test_a_new_temperature_makes_the_last_value_anew_with_the_voltage_of_its_frame(make_database: MakeDatabase) -> None:
+    layout = SMALL_LAYOUT.replace(
+        'voltage = "Net.Voltage" }',
+        'voltage = "Net.Voltage", corrected = "PairOut.Power", timeout_s = 60.0 }',
+    ).replace("branch = [", 'temperature = "heat"\nbranch = [', 1)
+    layout += '[[input]]\nname = "heat"\nsignal = "Net.Heat"\n'
+    dbc = SMALL_DBC.replace(
+        ' SG_ Voltage : 0|16@1+ (0.01,0) [0|650] "V" Node\n',
+        ' SG_ Voltage : 0|16@1+ (0.01,0) [0|650] "V" Node\n SG_ Heat : 16|8@1+ (1,-40) [-40|210] "degC" Node\n',
+    ).replace("258 Net: 2", "258 Net: 3")
+    dbc = dbc.replace(
+        ' SG_ Quality : 32|2@1+ (1,0) [0|3] "" Node\n',
+        ' SG_ Quality : 32|2@1+ (1,0) [0|3] "" Node\n SG_ Power : 34|16@1+ (1,0) [0|60000] "W" Node\n',
+    )
+    database = make_database(layout, dbc + 'VAL_ 512 Power 65535 "SNA";\n')
+    parameters = parameters_for(database, battery=(0.0, 0.0), heater=(0.0, 10.0))
+    model = TemperatureDrift(drift_per_k=0.01, reference_c=25.0)
+    bent = {**parameters.branches, "heater": replace(parameters.branches["heater"], sensor_model=model)}
+    corrector = wire(database, InForce(parameters=replace(parameters, branches=bent)), start_s=0.0)
+    pair = Frame(PAIR, database.message("Pair").encode({"Battery": 0.0, "Motor": 0.0}))
+
+    def power_w() -> float:
+        (answer,) = answers(corrector, pair, 0.0)
+        return float(decoded(database, "PairOut", answer.data)["Power"])
+
+    def net(voltage_code: int, celsius: float) -> None:
+        data = voltage_code.to_bytes(2, "little") + bytes([int(celsius) + 40])
+        answers(corrector, Frame(NET, data), 0.0)
+
+    answers(corrector, Frame(HEATER, database.message("Heater").encode({"Power": 3000.0})), 0.0)
+    assert power_w() == 3000.0, "passed through: no temperature"
+    net(65535, 25.0)
+    assert power_w() == 65535.0, "no value without a voltage"
+    net(30000, 25.0)
+    assert power_w() == 65535.0, "a voltage alone changes nothing before the next power"
+    net(20000, 0.0)
+    assert power_w() == round((3000.0 + 10.0 * 200.0) / 0.75)
+    net(20000, 25.0)
+    assert power_w() == 5000.0
+    answers(corrector, Frame(HEATER, bytes(1)), 0.0)
+    net(20000, 0.0)
+    assert power_w() == 65535.0, "of a frame that was cut off nothing is made"
+
+
 def test_shadow_mode_computes_and_changes_nothing(database: VehicleDatabase) -> None:
     parameters = parameters_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
     corrector = wire(database, InForce(parameters=parameters), start_s=0.0, shadow=True)

@@ -116,7 +116,7 @@ class _Branch:
         applied = branch.known and branch.apply
         fault = (branch.drift, branch.offset_a, branch.model) != (0.0, 0.0, None)
         self._corrects = applied and fault
-        self._seen, self._code = False, 0
+        self._seen, self._spoilt, self._code = False, False, 0
         self._outcomes = [_Outcome(None, Quality.NOT_AVAILABLE)]
 
     @property
@@ -138,7 +138,7 @@ class _Branch:
 
     def spoil(self) -> None:
         """A frame came that must not be used."""
-        self._outcomes = [_Outcome(None, Quality.INVALID)]
+        self._spoilt, self._outcomes = True, [_Outcome(None, Quality.INVALID)]
 
     def drift(self, code: int, voltage: int | None, temperature: Fraction | None) -> Fraction | None:
         """Drift that holds [1]; None: nothing is corrected."""
@@ -163,13 +163,13 @@ class _Branch:
 
     def take(self, code: int, voltage: int | None, temperature: Fraction | None) -> None:
         """Take the code of an intact frame."""
-        self._seen, self._code = True, code
+        self._seen, self._spoilt, self._code = True, False, code
         self._outcomes = [self._outcome(code, voltage, temperature)]
 
     def at_temperature(self, voltage: int | None, temperature: Fraction | None) -> None:
-        """The temperature changed: the last value may stay as it was, or be made anew, for which there may be none."""
-        if self._outcomes[-1].allowed is not None and isinstance(self.branch.model, TemperatureDrift):
-            self._outcomes = [self._outcomes[0], self._outcome(self._code, voltage, temperature)]
+        """The temperature changed: what the last code is worth is made anew."""
+        if self._seen and not self._spoilt and self._corrects and isinstance(self.branch.model, TemperatureDrift):
+            self._outcomes = [self._outcome(self._code, voltage, temperature)]
 
     def _outcome(self, code: int, voltage: int | None, temperature: Fraction | None) -> _Outcome:
         if not self.worth.is_value(code):
