@@ -6,18 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrator.drive import Array
-from calibrator.evidence.summary import DriveSummary
 from calibrator.options import Method
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import FileReference, Provenance
+from ecu_node.parameters import FileReference, JunctionResidual, Provenance
 
 __all__ = [
     "RunIdentity",
     "by_branch",
-    "correction_rms_a",
-    "junction_rms_a",
-    "junction_rms_of_blocks_a",
+    "current_moments",
+    "junction_residual",
 ]
 
 
@@ -73,8 +71,8 @@ def by_branch(branches: Sequence[str], values: Array) -> dict[str, float]:
     return dict(zip(branches, values.tolist(), strict=True))
 
 
-def junction_rms_a(mean_a: Array, product_a2: Array, *, drift: Array, offset_a: Array) -> float:
-    """Root mean square of the Kirchhoff sum after correction with given sensor faults.
+def current_moments(mean_a: Array, product_a2: Array) -> Array:
+    """Moments of the measured currents and of 1, of one block.
 
     Parameters
     ----------
@@ -82,58 +80,51 @@ def junction_rms_a(mean_a: Array, product_a2: Array, *, drift: Array, offset_a: 
         Mean measured currents. [A]
     product_a2 : ndarray of shape (K, K)
         Mean products of measured currents. [A^2]
-    drift, offset_a : ndarray of shape (K,)
-        Sensor faults to correct; zeros give the sum of the measured currents. [1], [A]
 
     Returns
     -------
-    float
-        RMS of sum_k (i_m,k - o_k) / (1 + d_k) over all valid samples. [A]
+    ndarray of shape (1, K + 1, K + 1)
+        Mean products of (i_m,1 ... i_m,K, 1).
     """
-    weight = 1.0 / (1.0 + drift)
-    constant = float(weight @ offset_a)
-    mean_square = weight @ product_a2 @ weight - 2.0 * constant * float(weight @ mean_a) + constant**2
-    return float(np.sqrt(max(float(mean_square), 0.0)))
+    row = np.append(mean_a, 1.0)
+    return np.block([[product_a2, mean_a[:, None]], [row[None, :]]])[None]
 
 
-def correction_rms_a(mean_a: Array, product_a2: Array, *, drift: Array, offset_a: Array) -> float:
-    """Root mean square of what the correction takes from the Kirchhoff sum.
+def junction_residual(moments: Array, *, gain: Array, offset_a: Array, expected_a: float) -> JunctionResidual:
+    """What the Kirchhoff sum is before and after correction with given sensor faults.
 
     Parameters
     ----------
-    mean_a, product_a2, drift, offset_a :
-        As for :func:`junction_rms_a`.
-
-    Returns
-    -------
-    float
-        RMS of sum_k i_m,k - (i_m,k - o_k) / (1 + d_k) over all valid samples. [A]
-    """
-    weight = 1.0 / (1.0 + drift)
-    change, constant = 1.0 - weight, float(weight @ offset_a)
-    mean_square = change @ product_a2 @ change + 2.0 * constant * float(change @ mean_a) + constant**2
-    return float(np.sqrt(max(float(mean_square), 0.0)))
-
-
-def junction_rms_of_blocks_a(summary: DriveSummary, *, gain: Array, offset_a: Array) -> float:
-    """Root mean square of the Kirchhoff sum where the gains of the sensors differ between the blocks of the drives.
-
-    Parameters
-    ----------
-    summary : DriveSummary
-        Of B blocks.
+    moments : ndarray of shape (B, K + 1, K + 1)
+        Sums or means of products of (i_m,1 ... i_m,K, 1), of each block of the drives. [A^2]
     gain : ndarray of shape (B, K)
-        What each current is divided by. [1]
+        What each current is divided by, 1 where it is not corrected. [1]
     offset_a : ndarray of shape (K,)
         What is taken from it before. [A]
+    expected_a : float
+        Mean sum that right sensors would show: the load that none of them sees. [A]
 
     Returns
     -------
-    float
-        RMS of sum_k (i_m,k - o_k) / gain_k over all valid samples. [A]
+    JunctionResidual
+        Of sum_k i_m,k and sum_k (i_m,k - o_k) / gain_k over all valid samples.
     """
     weight = 1.0 / gain
-    combined = np.column_stack([weight, -weight @ offset_a])
-    moments = summary.moments[:, summary.inputs :, summary.inputs :]
-    square = np.einsum("bk,bkl,bl->", combined, moments, combined)
-    return float(np.sqrt(max(float(square) / float(summary.total[-1, -1]), 0.0)))
+    corrected = np.column_stack([weight, -weight @ offset_a])
+    measured = np.column_stack([np.ones_like(weight), np.zeros(len(weight))])
+    samples = float(moments[:, -1, -1].sum())
+
+    def rms(sums: Array) -> float:
+        return float(np.sqrt(max(float(np.einsum("bk,bkl,bl->", sums, moments, sums)) / samples, 0.0)))
+
+    def mean(sums: Array) -> float:
+        return float(np.einsum("bk,bk->", sums, moments[:, :, -1])) / samples
+
+    return JunctionResidual(
+        measured_a=rms(measured),
+        corrected_a=rms(corrected),
+        correction_a=rms(measured - corrected),
+        measured_mean_a=mean(measured),
+        corrected_mean_a=mean(corrected),
+        expected_a=expected_a,
+    )

@@ -91,7 +91,9 @@ class Corrector:
         if status_fields is not None and status_fields.protection is not None:
             status_fields.protection.before_first(self._payload)
 
-    def put_in_force(self, *, reason: Reason, parameter_set: int, predicted_worse_a: float) -> None:
+    def put_in_force(
+        self, *, reason: Reason, parameter_set: int, expected_a: float = 0.0, predicted_worse_a: float = 0.0
+    ) -> None:
         """Begin with what the branches were just given; what was latched is released.
 
         Parameters
@@ -100,11 +102,11 @@ class Corrector:
             NONE if there are parameters that fit.
         parameter_set : int
             Its number as it is published; 0 where there is none.
-        predicted_worse_a : float
+        expected_a, predicted_worse_a : float
             See :meth:`JunctionWatch.restart`. [A]
         """
         self.reason, self.parameter_set = reason, parameter_set
-        self.watch.restart(predicted_worse_a=predicted_worse_a)
+        self.watch.restart(expected_a=expected_a, predicted_worse_a=predicted_worse_a)
         self._latch(Reason.NONE)
         self.told = self.state()
 

@@ -100,15 +100,19 @@ class JunctionWatch:
         self._stuck_a, self._rest_a = _STUCK_SHARE * full_scale_a, _REST_SHARE * full_scale_a
         self.restart()
 
-    def restart(self, *, predicted_worse_a: float = 0.0) -> None:
+    def restart(self, *, expected_a: float = 0.0, predicted_worse_a: float = 0.0) -> None:
         """Forget what was seen.
 
         Parameters
         ----------
+        expected_a : float
+            What right sensors would show: the load that none of them sees. Sums are judged by how far they are from
+            it. [A]
         predicted_worse_a : float
-            By how much the calibrator itself expects the corrected sum to be worse, as where an offset hides a load
-            that no sensor sees; added to the margin, up to ten times that. [A]
+            By how much the calibrator itself expects the corrected sum to be worse, as where one of two offsets that
+            cancel is corrected; added to the margin, up to ten times that. [A]
         """
+        self._expected_a = expected_a
         self._allowed_a = self._margin_a * (1.0 + min(max(predicted_worse_a / self._margin_a, 0.0), _MOST_MARGINS))
         self.forget()
 
@@ -147,7 +151,11 @@ class JunctionWatch:
             if not self._past or now_s - self._past[-1].time_s >= self._window_s / _MOST_LOOKS:
                 self._past.append(_Looks(now_s))
             latest = {branch.name: branch.latest() for branch in self._branches if branch.name in currents}
-            self._past[-1].add(self.sums, {name: found[1] for name, found in latest.items() if found is not None})
+            self._past[-1].add(
+                self.sums.measured_a - self._expected_a,
+                self.sums.corrected_a - self._expected_a,
+                {name: found[1] for name, found in latest.items() if found is not None},
+            )
         while self._past and now_s - self._past[0].time_s > self._window_s:
             self._past.popleft()
         return self.sums
@@ -185,7 +193,7 @@ class JunctionWatch:
 
 
 class _Looks:
-    """Sums and codes of some looks at the junction, one after the other."""
+    """Sums, less what is expected, and codes of some looks at the junction, one after the other."""
 
     def __init__(self, time_s: float) -> None:
         self.time_s, self.count = time_s, 0
@@ -193,10 +201,10 @@ class _Looks:
         self.codes: dict[str, int | None] = {}
         """By branch, the code of all of them; None if there were several."""
 
-    def add(self, sums: JunctionSums, codes: Mapping[str, int]) -> None:
+    def add(self, measured_a: float, corrected_a: float, codes: Mapping[str, int]) -> None:
         self.count += 1
-        self.measured += sums.measured_a
-        self.measured2 += sums.measured_a**2
-        self.corrected2 += sums.corrected_a**2
+        self.measured += measured_a
+        self.measured2 += measured_a**2
+        self.corrected2 += corrected_a**2
         before = self.codes
         self.codes = {name: code if before.get(name, code) == code else None for name, code in codes.items()}

@@ -4,6 +4,7 @@ JSON, UTF-8, one file per vehicle. The structures below are the schema: ``ecu-no
 made from them, which stands in ``ecu_node/parameters.schema.json``. Currents are positive into the junction.
 """
 
+import math
 import os
 import tempfile
 from pathlib import Path
@@ -54,6 +55,8 @@ HeldBack = Literal[
 _Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$", description="SHA-256, line ends counted as LF")]
 _Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 _NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+_MeanSum = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+_RmsSum = Annotated[float, msgspec.Meta(ge=0.0, le=1e6)]
 
 
 class BranchParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -105,13 +108,33 @@ class Explanation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class JunctionResidual(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Root mean square of the Kirchhoff sum on the drives used."""
+    """Kirchhoff sum on the drives used."""
 
-    measured_a: Annotated[_NotNegative, msgspec.Meta(description="from measured currents [A]")]
-    corrected_a: Annotated[_NotNegative, msgspec.Meta(description="from corrected currents [A]")]
+    measured_a: Annotated[_RmsSum, msgspec.Meta(description="root mean square, from measured currents [A]")]
+    corrected_a: Annotated[_RmsSum, msgspec.Meta(description="the same from corrected currents [A]")]
     correction_a: Annotated[
-        _NotNegative | None, msgspec.Meta(description="of the difference of the two; null: not known [A]")
+        _RmsSum | None, msgspec.Meta(description="the same of the difference of the two; null: not known [A]")
     ] = None
+    measured_mean_a: Annotated[
+        _MeanSum | None, msgspec.Meta(description="mean, from measured currents; null: not known [A]")
+    ] = None
+    corrected_mean_a: Annotated[
+        _MeanSum | None, msgspec.Meta(description="the same from corrected currents; null: not known [A]")
+    ] = None
+    expected_a: Annotated[
+        _MeanSum, msgspec.Meta(description="mean sum that right sensors show: a load that none of them sees [A]")
+    ] = 0.0
+
+    def about_expected(self) -> tuple[float, float]:
+        """Root mean squares of measured and corrected sum less what is expected; as they are if no means are known."""
+        if self.measured_mean_a is None or self.corrected_mean_a is None:
+            return self.measured_a, self.corrected_a
+        sums = ((self.measured_a, self.measured_mean_a), (self.corrected_a, self.corrected_mean_a))
+        measured_a, corrected_a = (
+            math.sqrt(max(rms_a**2 - 2.0 * self.expected_a * mean_a + self.expected_a**2, 0.0))
+            for rms_a, mean_a in sums
+        )
+        return measured_a, corrected_a
 
 
 class FileReference(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -242,6 +265,12 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
             Reason.WRONG_DBC,
             f"parameters were made with DBC {parameters.dbc.name} ({parameters.dbc.sha256[:12]}), "
             f"this is {layout.dbc_path} ({database.digest[:12]}); calibrate with this DBC",
+        )
+    if not abs(parameters.junction_residual.expected_a) <= layout.offset_limit_a:
+        raise UnfitError(
+            Reason.IMPLAUSIBLE_PARAMETERS,
+            f"an expected Kirchhoff sum of {parameters.junction_residual.expected_a:+.4g} A is beyond the layout's "
+            f"limit of offsets, {layout.offset_limit_a:g} A",
         )
     applied = [name for name, branch in parameters.branches.items() if branch.apply]
     if parameters.verdict in _UNDECIDED and applied:

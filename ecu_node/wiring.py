@@ -240,11 +240,15 @@ def put_in_force(
             expected_since_s=now_s if branch.name in found else None,
             counters=corrector.counters,
         )
-    residual = parameters.junction_residual if parameters is not None else None
+    if parameters is None:
+        corrector.put_in_force(reason=in_force.reason, parameter_set=0)
+        return
+    measured_a, corrected_a = parameters.junction_residual.about_expected()
     corrector.put_in_force(
         reason=in_force.reason,
-        parameter_set=parameters.number % PARAMETER_SETS if parameters is not None else 0,
-        predicted_worse_a=residual.corrected_a - residual.measured_a if residual is not None else 0.0,
+        parameter_set=parameters.number % PARAMETER_SETS,
+        expected_a=parameters.junction_residual.expected_a,
+        predicted_worse_a=corrected_a - measured_a,
     )
 
 

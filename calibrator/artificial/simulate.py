@@ -18,7 +18,7 @@ from calibrator.random_streams import Purpose, random_stream
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
-__all__ = ["FleetPlan", "simulate_fleet"]
+__all__ = ["FleetPlan", "balance_branch", "draw_vehicles", "simulate_fleet"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +98,7 @@ def simulate_fleet(
     """
     layout = database.layout
     branches = choose_branches(layout, trips.branches, plan.currents)
-    vehicles = _draw_vehicles(plan, layout, branches)
+    vehicles = draw_vehicles(plan, layout, branches)
     with whole_folder(out) as folder:
         tasks = (
             delayed(_write)(
@@ -118,7 +118,8 @@ def simulate_fleet(
     return fleet
 
 
-def _draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) -> list[Vehicle]:
+def draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) -> list[Vehicle]:
+    """Draw the vehicles of a fleet, each with what is wrong with it; of a plan, a layout, and the names of branches."""
     rng = random_stream(Purpose.FAULTS, plan.seed)
     faults = draw_faults(
         rng,
@@ -151,7 +152,7 @@ def _draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) -
 def _write(
     *, folder: Path, database: VehicleDatabase, vehicle: Vehicle, trips: TripSource, number: int, seed: int
 ) -> VehicleTruth:
-    balance = _balance_branch(database.layout, vehicle.branches)
+    balance = balance_branch(database.layout, vehicle.branches)
 
     def trip(purpose: TripPurpose) -> GroundTruth:
         return with_branches(trips.trip(number, purpose), vehicle.branches, balance)
@@ -161,8 +162,8 @@ def _write(
     )
 
 
-def _balance_branch(layout: Layout, branches: tuple[str, ...]) -> str:
-    """The branch that is minus the sum of the others: the layout's, or the last one as in (19) of the paper."""
+def balance_branch(layout: Layout, branches: tuple[str, ...]) -> str:
+    """Choose the branch that is minus the sum of the others: the layout's, or the last one as in (19) of the paper."""
     marked = [branch.name for branch in layout.branch if branch.balance and branch.name in branches]
     return marked[0] if marked else branches[-1]
 

@@ -22,7 +22,15 @@ from calibrator.recordings.canlog import FrameSeries, encode_message, sent_value
 from ecu_node.database import AMPERE, VehicleDatabase, unit_factor
 from ecu_node.layout import Branch, split_signal
 
-__all__ = ["Disturbances", "Vehicle", "draw_disturbances", "vehicle_drive", "vehicle_frames", "write_vehicle"]
+__all__ = [
+    "Disturbances",
+    "Vehicle",
+    "draw_disturbances",
+    "vehicle_currents",
+    "vehicle_drive",
+    "vehicle_frames",
+    "write_vehicle",
+]
 
 JITTER = 0.02
 """Standard deviation of a frame's instant in cycle times: a lightly loaded bus. [1]"""
@@ -166,7 +174,7 @@ def _sent_messages(
     rng: np.random.Generator, database: VehicleDatabase, vehicle: Vehicle, trip: GroundTruth
 ) -> Iterator[_Sent]:
     """Values of each message before they are encoded."""
-    i = _vehicle_currents(vehicle, trip)
+    i = vehicle_currents(vehicle, trip)
     for message_name, signals in _signals_by_message(database, vehicle.branches, trip).items():
         time_s = _frame_times(rng, database, message_name, trip)
         values: dict[str, Array] = {}
@@ -216,7 +224,7 @@ def write_vehicle(
         target = folder / kind / vehicle.name
         target.mkdir(parents=True, exist_ok=True)
         write_candump(target / LOG_NAME, vehicle_frames(rng, database, vehicle, trip))
-    i = _vehicle_currents(vehicle, unseen)
+    i = vehicle_currents(vehicle, unseen)
     faults, disturbances = vehicle.faults, vehicle.disturbances
 
     def by_branch(values: Array) -> dict[str, float]:
@@ -234,7 +242,7 @@ def write_vehicle(
     )
 
 
-def _vehicle_currents(vehicle: Vehicle, trip: GroundTruth) -> Array:
+def vehicle_currents(vehicle: Vehicle, trip: GroundTruth) -> Array:
     """True currents of the vehicle's branches, with what the unmeasured load draws from the first. [A]"""
     i = true_currents(trip.matrix_a(), vehicle.faults)
     i[:, 0] += vehicle.disturbances.unmeasured_a

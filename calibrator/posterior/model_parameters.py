@@ -6,13 +6,13 @@ import msgspec
 import numpy as np
 from scipy.special import expit, logit
 
-from calibrator.parameter_files import junction_rms_of_blocks_a
+from calibrator.parameter_files import junction_residual
 from calibrator.posterior.model_decision import JudgedSensor
 from calibrator.sensor_models.choice import LINEAR, PRIOR_SHARE, SensorModelChoice
 from calibrator.sensor_models.fleet import SensorFindings
 from calibrator.sensor_models.linear_part import sensor_parameters
 from calibrator.sensor_models.modelled import ModelledVehicle
-from ecu_node.parameters import BranchParameters, JunctionResidual, VehicleParameters
+from ecu_node.parameters import BranchParameters, VehicleParameters
 
 __all__ = ["finding_notices", "tell_sensors", "with_model_residual"]
 
@@ -128,9 +128,16 @@ def with_model_residual(
     for sensor in vehicle.sensors:
         if applied[sensor.branch]:
             gain[:, sensor.branch] *= sensor.block_gain()
-    corrected_a = junction_rms_of_blocks_a(parts, gain=gain, offset_a=np.where(applied, offset_a, 0.0))
-    measured_a = parameters.junction_residual.measured_a
-    residual = JunctionResidual(measured_a=measured_a, corrected_a=corrected_a)
+    before = parameters.junction_residual
+    found = junction_residual(
+        parts.moments[:, parts.inputs :, parts.inputs :],
+        gain=gain,
+        offset_a=np.where(applied, offset_a, 0.0),
+        expected_a=before.expected_a,
+    )
+    residual = msgspec.structs.replace(  # of the parts that are linear only what is corrected is that of the drives
+        before, corrected_a=found.corrected_a, corrected_mean_a=found.corrected_mean_a, correction_a=None
+    )
     return msgspec.structs.replace(parameters, junction_residual=residual)
 
 

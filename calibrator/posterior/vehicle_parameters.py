@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 
 from calibrator.evidence.vehicle_summary import VehicleSummary
-from calibrator.parameter_files import RunIdentity, by_branch, correction_rms_a, junction_rms_a
+from calibrator.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.posterior.advice import advise
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.explain import explanations
@@ -16,7 +16,6 @@ from ecu_node.parameters import (
     Explanation,
     HardwareFault,
     HeldBack,
-    JunctionResidual,
     VehicleParameters,
 )
 
@@ -86,9 +85,7 @@ def vehicle_parameters(
         As its parameter file says it.
     """
     j = position
-    faults, corrected, zeros = posterior.faults.take(j), deployment.corrected[j], np.zeros(len(branches))
-    moments = (vehicle.summary.mean_a, vehicle.summary.mean_product_a2)
-    deployed = {"drift": np.where(corrected, faults.drift, 0.0), "offset_a": np.where(corrected, faults.offset_a, 0.0)}
+    faults, corrected = posterior.faults.take(j), deployment.corrected[j]
     open_question = deployment.verdicts[j] == "cannot tell" or posterior.confidence[j] < 1.0 - UNTOLD
     told: list[Explanation] = []
     decisive = ""
@@ -109,10 +106,11 @@ def vehicle_parameters(
         ),
         explanations=told,
         deciding_evidence=decisive,
-        junction_residual=JunctionResidual(
-            measured_a=junction_rms_a(*moments, drift=zeros, offset_a=zeros),
-            corrected_a=junction_rms_a(*moments, **deployed),
-            correction_a=correction_rms_a(*moments, **deployed),
+        junction_residual=junction_residual(
+            current_moments(vehicle.summary.mean_a, vehicle.summary.mean_product_a2),
+            gain=np.where(corrected, 1.0 + faults.drift, 1.0)[None],
+            offset_a=np.where(corrected, faults.offset_a, 0.0),
+            expected_a=posterior.health.unmeasured_a if posterior.health is not None else 0.0,
         ),
         provenance=identity.provenance(
             fleet_size=fleet_size, drives=vehicle.drives, duration_s=vehicle.summary.duration_s

@@ -14,11 +14,11 @@ from calibrator.drive import Array
 from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
 from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_model
-from calibrator.parameter_files import RunIdentity, by_branch, correction_rms_a, junction_rms_a
+from calibrator.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.published.calibration import ExpectedFaults, calibrate_published
 from calibrator.published.recovery import Recovery
 from calibrator.vehicles import read_vehicles
-from ecu_node.parameters import BranchParameters, HardwareFault, JunctionResidual, VehicleParameters, Verdict
+from ecu_node.parameters import BranchParameters, HardwareFault, VehicleParameters, Verdict
 
 __all__ = ["calibrate_fleet_published", "few_vehicles_notice"]
 
@@ -191,12 +191,11 @@ def _parameters(
 ) -> VehicleParameters:
     """Write down what was found for one vehicle."""
     faults = recovery.faults.take(position)
-    zeros = np.zeros(len(branches))
-    moments = (vehicle.mean_a, vehicle.moment_a2)
-    residual = JunctionResidual(
-        measured_a=junction_rms_a(*moments, drift=zeros, offset_a=zeros),
-        corrected_a=junction_rms_a(*moments, drift=faults.drift, offset_a=faults.offset_a),
-        correction_a=correction_rms_a(*moments, drift=faults.drift, offset_a=faults.offset_a),
+    residual = junction_residual(
+        current_moments(vehicle.mean_a, vehicle.moment_a2),
+        gain=1.0 + faults.drift[None],
+        offset_a=faults.offset_a,
+        expected_a=0.0,
     )
     helps = residual.corrected_a <= residual.measured_a
     sensor = bool(recovery.classification.sensor[position])

@@ -14,8 +14,8 @@ from ecu_node.status import Reason
 from ecu_node.trust.activation import conclude, require_time, signed_parameters
 from ecu_node.trust.state import Slot, SlotName, TrustState, read_state, slot_path, state_path
 from ecu_node.trust.statements import SignedParameters
-from ecu_node.trust.trial import Trial, TrialResult, TrialRules
-from ecu_node.wiring import InForce, put_in_force, sensor_fault
+from ecu_node.trust.trial import Trial, TrialResult, begin_trial
+from ecu_node.wiring import InForce, put_in_force
 
 __all__ = ["ParameterStore"]
 
@@ -23,8 +23,6 @@ _LOOK_EVERY_S = 1.0
 """Between looks whether the state has changed, or what is in force has expired. [s]"""
 _CONCLUDE_EVERY_S = 60.0
 """Between attempts to keep how a trial ended, on a disk that is full or broken. [s]"""
-_LEAST_CURRENT_SHARE = 0.02
-"""A trial counts while a branch carries this share of full scale. [1]"""
 
 
 class ParameterStore:
@@ -191,25 +189,7 @@ class ParameterStore:
             self._say(f"no trial: {error}")
             return None
         self._say(f"number {signed.sequence} is on trial: parameter set {signed.parameters.number}")
-        return self._trial_of(signed, corrector)
-
-    def _trial_of(self, signed: SignedParameters, corrector: Corrector) -> Trial:
-        layout, parameters = self._database.layout, signed.parameters
-        faults = {
-            name: sensor_fault(self._database, InForce(parameters=parameters), name) for name in layout.branch_names
-        }
-        return Trial(
-            corrector.branches,
-            {name: fault for name, fault in faults.items() if fault.applied},
-            {name: branch.delay_s or 0.0 for name, branch in parameters.branches.items()},
-            parameters.junction_residual,
-            TrialRules(
-                duration_s=layout.activation.trial_s,
-                tolerance=layout.activation.tolerance,
-                margin_a=layout.watch_margin_a,
-                least_current_a=_LEAST_CURRENT_SHARE * layout.full_scale_a,
-            ),
-        )
+        return begin_trial(signed.parameters, self._database, corrector.branches)
 
 
 def _why_nothing(state: TrustState) -> tuple[Reason, str]:

@@ -1,24 +1,37 @@
 """Trial of a parameter set on its own vehicle: the Kirchhoff sum must fall as the calibrator says, before it is used.
 
-The set changes the sum from m (measured) to c, by m - c = s. If the set is right, what remains in c has nothing to do
-with s, and the mean square of the sum falls by just that of s:
+The set changes the sum from m (measured) to c, by m - c = s. Right sensors show the sum e: 0, or a load that none of
+them sees. If the set is right, what remains in c - e has nothing to do with s, and the mean square of the sum about e
+falls by just that of s:
 
-    share = (E[m^2] - E[c^2]) / E[s^2],    1 if the set is right, 0 if half of s is wrong, -1 if all of it is.
+    share = (E[(m - e)^2] - E[(c - e)^2]) / E[s^2]        1: the set is right; 0: half of s is wrong; -1: all of it is
 
-The share does not depend on how hard the vehicle is driven. The parameter file tells which share the calibrator saw on
-the drives that it used; where it is below 1, as where a load that no sensor sees is taken for an offset, so is this.
+The share does not depend on how hard the vehicle is driven. The parameter file tells e, and which share the calibrator
+saw on the drives that it used; where it is below 1, as where one of two offsets that cancel is corrected, so is this.
 A set whose s stays below the layout's margin changes nothing that this sum could tell, and must make it no worse.
+In either case what is left, the mean square of c - e, must be about what the calibrator saw: a set that takes away an
+error and leaves others is not this vehicle's, or no more.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from ecu_node.branch import LiveBranch
 from ecu_node.correction import SensorFault
+from ecu_node.database import VehicleDatabase
 from ecu_node.junction_watch import aligned_currents
-from ecu_node.parameters import JunctionResidual
+from ecu_node.parameters import JunctionResidual, VehicleParameters
+from ecu_node.wiring import InForce, sensor_fault
 
-__all__ = ["Trial", "TrialResult", "TrialRules"]
+__all__ = ["Trial", "TrialResult", "TrialRules", "begin_trial"]
+
+_LEAST_CURRENT_SHARE = 0.02
+"""A trial counts while a branch carries this share of full scale. [1]"""
+_MOST_LEFT = 2.0
+"""So many times what the calibrator saw may be left of the sum. [1]"""
+_LONGEST_STEP_S = 0.5
+"""More time than this between two looks is none in which currents were watched. [s]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +90,10 @@ class Trial:
         rules: TrialRules,
     ) -> None:
         self._branches, self._faults, self._delays_s, self._rules = branches, faults, delays_s, rules
-        self._promised = _share(residual.measured_a**2, residual.corrected_a**2, (residual.correction_a or 0.0) ** 2)
+        self._expected_a = residual.expected_a
+        measured_a, corrected_a = residual.about_expected()
+        self._promised = _share(measured_a**2, corrected_a**2, (residual.correction_a or 0.0) ** 2)
+        self._left_a, self._step_a = corrected_a, residual.correction_a
         self._looks = 0
         self._measured2 = self._corrected2 = self._step2 = 0.0
         self._time_s = 0.0
@@ -120,15 +136,23 @@ class Trial:
 
     def _add(self, measured_a: float, corrected_a: float) -> None:
         self._looks += 1
-        self._measured2 += measured_a**2
-        self._corrected2 += corrected_a**2
+        self._measured2 += (measured_a - self._expected_a) ** 2
+        self._corrected2 += (corrected_a - self._expected_a) ** 2
         self._step2 += (measured_a - corrected_a) ** 2
 
     def _result(self) -> TrialResult:
         measured, corrected, step = (
             (total / self._looks) ** 0.5 for total in (self._measured2, self._corrected2, self._step2)
         )
-        seen = f"Kirchhoff sum {measured:.3g} A measured, {corrected:.3g} A corrected (RMS)"
+        about = f" about {self._expected_a:+.3g} A" if self._expected_a else ""
+        seen = f"Kirchhoff sum {measured:.3g} A measured, {corrected:.3g} A corrected (RMS{about})"
+        most = self._most_left(step)
+        if corrected > most:
+            return TrialResult(
+                passed=False,
+                text=f"{seen}: at most {most:.3g} A were to be left; this vehicle has changed since its drives were "
+                f"recorded, or the set is not its own",
+            )
         if step <= self._rules.margin_a:
             return TrialResult(
                 passed=corrected <= measured + self._rules.margin_a, text=f"{seen}: no change that counts"
@@ -140,9 +164,12 @@ class Trial:
             f"{least:.2f} is enough",
         )
 
-
-_LONGEST_STEP_S = 0.5
-"""More time than this between two looks is none in which currents were watched. [s]"""
+    def _most_left(self, step_a: float) -> float:
+        """What may be left of the sum (RMS); more where the set changes more than the calibrator saw. [A]"""
+        if self._step_a is None:
+            return math.inf
+        harder = step_a / self._step_a if self._step_a > self._rules.margin_a else 1.0
+        return _MOST_LEFT * self._left_a * max(harder, 1.0) + self._rules.margin_a
 
 
 def _share(measured2: float, corrected2: float, step2: float) -> float:
@@ -150,3 +177,36 @@ def _share(measured2: float, corrected2: float, step2: float) -> float:
     if step2 <= 0.0:
         return 1.0 if corrected2 <= measured2 else 0.0
     return min(1.0, (measured2 - corrected2) / step2)
+
+
+def begin_trial(parameters: VehicleParameters, database: VehicleDatabase, branches: Sequence[LiveBranch]) -> Trial:
+    """Put a set on trial.
+
+    Parameters
+    ----------
+    parameters : VehicleParameters
+        The set.
+    database : VehicleDatabase
+        Layout and DBC in use; the layout says what a trial takes.
+    branches : sequence of LiveBranch
+        All branches of the layout, as the node sees them.
+
+    Returns
+    -------
+    Trial
+        To be asked at each look at the junction.
+    """
+    layout = database.layout
+    faults = {name: sensor_fault(database, InForce(parameters=parameters), name) for name in layout.branch_names}
+    return Trial(
+        branches,
+        {name: fault for name, fault in faults.items() if fault.applied},
+        {name: branch.delay_s or 0.0 for name, branch in parameters.branches.items()},
+        parameters.junction_residual,
+        TrialRules(
+            duration_s=layout.activation.trial_s,
+            tolerance=layout.activation.tolerance,
+            margin_a=layout.watch_margin_a,
+            least_current_a=_LEAST_CURRENT_SHARE * layout.full_scale_a,
+        ),
+    )

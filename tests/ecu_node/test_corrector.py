@@ -409,6 +409,25 @@ def test_a_set_of_which_the_calibrator_expects_no_better_sum_is_kept(database: V
         assert corrector.state()[1] == reason
 
 
+@pytest.mark.parametrize(
+    ("offset_a", "expected_a", "reason"),
+    [(3.0, 0.0, Reason.CORRECTION_WORSE), (3.0, -3.0, Reason.NONE), (-3.0, -3.0, Reason.CORRECTION_WORSE)],
+)
+def test_sums_are_judged_about_the_one_that_right_sensors_show(
+    database: VehicleDatabase, offset_a: float, expected_a: float, reason: Reason
+) -> None:
+    """Battery and motor sum to 0 A; with a load of -3 A right sensors would not."""
+    parameters = parameters_for(database, battery=(0.0, offset_a), motor=(0.0, 0.0))
+    sums = JunctionResidual(
+        measured_a=0.0, corrected_a=3.0, measured_mean_a=0.0, corrected_mean_a=expected_a, expected_a=expected_a
+    )
+    if expected_a == 0.0:
+        sums = JunctionResidual(measured_a=0.0, corrected_a=0.0)
+    corrector = wire(database, InForce(parameters=replace(parameters, junction_residual=sums)), start_s=0.0)
+    drive_balanced(database, corrector, 0.0, 12.0)
+    assert corrector.state()[1] == reason
+
+
 def drive_balanced(database: VehicleDatabase, corrector: Corrector, start_s: float, end_s: float) -> None:
     """Battery and motor that sum to 0 A, and looks."""
     for k in range(round(start_s / 0.05), round(end_s / 0.05)):

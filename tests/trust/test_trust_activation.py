@@ -145,6 +145,14 @@ def refusals(signers: Signers, parameters: VehicleParameters) -> list[tuple[str,
             Reason.IMPLAUSIBLE_PARAMETERS,
             "beyond the layout's limit",
         ),
+        (
+            "expected sum",
+            signers.parameters(
+                replace(parameters, junction_residual=replace(parameters.junction_residual, expected_a=-151.0)), 6
+            ),
+            Reason.IMPLAUSIBLE_PARAMETERS,
+            "an expected Kirchhoff sum of -151 A is beyond the layout's limit of offsets, 150 A",
+        ),
         ("signer", signers.parameters(parameters, 6, by="ad"), Reason.NOT_SIGNED, "which is not trusted here"),
         ("threshold", signers.parameters(parameters, 6, by="a"), Reason.NOT_SIGNED, "2 signers are needed"),
         ("keys", signers.key_set(signers.keys(version=3)), Reason.REPLAYED, "key set 3, and 1 is trusted here"),

@@ -38,13 +38,15 @@ class Drive:
         self.corrector = wire(database, self.store.in_force, 0.0)
         self._steps: Iterator[int] = count()
 
-    def go_on(self, duration_s: float, *, load_a: float = 0.0, drift: float = DRIFT) -> None:
+    def go_on(
+        self, duration_s: float, *, load_a: float = 0.0, drift: float = DRIFT, offset_a: float = OFFSET_A
+    ) -> None:
         """Drive; a load that nobody measures takes its share from the battery."""
         for _ in range(round(duration_s / PERIOD_S)):
             k = next(self._steps)
             now_s = PERIOD_S * k
             motor_a = 100.0 * math.sin(0.3 * k) + 40.0
-            battery_a = (1.0 + drift) * (motor_a + load_a) + OFFSET_A
+            battery_a = (1.0 + drift) * (motor_a + load_a) + offset_a
             frames = {
                 0x110: ("HV_Battery", {"BatteryCurrent": battery_a}),
                 0x120: ("HV_Motor", {"MotorCurrent": motor_a}),
@@ -130,6 +132,35 @@ def test_a_set_of_which_the_calibrator_promises_less_passes_with_less(
         drive.go_on(330.0, load_a=-3.0)
         results.append(any("has passed" in line for line in drive.said))
     assert results == [False, True]
+
+
+def test_a_set_is_tried_about_the_sum_that_right_sensors_show(
+    state: Path, signers: Signers, database: VehicleDatabase
+) -> None:
+    """A load that no sensor sees hides no error, and is no error itself."""
+    expected = replace(right(database).junction_residual, expected_a=3.0, measured_mean_a=7.0, corrected_mean_a=3.0)
+    takes_load_for_offset = right(database, 0.0, 3.0)
+    results = []
+    for number, parameters in ((5, right(database)), (6, takes_load_for_offset)):
+        put_on_trial(state, signers, replace(parameters, junction_residual=expected), database, number)
+        drive = Drive(state, database)
+        faulty = parameters is not takes_load_for_offset
+        drive.go_on(360.0, load_a=3.0, drift=DRIFT if faulty else 0.0, offset_a=OFFSET_A if faulty else 0.0)
+        results.append(any("has passed" in line for line in drive.said))
+        if faulty:
+            assert drive.told == (State.CORRECTING, Reason.NONE), "the watch does not take the load for an error either"
+    assert results == [True, False]
+
+
+def test_a_set_that_takes_away_an_error_and_leaves_another_is_not_of_this_vehicle(
+    state: Path, signers: Signers, database: VehicleDatabase
+) -> None:
+    put_on_trial(state, signers, right(database, DRIFT / 2.0, OFFSET_A / 2.0), database, 5)
+    drive = Drive(state, database)
+    drive.go_on(330.0)
+    (told,) = (line for line in drive.said if "its trial" in line)
+    assert "has failed" in told
+    assert "at most 2 A were to be left" in told
 
 
 def test_standing_is_no_trial(state: Path, signers: Signers, database: VehicleDatabase) -> None:

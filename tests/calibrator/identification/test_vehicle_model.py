@@ -9,7 +9,7 @@ from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError
 from calibrator.faults import corrected_currents
 from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_model
-from calibrator.parameter_files import correction_rms_a, junction_rms_a
+from calibrator.parameter_files import current_moments, junction_residual
 from ecu_node.database import VehicleDatabase
 
 INPUTS = ("driving_current", "heater_current")
@@ -94,21 +94,23 @@ def test_three_seconds_are_too_little(database: VehicleDatabase, tmp_path: Path)
         model_of(database, tmp_path, drive("a", 30))
 
 
-def test_junction_rms_from_moments_equals_that_of_the_samples(database: VehicleDatabase, tmp_path: Path) -> None:
+def test_the_junction_residual_from_moments_is_that_of_the_samples(database: VehicleDatabase, tmp_path: Path) -> None:
     recorded = drive("a", 3000)
     vehicle = model_of(database, tmp_path, recorded)
     measured = np.column_stack([recorded.branches[name].value for name in EQUIPMENT.branches])
     drift, offset_a = np.array([0.1, -0.05]), np.array([2.0, -1.0])
-    expected = np.sqrt(np.mean(corrected_currents(measured, drift=drift, offset_a=offset_a).sum(axis=1) ** 2))
-    assert junction_rms_a(vehicle.mean_a, vehicle.moment_a2, drift=drift, offset_a=offset_a) == pytest.approx(
-        float(expected), rel=1e-3
+    corrected = corrected_currents(measured, drift=drift, offset_a=offset_a)
+    found = junction_residual(
+        current_moments(vehicle.mean_a, vehicle.moment_a2), gain=1.0 + drift[None], offset_a=offset_a, expected_a=1.5
     )
-    change = measured - corrected_currents(measured, drift=drift, offset_a=offset_a)
-    expected = np.sqrt(np.mean(change.sum(axis=1) ** 2))
-    assert correction_rms_a(vehicle.mean_a, vehicle.moment_a2, drift=drift, offset_a=offset_a) == pytest.approx(
-        float(expected), rel=1e-3
-    )
-    raw = np.sqrt(np.mean(measured.sum(axis=1) ** 2))
-    assert junction_rms_a(vehicle.mean_a, vehicle.moment_a2, drift=np.zeros(2), offset_a=np.zeros(2)) == pytest.approx(
-        float(raw), rel=1e-3
-    )
+
+    def rms(values: Array) -> float:
+        return float(np.sqrt(np.mean(values.sum(axis=1) ** 2)))
+
+    assert found.measured_a == pytest.approx(rms(measured), rel=1e-3)
+    assert found.corrected_a == pytest.approx(rms(corrected), rel=1e-3)
+    assert found.correction_a == pytest.approx(rms(measured - corrected), rel=1e-3)
+    assert found.measured_mean_a == pytest.approx(float(measured.sum(axis=1).mean()), rel=1e-3)
+    assert found.corrected_mean_a == pytest.approx(float(corrected.sum(axis=1).mean()), rel=1e-3)
+    about = [float(np.sqrt(np.mean((sums.sum(axis=1) - 1.5) ** 2))) for sums in (measured, corrected)]
+    assert found.about_expected() == pytest.approx(about, rel=1e-3)

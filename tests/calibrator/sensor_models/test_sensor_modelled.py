@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.parameter_files import junction_rms_of_blocks_a
+from calibrator.parameter_files import junction_residual
 from calibrator.sensor_models.choice import SensorModelChoice
 from calibrator.sensor_models.families import GainBySign, SensorModel, TemperatureDrift
 from calibrator.sensor_models.linear_part import chosen_sensor, linear_summary, sensor_parameters
@@ -110,5 +110,8 @@ def test_the_junction_sum_after_correction_is_that_of_the_nodes_formula(
     gain = np.tile(1.0 + drift, (len(vehicle.linear_parts.moments), 1))
     for sensor in vehicle.sensors:
         gain[:, sensor.branch] *= sensor.block_gain()
-    found = junction_rms_of_blocks_a(vehicle.linear_parts, gain=gain, offset_a=offset_a)
-    assert found == pytest.approx(float(np.sqrt(np.mean(np.sum(corrected, axis=0) ** 2))), rel=0.02)
+    parts = vehicle.linear_parts
+    found = junction_residual(
+        parts.moments[:, parts.inputs :, parts.inputs :], gain=gain, offset_a=offset_a, expected_a=0.0
+    )
+    assert found.corrected_a == pytest.approx(float(np.sqrt(np.mean(np.sum(corrected, axis=0) ** 2))), rel=0.02)

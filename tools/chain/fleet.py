@@ -1,0 +1,87 @@
+"""An artificial fleet whose drives go straight into a store, without logs, and what its vehicles drive later."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from joblib import delayed
+
+from calibrator.artificial.ground_truth import GroundTruth, choose_branches, with_branches
+from calibrator.artificial.simulate import FleetPlan, balance_branch, draw_vehicles
+from calibrator.artificial.trips import TripPurpose, TripSource
+from calibrator.artificial.vehicle import Vehicle, vehicle_drive
+from calibrator.drives.store import write_drive
+from calibrator.interrupts import in_processes
+from calibrator.random_streams import Purpose, random_stream
+from ecu_node.database import VehicleDatabase
+
+__all__ = ["ChainFleet", "draw_fleet"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChainFleet:
+    """A fleet and its trips.
+
+    Attributes
+    ----------
+    database : VehicleDatabase
+        DBC and layout.
+    trips : TripSource
+        What the vehicles drive.
+    vehicles : sequence of Vehicle
+        With what is wrong with each.
+    unseen_s : float
+        Length of an unseen trip. [s]
+    seed : int
+        Of everything.
+    """
+
+    database: VehicleDatabase
+    trips: TripSource
+    vehicles: Sequence[Vehicle]
+    unseen_s: float
+    seed: int
+
+    def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
+        """Trip of a vehicle, with its branches alone; an unseen one ends when it is long enough."""
+        branches = self.vehicles[number].branches
+        found = self.trips.trip(number, purpose)
+        whole = with_branches(found, branches, balance_branch(self.database.layout, branches))
+        return whole.part(0, round(self.unseen_s / whole.period_s)) if purpose == "unseen" else whole
+
+    def write_drives(self, store: Path, *, workers: int) -> None:
+        """Write the drives to learn from into a store."""
+        for _ in in_processes(
+            (delayed(self.write_drive)(store, number) for number in range(len(self.vehicles))), workers=workers
+        ):
+            pass
+
+    def write_drive(self, store: Path, number: int) -> None:
+        """Write the drive of one vehicle."""
+        rng = random_stream(Purpose.FRAMES, self.seed, number)
+        drive = vehicle_drive(rng, self.database, self.vehicles[number], self.trip(number, "calibration"))
+        write_drive(store, drive, self.database.layout)
+
+
+def draw_fleet(plan: FleetPlan, trips: TripSource, database: VehicleDatabase, *, unseen_s: float) -> ChainFleet:
+    """Draw the vehicles of a fleet.
+
+    Parameters
+    ----------
+    plan : FleetPlan
+        What to draw.
+    trips : TripSource
+        What the vehicles drive.
+    database : VehicleDatabase
+        DBC and layout.
+    unseen_s : float
+        Length of an unseen trip. [s]
+
+    Returns
+    -------
+    ChainFleet
+        The fleet; nothing is written yet.
+    """
+    branches = choose_branches(database.layout, trips.branches, plan.currents)
+    vehicles = draw_vehicles(plan, database.layout, branches)
+    return ChainFleet(database=database, trips=trips, vehicles=vehicles, unseen_s=unseen_s, seed=plan.seed)

@@ -1,0 +1,148 @@
+"""The whole chain for a fleet: drives, calibration, signatures, activation, trial, and the drive after it."""
+
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from joblib import delayed
+
+from calibrator.interrupts import in_processes
+from calibrator.report.text import table
+from chain.fleet import ChainFleet
+from chain.one_vehicle import SignedFile, VehicleOutcome, drive_vehicle
+from ecu_node.errors import UserError
+from ecu_node.parameters import read_parameters
+from ecu_node.trust.canonical import read_canonical
+from ecu_node.trust.key_set import KEY_SET, KeySet
+
+__all__ = ["ChainScore", "drive_chain"]
+
+SIGNERS = ("anna", "ben")
+
+
+@dataclass(frozen=True)
+class ChainScore:
+    """What became of all vehicles."""
+
+    outcomes: Sequence[VehicleOutcome]
+
+    def counts(self) -> dict[str, int]:
+        """How many vehicles came how far, and how many wrong sets passed a trial."""
+        corrected = [found for found in self.outcomes if found.corrected]
+        counts = {
+            "vehicles": len(self.outcomes),
+            "with corrections": len(corrected),
+            "refused": sum(bool(found.refused) for found in corrected),
+            "passed their trial": sum(found.passed for found in corrected),
+            "deployed": sum(found.passed and not found.fell_back for found in corrected),
+            "made worse": sum(bool(found.worse) for found in corrected),
+        }
+        for kind in dict.fromkeys(kind for found in corrected for kind in found.wrong):
+            wrong = [found.wrong[kind] for found in corrected if kind in found.wrong and found.wrong[kind].worse]
+            counts[f"wrong sets on trial, {kind}"] = len(wrong)
+            counts[f"of these passed, {kind}"] = sum(found.passed for found in wrong)
+        return counts
+
+    def errors_a(self) -> Mapping[str, float]:
+        """Largest error of the corrected branches of a vehicle after its trial, median and worst. [A]"""
+        found = sorted(outcome.measured_a for outcome in self.outcomes if outcome.passed)
+        after = sorted(outcome.published_a for outcome in self.outcomes if outcome.passed)
+        if not found:
+            return {}
+        middle = len(found) // 2
+        return {
+            "error, median, measured": found[middle],
+            "error, median, published": after[middle],
+            "error, worst, measured": found[-1],
+            "error, worst, published": after[-1],
+        }
+
+    def as_text(self) -> str:
+        """Return the score for people, with a line for each vehicle that did not come to its end."""
+        rows = [(name, f"{count}") for name, count in self.counts().items()]
+        rows += [(f"{name} [A]", f"{value:.2f}") for name, value in self.errors_a().items()]
+        ends = [f"{found.vehicle}: {_end(found)}" for found in self.outcomes if _end(found)]
+        return "\n".join([table(("", ""), rows), *ends])
+
+
+def _end(found: VehicleOutcome) -> str:
+    """What kept a vehicle's corrections from being in force, or what they made worse; empty if all is well."""
+    if not found.corrected:
+        return ""
+    if found.refused or not found.passed:
+        return found.refused or found.text
+    if found.worse:
+        return f"worse: {', '.join(found.worse)}"
+    return "passing measured values through after all" if found.fell_back else ""
+
+
+def drive_chain(fleet: ChainFleet, folder: Path, *, workers: int) -> ChainScore:
+    """Take a fleet from its drives to corrected vehicles.
+
+    Parameters
+    ----------
+    fleet : ChainFleet
+        The fleet.
+    folder : Path
+        Empty; for drives, parameters, keys, signed files and the states of the vehicles.
+    workers : int
+        Number of processes.
+
+    Returns
+    -------
+    ChainScore
+        What became of them.
+
+    Raises
+    ------
+    UserError
+        If a command of the chain fails.
+    """
+    layout = fleet.database.layout.path
+    fleet.write_drives(folder / "drives", workers=workers)
+    _run(
+        *("calibrator", "calibrate", folder / "drives", "--layout", layout),
+        *("--out", folder / "result", "--workers", workers),
+    )
+    files = [folder / "result" / "params" / f"{vehicle.name}.json" for vehicle in fleet.vehicles]
+    _sign(folder, [path for path in files if path.exists()])
+    keys = read_canonical((folder / "keys.json").read_bytes().rstrip(), KeySet, "keys.json", KEY_SET)
+    calibrated = [number for number, path in enumerate(files) if path.exists()]
+    tasks = (
+        delayed(_drive)(fleet, number, folder, keys, calibrated[(place + 1) % len(calibrated)])
+        for place, number in enumerate(calibrated)
+    )
+    return ChainScore(list(in_processes(tasks, workers=workers)))
+
+
+def _sign(folder: Path, files: Sequence[Path]) -> None:
+    """Two signers make their keys, and sign all files."""
+    for name in SIGNERS:
+        _run("calibrator", "keys", "new", name, "--no-passphrase", "--out", folder / "keys")
+    public = [folder / "keys" / f"{name}.pub" for name in SIGNERS]
+    _run("calibrator", "keys", "set", *public, "--threshold", len(public), "--out", folder / "keys.json")
+    private = [part for name in SIGNERS for part in ("--key", folder / "keys" / f"{name}.key")]
+    _run("calibrator", "sign", *files, *private, "--out", folder / "signed")
+
+
+def _drive(fleet: ChainFleet, number: int, folder: Path, keys: KeySet, other: int) -> VehicleOutcome:
+    name = fleet.vehicles[number].name
+    params = folder / "result" / "params"
+    file = SignedFile(
+        parameters=read_parameters(params / f"{name}.json"),
+        content=(folder / "signed" / f"{name}.json").read_bytes(),
+        keys=keys,
+    )
+    others = read_parameters(params / f"{fleet.vehicles[other].name}.json")
+    return drive_vehicle(fleet, number, file, others, folder / "states" / name)
+
+
+def _run(*words: object) -> None:
+    """Run a command of the project; its last line if it fails."""
+    command = [sys.executable, "-m", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        last = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()[-1]
+        raise UserError(f"{words[0]} {words[1]}: ended with {done.returncode}: {last}")
