@@ -75,9 +75,9 @@ def _vehicle(text: str) -> str:
 
 
 def _provision(options: argparse.Namespace) -> int:
-    from ecu_node.trust.activation import provision  # noqa: PLC0415  # cryptography takes time to import
     from ecu_node.trust.canonical import read_bytes, read_canonical  # noqa: PLC0415
     from ecu_node.trust.key_set import KEY_SET, KeySet, check_key_set  # noqa: PLC0415
+    from ecu_node.trust.provision import provision  # noqa: PLC0415  # cryptography takes time to import
 
     where = str(options.keys)
     content = read_bytes(options.keys, KEY_SET).removesuffix(b"\n")

@@ -11,10 +11,11 @@ from ecu_node.guard import Mode
 from ecu_node.parameter_file import FileSignature, signature
 from ecu_node.parameters import check_fit
 from ecu_node.status import Reason
-from ecu_node.trust.activation import conclude, require_time, signed_parameters
-from ecu_node.trust.state import Slot, SlotName, TrustState, read_state, slot_path, state_path
+from ecu_node.trust.activation import conclude
+from ecu_node.trust.state import Slot, SlotName, TrustState, read_state, signed_parameters, slot_path, state_path
 from ecu_node.trust.statements import SignedParameters
 from ecu_node.trust.trial import Trial, TrialResult, TrialRules
+from ecu_node.trust.validity import require_time
 from ecu_node.wiring import InForce, put_in_force, sensor_fault
 
 __all__ = ["ParameterStore"]

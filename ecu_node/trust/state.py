@@ -21,7 +21,7 @@ from ecu_node.status import Reason
 from ecu_node.trust.audit import Event
 from ecu_node.trust.canonical import MAX_BYTES, Expected, canonical_bytes, malformed, read_bytes, read_canonical
 from ecu_node.trust.key_set import KeySet, check_key_set
-from ecu_node.trust.statements import instant
+from ecu_node.trust.statements import SignedParameters, instant, open_statement
 from ecu_node.trust.storage import move_file, replace_file, write_file
 from ecu_node.user_files import UnsuitableFileError, read_user_file
 
@@ -33,6 +33,7 @@ __all__ = [
     "read_slot",
     "read_state",
     "settle_slots",
+    "signed_parameters",
     "slot_of",
     "slot_path",
     "state_path",
@@ -188,6 +189,34 @@ def read_slot(folder: Path, state: TrustState, name: SlotName) -> bytes:
     if slot is None or slot_of(content, slot.sequence) != slot:
         raise TrustError(Reason.NOT_SIGNED, f"{path}: not what was accepted; activate parameters anew")
     return content
+
+
+def signed_parameters(folder: Path, state: TrustState, name: SlotName) -> SignedParameters:
+    """What stands in a slot.
+
+    Parameters
+    ----------
+    folder : Path
+        State of the vehicle.
+    state : TrustState
+        Of the same.
+    name : SlotName
+        Which slot.
+
+    Returns
+    -------
+    SignedParameters
+        As they were accepted.
+
+    Raises
+    ------
+    TrustError
+        If the slot does not hold what was accepted.
+    """
+    content = read_slot(folder, state, name)
+    _, statement = open_statement(content, str(folder / f"slot-{name}.json"))
+    assert isinstance(statement, SignedParameters), "nothing else is written into a slot"
+    return statement
 
 
 def audit_path(folder: Path) -> Path:

@@ -13,9 +13,11 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UnfitError, UserError
 from ecu_node.parameters import VehicleParameters
 from ecu_node.status import Reason
-from ecu_node.trust.activation import Accepted, accept, conclude, examine, provision, signed_parameters
+from ecu_node.trust.activation import accept, conclude, examine
 from ecu_node.trust.audit import AuditEntry, broken_line
-from ecu_node.trust.state import audit_path, read_slot, read_state
+from ecu_node.trust.judgement import Accepted
+from ecu_node.trust.provision import provision
+from ecu_node.trust.state import audit_path, read_slot, read_state, signed_parameters
 from tests.ecu_node.vehicles import parameters_for
 from tests.trust.signing import NOW, VEHICLE, Signers
 

@@ -10,10 +10,10 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UserError
 from ecu_node.parameters import VehicleParameters
 from ecu_node.status import Reason
-from ecu_node.trust.activation import accept, conclude, signed_parameters
+from ecu_node.trust.activation import accept, conclude
 from ecu_node.trust.audit import broken_line
 from ecu_node.trust.canonical import canonical_bytes
-from ecu_node.trust.state import audit_path, read_state, write_state
+from ecu_node.trust.state import audit_path, read_state, signed_parameters, write_state
 from tests.trust.damage import cut
 from tests.trust.signing import Signers
 
