@@ -17,6 +17,7 @@ from calibrator.signing.statements import signed_anew, signed_statement
 from ecu_node.errors import TrustError
 from ecu_node.parameters import read_parameters, write_atomically
 from ecu_node.trust.canonical import Expected, canonical_bytes, read_bytes, read_canonical
+from ecu_node.trust.envelope import Envelope
 from ecu_node.trust.key_set import SIGNER_NAME, KeySet, check_key_set
 from ecu_node.trust.statements import Revocation, SignedParameters, open_statement
 
@@ -25,6 +26,8 @@ __all__ = ["keys", "revoke", "sign"]
 _TIME = "%Y-%m-%dT%H:%M:%SZ"
 _DAYS, _LONGEST_DAYS = 365, 3650
 _REVOCATION = Expected(what="a revocation that a vehicle would take", advice="change the options")
+
+_KEY_SET = Expected(what="a key set that a vehicle would take", advice="change the options")
 
 keys = typer.Typer(help="Keys of signers, and the set of them that vehicles trust.", no_args_is_help=True)
 
@@ -84,7 +87,9 @@ def make_set(
             "the first key set is not signed, and every later one is: give --key from version 2 on"
         )
     signers = [read_signer(path, _passphrase()) for path in key]
-    content = signed_statement(found, signers) if signers else canonical_bytes(found) + b"\n"
+    plain = canonical_bytes(found)
+    read_canonical(plain, KeySet, "key set", _KEY_SET)
+    content = signed_statement(found, signers) if signers else plain + b"\n"
     _write({out: content}, replace=False)
 
 
@@ -121,9 +126,9 @@ def sign(
                 allow_large_step=allow_large_step,
                 parameters=read_parameters(path),
             )
-            files[out / path.name] = _signed(statement, signers, path)
+            files[out / path.name] = _signed(path, statement, signers)
         else:
-            files[out / path.name] = signed_anew(open_statement(content, str(path))[0], signers)
+            files[out / path.name] = _signed(path, open_statement(content, str(path))[0], signers)
     if len(files) < len(params):
         raise SigningError(f"files of one name would overwrite each other in {out}; sign them one after the other")
     out.mkdir(parents=True, exist_ok=True)
@@ -151,10 +156,10 @@ def revoke(
     _write({out: signed_statement(statement, [read_signer(path, _passphrase()) for path in key])}, replace=False)
 
 
-def _signed(statement: SignedParameters, signers: list[CryptoSigner], path: Path) -> bytes:
+def _signed(path: Path, what: SignedParameters | Envelope, signers: list[CryptoSigner]) -> bytes:
     """A signed file that can be read again."""
     try:
-        content = signed_statement(statement, signers)
+        content = signed_anew(what, signers) if isinstance(what, Envelope) else signed_statement(what, signers)
         open_statement(content, "signed")
     except TrustError as error:
         raise SigningError(f"{path}: no vehicle could read this signed: {error}") from None
