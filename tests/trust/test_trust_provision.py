@@ -114,12 +114,33 @@ def test_a_vehicle_whose_name_no_state_could_hold_is_not_provisioned(
 
 def test_a_folder_whose_name_is_no_text_is_provisioned(signers: Signers, tmp_path: Path) -> None:
     (tmp_path / "keys.json").write_bytes(canonical_bytes(signers.keys()) + b"\n")
-    command = [sys.executable, "-m", "ecu_node", "provision", "--vehicle", "v1", "--keys", tmp_path / "keys.json"]
+    command = [sys.executable, "-m", "ecu_node", "provision", "--vehicle", "v1", "--keys", f"{tmp_path}/keys.json"]
     done = subprocess.run(
-        [*command, "--state", tmp_path / "s\udcff"], capture_output=True, text=True, timeout=60, check=False
+        [*command, "--state", f"{tmp_path}/s\udcff"], capture_output=True, text=True, timeout=60, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert "s\\udcff: vehicle v1 trusts 2 of a, b, c" in done.stdout
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+@pytest.mark.parametrize("name", ["audit.log", "lock"])
+def test_another_name_of_a_file_of_roots_is_not_given_away(
+    name: str, in_force: Path, signers: Signers, parameters: VehicleParameters, tmp_path: Path, now: datetime, run: Run
+) -> None:
+    """Where the kernel lets users make hard links to files of others."""
+    secret, node = tmp_path / "secret", 1234
+    secret.write_text("secret")
+    (in_force / name).unlink(missing_ok=True)
+    os.link(secret, in_force / name)
+    os.chown(in_force, node, node)
+    (tmp_path / "p").write_bytes(signers.parameters(parameters, 6, not_before=now - HOUR))
+    code, out, err = run("activate", tmp_path / "p", *on(in_force))
+    assert (code, out, len(err.splitlines())) == (1, "", 1)
+    assert "another name of somebody else's file" in err
+    assert (secret.stat().st_uid, secret.read_text()) == (0, "secret")
+    (in_force / name).unlink()
+    assert run("activate", tmp_path / "p", *on(in_force))[0] in (0, 1)
+    assert (in_force / name).stat().st_uid == node
 
 
 @pytest.mark.parametrize("name", ["slot-a.json.next", ".state.json.new", "audit.log", "lock"])
