@@ -39,6 +39,8 @@ __all__ = [
 
 MAX_DELAY_S = 5.0
 """Branches of one vehicle do not lag each other by more. [s]"""
+MAX_RESIDUAL_A = 1e6
+"""No vehicle has such currents, and their squares can still be reckoned with. [A]"""
 MAX_FILE_BYTES = 1_000_000
 """A parameter file has some kilobytes; a larger one is not one."""
 
@@ -249,6 +251,12 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
             Reason.IMPLAUSIBLE_PARAMETERS,
             f"verdict {parameters.verdict!r}, yet branch {', '.join(applied)} has 'apply': true; nothing was found to "
             f"apply, calibrate with more drives",
+        )
+    residual = parameters.junction_residual
+    if max(residual.measured_a, residual.corrected_a, residual.correction_a or 0.0) > MAX_RESIDUAL_A:
+        raise UnfitError(
+            Reason.IMPLAUSIBLE_PARAMETERS,
+            f"the Kirchhoff sum is said to be beyond {MAX_RESIDUAL_A:g} A, which no vehicle has",
         )
     for name, branch in parameters.branches.items():
         if abs(branch.delay_s or 0.0) > MAX_DELAY_S:

@@ -15,9 +15,10 @@ from ecu_node.errors import TrustError, UnfitError
 from ecu_node.trust.audit import REFUSED, add_entry, event_now
 from ecu_node.trust.commit import commit, opened
 from ecu_node.trust.judgement import ALL_KINDS, Accepted, Arrival, judge
-from ecu_node.trust.state import TrustState, audit_path, read_slot, read_state, write_slot
+from ecu_node.trust.state import TrustState, audit_path, read_state, signed_parameters, write_slot
 from ecu_node.trust.statements import Statement
 from ecu_node.trust.storage import locked
+from ecu_node.trust.validity import require_not_expired
 
 __all__ = ["accept", "conclude", "examine"]
 
@@ -90,7 +91,7 @@ def conclude(folder: Path, sequence: int, *, passed: bool, text: str, now: datet
     sequence : int
         Number of the set that was tried.
     passed : bool
-        Whether it showed what it promised; a set that cannot be read any more has not.
+        Whether it showed what it promised; a set that cannot be read any more, or expired meanwhile, has not.
     text : str
         What was seen.
     now : datetime
@@ -112,7 +113,7 @@ def conclude(folder: Path, sequence: int, *, passed: bool, text: str, now: datet
         if name is None or state.slots[name].sequence != sequence:
             return state
         try:
-            read_slot(folder, state, name)
+            require_not_expired(state, signed_parameters(folder, state, name), str(folder), now)
         except TrustError as error:
             passed, text = False, str(error)
         if passed:

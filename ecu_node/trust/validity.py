@@ -7,7 +7,7 @@ from ecu_node.status import Reason
 from ecu_node.trust.state import TrustState
 from ecu_node.trust.statements import SignedParameters, instant
 
-__all__ = ["require_time"]
+__all__ = ["require_not_expired", "require_time"]
 
 
 def require_time(state: TrustState, signed: SignedParameters, where: str, now: datetime) -> None:
@@ -29,15 +29,26 @@ def require_time(state: TrustState, signed: SignedParameters, where: str, now: d
     TrustError
         With reason NOT_VALID_NOW.
     """
-    begin, end = instant(signed.not_before, where), instant(signed.expires, where)
-    if now < begin:
+    if now < instant(signed.not_before, where):
         raise TrustError(
             Reason.NOT_VALID_NOW,
             f"{where}: holds from {signed.not_before} on, and now it is {_text(now)}; is the clock set?",
         )
-    if max(now, instant(state.newest, where)) >= end:
+    require_not_expired(state, signed, where, now)
+
+
+def require_not_expired(state: TrustState, signed: SignedParameters, where: str, now: datetime) -> None:
+    """Check that the time of signed parameters is not over; parameters and errors as for :func:`require_time`."""
+    end = instant(signed.expires, where)
+    if now >= end:
         raise TrustError(
             Reason.NOT_VALID_NOW, f"{where}: expired at {signed.expires}, and now it is {_text(now)}; sign it anew"
+        )
+    if instant(state.newest, where) >= end:
+        raise TrustError(
+            Reason.NOT_VALID_NOW,
+            f"{where}: expired at {signed.expires}: the newest file accepted here is of {state.newest}, though the "
+            f"clock says {_text(now)}; sign it anew",
         )
 
 
