@@ -5,11 +5,14 @@ from pathlib import Path
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError
 from ecu_node.parameters import BranchParameters, VehicleParameters
-from ecu_node.sensor_models import GainBySign
+from ecu_node.sensor_models import GainBySign, TemperatureDrift
 from ecu_node.status import Reason
 from ecu_node.trust.state import TrustState, signed_parameters
 
 __all__ = ["require_small_step"]
+
+_COLDEST_C, _HOTTEST_C = -40.0, 125.0
+"""Of sensors in vehicles. Between the two no drift differs by more than at one of them. [degC]"""
 
 
 def require_small_step(
@@ -43,9 +46,9 @@ def require_small_step(
     except TrustError:
         return  # what is damaged is not in force, and must not keep its successor out
     for name in layout.branch_names:
-        old, next_ = _applied(before.branches.get(name)), _applied(new.branches.get(name))
-        drift = max(abs(a - b) for a, b in zip(old[:2], next_[:2], strict=True))
-        offset_a = abs(old[2] - next_[2])
+        (old_drifts, old_a), (new_drifts, new_a) = (_applied(item.branches.get(name)) for item in (before, new))
+        drift = max(abs(a - b) for a, b in zip(old_drifts, new_drifts, strict=True))
+        offset_a = abs(old_a - new_a)
         if drift > layout.activation.step_drift or offset_a > layout.step_offset_a:
             raise TrustError(
                 Reason.IMPLAUSIBLE_PARAMETERS,
@@ -55,11 +58,19 @@ def require_small_step(
             )
 
 
-def _applied(branch: BranchParameters | None) -> tuple[float, float, float]:
-    """Drifts for currents into and out of the junction, and offset, as they are applied. [1, 1, A]"""
+def _applied(branch: BranchParameters | None) -> tuple[tuple[float, ...], float]:
+    """Drifts as they are applied, cold and hot, to currents into and out of the junction [1], and the offset [A]."""
     if branch is None or not branch.apply:
-        return 0.0, 0.0, 0.0
-    model = branch.sensor_model
-    if isinstance(model, GainBySign):
-        return model.drift_positive, model.drift_negative, branch.offset_a
-    return branch.drift, branch.drift, branch.offset_a
+        return (0.0,) * 4, 0.0
+    match branch.sensor_model:
+        case GainBySign() as model:
+            drifts = (model.drift_positive, model.drift_negative) * 2
+        case TemperatureDrift() as model:
+            cold, hot = (
+                branch.drift + model.drift_per_k * (temperature_c - model.reference_c)
+                for temperature_c in (_COLDEST_C, _HOTTEST_C)
+            )
+            drifts = (cold, cold, hot, hot)
+        case None:
+            drifts = (branch.drift,) * 4
+    return drifts, branch.offset_a
