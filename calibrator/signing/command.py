@@ -14,7 +14,7 @@ from calibrator.errors import ContradictionError, SigningError
 from calibrator.folders import require_possible_folder
 from calibrator.signing.key_files import PASSPHRASE_VARIABLE, new_key, read_public_key, read_signer
 from calibrator.signing.statements import signed_anew, signed_statement
-from ecu_node.errors import TrustError
+from ecu_node.errors import TrustError, printable
 from ecu_node.parameters import read_parameters, write_atomically
 from ecu_node.trust.canonical import Expected, canonical_bytes, read_bytes, read_canonical
 from ecu_node.trust.envelope import Envelope
@@ -65,7 +65,7 @@ def new(
         raise SigningError(f"{name!r}: a name of letters, digits, '.', '_' and '-' is expected")
     require_possible_folder(out)
     out.mkdir(parents=True, exist_ok=True)
-    sys.stdout.write("".join(f"{path}\n" for path in new_key(name, out, passphrase)))
+    sys.stdout.write("".join(f"{printable(str(path))}\n" for path in new_key(name, out, passphrase)))
 
 
 @keys.command("set")
@@ -185,7 +185,7 @@ def _write(files: dict[Path, bytes], *, replace: bool) -> None:
             write_atomically(path, content)
         except OSError as error:
             raise SigningError(f"{path}: cannot be written: {error.strerror}") from None
-        print(path)
+        print(printable(str(path)))
 
 
 def _passphrase() -> str | None:
