@@ -153,6 +153,7 @@ def test_a_trial_begins_once_the_clock_is_set(
     now = datetime.now(UTC)
     accept(two_slots, signers.parameters(parameters, 7, not_before=now - DAY), "f", database, now)
     running = Running(two_slots, database, now=lambda: now - 1000 * DAY)
+    assert running.corrector.reason is Reason.NOT_VALID_NOW
     for now_s in range(0, 50, 2):
         running.store.look(running.corrector, float(now_s))
     (line,) = running.said
@@ -161,6 +162,7 @@ def test_a_trial_begins_once_the_clock_is_set(
     running.now = lambda: now
     for now_s in range(50, 70, 2):
         running.store.look(running.corrector, float(now_s))
+    assert (running.drift, running.corrector.reason) == (DRIFT, Reason.NONE)
     assert "number 7 is on trial: parameter set 300" in running.said
 
 
