@@ -76,7 +76,7 @@ def make_set(
     version: Annotated[int, typer.Option(min=1, help="One more than that of the set before.")] = 1,
     key: KeyOption = [],  # noqa: B006
 ) -> None:
-    """Say whom vehicles trust. The first set is not signed; a later one by enough signers of the set before, and of its own."""
+    """Say whom vehicles trust. The first set is not signed; a later one by enough of the set before and of its own."""
     named = [read_public_key(path) for path in public]
     found = KeySet(version=version, threshold=threshold, keys={item.keyid: item.key for item in named})
     if len(found.keys) < len(named):
