@@ -5,7 +5,16 @@ The command line turns every :class:`UserError` into that line and an exit code;
 
 from ecu_node.status import Reason
 
-__all__ = ["BusError", "DatabaseError", "LayoutError", "ParameterError", "TrustError", "UnfitError", "UserError"]
+__all__ = [
+    "BusError",
+    "DatabaseError",
+    "LayoutError",
+    "ParameterError",
+    "TrustError",
+    "UnfitError",
+    "UserError",
+    "printable",
+]
 
 
 class UserError(Exception):
@@ -42,3 +51,8 @@ class TrustError(UnfitError):
 
 class BusError(UserError):
     """The CAN bus cannot be opened, or fails while in use."""
+
+
+def printable(text: str) -> str:
+    """A text of a stranger's file without characters that would break the line or move the cursor."""
+    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)

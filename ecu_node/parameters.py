@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import ParameterError, UnfitError
+from ecu_node.errors import ParameterError, UnfitError, printable
 from ecu_node.field_errors import field_error, quoted_place
 from ecu_node.sensor_models import GainBySign, SensorModel
 from ecu_node.status import Reason
@@ -32,6 +32,7 @@ __all__ = [
     "check_fit",
     "decode_parameters",
     "encode_parameters",
+    "parameter_bytes",
     "parameter_schema",
     "read_parameters",
     "write_atomically",
@@ -42,6 +43,9 @@ MAX_DELAY_S = 5.0
 """Branches of one vehicle do not lag each other by more. [s]"""
 MAX_FILE_BYTES = 1_000_000
 """A parameter file has some kilobytes; a larger one is not one."""
+
+_LONGEST_NAME = 64
+"""Characters of a name that are shown."""
 
 Verdict = Literal["no sensor fault", "corrected", "cannot tell", "not enough data"]
 _UNDECIDED: tuple[Verdict, ...] = ("cannot tell", "not enough data")
@@ -55,7 +59,7 @@ HeldBack = Literal[
 _Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$", description="SHA-256, line ends counted as LF")]
 _Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 _NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
-_MeanSum = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+_MeanSum = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # no vehicle has such currents, and squares are still finite
 _RmsSum = Annotated[float, msgspec.Meta(ge=0.0, le=1e6)]
 
 
@@ -198,15 +202,19 @@ def read_parameters(path: Path) -> VehicleParameters:
     UnfitError
         With reason NO_PARAMETERS if there is no such file or it may not be read, else MALFORMED_PARAMETERS.
     """
+    return decode_parameters(parameter_bytes(path), str(path))
+
+
+def parameter_bytes(path: Path) -> bytes:
+    """Text of a parameter file, for :func:`decode_parameters`; raises as :func:`read_parameters`."""
     try:
-        content = read_user_file(path, largest_bytes=MAX_FILE_BYTES)
+        return read_user_file(path, largest_bytes=MAX_FILE_BYTES)
     except FileNotFoundError:
         raise UnfitError(Reason.NO_PARAMETERS, f"{path}: no such parameter file") from None
     except OSError as error:
         raise UnfitError(Reason.NO_PARAMETERS, f"{path}: cannot read the parameter file: {error.strerror}") from None
     except UnsuitableFileError as error:
         raise UnfitError(Reason.MALFORMED_PARAMETERS, f"{path}: not a parameter file: {error}") from None
-    return decode_parameters(content, str(path))
 
 
 def decode_parameters(content: bytes, where: str) -> VehicleParameters:
@@ -257,13 +265,13 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
     if parameters.layout.sha256 != layout.digest:
         raise UnfitError(
             Reason.WRONG_LAYOUT,
-            f"parameters were made with layout {parameters.layout.name} ({parameters.layout.sha256[:12]}), "
+            f"parameters were made with layout {_shown(parameters.layout.name)} ({parameters.layout.sha256[:12]}), "
             f"this is {layout.path} ({layout.digest[:12]}); calibrate with this layout",
         )
     if parameters.dbc.sha256 != database.digest:
         raise UnfitError(
             Reason.WRONG_DBC,
-            f"parameters were made with DBC {parameters.dbc.name} ({parameters.dbc.sha256[:12]}), "
+            f"parameters were made with DBC {_shown(parameters.dbc.name)} ({parameters.dbc.sha256[:12]}), "
             f"this is {layout.dbc_path} ({database.digest[:12]}); calibrate with this DBC",
         )
     if not abs(parameters.junction_residual.expected_a) <= layout.offset_limit_a:
@@ -276,16 +284,18 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
     if parameters.verdict in _UNDECIDED and applied:
         raise UnfitError(
             Reason.IMPLAUSIBLE_PARAMETERS,
-            f"verdict {parameters.verdict!r}, yet branch {', '.join(applied)} has 'apply': true; nothing was found to "
-            f"apply, calibrate with more drives",
+            f"verdict {parameters.verdict!r}, yet branch {', '.join(map(_shown, applied))} has 'apply': true; "
+            f"nothing was found to apply, calibrate with more drives",
         )
     for name, branch in parameters.branches.items():
+        if name not in layout.branch_names:
+            raise UnfitError(
+                Reason.WRONG_LAYOUT, f"parameters for branch {_shown(name)!r}, which {layout.path} does not have"
+            )
         if abs(branch.delay_s or 0.0) > MAX_DELAY_S:
             raise UnfitError(
                 Reason.IMPLAUSIBLE_PARAMETERS, f"branch {name}: delay {branch.delay_s:g} s is beyond {MAX_DELAY_S:g} s"
             )
-        if name not in layout.branch_names:
-            raise UnfitError(Reason.WRONG_LAYOUT, f"parameters for branch {name!r}, which {layout.path} does not have")
         if not branch.apply:
             continue
         for drift in _drifts(branch):
@@ -300,6 +310,11 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
                 f"branch {name}: offset {branch.offset_a:+.4g} A is beyond the layout's limit of "
                 f"{layout.offset_limit_a:g} A",
             )
+
+
+def _shown(name: str) -> str:
+    """A name that the file gives to something, such that it stays within a line."""
+    return printable(name if len(name) <= _LONGEST_NAME else f"{name[:_LONGEST_NAME]}...")
 
 
 def _drifts(branch: BranchParameters) -> tuple[float, ...]:

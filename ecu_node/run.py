@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -138,7 +139,13 @@ def _source(options: RunOptions, database: VehicleDatabase, mode: Mode, say: Cal
 
     assert options.state is not None
     return ParameterStore(
-        options.state, database, mode=mode, say=say, now=lambda: datetime.now(UTC), vehicle=options.vehicle
+        options.state,
+        database,
+        mode=mode,
+        say=say,
+        now=lambda: datetime.now(UTC),
+        vehicle=options.vehicle,
+        background=ThreadPoolExecutor(1, "state of the vehicle"),
     )
 
 

@@ -1,7 +1,10 @@
 """The source file of the C export: one function per branch, per message, and per voltage or temperature."""
 
+import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 
+from calibrator.errors import ExportError
 from calibrator.export import c_helpers
 from calibrator.export.c_arithmetic import Arithmetic, arithmetic_of, is_no_value, outcome, rule_test
 from calibrator.export.c_bits import literal, presence_function, put_function, reading_function
@@ -13,6 +16,8 @@ __all__ = ["source_body"]
 
 _LONGEST_CODE = 64
 """[bit]"""
+_DEFINED = re.compile(r"^(?:static )?(?:const )?(?:struct )?\w+ (\w+)[(\[]", re.MULTILINE)
+"""Begin of a function or table."""
 
 
 def source_body(program: CProgram) -> str:
@@ -31,7 +36,7 @@ def source_body(program: CProgram) -> str:
     Raises
     ------
     ExportError
-        If a signal is too wide for exact arithmetic, naming it.
+        If a signal is too wide for exact arithmetic, naming it, or two things would have one name.
     """
     corrected = {branch.name: arithmetic_of(branch) for branch in program.branches if branch.plans}
     blocks = [text.rstrip() for text in _helpers(program, corrected)]
@@ -44,7 +49,17 @@ def source_body(program: CProgram) -> str:
         blocks.append("\n".join(reading_function(f"input_{item.name}", item.placed.place)))
         blocks.append("\n".join(presence_function(f"present_input_{item.name}", item.placed)))
         blocks.append("\n".join(_input_function(item)))
-    return "\n\n".join(blocks) + "\n"
+    text = "\n\n".join(blocks) + "\n"
+    _require_own_names(text)
+    return text
+
+
+def _require_own_names(text: str) -> None:
+    """Refuse names of branches and signals of which two functions or tables would have one name."""
+    names = Counter(_DEFINED.findall(text))
+    name, times = names.most_common(1)[0]
+    if times > 1:
+        raise ExportError(f"{name}: two things would have this name in C; rename a branch, or a signal in the DBC")
 
 
 def _helpers(program: CProgram, corrected: Mapping[str, Arithmetic]) -> Iterator[str]:

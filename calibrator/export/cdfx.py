@@ -10,6 +10,7 @@ import xml.etree.ElementTree as ET
 from calibrator.export.characteristics import Characteristic, Note, characteristics, notes
 from calibrator.export.checked import Checked
 from ecu_node import __version__
+from ecu_node.errors import printable
 
 __all__ = ["cdfx_document"]
 
@@ -40,13 +41,13 @@ def cdfx_document(checked: Checked) -> bytes:
     _add(root, "SHORT-NAME", "HV_current_correction")
     _add(root, "CATEGORY", "CDF20")
     system = ET.SubElement(ET.SubElement(root, "SW-SYSTEMS"), "SW-SYSTEM")
-    _add(system, "SHORT-NAME", checked.database.layout.name)
+    _add(system, "SHORT-NAME", printable(checked.database.layout.name))
     tree = ET.SubElement(ET.SubElement(system, "SW-INSTANCE-SPEC"), "SW-INSTANCE-TREE")
     _add(tree, "SHORT-NAME", checked.provenance["vehicle"])
     _add(tree, "CATEGORY", "NO_VCD")
     origin = ET.SubElement(tree, "SW-INSTANCE-TREE-ORIGIN")
-    _add(origin, "SYMBOLIC-FILE", checked.database.layout.path.name)
-    _add(origin, "DATA-FILE", checked.name)
+    _add(origin, "SYMBOLIC-FILE", printable(checked.database.layout.path.name))
+    _add(origin, "DATA-FILE", printable(checked.name))
     _add_features(tree, checked)
     for note in texts:
         _add_text(tree, note, checked)

@@ -6,11 +6,10 @@ from pathlib import Path
 from ecu_node.check import warnings_of
 from ecu_node.correction import NO_FAULT, SensorFault
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import ParameterError
+from ecu_node.errors import ParameterError, printable
 from ecu_node.guard import Mode
-from ecu_node.layout import file_digest
-from ecu_node.parameter_file import choose_parameters
-from ecu_node.parameters import VehicleParameters
+from ecu_node.parameters import VehicleParameters, check_fit, decode_parameters, parameter_bytes
+from ecu_node.user_files import text_digest
 from ecu_node.wiring import InForce, sensor_fault
 
 __all__ = ["Checked", "read_checked"]
@@ -70,7 +69,7 @@ class Checked:
     def notices(self) -> list[str]:
         """What of the parameters a node does not do, one line each."""
         texts = warnings_of(self.database, self.in_force, Mode.GATEWAY, fd=True)
-        return [f"{self.name}: {text}" for text in texts]
+        return [f"{printable(self.name)}: {text}" for text in texts]
 
 
 def read_checked(path: Path, database: VehicleDatabase, vehicle: str | None) -> Checked:
@@ -95,7 +94,10 @@ def read_checked(path: Path, database: VehicleDatabase, vehicle: str | None) -> 
     ParameterError
         If the file cannot be read, or its parameters are for another vehicle, layout or DBC, or implausible.
     """
-    in_force, why_not = choose_parameters(path, database, vehicle)
-    if in_force.parameters is None:
-        raise ParameterError(why_not)
-    return Checked(name=path.name, digest=file_digest(path), parameters=in_force.parameters, database=database)
+    content = parameter_bytes(path)
+    parameters = decode_parameters(content, str(path))
+    try:
+        check_fit(parameters, database, vehicle)
+    except ParameterError as error:
+        raise ParameterError(f"{path}: {error}") from None
+    return Checked(name=path.name, digest=text_digest(content), parameters=parameters, database=database)

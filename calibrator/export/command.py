@@ -17,6 +17,7 @@ from calibrator.export.dcm import dcm_text
 from calibrator.folders import require_possible_file, require_possible_folder
 from calibrator.options import ExportFormat
 from ecu_node.database import read_database
+from ecu_node.errors import printable
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_atomically
 
@@ -45,7 +46,7 @@ def export(
         write_atomically(path, content)
     for text in (text for checked in tables for text in checked.notices()):
         print(f"notice: {text}", file=sys.stderr)
-    sys.stdout.write("".join(f"{path}\n" for path in files))
+    sys.stdout.write("".join(f"{printable(str(path))}\n" for path in files))
 
 
 def exported_files(tables: Sequence[Checked], format_: ExportFormat, output: Path) -> dict[Path, bytes]:

@@ -4,7 +4,9 @@ import csv
 import io
 from collections.abc import Sequence
 
+from calibrator.errors import ExportError
 from calibrator.export.checked import Checked
+from ecu_node.errors import printable
 from ecu_node.parameters import BranchParameters
 from ecu_node.sensor_models import GainBySign, TemperatureDrift
 
@@ -45,6 +47,8 @@ COLUMNS = (
 """Drifts are pure numbers, currents are in A, positive into the junction; empty: not known, or does not apply."""
 
 _Cell = str | float | bool | None
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
+"""With these a spreadsheet takes a text for a formula, which may fetch and run what it likes."""
 
 
 def csv_text(tables: Sequence[Checked]) -> str:
@@ -59,20 +63,39 @@ def csv_text(tables: Sequence[Checked]) -> str:
     -------
     str
         The table with its header, lines ended by CR LF; drifts and offsets are those that were found, corrected or not.
+
+    Raises
+    ------
+    ExportError
+        If a text, such as the vehicle's name, would be a formula in a spreadsheet.
     """
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, COLUMNS, restval="", lineterminator="\r\n")
     writer.writeheader()
     for checked in tables:
         for name, found in checked.parameters.branches.items():
-            writer.writerow({column: _cell(value) for column, value in _row(checked, name, found).items()})
+            row = _row(checked, name, found)
+            writer.writerow({column: _cell(value, column, checked) for column, value in row.items()})
     return text.getvalue()
 
 
-def _cell(value: _Cell) -> str:
+def _cell(value: _Cell, column: str, checked: Checked) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
+    if isinstance(value, str) and value.startswith(_FORMULA) and not _is_number(value):
+        raise ExportError(
+            f"{printable(checked.name)}: {column} {value!r} begins as a formula does, which a spreadsheet would work "
+            f"out; rename it"
+        )
     return "" if value is None else str(value)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _row(checked: Checked, name: str, found: BranchParameters) -> dict[str, _Cell]:

@@ -14,9 +14,10 @@ from calibrator.errors import ContradictionError, SigningError
 from calibrator.folders import require_possible_folder
 from calibrator.signing.key_files import PASSPHRASE_VARIABLE, new_key, read_public_key, read_signer
 from calibrator.signing.statements import signed_anew, signed_statement
-from ecu_node.errors import TrustError
+from ecu_node.errors import TrustError, printable
 from ecu_node.parameters import read_parameters, write_atomically
 from ecu_node.trust.canonical import Expected, canonical_bytes, read_bytes, read_canonical
+from ecu_node.trust.envelope import Envelope
 from ecu_node.trust.key_set import SIGNER_NAME, KeySet, check_key_set
 from ecu_node.trust.statements import Revocation, SignedParameters, open_statement
 
@@ -25,6 +26,8 @@ __all__ = ["keys", "revoke", "sign"]
 _TIME = "%Y-%m-%dT%H:%M:%SZ"
 _DAYS, _LONGEST_DAYS = 365, 3650
 _REVOCATION = Expected(what="a revocation that a vehicle would take", advice="change the options")
+
+_KEY_SET = Expected(what="a key set that a vehicle would take", advice="change the options")
 
 keys = typer.Typer(help="Keys of signers, and the set of them that vehicles trust.", no_args_is_help=True)
 
@@ -62,7 +65,7 @@ def new(
         raise SigningError(f"{name!r}: a name of letters, digits, '.', '_' and '-' is expected")
     require_possible_folder(out)
     out.mkdir(parents=True, exist_ok=True)
-    sys.stdout.write("".join(f"{path}\n" for path in new_key(name, out, passphrase)))
+    sys.stdout.write("".join(f"{printable(str(path))}\n" for path in new_key(name, out, passphrase)))
 
 
 @keys.command("set")
@@ -73,7 +76,7 @@ def make_set(
     version: Annotated[int, typer.Option(min=1, help="One more than that of the set before.")] = 1,
     key: KeyOption = [],  # noqa: B006
 ) -> None:
-    """Say whom vehicles trust. The first set is not signed; a later one is signed by signers of the set before."""
+    """Say whom vehicles trust. The first set is not signed; a later one by enough of the set before and of its own."""
     named = [read_public_key(path) for path in public]
     found = KeySet(version=version, threshold=threshold, keys={item.keyid: item.key for item in named})
     if len(found.keys) < len(named):
@@ -84,7 +87,9 @@ def make_set(
             "the first key set is not signed, and every later one is: give --key from version 2 on"
         )
     signers = [read_signer(path, _passphrase()) for path in key]
-    content = signed_statement(found, signers) if signers else canonical_bytes(found) + b"\n"
+    plain = canonical_bytes(found)
+    read_canonical(plain, KeySet, "key set", _KEY_SET)
+    content = signed_statement(found, signers) if signers else plain + b"\n"
     _write({out: content}, replace=False)
 
 
@@ -121,9 +126,9 @@ def sign(
                 allow_large_step=allow_large_step,
                 parameters=read_parameters(path),
             )
-            files[out / path.name] = _signed(statement, signers, path)
+            files[out / path.name] = _signed(path, statement, signers)
         else:
-            files[out / path.name] = signed_anew(open_statement(content, str(path))[0], signers)
+            files[out / path.name] = _signed(path, open_statement(content, str(path))[0], signers)
     if len(files) < len(params):
         raise SigningError(f"files of one name would overwrite each other in {out}; sign them one after the other")
     out.mkdir(parents=True, exist_ok=True)
@@ -151,10 +156,10 @@ def revoke(
     _write({out: signed_statement(statement, [read_signer(path, _passphrase()) for path in key])}, replace=False)
 
 
-def _signed(statement: SignedParameters, signers: list[CryptoSigner], path: Path) -> bytes:
+def _signed(path: Path, what: SignedParameters | Envelope, signers: list[CryptoSigner]) -> bytes:
     """A signed file that can be read again."""
     try:
-        content = signed_statement(statement, signers)
+        content = signed_anew(what, signers) if isinstance(what, Envelope) else signed_statement(what, signers)
         open_statement(content, "signed")
     except TrustError as error:
         raise SigningError(f"{path}: no vehicle could read this signed: {error}") from None
@@ -180,7 +185,7 @@ def _write(files: dict[Path, bytes], *, replace: bool) -> None:
             write_atomically(path, content)
         except OSError as error:
             raise SigningError(f"{path}: cannot be written: {error.strerror}") from None
-        print(path)
+        print(printable(str(path)))
 
 
 def _passphrase() -> str | None:

@@ -6,14 +6,13 @@ after a power cut between the two it is added before anything else is (:func:`te
 was not made, and of each that was.
 """
 
-import hashlib
 from datetime import UTC, datetime
 from pathlib import Path
 
 import msgspec
 
-from ecu_node.errors import UserError
 from ecu_node.trust.canonical import canonical_bytes
+from ecu_node.trust.log_lines import lines, lines_from_the_end
 from ecu_node.trust.storage import append_line
 
 __all__ = ["REFUSED", "AuditEntry", "Event", "add_entry", "broken_line", "event_now", "is_told", "tell"]
@@ -82,7 +81,8 @@ def add_entry(path: Path, event: Event) -> None:
     UserError
         If it cannot be written.
     """
-    entry = AuditEntry(**msgspec.structs.asdict(event), before=_digest(_last(_lines(path))))
+    last = next(lines_from_the_end(path), None)
+    entry = AuditEntry(**msgspec.structs.asdict(event), before=last.digest if last is not None else _FIRST)
     append_line(path, canonical_bytes(entry))
 
 
@@ -94,7 +94,7 @@ def tell(path: Path, event: Event | None) -> None:
 
 def is_told(path: Path, event: Event) -> bool:
     """Whether this is the last change of which the log tells."""
-    entries = (_entry(line) for line in reversed(_lines(path)))
+    entries = (_entry(line.text) for line in lines_from_the_end(path))
     last = next((entry for entry in entries if entry is not None and entry.event != REFUSED), None)
     return last is not None and last == AuditEntry(**msgspec.structs.asdict(event), before=last.before)
 
@@ -120,12 +120,12 @@ def broken_line(path: Path) -> int | None:
     UserError
         If it cannot be read.
     """
-    before = None
-    for number, line in enumerate(_lines(path), start=1):
-        start = b'{"before":"%b"' % _digest(before).encode()
-        if not start.startswith(line.rstrip(b"\0")[: len(start)]):
+    before = _FIRST
+    for number, line in enumerate(lines(path), start=1):
+        start = b'{"before":"%b"' % before.encode()
+        if not start.startswith(line.text.rstrip(b"\0")[: len(start)]):
             return number
-        before = line
+        before = line.digest
     return None
 
 
@@ -135,20 +135,3 @@ def _entry(line: bytes) -> AuditEntry | None:
         return msgspec.json.decode(line, type=AuditEntry)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
-
-
-def _last(lines: list[bytes]) -> bytes | None:
-    return lines[-1] if lines else None
-
-
-def _digest(line: bytes | None) -> str:
-    return hashlib.sha256(line).hexdigest() if line is not None else _FIRST
-
-
-def _lines(path: Path) -> list[bytes]:
-    try:
-        return path.read_bytes().splitlines()
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the audit log: {error.strerror}") from None

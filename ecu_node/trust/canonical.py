@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import msgspec
 import rfc8785
 
-from ecu_node.errors import TrustError
+from ecu_node.errors import TrustError, printable
 from ecu_node.status import Reason
 from ecu_node.user_files import UnsuitableFileError, read_user_file
 
@@ -139,8 +139,3 @@ def malformed(where: str, why: str, expected: Expected = SIGNED_FILE) -> TrustEr
     if len(shown) > _LONGEST_WHY:
         shown = f"{shown[:_LONGEST_WHY]}..."
     return TrustError(Reason.MALFORMED_PARAMETERS, f"{where}: not {expected.what}: {shown}; {expected.advice}")
-
-
-def printable(text: str) -> str:
-    """A text of a stranger's file without characters that would break the line or move the cursor."""
-    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)

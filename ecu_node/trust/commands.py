@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 from ecu_node.standard_output import write_output
 
 if TYPE_CHECKING:
+    from ecu_node.parameters import BranchParameters
+    from ecu_node.trust.key_set import KeySet
     from ecu_node.trust.statements import Statement
 
 __all__ = ["add_trust_commands"]
@@ -69,21 +71,21 @@ def _add_state(parser: argparse.ArgumentParser) -> None:
 
 
 def _vehicle(text: str) -> str:
-    if not 1 <= len(text.strip()) <= 64:  # as in the parameter file
+    if not text.strip() or len(text) > 64:  # as in the parameter file
         raise argparse.ArgumentTypeError("the vehicle's identity is expected, of at most 64 characters")
     return text
 
 
 def _provision(options: argparse.Namespace) -> int:
-    from ecu_node.trust.activation import provision  # noqa: PLC0415  # cryptography takes time to import
-    from ecu_node.trust.canonical import read_bytes, read_canonical  # noqa: PLC0415
+    from ecu_node.trust.canonical import printable, read_bytes, read_canonical  # noqa: PLC0415
     from ecu_node.trust.key_set import KEY_SET, KeySet, check_key_set  # noqa: PLC0415
+    from ecu_node.trust.provision import provision  # noqa: PLC0415  # cryptography takes time to import
 
     where = str(options.keys)
     content = read_bytes(options.keys, KEY_SET).removesuffix(b"\n")
     keys = check_key_set(read_canonical(content, KeySet, where, KEY_SET), where)
     provision(options.state, options.vehicle, keys, _now())
-    write_output(f"{options.state}: vehicle {options.vehicle} trusts {_signers(keys)}")
+    write_output(printable(f"{options.state}: vehicle {options.vehicle} trusts {_signers(keys)}"))
     return 0
 
 
@@ -128,10 +130,13 @@ def _statement_lines(statement: "Statement") -> list[str]:
     from ecu_node.trust.statements import Revocation  # noqa: PLC0415
 
     if isinstance(statement, KeySet):
-        return [f"key set {statement.version}: {_signers(statement)}"]
+        return [f"key set {statement.version}: {_signers(statement)}", *_keys(statement)]
     if isinstance(statement, Revocation):
         numbers = ", ".join(map(str, statement.revokes))
-        return [f"revocation number {statement.sequence} for vehicle {statement.vehicle}: {numbers}; {statement.why}"]
+        return [
+            f"revocation number {statement.sequence} for vehicle {statement.vehicle}: {numbers}; {statement.why}",
+            f"made at {statement.created}, before which no vehicle that takes it believes to be any more",
+        ]
     parameters = statement.parameters
     lines = [
         f"parameter set {parameters.number} for vehicle {statement.vehicle}, number {statement.sequence}",
@@ -141,8 +146,20 @@ def _statement_lines(statement: "Statement") -> list[str]:
     lines += ["may differ a lot from what is in force"] * statement.allow_large_step
     for name, branch in parameters.branches.items():
         applied = "applied" if branch.apply else f"not applied ({branch.held_back or 'no fault'})"
-        lines.append(f"branch {name}: drift {branch.drift:+.4g}, offset {branch.offset_a:+.4g} A, {applied}")
+        lines.append(f"branch {name}: {_drift(branch)}, offset {branch.offset_a:+.4g} A, {applied}")
     return lines
+
+
+def _drift(branch: "BranchParameters") -> str:
+    from ecu_node.sensor_models import GainBySign, TemperatureDrift  # noqa: PLC0415
+
+    match branch.sensor_model:
+        case GainBySign() as model:
+            return f"drift {model.drift_positive:+.4g} into and {model.drift_negative:+.4g} out of the junction"
+        case TemperatureDrift() as model:
+            return f"drift {branch.drift:+.4g} at {model.reference_c:g} degC, {model.drift_per_k:+.4g} per K"
+        case None:
+            return f"drift {branch.drift:+.4g}"
 
 
 def _inspect_state(folder: Path) -> int:
@@ -153,6 +170,7 @@ def _inspect_state(folder: Path) -> int:
     lines = [
         f"vehicle {state.vehicle}, highest number {state.highest_sequence}",
         f"key set {state.keys.version}: {_signers(state.keys)}",
+        *_keys(state.keys),
     ]
     for name, slot in sorted(state.slots.items()):
         places = {state.in_force: "in force", state.on_trial: "on trial", state.fallback: "in force before"}
@@ -168,11 +186,13 @@ def _inspect_state(folder: Path) -> int:
     return 0 if broken is None else 1
 
 
-def _signers(keys: "object") -> str:
-    from ecu_node.trust.key_set import KeySet  # noqa: PLC0415
-
-    assert isinstance(keys, KeySet)
+def _signers(keys: "KeySet") -> str:
     return f"{keys.threshold} of {', '.join(sorted(key.name for key in keys.keys.values()))}"
+
+
+def _keys(keys: "KeySet") -> list[str]:
+    """Whose key is which, to be compared with what the signers themselves say (NAME.pub)."""
+    return [f"  {key.name}: {key.ed25519}" for key in sorted(keys.keys.values(), key=lambda key: key.name)]
 
 
 def _now() -> datetime:

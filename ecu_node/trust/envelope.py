@@ -9,6 +9,7 @@ not only as many as the threshold asks for: no byte of a file that is accepted c
 
 import base64
 import binascii
+from collections.abc import Container
 from typing import Annotated
 
 import msgspec
@@ -18,9 +19,19 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from ecu_node.errors import TrustError
 from ecu_node.status import Reason
 from ecu_node.trust.canonical import canonical_bytes, malformed, printable, read_canonical
-from ecu_node.trust.key_set import KeySet
+from ecu_node.trust.key_set import KeyId, KeySet, PublicKey
 
-__all__ = ["Envelope", "Signature", "pae", "read_envelope", "signers", "write_envelope"]
+__all__ = [
+    "Envelope",
+    "Signature",
+    "not_signed",
+    "pae",
+    "read_envelope",
+    "require_known",
+    "signers",
+    "signers_among",
+    "write_envelope",
+]
 
 _Base64 = Annotated[str, msgspec.Meta(pattern="^[A-Za-z0-9+/]*={0,2}$")]
 
@@ -28,7 +39,7 @@ _Base64 = Annotated[str, msgspec.Meta(pattern="^[A-Za-z0-9+/]*={0,2}$")]
 class Signature(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Of one signer."""
 
-    keyid: Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
+    keyid: KeyId
     sig: _Base64
 
 
@@ -135,24 +146,46 @@ def signers(envelope: Envelope, keys: KeySet, where: str) -> list[str]:
     TrustError
         With reason NOT_SIGNED if a signature is wrong or of an unknown key, or there are fewer than the threshold.
     """
+    require_known(envelope, keys.keys, where)
+    return signers_among(envelope, keys, where)
+
+
+def signers_among(envelope: Envelope, keys: KeySet, where: str) -> list[str]:
+    """Who of a key set vouches for an envelope; signatures of other keys are not looked at.
+
+    Parameters, values and errors are those of :func:`signers`, but for unknown keys: see :func:`require_known`.
+    """
     signed = pae(envelope.payloadType, envelope.content)
     names = []
     for signature in envelope.signatures:
         key = keys.keys.get(signature.keyid)
         if key is None:
-            raise _not_signed(where, f"signed with key {printable(signature.keyid[:12])}, which is not trusted here")
-        try:
-            Ed25519PublicKey.from_public_bytes(bytes.fromhex(key.ed25519)).verify(
-                base64.b64decode(signature.sig), signed
-            )
-        except (InvalidSignature, ValueError):
-            raise _not_signed(where, f"the signature of {key.name} is wrong: the file was changed") from None
+            continue
+        if not _is_right(signature, key, signed):
+            raise not_signed(where, f"the signature of {key.name} is wrong: the file was changed")
         names.append(key.name)
     names.sort()
     if len(names) < keys.threshold:
-        raise _not_signed(where, f"signed by {', '.join(names)}; {keys.threshold} signers are needed")
+        by = ", ".join(names) or "nobody of them"
+        raise not_signed(where, f"signed by {by}; {keys.threshold} signers are needed")
     return names
 
 
-def _not_signed(where: str, why: str) -> TrustError:
+def require_known(envelope: Envelope, keys: Container[str], where: str) -> None:
+    """Refuse, with reason NOT_SIGNED, an envelope with a signature of a key that is not among these."""
+    for signature in envelope.signatures:
+        if signature.keyid not in keys:
+            raise not_signed(where, f"signed with key {printable(signature.keyid[:12])}, which is not trusted here")
+
+
+def _is_right(signature: Signature, key: PublicKey, signed: bytes) -> bool:
+    try:
+        Ed25519PublicKey.from_public_bytes(bytes.fromhex(key.ed25519)).verify(base64.b64decode(signature.sig), signed)
+    except (InvalidSignature, ValueError):
+        return False
+    return True
+
+
+def not_signed(where: str, why: str) -> TrustError:
+    """That not enough people vouch for a file."""
     return TrustError(Reason.NOT_SIGNED, f"{where}: {why}")

@@ -1,5 +1,6 @@
 """Whom a vehicle trusts: the public keys of the signers, and how many of them a statement needs."""
 
+from itertools import pairwise
 from typing import Annotated, Literal
 
 import msgspec
@@ -8,28 +9,30 @@ from ecu_node.errors import TrustError
 from ecu_node.status import Reason
 from ecu_node.trust.canonical import Expected
 
-__all__ = ["KEYS_TYPE", "KEY_SET", "SIGNER_NAME", "KeySet", "PublicKey", "check_key_set"]
+__all__ = ["KEYS_TYPE", "KEY_SET", "SIGNER_NAME", "KeyId", "KeySet", "PublicKey", "check_key_set"]
 
 KEYS_TYPE = "application/vnd.hv-current-correction.keys+json"
 KEY_SET = Expected(what="a key set", advice="make one with 'calibrator keys set'")
 SIGNER_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"
 """It stands in messages and in names of files."""
+KeyId = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
+"""By which a signature names its key; which key that is, the key set alone says."""
 
 
 class PublicKey(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Of one signer."""
 
     name: Annotated[str, msgspec.Meta(pattern=SIGNER_NAME)]
-    ed25519: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$", description="public key, RFC 8032")]
+    ed25519: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z", description="public key, RFC 8032")]
 
 
 class KeySet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Signers that are trusted. A new set takes the place of an old one if the old one's signers vouch for it."""
+    """Signers that are trusted. A new set takes the place of an old one if enough signers of both vouch for it."""
 
     schema_version: Literal[1] = 1
     version: Annotated[int, msgspec.Meta(ge=1, le=1_000_000, description="one more than that of the set before")]
     threshold: Annotated[int, msgspec.Meta(ge=1, le=16)]
-    keys: Annotated[dict[str, PublicKey], msgspec.Meta(min_length=1, max_length=16)]
+    keys: Annotated[dict[KeyId, PublicKey], msgspec.Meta(min_length=1, max_length=16)]
 
 
 def check_key_set(keys: KeySet, where: str) -> KeySet:
@@ -50,11 +53,17 @@ def check_key_set(keys: KeySet, where: str) -> KeySet:
     Raises
     ------
     TrustError
-        If one key stands there twice, or the threshold cannot be reached.
+        If one key or name stands there twice, or the threshold cannot be reached.
     """
     values = [key.ed25519 for key in keys.keys.values()]
     if len(set(values)) < len(values):
         raise TrustError(Reason.NOT_SIGNED, f"{where}: a key stands there twice; each signer has one of their own")
+    names = sorted(key.name for key in keys.keys.values())
+    twice = next((name for name, after in pairwise(names) if name == after), None)
+    if twice is not None:
+        raise TrustError(
+            Reason.NOT_SIGNED, f"{where}: {twice} stands there with two keys; each signer counts once, with one key"
+        )
     if keys.threshold > len(values):
         raise TrustError(
             Reason.NOT_SIGNED, f"{where}: {keys.threshold} signers are needed, and {len(values)} keys are there"

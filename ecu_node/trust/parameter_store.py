@@ -1,7 +1,9 @@
 """Signed parameters of a running node: those in force, those on trial, and the way from one to the other."""
 
 from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 from ecu_node.corrector import Corrector
@@ -11,18 +13,19 @@ from ecu_node.guard import Mode
 from ecu_node.parameter_file import FileSignature, signature
 from ecu_node.parameters import check_fit
 from ecu_node.status import Reason
-from ecu_node.trust.activation import conclude, require_time, signed_parameters
-from ecu_node.trust.state import Slot, SlotName, TrustState, read_state, slot_path, state_path
+from ecu_node.trust.activation import conclude
+from ecu_node.trust.state import Slot, SlotName, TrustState, read_state, signed_parameters, slot_path, state_path
 from ecu_node.trust.statements import SignedParameters
 from ecu_node.trust.trial import Trial, TrialResult, begin_trial
+from ecu_node.trust.validity import require_time
 from ecu_node.wiring import InForce, put_in_force
 
 __all__ = ["ParameterStore"]
 
 _LOOK_EVERY_S = 1.0
 """Between looks whether the state has changed, or what is in force has expired. [s]"""
-_CONCLUDE_EVERY_S = 60.0
-"""Between attempts to keep how a trial ended, on a disk that is full or broken. [s]"""
+_RETRY_EVERY_S = 60.0
+"""Between attempts to begin a trial, as before the clock is set, or to keep its end, as on a full disk. [s]"""
 
 
 class ParameterStore:
@@ -42,6 +45,8 @@ class ParameterStore:
         The time of day.
     vehicle : str or None
         Identity of the vehicle, where it is known besides; the state of another one is not used.
+    background : Executor or None
+        Writes how a trial ended, as a slow disk may take seconds, and the bus must not wait; None: written at once.
     """
 
     def __init__(
@@ -53,13 +58,18 @@ class ParameterStore:
         say: Callable[[str], None],
         now: Callable[[], datetime],
         vehicle: str | None = None,
+        background: Executor | None = None,
     ) -> None:
         self._folder, self._database, self._mode, self._say, self._now = folder, database, mode, say, now
         self._vehicle = vehicle
-        self._due_s = self._conclude_due_s = float("-inf")
+        self._background = background
+        self._due_s = self._retry_due_s = float("-inf")
         self._trial: Trial | None = None
+        self._no_trial: Reason | None = None
         self._result: TrialResult | None = None
+        self._end: Future[TrustState] | None = None
         self._tried: int | None = None
+        self._unread: str | None = None
         self._read: tuple[Slot, FileSignature | None, SignedParameters] | None = None
         self._seen = signature(state_path(folder))
         self._state: TrustState | None = None
@@ -69,6 +79,7 @@ class ParameterStore:
             self._state = read_state(folder)
         except TrustError as error:
             self.in_force, self.why_not = InForce(parameters=None, reason=error.reason), str(error)
+            self._unread = str(error)
         else:
             self.in_force, self.why_not = self._in_force(self._state)
 
@@ -93,15 +104,22 @@ class ParameterStore:
         if not asked and now_s < self._due_s:
             return False
         self._due_s = now_s + _LOOK_EVERY_S
-        seen = signature(state_path(self._folder))
-        if asked or seen != self._seen:
-            self._seen = seen
-            try:
-                self._state = read_state(self._folder)
-            except UserError as error:
-                self._say(f"the state of the vehicle is not read, what was in force stays: {error}")
-                return False
+        if self._end is None:
+            self._read_again(asked=asked)
         return self._state is not None and self._put_in_force(corrector, self._state, now_s)
+
+    def _read_again(self, *, asked: bool) -> None:
+        """Read the state if it was changed, or could not be read the last time: it may hold a revocation."""
+        seen = signature(state_path(self._folder))
+        if not asked and self._unread is None and seen == self._seen:
+            return
+        self._seen = seen
+        try:
+            self._state, self._unread = read_state(self._folder), None
+        except UserError as error:
+            if asked or str(error) != self._unread:
+                self._say(f"the state of the vehicle is not read, what was in force stays: {error}")
+            self._unread = str(error)
 
     def _put_in_force(self, corrector: Corrector, state: TrustState, now_s: float) -> bool:
         in_force, why_not = self._in_force(state)
@@ -155,41 +173,69 @@ class ParameterStore:
         """Go on with a trial; at its end what was tried is in force, or gone."""
         number = self._number_on_trial()
         if number != self._tried:
-            self._tried, self._result = number, None
-            self._trial = self._begin(corrector) if number is not None else None
-        if number is not None and self._result is not None:
+            self._tried, self._trial, self._no_trial, self._result = number, None, None, None
+            self._retry_due_s = float("-inf")
+        if number is None:
+            return
+        if self._result is not None:
             self._conclude(number, self._result, now_s)
-        elif self._trial is not None and corrector.watch.is_whole():
+        elif self._trial is None:
+            self._begin(corrector, now_s)
+        elif corrector.watch.is_whole():
             self._result = self._trial.look(now_s)
 
     def _conclude(self, number: int, result: TrialResult, now_s: float) -> None:
         """Keep how a trial ended; try again later if that cannot be written, as what was in force stays meanwhile."""
-        if now_s < self._conclude_due_s:
+        if self._end is None:
+            if now_s < self._retry_due_s:
+                return
+            self._end = self._start(
+                partial(conclude, self._folder, number, passed=result.passed, text=result.text, now=self._now())
+            )
+        if not self._end.done():
             return
+        end, self._end = self._end, None
         try:
-            self._state = conclude(self._folder, number, passed=result.passed, text=result.text, now=self._now())
+            self._state = end.result()
         except UserError as error:
-            self._conclude_due_s = now_s + _CONCLUDE_EVERY_S
+            self._retry_due_s = now_s + _RETRY_EVERY_S
             self._say(f"how the trial of number {number} ended cannot be kept, what was in force stays: {error}")
             return
         self._result, self._due_s = None, float("-inf")
         self._say(f"number {number} {'has passed' if result.passed else 'has failed'} its trial: {result.text}")
+
+    def _start(self, work: Callable[[], TrustState]) -> "Future[TrustState]":
+        if self._background is not None:
+            return self._background.submit(work)
+        done: Future[TrustState] = Future()
+        try:
+            done.set_result(work())
+        except UserError as error:
+            done.set_exception(error)
+        return done
 
     def _number_on_trial(self) -> int | None:
         if self._state is None or self._state.on_trial is None:
             return None
         return self._state.slots[self._state.on_trial].sequence
 
-    def _begin(self, corrector: Corrector) -> Trial | None:
+    def _begin(self, corrector: Corrector, now_s: float) -> None:
+        """Begin the trial if the set may be used here and now; else try again later, as when the clock is set."""
         assert self._state is not None
         assert self._state.on_trial is not None
+        if now_s < self._retry_due_s:
+            return
         try:
             signed = self._fitting(self._state, self._state.on_trial)
         except UnfitError as error:
-            self._say(f"no trial: {error}")
-            return None
+            self._retry_due_s = now_s + _RETRY_EVERY_S
+            if error.reason is not self._no_trial:
+                self._no_trial = error.reason
+                self._say(f"no trial yet: {error}")
+            return
+        self._retry_due_s = float("-inf")
         self._say(f"number {signed.sequence} is on trial: parameter set {signed.parameters.number}")
-        return begin_trial(signed.parameters, self._database, corrector.branches)
+        self._trial = begin_trial(signed.parameters, self._database, corrector.branches)
 
 
 def _why_nothing(state: TrustState) -> tuple[Reason, str]:

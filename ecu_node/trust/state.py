@@ -7,7 +7,8 @@
 
 A signed file is written beside its slot first, then ``state.json`` is replaced, and then the file takes its place.
 ``state.json`` holds the SHA-256 of each slot: of the file in the slot and the one beside it that one counts. So after a
-power cut at any moment the state is that of before or of after, both slots whole.
+power cut at any moment the state is that of before or of after, both slots whole. It holds that of itself, too: a bit
+that the disk has changed might otherwise lower a number, drop a key, or put the other slot in force.
 """
 
 import hashlib
@@ -21,7 +22,7 @@ from ecu_node.status import Reason
 from ecu_node.trust.audit import Event
 from ecu_node.trust.canonical import MAX_BYTES, Expected, canonical_bytes, malformed, read_bytes, read_canonical
 from ecu_node.trust.key_set import KeySet, check_key_set
-from ecu_node.trust.statements import instant
+from ecu_node.trust.statements import SignedParameters, instant, open_statement
 from ecu_node.trust.storage import move_file, replace_file, write_file
 from ecu_node.user_files import UnsuitableFileError, read_user_file
 
@@ -33,6 +34,7 @@ __all__ = [
     "read_slot",
     "read_state",
     "settle_slots",
+    "signed_parameters",
     "slot_of",
     "slot_path",
     "state_path",
@@ -76,6 +78,13 @@ class TrustState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return self.on_trial or ("b" if self.in_force == "a" else "a")
 
 
+class _SealedState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Content of ``state.json``."""
+
+    sha256: Annotated[_Digest, msgspec.Meta(description="of the text of the state")]
+    state: TrustState
+
+
 def state_path(folder: Path) -> Path:
     """Where the state stands."""
     return folder / "state.json"
@@ -100,7 +109,10 @@ def read_state(folder: Path) -> TrustState:
         If there is none, or it is damaged.
     """
     path = state_path(folder)
-    state = read_canonical(_state_bytes(folder), TrustState, str(path), _STATE)
+    content = _state_bytes(folder)
+    state = read_canonical(content, _SealedState, str(path), _STATE).state
+    if _sealed(content[len(_sealed(b"")) - 1 : -1]) != content:
+        raise malformed(str(path), "it is not what was written there", _STATE)
     named = [name for name in (state.in_force, state.on_trial) if name is not None]
     if len(set(named)) < len(named) or not set(named) <= state.slots.keys():
         raise malformed(str(path), "slots in force and on trial do not go together", _STATE)
@@ -126,7 +138,12 @@ def _state_bytes(folder: Path) -> bytes:
 
 def write_state(folder: Path, state: TrustState) -> None:
     """Put a new state in the place of the one before; all that it speaks of must be written already."""
-    replace_file(state_path(folder), canonical_bytes(state))
+    replace_file(state_path(folder), _sealed(canonical_bytes(state)))
+
+
+def _sealed(state: bytes) -> bytes:
+    """Canonical JSON with the digest of a state before it."""
+    return b'{"sha256":"%b","state":%b}' % (hashlib.sha256(state).hexdigest().encode(), state)
 
 
 def write_slot(folder: Path, name: SlotName, content: bytes) -> None:
@@ -188,6 +205,34 @@ def read_slot(folder: Path, state: TrustState, name: SlotName) -> bytes:
     if slot is None or slot_of(content, slot.sequence) != slot:
         raise TrustError(Reason.NOT_SIGNED, f"{path}: not what was accepted; activate parameters anew")
     return content
+
+
+def signed_parameters(folder: Path, state: TrustState, name: SlotName) -> SignedParameters:
+    """What stands in a slot.
+
+    Parameters
+    ----------
+    folder : Path
+        State of the vehicle.
+    state : TrustState
+        Of the same.
+    name : SlotName
+        Which slot.
+
+    Returns
+    -------
+    SignedParameters
+        As they were accepted.
+
+    Raises
+    ------
+    TrustError
+        If the slot does not hold what was accepted.
+    """
+    content = read_slot(folder, state, name)
+    _, statement = open_statement(content, str(folder / f"slot-{name}.json"))
+    assert isinstance(statement, SignedParameters), "nothing else is written into a slot"
+    return statement
 
 
 def audit_path(folder: Path) -> Path:

@@ -13,7 +13,7 @@ from ecu_node.errors import TrustError
 from ecu_node.parameters import VehicleParameters
 from ecu_node.status import Reason
 from ecu_node.trust.canonical import read_canonical
-from ecu_node.trust.envelope import Envelope, read_envelope, signers
+from ecu_node.trust.envelope import Envelope, not_signed, read_envelope, require_known, signers, signers_among
 from ecu_node.trust.key_set import KEYS_TYPE, KeySet, check_key_set
 
 __all__ = [
@@ -108,6 +108,10 @@ def open_statement(content: bytes, where: str) -> tuple[Envelope, Statement]:
         With reason MALFORMED_PARAMETERS if it is no signed file, or of no known kind.
     """
     envelope = read_envelope(content, where)
+    return envelope, _statement(envelope, where)
+
+
+def _statement(envelope: Envelope, where: str) -> Statement:
     kind = _KINDS.get(envelope.payloadType)
     if kind is None:
         raise TrustError(
@@ -122,11 +126,14 @@ def open_statement(content: bytes, where: str) -> tuple[Envelope, Statement]:
         instant(statement.expires, where)
     else:
         instant(statement.created, where)
-    return envelope, statement
+    return statement
 
 
 def verify(content: bytes, keys: KeySet, where: str) -> Verified:
     """Read a signed file that must be vouched for.
+
+    A key set must be signed by enough signers of the set that is trusted, and by enough of its own: one whose keys
+    nobody has would keep the vehicle from ever taking anything again. Its own are asked only after the others.
 
     Parameters
     ----------
@@ -148,8 +155,25 @@ def verify(content: bytes, keys: KeySet, where: str) -> Verified:
         As :func:`open_statement`, or with reason NOT_SIGNED.
     """
     envelope = read_envelope(content, where)
+    if envelope.payloadType == KEYS_TYPE:
+        return _verified_keys(envelope, keys, where)
     names = signers(envelope, keys, where)
-    return Verified(statement=open_statement(content, where)[1], signers=names)
+    return Verified(statement=_statement(envelope, where), signers=names)
+
+
+def _verified_keys(envelope: Envelope, keys: KeySet, where: str) -> Verified:
+    """A key set; its content is not looked at before enough of those who are trusted vouch for it."""
+    names = signers_among(envelope, keys, where)
+    new = _statement(envelope, where)
+    assert isinstance(new, KeySet), "the kind says so"
+    require_known(envelope, keys.keys | new.keys, where)
+    own = sum(signature.keyid in new.keys for signature in envelope.signatures)
+    if own < new.threshold:
+        raise not_signed(
+            where,
+            f"signed by {own} of the new set itself; {new.threshold} are needed, who so show that they have their keys",
+        )
+    return Verified(statement=new, signers=sorted({*names, *signers_among(envelope, new, where)}))
 
 
 def instant(text: str, where: str) -> datetime:

@@ -1,7 +1,10 @@
 """Files that a power cut must not spoil: replaced whole, or added to at the end."""
 
+import errno
 import fcntl
 import os
+import stat
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -10,9 +13,13 @@ from ecu_node.errors import UserError
 
 __all__ = ["append_line", "locked", "move_file", "replace_file", "write_file"]
 
-_CAREFUL = os.O_CLOEXEC | os.O_NOFOLLOW
-"""Root writes into a folder that belongs to the node: a link there must not lead it to another file."""
+_CAREFUL = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+"""Root writes into a folder that belongs to the node: a link there leads it nowhere, and no pipe keeps it waiting."""
 _MODE = 0o644
+LONGEST_WAIT_S = 30.0
+"""For another process; one that was stopped never ends. [s]"""
+_ASK_EVERY_S = 0.01
+"""[s]"""
 
 
 def replace_file(path: Path, content: bytes) -> None:
@@ -52,7 +59,11 @@ def write_file(path: Path, content: bytes) -> None:
     """
     try:
         path.unlink(missing_ok=True)
-        _write(path, content, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+        handle = _open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+        try:
+            _write(handle, content)
+        finally:
+            os.close(handle)
         _sync_folder(path.parent)
     except OSError as error:
         with suppress(OSError):
@@ -102,8 +113,15 @@ def append_line(path: Path, line: bytes) -> None:
         If it cannot be written.
     """
     try:
-        start = b"" if _ends_whole(path) else b"\n"
-        _write(path, start + line + b"\n", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        handle = _open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND)
+        try:
+            size = os.fstat(handle).st_size
+            is_whole = size == 0 or os.pread(handle, 1, size - 1) == b"\n"
+            _write(handle, (b"" if is_whole else b"\n") + line + b"\n")
+        finally:
+            os.close(handle)
+        if size == 0:
+            _sync_folder(path.parent)
     except OSError as error:
         raise _not_written(path, error) from None
 
@@ -117,7 +135,7 @@ def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
     folder : Path
         It must exist.
     wait : bool
-        Until no other process changes it; else that is an error.
+        For a while, until no other process changes it; else that is an error at once.
 
     Raises
     ------
@@ -125,24 +143,28 @@ def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
         If there is no such folder, it must not be written, or another process changes it now.
     """
     try:
-        handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | _CAREFUL, _MODE)
+        handle = _open(folder / "lock", os.O_RDWR | os.O_CREAT)
     except OSError as error:
         raise _unusable(folder, error) from None
     try:
-        _lock(folder, handle, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _lock(folder, handle, time.monotonic() + (LONGEST_WAIT_S if wait else 0.0))
         yield
     finally:
         os.close(handle)
 
 
-def _lock(folder: Path, handle: int, how: int) -> None:
-    try:
-        _give_to_owner_of(folder, handle)
-        fcntl.flock(handle, how)
-    except BlockingIOError:
-        raise UserError(f"{folder}: another process changes it now; try again") from None
-    except OSError as error:
-        raise _unusable(folder, error) from None
+def _lock(folder: Path, handle: int, until_s: float) -> None:
+    while True:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= until_s:
+                raise UserError(f"{folder}: another process changes it now; try again") from None
+            time.sleep(_ASK_EVERY_S)
+        except OSError as error:
+            raise _unusable(folder, error) from None
+        else:
+            return
 
 
 def _unusable(folder: Path, error: OSError) -> UserError:
@@ -153,23 +175,29 @@ def _not_written(path: Path, error: OSError) -> UserError:
     return UserError(f"{path}: cannot be written: {error.strerror}")
 
 
-def _write(path: Path, content: bytes, flags: int) -> None:
+def _open(path: Path, flags: int) -> int:
+    """Open a file that is this folder's own, and belongs to whom the folder belongs to: the node goes on with it."""
     handle = os.open(path, flags | _CAREFUL, _MODE)
     try:
-        _give_to_owner_of(path.parent, handle)
-        done = 0
-        while done < len(content):
-            done += os.write(handle, content[done:])
-        os.fsync(handle)
-    finally:
+        found = os.fstat(handle)
+        if not stat.S_ISREG(found.st_mode):
+            raise OSError(errno.EINVAL, "it is no file; remove it")
+        owner = path.parent.stat()
+        if os.geteuid() == 0 and (found.st_uid, found.st_gid) != (owner.st_uid, owner.st_gid):
+            if found.st_nlink != 1:
+                raise OSError(errno.EPERM, "it is another name of somebody else's file; remove it")
+            os.fchown(handle, owner.st_uid, owner.st_gid)
+    except BaseException:
         os.close(handle)
+        raise
+    return handle
 
 
-def _give_to_owner_of(folder: Path, handle: int) -> None:
-    """What root writes belongs to whom the folder belongs to: the node, which must be able to go on with it."""
-    if os.geteuid() == 0:
-        owner = folder.stat()
-        os.fchown(handle, owner.st_uid, owner.st_gid)
+def _write(handle: int, content: bytes) -> None:
+    done = 0
+    while done < len(content):
+        done += os.write(handle, content[done:])
+    os.fsync(handle)
 
 
 def _sync_folder(folder: Path) -> None:
@@ -178,15 +206,3 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _ends_whole(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            file.seek(0, os.SEEK_END)
-            if file.tell() == 0:
-                return True
-            file.seek(-1, os.SEEK_END)
-            return file.read(1) == b"\n"
-    except FileNotFoundError:
-        return True

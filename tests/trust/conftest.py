@@ -12,7 +12,8 @@ from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import VehicleParameters, write_parameters
-from ecu_node.trust.activation import accept, conclude, provision
+from ecu_node.trust.activation import accept, conclude
+from ecu_node.trust.provision import provision
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
 from tests.trust.signing import NOW, VEHICLE, Run, Signers, make_signers
 

@@ -45,13 +45,13 @@ class Signers:
         *,
         by: str = "ab",
         not_before: datetime = NOW,
-        expires: datetime = NOW + timedelta(days=365),
+        expires: datetime | None = None,
         allow_large_step: bool = False,
     ) -> bytes:
         statement = SignedParameters(
             sequence=sequence,
             not_before=time_text(not_before),
-            expires=time_text(expires),
+            expires=time_text(expires if expires is not None else not_before + timedelta(days=365)),
             allow_large_step=allow_large_step,
             parameters=parameters,
         )

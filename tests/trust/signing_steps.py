@@ -1,7 +1,7 @@
 """What the tests of the signers' commands have in common."""
 
 import resource
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import msgspec
 from ecu_node.trust.key_set import KeySet, check_key_set
 
 
-def by(keys: Path, names: str) -> list[object]:
+def by(keys: Path, names: Iterable[str]) -> list[object]:
     return [item for name in names for item in ("--key", keys / f"{name}.key")]
 
 

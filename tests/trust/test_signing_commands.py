@@ -23,6 +23,17 @@ def test_each_signer_adds_a_signature(calibrator: Run, keys: Path, params: Path,
     assert (tmp_path / "third" / "v1.json").read_bytes() == (second / "v1.json").read_bytes(), "who signs twice"
 
 
+def test_a_file_takes_no_more_signatures_than_a_vehicle_reads(calibrator: Run, params: Path, tmp_path: Path) -> None:
+    names = [f"n{number}" for number in range(17)]
+    for name in names:
+        assert calibrator("keys", "new", name, "--no-passphrase", "--out", tmp_path / "many")[0] == 0
+    many = by(tmp_path / "many", names)
+    assert calibrator("sign", params, *many[:32], "--out", tmp_path / "sixteen")[0] == 0
+    done = calibrator("sign", tmp_path / "sixteen" / "v1.json", *many[32:], "--out", tmp_path / "more")
+    require_one_line(done, "no vehicle could read this signed")
+    assert not (tmp_path / "more").exists()
+
+
 def test_a_file_that_was_changed_after_it_was_signed_is_not_signed_by_one_more(
     calibrator: Run, keys: Path, params: Path, tmp_path: Path
 ) -> None:

@@ -171,6 +171,27 @@ def test_only_a_later_key_set_is_signed(calibrator: Run, keys: Path, tmp_path: P
     require_one_line(calibrator(*make, "--version", 2, *by(keys, "ab")), "there is a file already")
 
 
+def test_a_key_set_that_no_vehicle_could_read_is_not_made(calibrator: Run, tmp_path: Path) -> None:
+    folder, out = tmp_path / "many", tmp_path / "s"
+    for number in range(17):
+        assert calibrator("keys", "new", f"n{number}", "--no-passphrase", "--out", folder)[0] == 0
+    public = sorted(folder.glob("*.pub"))
+    words = "not a key set that a vehicle would take: "
+    require_one_line(calibrator("keys", "set", *public, "--threshold", 2, "--out", out), words)
+    make = ["keys", "set", *public[:3], "--threshold", 2, "--out", out]
+    require_one_line(calibrator(*make, "--version", 1_000_001, *by(folder, ["n0"])), words)
+    assert not out.exists()
+    assert calibrator(*make)[0] == 0
+
+
+def test_one_name_for_two_keys_is_refused(calibrator: Run, tmp_path: Path) -> None:
+    for folder in ("one", "other"):
+        assert calibrator("keys", "new", "a", "--no-passphrase", "--out", tmp_path / folder)[0] == 0
+    public = [tmp_path / "one" / "a.pub", tmp_path / "other" / "a.pub"]
+    done = calibrator("keys", "set", *public, "--threshold", 2, "--out", tmp_path / "s")
+    require_one_line(done, "a stands there with two keys")
+
+
 @pytest.mark.parametrize("free_bytes", [0, 60, 150])
 def test_a_key_on_a_full_disk_leaves_nothing(free_bytes: int, calibrator: Run, tmp_path: Path) -> None:
     """The private key has 119 bytes, the public one more."""

@@ -11,11 +11,14 @@ from msgspec.structs import replace
 
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UnfitError, UserError
-from ecu_node.parameters import VehicleParameters
+from ecu_node.parameters import FileReference, VehicleParameters
+from ecu_node.sensor_models import TemperatureDrift
 from ecu_node.status import Reason
-from ecu_node.trust.activation import Accepted, accept, conclude, examine, provision, signed_parameters
+from ecu_node.trust.activation import accept, conclude, examine
 from ecu_node.trust.audit import AuditEntry, broken_line
-from ecu_node.trust.state import audit_path, read_slot, read_state
+from ecu_node.trust.judgement import Accepted
+from ecu_node.trust.provision import provision
+from ecu_node.trust.state import audit_path, read_slot, read_state, signed_parameters
 from tests.ecu_node.vehicles import parameters_for
 from tests.trust.signing import NOW, VEHICLE, Signers
 
@@ -195,12 +198,51 @@ def test_a_large_step_needs_the_signers_word(
     assert read_state(state).slots["b"].sequence == 6
 
 
+def test_a_drift_that_changes_with_temperature_is_no_way_around_the_largest_step(
+    state: Path, signers: Signers, parameters: VehicleParameters, database: VehicleDatabase
+) -> None:
+    activate(state, signers.parameters(parameters, 5), database)
+    battery = parameters.branches["battery"]
+
+    def with_model(per_k: float, reference_c: float) -> VehicleParameters:
+        model = TemperatureDrift(drift_per_k=per_k, reference_c=reference_c)
+        return replace(parameters, branches={**parameters.branches, "battery": replace(battery, sensor_model=model)})
+
+    for per_k, reference_c in ((0.005, 25.0), (-0.005, 25.0), (0.001, 400.0), (0.9, 1e308)):
+        with pytest.raises(UnfitError, match=r"branch battery: differs from the set in force by .* in drift"):
+            take(state, signers.parameters(with_model(per_k, reference_c), 6), database)
+    activate(state, signers.parameters(with_model(0.001, 25.0), 6), database)
+    assert read_state(state).in_force == "b"
+
+
+def test_names_from_a_file_stay_within_one_line(
+    state: Path, signers: Signers, parameters: VehicleParameters, database: VehicleDatabase
+) -> None:
+    bad = "x\n\x1b[2Jall is well" + "y" * 100_000
+    reference = FileReference(name=bad, sha256="0" * 64)
+    battery = parameters.branches["battery"]
+    for other in (
+        replace(parameters, layout=reference),
+        replace(parameters, dbc=reference),
+        replace(parameters, branches={bad: battery}),
+        replace(parameters, branches={bad: replace(battery, delay_s=99.0)}),
+        replace(parameters, branches={bad: battery}, verdict="cannot tell"),
+    ):
+        with pytest.raises(UnfitError) as caught:
+            take(state, signers.parameters(other, 5), database)
+        assert str(caught.value).isprintable(), str(caught.value)[:200]
+        assert len(str(caught.value)) < 1000
+
+
 def test_a_clock_that_was_set_back_does_not_bring_back_what_has_expired(
     state: Path, signers: Signers, parameters: VehicleParameters, database: VehicleDatabase
 ) -> None:
     later = NOW + timedelta(days=30)
     accept(state, signers.parameters(parameters, 5, not_before=later), "f", database, later)
-    with pytest.raises(TrustError, match="expired at") as caught:
+    words = (
+        "expired at 2026-06-11T12:00:00Z: the newest file accepted here is of 2026-07-01T12:00:00Z, though the clock"
+    )
+    with pytest.raises(TrustError, match=words) as caught:
         take(state, signers.parameters(parameters, 6, expires=NOW + timedelta(days=10)), database)
     assert caught.value.reason is Reason.NOT_VALID_NOW
 
@@ -239,19 +281,6 @@ def test_a_revocation_does_not_put_in_force_what_is_on_trial(
     take(state, signers.revocation(7, 5), database)
     found = read_state(state)
     assert (found.in_force, found.on_trial) == (None, "b")
-
-
-def test_keys_are_rotated_by_the_signers_of_before(
-    state: Path, signers: Signers, parameters: VehicleParameters, database: VehicleDatabase
-) -> None:
-    with pytest.raises(TrustError, match="which is not trusted here"):
-        take(state, signers.key_set(signers.keys("acd", version=2), by="cd"), database)
-    take(state, signers.key_set(signers.keys("acd", version=2), by="ab"), database)
-    with pytest.raises(TrustError, match="which is not trusted here"):
-        take(state, signers.parameters(parameters, 5, by="ab"), database)
-    take(state, signers.parameters(parameters, 5, by="cd"), database)
-    with pytest.raises(TrustError, match="which is not trusted here"):
-        take(state, signers.key_set(signers.keys("abc", version=3), by="ab"), database)
 
 
 def test_a_slot_that_was_changed_is_not_used(

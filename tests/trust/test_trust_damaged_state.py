@@ -116,6 +116,7 @@ def test_a_whole_state_is_corrected_with(two_slots: Path, node: Callable[..., Se
 
 
 DAMAGED = "not the state of a vehicle"
+CHANGED = f"{DAMAGED}: it is not what was written there"
 NOT_ACCEPTED = "not what was accepted; activate parameters anew"
 
 
@@ -133,8 +134,15 @@ NOT_ACCEPTED = "not what was accepted; activate parameters anew"
         ("state.json", lambda path: path.write_bytes(b"[]"), Reason.MALFORMED_PARAMETERS, DAMAGED),
         ("state.json", with_text(b'"in_force":"b"', b'"in_force":"c"'), Reason.MALFORMED_PARAMETERS, DAMAGED),
         ("state.json", with_text(b'"on_trial":null', b'"on_trial":"b"'), Reason.MALFORMED_PARAMETERS, DAMAGED),
-        ("state.json", with_text(b'"newest":"2', b'"newest":"x'), Reason.MALFORMED_PARAMETERS, "is no time"),
-        ("state.json", with_text(b'"threshold":2', b'"threshold":9'), Reason.NOT_SIGNED, "9 signers are needed"),
+        ("state.json", with_text(b'"newest":"2', b'"newest":"x'), Reason.MALFORMED_PARAMETERS, CHANGED),
+        ("state.json", with_text(b'"threshold":2', b'"threshold":1'), Reason.MALFORMED_PARAMETERS, CHANGED),
+        ("state.json", with_text(b'"in_force":"b"', b'"in_force":"a"'), Reason.MALFORMED_PARAMETERS, CHANGED),
+        (
+            "state.json",
+            with_text(b'"highest_sequence":6', b'"highest_sequence":2'),
+            Reason.MALFORMED_PARAMETERS,
+            CHANGED,
+        ),
         ("slot-b.json", without, Reason.NO_PARAMETERS, "cannot read the file"),
         ("slot-b.json", a_folder, Reason.MALFORMED_PARAMETERS, "it is a folder"),
         ("slot-b.json", cut, Reason.NOT_SIGNED, NOT_ACCEPTED),

@@ -11,9 +11,9 @@ from securesystemslib.dsse import Envelope as DsseEnvelope
 from ecu_node.errors import TrustError
 from ecu_node.parameters import VehicleParameters
 from ecu_node.status import Reason
-from ecu_node.trust.canonical import canonical_bytes
+from ecu_node.trust.canonical import canonical_bytes, read_canonical
 from ecu_node.trust.envelope import read_envelope
-from ecu_node.trust.key_set import KeySet, PublicKey, check_key_set
+from ecu_node.trust.key_set import KEY_SET, KeySet, PublicKey, check_key_set
 from ecu_node.trust.statements import PARAMETERS_TYPE, Revocation, SignedParameters, open_statement, verify
 from tests.trust.signing import Signers
 
@@ -199,6 +199,18 @@ def test_key_sets_that_cannot_work_are_refused(signers: Signers) -> None:
     twice = KeySet(version=1, threshold=2, keys={"x": one, "y": PublicKey(name="b", ed25519=one.ed25519)})
     with pytest.raises(TrustError, match="a key stands there twice"):
         check_key_set(twice, "k")
+    named = KeySet(version=1, threshold=2, keys={"x": one, "y": PublicKey(name="a", ed25519="0" * 64)})
+    with pytest.raises(TrustError, match="a stands there with two keys"):
+        check_key_set(named, "k")
+
+
+def test_a_key_has_one_spelling(signers: Signers) -> None:
+    """Else one key could stand in a set twice, and its owner count for two."""
+    content = canonical_bytes(signers.keys())
+    key = signers.public["a"].key.ed25519
+    for other in (key + "\\n", key.upper(), f"{key[:2]} {key[2:]}"):
+        with pytest.raises(TrustError, match="not a key set"):
+            read_canonical(content.replace(key.encode(), other.encode()), KeySet, "k", KEY_SET)
 
 
 def test_a_revocation_says_what_it_revokes(signers: Signers) -> None:

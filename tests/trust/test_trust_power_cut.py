@@ -20,11 +20,12 @@ from msgspec.structs import replace
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UserError
 from ecu_node.parameters import VehicleParameters
-from ecu_node.trust.activation import accept, conclude, provision, signed_parameters
+from ecu_node.trust.activation import accept, conclude
 from ecu_node.trust.audit import REFUSED, AuditEntry, broken_line
 from ecu_node.trust.envelope import read_envelope
 from ecu_node.trust.envelope import signers as signers_of
-from ecu_node.trust.state import TrustState, audit_path, read_slot, read_state
+from ecu_node.trust.provision import provision
+from ecu_node.trust.state import TrustState, audit_path, read_slot, read_state, signed_parameters
 from tests.ecu_node.vehicles import LAYOUT
 from tests.trust.signing import VEHICLE, Signers
 from tests.trust.system_calls import Call, calls_of, failing, killed_before, not_synced, traced

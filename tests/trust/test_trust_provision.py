@@ -1,13 +1,17 @@
 """Where a vehicle keeps its state: made once, of a key set, in a folder; and what files and links must not do there."""
 
 import os
+import subprocess
+import sys
 from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
+from ecu_node.cli import main
 from ecu_node.parameters import VehicleParameters
+from ecu_node.sensor_models import GainBySign, TemperatureDrift
 from ecu_node.trust.canonical import canonical_bytes
 from tests.trust.signing import Run, Signers, on
 
@@ -70,6 +74,73 @@ def test_inspecting_shows_names_from_files_without_control_characters(
     code, out, err = run("inspect", tmp_path / "p")
     assert (code, err) == (0, "")
     assert out.splitlines()[0] == "parameter set 300 for vehicle v\\n\\x1b[2Jall is well, number 6"
+
+
+def test_inspecting_shows_all_that_a_second_signer_vouches_for(
+    signers: Signers, parameters: VehicleParameters, state: Path, tmp_path: Path, run: Run
+) -> None:
+    """Names alone do not tell whose key is in a set, nor one drift what a sensor that is not linear gets."""
+
+    def shown(content: bytes) -> str:
+        (tmp_path / "f").write_bytes(content)
+        code, out, _ = run("inspect", tmp_path / "f")
+        assert code == 0
+        return out
+
+    found = shown(signers.key_set(signers.keys("abd", version=2)))
+    assert all(signers.public[name].key.ed25519 in found for name in "abd")
+    assert signers.public["a"].key.ed25519 in run("inspect", state)[1]
+    battery = parameters.branches["battery"]
+    for model, words in (
+        (GainBySign(drift_positive=0.3, drift_negative=-0.2), "drift +0.3 into and -0.2 out of the junction"),
+        (TemperatureDrift(drift_per_k=0.001, reference_c=25.0), "drift +0.05 at 25 degC, +0.001 per K"),
+    ):
+        other = replace(parameters, branches={"battery": replace(battery, sensor_model=model)})
+        assert words in shown(signers.parameters(other, 6))
+    assert "made at 2026-06-01T12:00:00Z" in shown(signers.revocation(9, 5))
+
+
+def test_a_vehicle_whose_name_no_state_could_hold_is_not_provisioned(
+    signers: Signers, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "keys.json").write_bytes(canonical_bytes(signers.keys()) + b"\n")
+    for name in ("", "   ", " " * 70 + "v", "v" * 65):
+        with pytest.raises(SystemExit) as caught:
+            main(["provision", "--vehicle", name, "--keys", f"{tmp_path}/keys.json", "--state", f"{tmp_path}/state"])
+        assert caught.value.code == 2
+        assert "at most 64 characters" in capsys.readouterr().err
+        assert not (tmp_path / "state").exists()
+
+
+def test_a_folder_whose_name_is_no_text_is_provisioned(signers: Signers, tmp_path: Path) -> None:
+    (tmp_path / "keys.json").write_bytes(canonical_bytes(signers.keys()) + b"\n")
+    command = [sys.executable, "-m", "ecu_node", "provision", "--vehicle", "v1", "--keys", f"{tmp_path}/keys.json"]
+    done = subprocess.run(
+        [*command, "--state", f"{tmp_path}/s\udcff"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "s\\udcff: vehicle v1 trusts 2 of a, b, c" in done.stdout
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+@pytest.mark.parametrize("name", ["audit.log", "lock"])
+def test_another_name_of_a_file_of_roots_is_not_given_away(
+    name: str, in_force: Path, signers: Signers, parameters: VehicleParameters, tmp_path: Path, now: datetime, run: Run
+) -> None:
+    """Where the kernel lets users make hard links to files of others."""
+    secret, node = tmp_path / "secret", 1234
+    secret.write_text("secret")
+    (in_force / name).unlink(missing_ok=True)
+    os.link(secret, in_force / name)
+    os.chown(in_force, node, node)
+    (tmp_path / "p").write_bytes(signers.parameters(parameters, 6, not_before=now - HOUR))
+    code, out, err = run("activate", tmp_path / "p", *on(in_force))
+    assert (code, out, len(err.splitlines())) == (1, "", 1)
+    assert "another name of somebody else's file" in err
+    assert (secret.stat().st_uid, secret.read_text()) == (0, "secret")
+    (in_force / name).unlink()
+    assert run("activate", tmp_path / "p", *on(in_force))[0] in (0, 1)
+    assert (in_force / name).stat().st_uid == node
 
 
 @pytest.mark.parametrize("name", ["slot-a.json.next", ".state.json.new", "audit.log", "lock"])

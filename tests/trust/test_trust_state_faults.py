@@ -10,10 +10,9 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UserError
 from ecu_node.parameters import VehicleParameters
 from ecu_node.status import Reason
-from ecu_node.trust.activation import accept, conclude, signed_parameters
+from ecu_node.trust.activation import accept, conclude
 from ecu_node.trust.audit import broken_line
-from ecu_node.trust.canonical import canonical_bytes
-from ecu_node.trust.state import audit_path, read_state, write_state
+from ecu_node.trust.state import audit_path, read_state, signed_parameters, write_state
 from tests.trust.damage import cut
 from tests.trust.signing import Signers
 
@@ -102,6 +101,27 @@ def test_a_state_that_speaks_of_slots_that_are_not_there_is_refused(two_slots: P
         write_state(two_slots, wrong)
         with pytest.raises(TrustError, match="slots in force and on trial do not go together"):
             read_state(two_slots)
-    (two_slots / "state.json").write_bytes(canonical_bytes(found) + b"\n")
+    write_state(two_slots, replace(found, keys=replace(found.keys, threshold=9)))
+    with pytest.raises(TrustError, match="9 signers are needed"):
+        read_state(two_slots)
+    write_state(two_slots, replace(found, newest="2026-06-31T00:00:00Z"))
+    with pytest.raises(TrustError, match="is no time"):
+        read_state(two_slots)
+    write_state(two_slots, found)
+    path = two_slots / "state.json"
+    path.write_bytes(path.read_bytes() + b"\n")
     with pytest.raises(TrustError, match="not canonical JSON"):
         read_state(two_slots)
+
+
+def test_no_bit_of_the_state_can_be_another_one(two_slots: Path) -> None:
+    path = two_slots / "state.json"
+    whole = path.read_bytes()
+    for bit in range(8 * len(whole)):
+        changed = bytearray(whole)
+        changed[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(changed)
+        with pytest.raises(TrustError, match="not the state of a vehicle: "):
+            read_state(two_slots)
+    path.write_bytes(whole)
+    assert read_state(two_slots).in_force == "b"

@@ -32,9 +32,10 @@ from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import UserError
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters
-from ecu_node.trust.activation import accept, conclude, examine, provision
+from ecu_node.trust.activation import accept, conclude, examine
 from ecu_node.trust.envelope import Envelope
 from ecu_node.trust.key_set import KeySet, PublicKey
+from ecu_node.trust.provision import provision
 from ecu_node.trust.statements import Revocation, SignedParameters, Statement
 
 __all__ = ["Vehicle", "WrongAnswerError", "fuzz"]

@@ -15,9 +15,10 @@ from ecu_node.errors import UserError
 from ecu_node.guard import Mode
 from ecu_node.parameters import BranchParameters, VehicleParameters
 from ecu_node.status import State
-from ecu_node.trust.activation import accept, provision
+from ecu_node.trust.activation import accept
 from ecu_node.trust.key_set import KeySet
 from ecu_node.trust.parameter_store import ParameterStore
+from ecu_node.trust.provision import provision
 from ecu_node.trust.trial import Trial, TrialResult, begin_trial
 from ecu_node.wiring import InForce, sensor_fault, wire
 

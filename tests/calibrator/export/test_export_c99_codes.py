@@ -193,6 +193,25 @@ def test_what_the_gateway_refuses_is_refused(make_database: MakeDatabase, tmp_pa
         c99_files(checked)
 
 
+def test_two_functions_with_one_name_are_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
+    database = make_database(SMALL_LAYOUT.replace('"battery"', '"input_Net_Voltage"'))
+    checked = checked_with(database, parameters_for(database, input_Net_Voltage=(0.05, 2.3)), tmp_path)
+    with pytest.raises(ExportError, match="present_input_Net_Voltage: two things would have this name in C"):
+        c99_files(checked)
+
+
+def test_a_name_ends_where_it_ends(make_database: MakeDatabase) -> None:
+    with pytest.raises(LayoutError):
+        make_database(SMALL_LAYOUT.replace('"battery"', r'"battery\n"'))
+
+
+def test_a_number_that_c_does_not_have_is_refused(database: VehicleDatabase, tmp_path: Path) -> None:
+    parameters = parameters_for(database, battery=(0.05, 2.3))
+    assert "ULL" in c99_files(checked_with(database, replace(parameters, number=(1 << 64) - 1), tmp_path))[HEADER]
+    with pytest.raises(ExportError, match="parameter set 18446744073709551616: C has no number above 64 bits"):
+        c99_files(checked_with(database, replace(parameters, number=1 << 64), tmp_path))
+
+
 def test_two_inputs_with_one_name_are_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
     cooler = '    { name = "cooler", sign = -1, power = "Heater.Cooling", voltage = "Net_A.B" },\n]\n'
     layout = SMALL_LAYOUT.replace("Net.Voltage", "Net.A_B").replace("]\n", cooler)

@@ -1,5 +1,6 @@
 """CDFX: elements in the order of ASAM's DTD of CDF 2.0, and values, units, limits and provenance as in the file."""
 
+import dataclasses
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -137,6 +138,18 @@ def test_names_with_signs_of_xml_survive(database: VehicleDatabase, tmp_path: Pa
     )
     (tree,) = ET.fromstring(cdfx_document(checked)).iter("SW-INSTANCE-TREE")
     assert tree.findtext("SHORT-NAME") == "<Zoë & 1>"
+
+
+@pytest.mark.parametrize("name", ["a\x01.json", "a\n.json", "a\udcff.json", "<a>&.json"])
+def test_a_file_of_any_name_gives_a_document_that_can_be_read(
+    name: str, checked: Checked, database: VehicleDatabase
+) -> None:
+    layout = replace(database.layout, name="l\x02")
+    other = dataclasses.replace(checked, name=name, database=dataclasses.replace(database, layout=layout))
+    document = ET.fromstring(cdfx_document(other))
+    shown = name.encode("unicode_escape").decode()
+    assert document.findtext(".//SW-INSTANCE-TREE-ORIGIN/DATA-FILE") == shown
+    assert document.findtext(".//SW-SYSTEM/SHORT-NAME") == "l\\x02"
 
 
 def test_control_characters_are_refused(database: VehicleDatabase, tmp_path: Path) -> None:

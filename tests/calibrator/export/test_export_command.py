@@ -1,17 +1,24 @@
 """``calibrator export``: files written whole or not at all, and what is refused with one line."""
 
 import csv
+import os
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 from typer.testing import CliRunner, Result
 
 from calibrator.cli import app
 from calibrator.errors import ContradictionError, ExportError, FleetError
+from calibrator.export.checked import read_checked
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError, UserError
-from ecu_node.parameters import write_parameters
+from ecu_node.layout import file_digest
+from ecu_node.parameters import encode_parameters, write_parameters
 from ecu_node.sensor_models import TemperatureDrift
 from tests.calibrator.export.exports import MakeDatabase, parameters_for, with_branch
 from tests.ecu_node.vehicles import LAYOUT
@@ -106,6 +113,37 @@ def test_parameters_of_another_layout_are_refused(
 def test_no_parameter_file_is_told(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"none\.json: no such parameter file"):
         raise refused(tmp_path / "none.json", "--format", "dcm", "--output", tmp_path / "out")
+
+
+def test_the_digest_is_of_what_was_read(
+    params: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not of a file that takes its place meanwhile."""
+    digest, decode = file_digest(params), msgspec.json.decode
+    other = encode_parameters(parameters_for(database, battery=(0.3, 0.0)), "other")
+
+    def replaced_meanwhile(*arguments: Any, **more: Any) -> Any:
+        params.write_bytes(other)
+        return decode(*arguments, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(msgspec.json, "decode", replaced_meanwhile)
+        checked = read_checked(params, database, None)
+    assert (checked.parameters.branches["battery"].drift, checked.digest) == (0.05, digest)
+
+
+def test_names_that_are_no_text_are_written_escaped(database: VehicleDatabase, tmp_path: Path) -> None:
+    write_parameters(parameters_for(database, battery=(0.05, 2.3)), tmp_path / "v\udcff.json")
+    command = [sys.executable, "-m", "calibrator", "export", f"{tmp_path}/v\udcff.json", "--layout", str(LAYOUT)]
+    done = subprocess.run(
+        [*command, "--format", "csv", "--out", f"{tmp_path}/o\udcff.csv"],
+        env={**os.environ, "PYTHONIOENCODING": "utf-8:strict"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{tmp_path}/o\\udcff.csv\n", "")
 
 
 def test_what_is_not_corrected_is_told(make_database: MakeDatabase, tmp_path: Path) -> None:

@@ -3,8 +3,10 @@
 import csv
 from pathlib import Path
 
+import pytest
 from msgspec.structs import replace
 
+from calibrator.errors import ExportError
 from calibrator.export.csv_table import COLUMNS, csv_text
 from ecu_node.database import VehicleDatabase
 from ecu_node.sensor_models import TemperatureDrift
@@ -44,6 +46,21 @@ def test_vehicles_stand_below_each_other_under_one_header(database: VehicleDatab
     assert found == [("a", "battery"), ("a", "motor"), ('b, "c"\nd', "battery"), ('b, "c"\nd', "motor")]
     assert text.startswith(",".join(COLUMNS) + "\r\n")
     assert text.count("\r\n") == 5
+
+
+@pytest.mark.parametrize("vehicle", ["=1+1", "+cmd|' /C calc'!A0", "-x", "@SUM(A1)", "\t=1", "\r=1"])
+def test_a_name_that_a_spreadsheet_would_run_is_refused(
+    vehicle: str, database: VehicleDatabase, tmp_path: Path
+) -> None:
+    checked = checked_with(database, replace(parameters_for(database, battery=(0.05, 0.0)), vehicle=vehicle), tmp_path)
+    with pytest.raises(ExportError, match=r"^v1\.json: vehicle ['\"].*['\"] begins as a formula does"):
+        csv_text([checked])
+
+
+@pytest.mark.parametrize("vehicle", ["-12", "+1", "a=1", "Zoë-1"])
+def test_numbers_and_other_names_are_no_formulas(vehicle: str, database: VehicleDatabase, tmp_path: Path) -> None:
+    checked = checked_with(database, replace(parameters_for(database, battery=(0.05, 0.0)), vehicle=vehicle), tmp_path)
+    assert rows(csv_text([checked]))[0]["vehicle"] == vehicle
 
 
 def test_where_it_comes_from_stands_in_every_row(database: VehicleDatabase, tmp_path: Path) -> None:

@@ -1,0 +1,76 @@
+"""How far signed parameters may be from those in force, unless their signers allow more."""
+
+from pathlib import Path
+
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import TrustError
+from ecu_node.parameters import BranchParameters, VehicleParameters
+from ecu_node.sensor_models import GainBySign, TemperatureDrift
+from ecu_node.status import Reason
+from ecu_node.trust.state import TrustState, signed_parameters
+
+__all__ = ["require_small_step"]
+
+_COLDEST_C, _HOTTEST_C = -40.0, 125.0
+"""Of sensors in vehicles. Between the two no drift differs by more than at one of them. [degC]"""
+
+
+def require_small_step(
+    folder: Path, state: TrustState, new: VehicleParameters, database: VehicleDatabase, where: str
+) -> None:
+    """Check that parameters differ from the set in force by the layout's largest step at most.
+
+    Parameters
+    ----------
+    folder : Path
+        State of the vehicle.
+    state : TrustState
+        Of the same.
+    new : VehicleParameters
+        What is to come.
+    database : VehicleDatabase
+        Layout and DBC of the vehicle.
+    where : str
+        Where the new ones are from, for messages.
+
+    Raises
+    ------
+    TrustError
+        With reason IMPLAUSIBLE_PARAMETERS.
+    """
+    layout = database.layout
+    if state.in_force is None:
+        return
+    try:
+        before = signed_parameters(folder, state, state.in_force).parameters
+    except TrustError:
+        return  # what is damaged is not in force, and must not keep its successor out
+    for name in layout.branch_names:
+        (old_drifts, old_a), (new_drifts, new_a) = (_applied(item.branches.get(name)) for item in (before, new))
+        drift = max(abs(a - b) for a, b in zip(old_drifts, new_drifts, strict=True))
+        offset_a = abs(old_a - new_a)
+        if drift > layout.activation.step_drift or offset_a > layout.step_offset_a:
+            raise TrustError(
+                Reason.IMPLAUSIBLE_PARAMETERS,
+                f"{where}: branch {name}: differs from the set in force by {drift:.3g} in drift and "
+                f"{offset_a:.3g} A in offset, at most {layout.activation.step_drift:g} and "
+                f"{layout.step_offset_a:g} A are allowed; if that is meant, sign with --allow-large-step",
+            )
+
+
+def _applied(branch: BranchParameters | None) -> tuple[tuple[float, ...], float]:
+    """Drifts as they are applied, cold and hot, to currents into and out of the junction [1], and the offset [A]."""
+    if branch is None or not branch.apply:
+        return (0.0,) * 4, 0.0
+    match branch.sensor_model:
+        case GainBySign() as model:
+            drifts = (model.drift_positive, model.drift_negative) * 2
+        case TemperatureDrift() as model:
+            cold, hot = (
+                branch.drift + model.drift_per_k * (temperature_c - model.reference_c)
+                for temperature_c in (_COLDEST_C, _HOTTEST_C)
+            )
+            drifts = (cold, cold, hot, hot)
+        case None:
+            drifts = (branch.drift,) * 4
+    return drifts, branch.offset_a

@@ -1,0 +1,48 @@
+"""The begin of a vehicle's state: whom it trusts."""
+
+from datetime import datetime
+from pathlib import Path
+
+from ecu_node.errors import TrustError, UserError
+from ecu_node.status import Reason
+from ecu_node.trust.audit import event_now
+from ecu_node.trust.commit import commit
+from ecu_node.trust.key_set import KeySet
+from ecu_node.trust.state import TrustState, state_path
+from ecu_node.trust.storage import locked
+
+__all__ = ["provision"]
+
+
+def provision(folder: Path, vehicle: str, keys: KeySet, now: datetime) -> None:
+    """Begin the state of a vehicle: whom it trusts.
+
+    Parameters
+    ----------
+    folder : Path
+        Where; made if it does not exist.
+    vehicle : str
+        Identity of the vehicle.
+    keys : KeySet
+        Whom it trusts from now on, until these say otherwise.
+    now : datetime
+        For the audit log.
+
+    Raises
+    ------
+    TrustError
+        If there is a state already.
+    UserError
+        If it cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be made: {error.strerror}") from None
+    with locked(folder):
+        if state_path(folder).exists():
+            raise TrustError(
+                Reason.NONE, f"{folder}: there is a state already; keys are changed by a signed key set ('activate')"
+            )
+        event = event_now("provisioned", f"vehicle {vehicle}, key set {keys.version}", now=now)
+        commit(folder, TrustState(vehicle=vehicle, keys=keys), event)
