@@ -20,12 +20,11 @@ from calibrator.whole_files import made_folder, remove_abandoned, require_own_fi
 from ecu_node.errors import printable
 from ecu_node.trust.canonical import Expected, canonical_bytes, read_canonical
 from ecu_node.trust.key_set import SIGNER_NAME, KeySet, check_key_set
-from ecu_node.trust.statements import Revocation
+from ecu_node.trust.statements import LAST_SEQUENCE, MAX_SEQUENCE, Revocation
 
 __all__ = ["keys", "revoke", "sign"]
 
 _LONGEST_DAYS = 3650
-MAX_SEQUENCE, LAST_SEQUENCE = 1 << 52, (1 << 53) - 1
 _HIGHEST_VERSION = 1_000_000
 """Of a key set."""
 _REVOCATION = Expected(what="a revocation that a vehicle would take", advice="change the options")
@@ -47,7 +46,7 @@ FarOption = Annotated[
     ),
 ]
 RevokedOption = Annotated[
-    list[int], typer.Option("--number", min=1, help="Number that was signed; repeat for several.")
+    list[int], typer.Option("--number", min=1, max=LAST_SEQUENCE, help="Number that was signed; repeat for several.")
 ]
 
 
