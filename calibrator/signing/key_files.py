@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -196,6 +197,6 @@ def _private_bytes(path: Path) -> bytes:
     if rights & _OTHERS:
         raise SigningError(
             f"{path}: others than its owner can read or write this private key (mode {rights & 0o777:03o}); "
-            f"'chmod 600 {path}', and if somebody may have read it, make another key"
+            f"'chmod 600 {shlex.quote(str(path))}', and if somebody may have read it, make another key"
         )
     return content
