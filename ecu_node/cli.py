@@ -1,4 +1,4 @@
-"""Command line of the node: ``ecu-node run``, ``ecu-node monitor``, ``ecu-node check``, ``ecu-node schema``.
+"""Command line of the node: ``ecu-node run``, ``ecu-node monitor``, ``ecu-node check``, ``ecu-node template``.
 
 Results go to standard output, what happens to standard error. Exit code 0: done, 1: failed, 2: wrong use,
 130: interrupted by Ctrl-C before the node was at work (at work, Ctrl-C and SIGTERM end it with 0).
@@ -19,6 +19,7 @@ from ecu_node import __version__
 from ecu_node.errors import UserError
 from ecu_node.interrupts import ending_at_interrupt, ignoring_hangups
 from ecu_node.standard_output import drop_output, flush_output, write_output
+from ecu_node.template import add_template_command
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
@@ -126,6 +127,7 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--gateway", action="store_true", help="as a gateway would apply them")
     check.add_argument("--json", action="store_true", help="print JSON")
     check.set_defaults(command=_check)
+    add_template_command(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of the parameter file")
     schema.set_defaults(command=_schema)
     return parser

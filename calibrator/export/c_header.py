@@ -18,8 +18,11 @@ _PREAMBLE = """\
  * hv_rewrite_MESSAGE  writes the corrected codes into a payload in the place of the measured ones, and says whether a
  *                     bit has changed. Codes that are no values, and signals that the payload does not have, stay.
  * hv_correct_BRANCH   corrects one code; one that is no value comes back as it is.
- * hv_read_SIGNAL      reads a voltage or a temperature that others need. It says whether the payload has the signal;
- *                     keep the code until then, and put HV_NO_CODE in its place when it has become too old.
+ * hv_read_MESSAGE_SIGNAL
+ *                     reads a voltage or a temperature that others need. It returns true and writes the code if the
+ *                     payload has the signal; else it returns false and leaves *code as it was, so that the code of
+ *                     the frame before stays. Write HV_NO_CODE there yourself at the start, and when the last code
+ *                     has become too old.
  *
  * End-to-end protection is NOT part of this. Check CRC and counter of a frame before, and write its CRC anew afterwards
  * where a bit has changed. Nor are the watch over the sum of the currents, time-outs, and the status message.

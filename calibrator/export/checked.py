@@ -9,10 +9,14 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError, printable
 from ecu_node.guard import Mode
 from ecu_node.parameters import VehicleParameters, check_fit, decode_parameters, parameter_bytes
+from ecu_node.trust.statements import SignedParameters, open_statement
 from ecu_node.user_files import text_digest
 from ecu_node.wiring import InForce, sensor_fault
 
 __all__ = ["Checked", "read_checked"]
+
+_SIGNED = b'{"payload":'
+"""How a signed file begins: it is canonical JSON."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,17 +28,20 @@ class Checked:
     name : str
         Name of the parameter file.
     digest : str
-        Its SHA-256, line ends counted as LF.
+        SHA-256 of the file as it was read, signed or not, line ends counted as LF.
     parameters : VehicleParameters
         What it says.
     database : VehicleDatabase
         Layout and DBC that it was made for.
+    signed : SignedParameters or None
+        The statement that the parameters were taken out of.
     """
 
     name: str
     digest: str
     parameters: VehicleParameters
     database: VehicleDatabase
+    signed: SignedParameters | None = None
 
     @property
     def in_force(self) -> InForce:
@@ -67,13 +74,18 @@ class Checked:
         return self.fault(branch) is not NO_FAULT
 
     def notices(self) -> list[str]:
-        """What of the parameters a node does not do, one line each."""
+        """What of the parameters a node does not do, and what was not checked of them, one line each."""
         texts = warnings_of(self.database, self.in_force, Mode.GATEWAY, fd=True)
+        if self.signed is not None:
+            texts.append(
+                f"signed, number {self.signed.sequence}, to hold from {self.signed.not_before} to "
+                f"{self.signed.expires}; signatures, number and times were not checked, 'ecu-node verify' does"
+            )
         return [f"{printable(self.name)}: {text}" for text in texts]
 
 
 def read_checked(path: Path, database: VehicleDatabase, vehicle: str | None) -> Checked:
-    """Read a parameter file, and refuse what the node would not apply.
+    """Read a parameter file, signed or not, and refuse what the node would not apply. No signature is checked.
 
     Parameters
     ----------
@@ -95,9 +107,17 @@ def read_checked(path: Path, database: VehicleDatabase, vehicle: str | None) -> 
         If the file cannot be read, or its parameters are for another vehicle, layout or DBC, or implausible.
     """
     content = parameter_bytes(path)
-    parameters = decode_parameters(content, str(path))
+    signed = _signed(content, path) if content.startswith(_SIGNED) else None
+    parameters = decode_parameters(content, str(path)) if signed is None else signed.parameters
     try:
         check_fit(parameters, database, vehicle)
     except ParameterError as error:
         raise ParameterError(f"{path}: {error}") from None
-    return Checked(name=path.name, digest=text_digest(content), parameters=parameters, database=database)
+    return Checked(name=path.name, digest=text_digest(content), parameters=parameters, database=database, signed=signed)
+
+
+def _signed(content: bytes, path: Path) -> SignedParameters:
+    _, statement = open_statement(content, str(path))
+    if not isinstance(statement, SignedParameters):
+        raise ParameterError(f"{path}: signed, but no parameters: a revocation or a key set; name signed parameters")
+    return statement

@@ -1,10 +1,11 @@
 """``calibrator export``: from parameter files to files of other formats, each written whole or not at all."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import typer
 
 from calibrator.command_options import LayoutOption
@@ -16,16 +17,16 @@ from calibrator.export.csv_table import csv_text
 from calibrator.export.dcm import dcm_text
 from calibrator.folders import require_possible_file, require_possible_folder
 from calibrator.options import ExportFormat
+from calibrator.whole_files import made_folder, remove_abandoned, require_own_file, write_files
 from ecu_node.database import read_database
 from ecu_node.errors import printable
 from ecu_node.layout import read_layout
-from ecu_node.parameters import write_atomically
 
 __all__ = ["export", "exported_files"]
 
 
 def export(
-    params: Annotated[list[Path], typer.Argument(help="Parameter file; of several vehicles for csv.")],
+    params: Annotated[list[Path], typer.Argument(help="Parameter file, signed or not; of several vehicles for csv.")],
     layout: LayoutOption,
     format_: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
     output: Annotated[Path, typer.Option("--output", "--out", help="File to write; for c99 a folder.")],
@@ -40,10 +41,11 @@ def export(
     database = read_database(read_layout(layout))
     tables = [read_checked(path, database, vehicle) for path in params]
     files = exported_files(tables, format_, output)
-    _require_possible(list(files), output, is_folder=format_ is ExportFormat.C99, replace=replace)
-    for path, content in files.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, content)
+    is_folder = format_ is ExportFormat.C99
+    _require_possible(files, output, is_folder=is_folder, replace=replace)
+    with made_folder(output if is_folder else output.parent):
+        remove_abandoned(files)
+        write_files(files)
     for text in (text for checked in tables for text in checked.notices()):
         print(f"notice: {text}", file=sys.stderr)
     sys.stdout.write("".join(f"{printable(str(path))}\n" for path in files))
@@ -69,13 +71,14 @@ def exported_files(tables: Sequence[Checked], format_: ExportFormat, output: Pat
     Raises
     ------
     ContradictionError
-        If a format of one vehicle is given several.
+        If a format of one vehicle is given several, or a table the same parameters twice.
     ExportError
         If the parameters cannot be written in the format.
     LayoutError, DatabaseError
         If the node refuses layout or DBC as a gateway; C99 alone.
     """
     if format_ is ExportFormat.CSV:
+        _require_different(tables)
         return {output: csv_text(tables).encode()}
     if len(tables) != 1:
         raise ContradictionError(
@@ -91,13 +94,24 @@ def exported_files(tables: Sequence[Checked], format_: ExportFormat, output: Pat
             return {output / name: text.encode() for name, text in c99_files(checked).items()}
 
 
-def _require_possible(files: Sequence[Path], output: Path, *, is_folder: bool, replace: bool) -> None:
-    """Refuse, before anything is written, files that exist or cannot be made."""
-    for path in files:
-        if path.exists() and not path.is_dir() and not replace:
+def _require_different(tables: Sequence[Checked]) -> None:
+    seen: dict[bytes, Checked] = {}
+    for checked in tables:
+        other = seen.setdefault(msgspec.json.encode(checked.parameters), checked)
+        if other is not checked:
+            raise ContradictionError(
+                f"{printable(checked.name)}: says the same as {printable(other.name)}, so its rows would stand in the "
+                f"table twice; give each parameter set once"
+            )
+
+
+def _require_possible(files: Mapping[Path, bytes], output: Path, *, is_folder: bool, replace: bool) -> None:
+    """Refuse, before anything is written, files that hold something else or cannot be made."""
+    for path, content in files.items():
+        require_own_file(path)
+        if path.exists() and not replace and path.read_bytes() != content:
             raise ExportError(f"{path}: exists; choose another --output, or replace it with --replace")
     if is_folder:
         require_possible_folder(output)
-    for path in files:
-        if not is_folder or path.is_dir():
-            require_possible_file(path)
+    else:
+        require_possible_file(output)

@@ -3,28 +3,30 @@
 import os
 import re
 import sys
-from datetime import UTC, datetime, timedelta
+from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from securesystemslib.signer import CryptoSigner
 
 from calibrator.errors import ContradictionError, SigningError
 from calibrator.folders import require_possible_folder
 from calibrator.signing.key_files import PASSPHRASE_VARIABLE, new_key, read_public_key, read_signer
-from calibrator.signing.statements import signed_anew, signed_statement
-from ecu_node.errors import TrustError, printable
-from ecu_node.parameters import read_parameters, write_atomically
-from ecu_node.trust.canonical import Expected, canonical_bytes, read_bytes, read_canonical
-from ecu_node.trust.envelope import Envelope
+from calibrator.signing.numbers import require_near_number, signing_time, time_text
+from calibrator.signing.orders import Order
+from calibrator.signing.statements import signed_statement
+from calibrator.whole_files import made_folder, remove_abandoned, require_own_file, write_files
+from ecu_node.errors import printable
+from ecu_node.trust.canonical import Expected, canonical_bytes, read_canonical
 from ecu_node.trust.key_set import SIGNER_NAME, KeySet, check_key_set
-from ecu_node.trust.statements import Revocation, SignedParameters, open_statement
+from ecu_node.trust.statements import LAST_SEQUENCE, MAX_SEQUENCE, Revocation
 
 __all__ = ["keys", "revoke", "sign"]
 
-_TIME = "%Y-%m-%dT%H:%M:%SZ"
-_DAYS, _LONGEST_DAYS = 365, 3650
+_LONGEST_DAYS = 3650
+_HIGHEST_VERSION = 1_000_000
+"""Of a key set."""
 _REVOCATION = Expected(what="a revocation that a vehicle would take", advice="change the options")
 
 _KEY_SET = Expected(what="a key set that a vehicle would take", advice="change the options")
@@ -36,16 +38,15 @@ KeyOption = Annotated[
     typer.Option("--key", help=f"Private key of a signer; repeat for several. Its passphrase: ${PASSPHRASE_VARIABLE}."),
 ]
 OutFileOption = Annotated[Path, typer.Option("--out", help="File to write.")]
-SequenceOption = Annotated[
-    int | None,
+_SEQUENCE = "Number, above all that the vehicle accepted (default: time in seconds, UTC)."
+FarOption = Annotated[
+    bool,
     typer.Option(
-        min=1,
-        max=(1 << 53) - 1,
-        help="Number, above all that the vehicle accepted (default: time in seconds, UTC).",
+        "--far-sequence", help="The number may be far above the time, as where the vehicle took such a one by mistake."
     ),
 ]
 RevokedOption = Annotated[
-    list[int], typer.Option("--number", min=1, help="Number that was signed; repeat for several.")
+    list[int], typer.Option("--number", min=1, max=LAST_SEQUENCE, help="Number that was signed; repeat for several.")
 ]
 
 
@@ -64,8 +65,9 @@ def new(
     if not re.match(SIGNER_NAME, name):
         raise SigningError(f"{name!r}: a name of letters, digits, '.', '_' and '-' is expected")
     require_possible_folder(out)
-    out.mkdir(parents=True, exist_ok=True)
-    sys.stdout.write("".join(f"{printable(str(path))}\n" for path in new_key(name, out, passphrase)))
+    with made_folder(out):
+        made = new_key(name, out, passphrase)
+    sys.stdout.write("".join(f"{printable(str(path))}\n" for path in made))
 
 
 @keys.command("set")
@@ -73,7 +75,9 @@ def make_set(
     public: Annotated[list[Path], typer.Argument(help="Public keys (NAME.pub) of all signers.")],
     threshold: Annotated[int, typer.Option(min=1, max=16, help="So many of them must sign.")],
     out: OutFileOption,
-    version: Annotated[int, typer.Option(min=1, help="One more than that of the set before.")] = 1,
+    version: Annotated[
+        int, typer.Option(min=1, max=_HIGHEST_VERSION, help="One more than that of the set before.")
+    ] = 1,
     key: KeyOption = [],  # noqa: B006
 ) -> None:
     """Say whom vehicles trust. The first set is not signed; a later one by enough of the set before and of its own."""
@@ -89,50 +93,51 @@ def make_set(
     signers = [read_signer(path, _passphrase()) for path in key]
     plain = canonical_bytes(found)
     read_canonical(plain, KeySet, "key set", _KEY_SET)
-    content = signed_statement(found, signers) if signers else plain + b"\n"
-    _write({out: content}, replace=False)
+    _write_one(out, signed_statement(found, signers) if signers else plain + b"\n")
 
 
 def sign(
     params: Annotated[list[Path], typer.Argument(help="Parameter files, or signed files to be signed by one more.")],
     key: KeyOption,
     out: Annotated[Path, typer.Option("--out", help="Folder for the signed files.")],
-    sequence: SequenceOption = None,
+    sequence: Annotated[int | None, typer.Option(min=1, max=MAX_SEQUENCE, help=_SEQUENCE)] = None,
     days: Annotated[
         int | None, typer.Option(min=1, max=_LONGEST_DAYS, help="How long they hold, from now on. [d] (default: 365)")
     ] = None,
     allow_large_step: Annotated[
         bool, typer.Option("--allow-large-step", help="They may differ a lot from what is in force, as after a repair.")
     ] = False,
+    far_sequence: FarOption = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace files that exist.")] = False,
 ) -> None:
-    """Sign parameter files, one signed file per vehicle; 'ecu-node activate' takes them."""
-    signers = [read_signer(path, _passphrase()) for path in key]
+    """Sign parameter files, one signed file per vehicle; 'ecu-node activate' takes them.
+
+    The same command, run again within a day, keeps what it signed, and goes on.
+    """
+    now = signing_time(datetime.now(UTC))
+    require_near_number(sequence, now, far=far_sequence)
+    order = Order(
+        signers=[read_signer(path, _passphrase()) for path in key],
+        now=now,
+        sequence=sequence,
+        days=days,
+        allow_large_step=allow_large_step,
+    )
     require_possible_folder(out)
-    now = datetime.now(UTC)
-    files = {}
-    for path in params:
-        content = _signed_before(path)
-        if content is not None and (sequence is not None or days is not None or allow_large_step):
-            raise ContradictionError(
-                f"{path}: it is signed already, and can only be signed by one more; leave --sequence, --days and "
-                f"--allow-large-step out, or sign the parameter file"
-            )
-        if content is None:
-            statement = SignedParameters(
-                sequence=sequence or int(now.timestamp()),
-                not_before=now.strftime(_TIME),
-                expires=(now + timedelta(days=days or _DAYS)).strftime(_TIME),
-                allow_large_step=allow_large_step,
-                parameters=read_parameters(path),
-            )
-            files[out / path.name] = _signed(path, statement, signers)
-        else:
-            files[out / path.name] = _signed(path, open_statement(content, str(path))[0], signers)
-    if len(files) < len(params):
+    places = {out / path.name: path for path in params}
+    if len(places) < len(params):
         raise SigningError(f"files of one name would overwrite each other in {out}; sign them one after the other")
-    out.mkdir(parents=True, exist_ok=True)
-    _write(files, replace=replace)
+    done = set() if replace else {place for place, path in places.items() if order.is_done(path, place)}
+    files = {place: None if place in done else order.signed(path) for place, path in places.items()}
+    for place in places.keys() - done:
+        require_own_file(place)
+    there = sorted(place for place in places.keys() - done if place.exists())
+    if there and not replace:
+        raise SigningError(
+            f"{there[0]}: there is a file already, and not what this command wrote within a day; name another folder, "
+            f"or replace it with --replace"
+        )
+    _write_all(files, out)
 
 
 def revoke(
@@ -141,51 +146,43 @@ def revoke(
     why: Annotated[str, typer.Option(help="Reason, for the vehicle's audit log.")],
     key: KeyOption,
     out: OutFileOption,
-    sequence: SequenceOption = None,
+    sequence: Annotated[int | None, typer.Option(min=1, max=LAST_SEQUENCE, help=_SEQUENCE)] = None,
+    far_sequence: FarOption = False,
 ) -> None:
     """Take signed parameters of a vehicle back; 'ecu-node revoke' takes the file."""
-    now = datetime.now(UTC)
+    now = signing_time(datetime.now(UTC))
+    require_near_number(sequence, now, far=far_sequence)
     statement = Revocation(
         vehicle=vehicle,
         sequence=sequence or int(now.timestamp()),
-        created=now.strftime(_TIME),
+        created=time_text(now),
         revokes=sorted(set(number)),
         why=why,
     )
     read_canonical(canonical_bytes(statement), Revocation, "revocation", _REVOCATION)
-    _write({out: signed_statement(statement, [read_signer(path, _passphrase()) for path in key])}, replace=False)
+    _write_one(out, signed_statement(statement, [read_signer(path, _passphrase()) for path in key]))
 
 
-def _signed(path: Path, what: SignedParameters | Envelope, signers: list[CryptoSigner]) -> bytes:
-    """A signed file that can be read again."""
-    try:
-        content = signed_anew(what, signers) if isinstance(what, Envelope) else signed_statement(what, signers)
-        open_statement(content, "signed")
-    except TrustError as error:
-        raise SigningError(f"{path}: no vehicle could read this signed: {error}") from None
-    return content
+def _write_one(path: Path, content: bytes) -> None:
+    require_own_file(path)
+    if path.exists():
+        raise SigningError(f"{path}: there is a file already; name another one")
+    remove_abandoned([path])
+    write_files({path: content})
+    print(printable(str(path)))
 
 
-def _signed_before(path: Path) -> bytes | None:
-    """Content of a file that is signed already; None if it is a parameter file, or nothing of either kind."""
-    try:
-        content = read_bytes(path)
-        open_statement(content, str(path))
-    except TrustError:
-        return None
-    return content
-
-
-def _write(files: dict[Path, bytes], *, replace: bool) -> None:
-    there = [path for path in files if path.exists()]
-    if there and not replace:
-        raise SigningError(f"{there[0]}: there is a file already; name another one")
-    for path, content in files.items():
-        try:
-            write_atomically(path, content)
-        except OSError as error:
-            raise SigningError(f"{path}: cannot be written: {error.strerror}") from None
-        print(printable(str(path)))
+def _write_all(files: Mapping[Path, bytes | None], out: Path) -> None:
+    """Write files one by one, so that none of them waits for the others; None: it is there already."""
+    kept = sum(content is None for content in files.values())
+    with made_folder(out):
+        remove_abandoned(files)
+        for path, content in files.items():
+            if content is not None:
+                write_files({path: content})
+            print(printable(str(path)))
+    if kept:
+        print(f"notice: {kept} of {len(files)} were signed before by the same command, and are kept", file=sys.stderr)
 
 
 def _passphrase() -> str | None:

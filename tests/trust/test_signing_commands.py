@@ -1,13 +1,22 @@
 """``calibrator sign`` and ``revoke``: what goes wrong is one line, and nothing is half signed."""
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
+from calibrator.errors import SigningError
+from calibrator.signing.numbers import signing_time
 from ecu_node.trust.statements import Revocation, SignedParameters, open_statement, verify
 from tests.trust.signing import Run
 from tests.trust.signing_steps import by, full_disk, key_set, require_one_line
+
+
+def sequence_of(path: Path) -> int:
+    _, statement = open_statement(path.read_bytes(), "f")
+    assert isinstance(statement, SignedParameters | Revocation)
+    return statement.sequence
 
 
 def test_each_signer_adds_a_signature(calibrator: Run, keys: Path, params: Path, tmp_path: Path) -> None:
@@ -92,7 +101,9 @@ def test_files_that_exist_are_replaced_only_if_that_is_asked_for(
     sign = ["sign", params, *by(keys, "a"), "--sequence"]
     assert calibrator(*sign, 7, "--out", tmp_path / "signed")[0] == 0
     before = (tmp_path / "signed" / "v1.json").read_bytes()
-    require_one_line(calibrator(*sign, 8, "--out", tmp_path / "signed"), "there is a file already")
+    done = calibrator(*sign, 8, "--out", tmp_path / "signed")
+    require_one_line(done, f"{tmp_path}/signed/v1.json: there is a file already")
+    assert "--replace" in done[2]
     assert (tmp_path / "signed" / "v1.json").read_bytes() == before
     assert calibrator(*sign, 8, "--out", tmp_path / "signed", "--replace")[0] == 0
     assert (tmp_path / "signed" / "v1.json").read_bytes() != before
@@ -103,16 +114,51 @@ def test_files_that_exist_are_replaced_only_if_that_is_asked_for(
 def test_a_later_signature_has_a_higher_number(calibrator: Run, keys: Path, params: Path, tmp_path: Path) -> None:
     for options in (["--sequence", "0"], ["--sequence", str(1 << 53)], ["--sequence", "x"], ["--days", "0"]):
         assert calibrator("sign", params, *by(keys, "a"), "--out", tmp_path / "s", *options)[0] == 2
-    highest = (1 << 53) - 1
-    assert calibrator("sign", params, *by(keys, "a"), "--out", tmp_path / "s", "--sequence", highest)[0] == 0
-    assert calibrator("sign", params, *by(keys, "a"), "--out", tmp_path / "t")[0] == 0
+    wrong = ["revoke", "--vehicle", "v1", "--number", 1 << 53, "--why", "w", *by(keys, "a"), "--out", tmp_path / "r"]
+    code, _, error = calibrator(*wrong)
+    assert (code, error.count("'--number'")) == (2, 1)
+    now = int(datetime.now(UTC).timestamp())
+    assert calibrator("sign", params, *by(keys, "a"), "--out", tmp_path / "hand", "--sequence", 7)[0] == 0
+    assert calibrator("sign", params, *by(keys, "a"), "--out", tmp_path / "time")[0] == 0
     revoke = ["revoke", "--vehicle", "v1", "--number", 5, "--why", "w", *by(keys, "a")]
     assert calibrator(*revoke, "--out", tmp_path / "r")[0] == 0
-    paths = (tmp_path / "t" / "v1.json", tmp_path / "r", tmp_path / "s" / "v1.json")
-    found = [open_statement(path.read_bytes(), "f")[1] for path in paths]
-    numbers = [item.sequence for item in found if isinstance(item, SignedParameters | Revocation)]
+    tomorrow = ["--sequence", now + 86_000]
+    assert calibrator("sign", params, *by(keys, "a"), "--out", tmp_path / "tomorrow", *tomorrow)[0] == 0
+    paths = (
+        tmp_path / "hand" / "v1.json",
+        tmp_path / "time" / "v1.json",
+        tmp_path / "r",
+        tmp_path / "tomorrow/v1.json",
+    )
+    numbers = [sequence_of(path) for path in paths]
     assert numbers == sorted(numbers)
-    assert numbers[-1] == highest
+    assert numbers[0] == 7
+    assert now <= numbers[1] <= now + 60
+
+
+def test_a_digit_too_many_in_the_number_is_refused(calibrator: Run, keys: Path, params: Path, tmp_path: Path) -> None:
+    """A vehicle that took it would refuse all that is signed with the time as number."""
+    now = int(datetime.now(UTC).timestamp())
+    sign = ["sign", params, *by(keys, "a"), "--out", tmp_path / "s", "--sequence"]
+    revoke = ["revoke", "--vehicle", "v1", "--number", 5, "--why", "w", *by(keys, "a"), "--out", tmp_path / "r"]
+    revoke.append("--sequence")
+    for number in (10 * now, now + 90_000, 1 << 52):
+        for command in (sign, revoke):
+            require_one_line(calibrator(*command, number), f"--sequence {number}: above the time in seconds, ")
+    assert not (tmp_path / "s").exists()
+    assert not (tmp_path / "r").exists()
+    assert calibrator(*sign, 10 * now, "--far-sequence")[0] == 0
+    assert calibrator(*revoke, (1 << 53) - 1, "--far-sequence")[0] == 0
+    assert (sequence_of(tmp_path / "s" / "v1.json"), sequence_of(tmp_path / "r")) == (10 * now, (1 << 53) - 1)
+
+
+@pytest.mark.parametrize(
+    "now", ["1969-12-31T23:59:59", "1970-01-01T00:03:00", "2024-12-31T23:59:59", "9999-01-01T00:00:00"]
+)
+def test_a_clock_that_cannot_be_right_is_told(now: str) -> None:
+    with pytest.raises(SigningError, match=f"the clock of this machine says {now}.*; set it: ") as caught:
+        signing_time(datetime.fromisoformat(now).replace(tzinfo=UTC))
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +168,6 @@ def test_a_later_signature_has_a_higher_number(calibrator: Run, keys: Path, para
         (["--vehicle", "v" * 65, "--number", "5", "--why", "w"], "`$.vehicle`"),
         (["--vehicle", "v1", "--number", "5", "--why", ""], "`$.why`"),
         (["--vehicle", "v1", "--number", "5", "--why", "w" * 201], "`$.why`"),
-        (["--vehicle", "v1", "--number", str(1 << 53), "--why", "w"], "canonical JSON"),
         (["--vehicle", "v1", *(f"--number={n}" for n in range(1, 70)), "--why", "w"], "`$.revokes`"),
         (["--vehicle", "v1", "--number", "5", "--why", "\udcff"], "canonical JSON"),
     ],
@@ -139,11 +184,12 @@ def test_a_signed_file_on_a_full_disk_leaves_nothing(calibrator: Run, keys: Path
     revoke = ["revoke", "--vehicle", "v1", "--number", 5, "--why", "w", *by(keys, "a"), "--out", tmp_path / "r"]
     with full_disk(500):
         done = calibrator("sign", params, *by(keys, "a"), "--out", out)
-    require_one_line(done, "cannot be written: File too large")
-    assert list(out.iterdir()) == []
+    require_one_line(done, f"{out}/v1.json: cannot be written: File too large")
+    assert not out.exists()
     with full_disk(0):
         done = calibrator(*revoke)
-    require_one_line(done, "cannot be written: File too large")
+    require_one_line(done, f"{tmp_path}/r: cannot be written: File too large")
+    assert not list(tmp_path.glob("*r*.partial*"))
     assert not (tmp_path / "r").exists()
 
 

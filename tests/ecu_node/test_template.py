@@ -1,0 +1,90 @@
+"""``ecu-node template``: what it prints fits at once, and once filled in it is applied."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from ecu_node.cli import main
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import check_fit, decode_parameters
+from ecu_node.template import template_text
+from ecu_node.trust.trial import begin_trial
+from tests.ecu_node.vehicles import LAYOUT
+
+NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
+
+
+def check(params: Path) -> list[str]:
+    return ["check", "--params", str(params), "--layout", str(LAYOUT), "--vehicle", "my car", "--json"]
+
+
+def test_the_template_of_a_layout_fits_it_at_once_and_corrects_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["template", "--layout", str(LAYOUT), "--vehicle", "my car"]) == 0
+    (tmp_path / "V.json").write_text(capsys.readouterr().out)
+    assert main(check(tmp_path / "V.json")) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["vehicle"], report["warnings"]) == ("my car", [])
+    assert [branch["applied"] for branch in report["branches"].values()] == [False] * len(report["branches"])
+
+
+def test_what_is_filled_in_is_applied(
+    database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    document = json.loads(template_text(database, "my car", NOW))
+    document["branches"]["motor"] = {"drift": 0.04, "offset_a": -1.5, "apply": True}
+    (tmp_path / "V.json").write_text(json.dumps(document))
+    assert main(check(tmp_path / "V.json")) == 0
+    found = json.loads(capsys.readouterr().out)["branches"]
+    assert {name: (branch["drift"], branch["offset_a"]) for name, branch in found.items() if branch["applied"]} == {
+        "motor": (0.04, -1.5)
+    }
+
+
+def test_all_branches_stand_in_it_with_names_and_digests(make_database: Callable[..., VehicleDatabase]) -> None:
+    database = make_database()
+    parameters = decode_parameters(template_text(database, "v1", NOW).encode(), "t")
+    check_fit(parameters, database, "v1")
+    assert tuple(parameters.branches) == database.layout.branch_names
+    assert (parameters.layout.name, parameters.dbc.name) == ("small.toml", "small.dbc")
+    assert (parameters.provenance.method, parameters.provenance.created) == ("by hand", "2026-06-01T12:00:00Z")
+    assert begin_trial(parameters, database, []) is not None
+
+
+@pytest.mark.parametrize("vehicle", ["", " ", "v" * 65, "a\nb", "\udcff"])
+def test_a_vehicle_that_no_parameter_file_can_name_is_wrong_use(
+    vehicle: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["template", "--layout", str(LAYOUT), "--vehicle", vehicle])
+    assert caught.value.code == 2
+    assert "--vehicle: the identity of the vehicle is expected" in capsys.readouterr().err
+
+
+def test_a_layout_that_cannot_be_read_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["template", "--layout", str(tmp_path / "none.toml"), "--vehicle", "v"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(f"ecu-node: {tmp_path}/none.toml")
+    assert captured.err.count("\n") == 1
+
+
+def test_a_full_disk_is_told() -> None:
+    command = [sys.executable, "-m", "ecu_node", "template", "--layout", str(LAYOUT), "--vehicle", "v"]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "standard output: cannot write the result: No space left on device" in done.stderr
+
+
+def test_help_says_what_to_fill_in(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["template", "--help"])
+    assert caught.value.code == 0
+    assert '"apply": true' in capsys.readouterr().out
