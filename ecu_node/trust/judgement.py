@@ -17,7 +17,14 @@ from ecu_node.status import Reason
 from ecu_node.trust.key_set import KeySet
 from ecu_node.trust.largest_step import require_small_step
 from ecu_node.trust.state import Slot, SlotName, TrustState, slot_of
-from ecu_node.trust.statements import Revocation, SignedParameters, Statement, verify
+from ecu_node.trust.statements import (
+    LAST_SEQUENCE,
+    MAX_SEQUENCE,
+    Revocation,
+    SignedParameters,
+    Statement,
+    verify,
+)
 from ecu_node.trust.validity import require_time
 
 __all__ = ["ALL_KINDS", "Accepted", "Arrival", "judge"]
@@ -99,7 +106,8 @@ def _take_keys(arrival: Arrival, keys: KeySet, by: str) -> Accepted:
 
 def _take_revocation(arrival: Arrival, revocation: Revocation, by: str) -> Accepted:
     state = arrival.state
-    _require_next(arrival, revocation.vehicle, revocation.sequence)
+    _require_vehicle(arrival, revocation.vehicle)
+    _require_revocation_number(arrival, revocation.sequence)
     revoked = sorted({*state.revoked, *revocation.revokes})[-_REMEMBERED:]
     slots = {name: slot for name, slot in state.slots.items() if slot.sequence not in revoked}
     in_force = state.in_force if state.in_force in slots else None
@@ -131,7 +139,8 @@ def _what(slots: dict[SlotName, Slot], name: SlotName | None) -> str:
 
 def _take_parameters(arrival: Arrival, signed: SignedParameters, by: str, database: VehicleDatabase) -> Accepted:
     state, parameters = arrival.state, signed.parameters
-    _require_next(arrival, signed.vehicle, signed.sequence)
+    _require_vehicle(arrival, signed.vehicle)
+    _require_number(arrival, signed.sequence, highest=MAX_SEQUENCE)
     if signed.sequence in state.revoked:
         raise TrustError(Reason.REVOKED, f"{arrival.where}: number {signed.sequence} was revoked; sign it with another")
     require_time(state, signed, arrival.where, arrival.now)
@@ -158,13 +167,33 @@ def _take_parameters(arrival: Arrival, signed: SignedParameters, by: str, databa
     )
 
 
-def _require_next(arrival: Arrival, vehicle: str, sequence: int) -> None:
-    state = arrival.state
-    if vehicle != state.vehicle:
-        raise TrustError(Reason.WRONG_VEHICLE, f"{arrival.where}: for vehicle {vehicle!r}, this is {state.vehicle!r}")
-    if sequence <= state.highest_sequence:
+def _require_vehicle(arrival: Arrival, vehicle: str) -> None:
+    expected = arrival.state.vehicle
+    if vehicle != expected:
+        raise TrustError(Reason.WRONG_VEHICLE, f"{arrival.where}: for vehicle {vehicle!r}, this is {expected!r}")
+
+
+def _require_revocation_number(arrival: Arrival, sequence: int) -> None:
+    """The numbers above those of parameters are for revocations that need them; the last one may come again.
+
+    An old revocation does no harm: what it takes back has a number that is never accepted again.
+    """
+    before = arrival.state.highest_sequence
+    if sequence == before == LAST_SEQUENCE:
+        return
+    _require_number(arrival, sequence, highest=MAX_SEQUENCE if before < MAX_SEQUENCE else LAST_SEQUENCE)
+
+
+def _require_number(arrival: Arrival, sequence: int, *, highest: int) -> None:
+    before = arrival.state.highest_sequence
+    if sequence <= before:
+        advice = "sign it with a higher one" if before < highest else "only revocations can be signed for it any more"
+        raise TrustError(
+            Reason.REPLAYED, f"{arrival.where}: number {sequence}, and {before} was accepted before; {advice}"
+        )
+    if sequence > highest:
         raise TrustError(
             Reason.REPLAYED,
-            f"{arrival.where}: number {sequence}, and {state.highest_sequence} was accepted before; sign it with a "
-            f"higher one",
+            f"{arrival.where}: number {sequence}, and the highest is {highest}, as nothing could come after it; "
+            f"sign it with a lower one, such as the time in seconds",
         )

@@ -9,10 +9,21 @@ from ecu_node.errors import TrustError
 from ecu_node.status import Reason
 from ecu_node.trust.canonical import Expected
 
-__all__ = ["KEYS_TYPE", "KEY_SET", "SIGNER_NAME", "KeyId", "KeySet", "PublicKey", "check_key_set"]
+__all__ = [
+    "KEYS_TYPE",
+    "KEY_SET",
+    "MAX_FIRST_VERSION",
+    "SIGNER_NAME",
+    "KeyId",
+    "KeySet",
+    "PublicKey",
+    "check_key_set",
+]
 
 KEYS_TYPE = "application/vnd.hv-current-correction.keys+json"
 KEY_SET = Expected(what="a key set", advice="make one with 'calibrator keys set'")
+MAX_FIRST_VERSION = 500_000
+"""Of the set that a vehicle begins with: others must be able to come after it."""
 SIGNER_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"
 """It stands in messages and in names of files."""
 KeyId = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]

@@ -7,7 +7,7 @@ from ecu_node.errors import TrustError, UserError
 from ecu_node.status import Reason
 from ecu_node.trust.audit import event_now
 from ecu_node.trust.commit import commit
-from ecu_node.trust.key_set import KeySet
+from ecu_node.trust.key_set import MAX_FIRST_VERSION, KeySet
 from ecu_node.trust.state import TrustState, state_path
 from ecu_node.trust.storage import locked
 
@@ -31,10 +31,16 @@ def provision(folder: Path, vehicle: str, keys: KeySet, now: datetime) -> None:
     Raises
     ------
     TrustError
-        If there is a state already.
+        If there is a state already, or no other key set could come after this one.
     UserError
         If it cannot be written.
     """
+    if keys.version > MAX_FIRST_VERSION:
+        raise TrustError(
+            Reason.NONE,
+            f"key set {keys.version}: the first one of a vehicle is at most {MAX_FIRST_VERSION}, so that others can come "
+            f"after it; make one with 'calibrator keys set', without --version",
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

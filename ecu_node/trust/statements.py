@@ -18,6 +18,8 @@ from ecu_node.trust.key_set import KEYS_TYPE, KeySet, check_key_set
 
 __all__ = [
     "KEYS_TYPE",
+    "LAST_SEQUENCE",
+    "MAX_SEQUENCE",
     "PARAMETERS_TYPE",
     "REVOCATION_TYPE",
     "Revocation",
@@ -31,7 +33,12 @@ __all__ = [
 PARAMETERS_TYPE = "application/vnd.hv-current-correction.parameters+json"
 REVOCATION_TYPE = "application/vnd.hv-current-correction.revocation+json"
 
-_Sequence = Annotated[int, msgspec.Meta(ge=1, le=(1 << 53) - 1, description="above that of all statements before")]
+MAX_SEQUENCE = 1 << 52
+"""Highest number of parameters. What is above is kept for revocations, so that any set can be taken back."""
+LAST_SEQUENCE = (1 << 53) - 1
+"""Highest number that canonical JSON can say."""
+
+_Sequence = Annotated[int, msgspec.Meta(ge=1, le=LAST_SEQUENCE, description="above that of all statements before")]
 _Time = Annotated[
     str, msgspec.Meta(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z\Z", description="ISO 8601, UTC")
 ]
