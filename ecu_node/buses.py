@@ -76,6 +76,8 @@ def connect(
         )
     except (can.CanError, OSError, ValueError, TypeError, NotImplementedError) as error:
         raise BusError(f"{interface} {channel}: cannot open the bus: {_why(error)}") from None
+    if bus.channel_info == can.BusABC.channel_info:
+        bus.channel_info = f"{interface} {channel}"  # what an interface does not tell of itself
     opened = _socket(bus)
     if opened is not None:
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)

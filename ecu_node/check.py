@@ -8,6 +8,7 @@ from typing import Any
 
 from ecu_node.correction import CorrectionPlan, IntegerPlan, SignPlan
 from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.errors import printable
 from ecu_node.guard import Mode, needs_fd
 from ecu_node.layout import Branch, read_layout
 from ecu_node.parameter_file import choose_parameters
@@ -62,7 +63,7 @@ def check_report(params: Path, layout: Path, vehicle: str | None, mode: Mode = M
 def report_text(report: dict[str, Any]) -> str:
     """Show a report of :func:`check_report` as text."""
     head = f"vehicle {report['vehicle']}, parameter set {report['parameter_set']}: fit"
-    lines = [head if report["fit"] else f"NOT FIT ({report['reason']}): {report['message']}"]
+    lines = [head if report["fit"] else f"NOT FIT ({report['reason']}): {printable(report['message'])}"]
     width = max(map(len, ["branch", *report["branches"]]))
     lines.append(f"{'branch':<{width}}{'drift':>11}{'offset':>13}")
     for name, branch in report["branches"].items():

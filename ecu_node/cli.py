@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ecu_node import __version__
-from ecu_node.errors import UserError
+from ecu_node.errors import UserError, printable
 from ecu_node.interrupts import ending_at_interrupt, ignoring_hangups
 from ecu_node.standard_output import drop_output, flush_output, write_output
 from ecu_node.template import add_template_command
@@ -182,6 +182,8 @@ def _name(text: str) -> str:
 def _vehicle(text: str) -> str:
     if not text.strip():
         raise argparse.ArgumentTypeError("the identity of this vehicle is expected, found none; or leave it out")
+    if not text.isprintable():
+        raise argparse.ArgumentTypeError(f"{text!a}: the identity of this vehicle is a text without control characters")
     return text
 
 
@@ -286,4 +288,4 @@ def _schema(options: argparse.Namespace) -> int:  # noqa: ARG001
 
 
 def _say(text: str) -> None:
-    print(f"ecu-node: {text}", file=sys.stderr, flush=True)
+    print(f"ecu-node: {printable(text)}", file=sys.stderr, flush=True)

@@ -4,6 +4,7 @@ msgspec says it as ``Expected `float`, got `str` - at `$.branch[2].timeout_s```.
 document, of which :func:`field_error` makes words that a user finds again in the file.
 """
 
+import codecs
 import difflib
 import json
 import re
@@ -13,7 +14,7 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
-__all__ = ["Place", "field_error", "quoted_place", "toml_place"]
+__all__ = ["Place", "field_error", "json_error", "quoted_place", "toml_place"]
 
 Step = str | int
 Place = tuple[Step, ...]
@@ -59,6 +60,17 @@ def field_error(error: msgspec.ValidationError, document: Any, schema: Any, plac
     words = place(document, steps)
     what = _what(match["what"], _found(document, steps), _kind(schema, document, steps))
     return f"{words}: {what}" if words else what
+
+
+def json_error(error: Exception, content: bytes) -> str:
+    """Say why a text is no JSON; other errors of its decoding in the words that they have."""
+    if not content.strip():
+        return "it is empty"
+    if content.startswith(codecs.BOM_UTF8):
+        return "it begins with a byte order mark (BOM); save it as UTF-8 without one"
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    return "it is no text in UTF-8" if isinstance(error, UnicodeDecodeError) else str(error)
 
 
 def toml_place(document: Any, steps: Place) -> str:
@@ -212,4 +224,6 @@ def _shown(value: Any) -> str:
     if isinstance(value, list):
         return f"a list of {len(value)}"
     text = json.dumps(value, default=str)
-    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
+    if len(text) <= _LONGEST_VALUE:
+        return text
+    return f"{text[:_LONGEST_VALUE]}..." + (f" ({len(value)} characters)" if isinstance(value, str) else "")

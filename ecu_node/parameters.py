@@ -4,6 +4,7 @@ JSON, UTF-8, one file per vehicle. The structures below are the schema: ``ecu-no
 made from them, which stands in ``ecu_node/parameters.schema.json``. Currents are positive into the junction.
 """
 
+import json
 import math
 import os
 import tempfile
@@ -14,7 +15,7 @@ import msgspec
 
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError, UnfitError, printable
-from ecu_node.field_errors import field_error, quoted_place
+from ecu_node.field_errors import field_error, json_error, quoted_place
 from ecu_node.sensor_models import GainBySign, SensorModel
 from ecu_node.status import Reason
 from ecu_node.user_files import UnsuitableFileError, read_user_file
@@ -44,6 +45,10 @@ MAX_DELAY_S = 5.0
 MAX_FILE_BYTES = 1_000_000
 """A parameter file has some kilobytes; a larger one is not one."""
 
+_LARGEST_NUMBER = (1 << 53) - 1
+"""Beyond it readers of JSON differ."""
+_SIGNED = "this file is signed"
+_SIGNED_ADVICE = "use 'ecu-node activate' and --state, or name the file that was signed"
 _LONGEST_NAME = 64
 """Characters of a name that are shown."""
 
@@ -165,7 +170,9 @@ class VehicleParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
 
     schema_version: Literal[1] = 1
     vehicle: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
-    number: Annotated[int, msgspec.Meta(ge=1, description="number of the parameter set, published modulo 256")] = 1
+    number: Annotated[
+        int, msgspec.Meta(ge=1, le=_LARGEST_NUMBER, description="number of the parameter set, published modulo 256")
+    ] = 1
     layout: FileReference
     dbc: FileReference
     verdict: Verdict
@@ -220,21 +227,42 @@ def parameter_bytes(path: Path) -> bytes:
 def decode_parameters(content: bytes, where: str) -> VehicleParameters:
     """Parameters from the text of a parameter file; `where` it is from, for messages. Raises as its reading does."""
     try:
-        return msgspec.json.decode(content, type=VehicleParameters)
+        found = msgspec.json.decode(content, type=VehicleParameters)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise UnfitError(
-            Reason.MALFORMED_PARAMETERS,
-            f"{where}: not a parameter file: {_why_not(error, content)}; write it anew with 'calibrator calibrate'",
-        ) from None
+        raise _malformed(where, _why_not(error, content)) from None
+    try:
+        json.loads(content, object_pairs_hook=_once_each, parse_float=str, parse_int=str)
+    except _TwiceError as error:
+        raise _malformed(where, str(error)) from None
+    return found
+
+
+class _TwiceError(Exception):
+    """A key stands twice in one object: readers differ in which of the values they take."""
+
+
+def _once_each(pairs: list[tuple[str, Any]]) -> None:
+    keys = [key for key, _ in pairs]
+    if len(set(keys)) < len(keys):
+        twice = next(key for place, key in enumerate(keys) if key in keys[:place])
+        raise _TwiceError(f"'{_shown(twice)}' stands there twice in one place")
+
+
+def _malformed(where: str, why: str) -> UnfitError:
+    advice = _SIGNED_ADVICE if why == _SIGNED else "correct it, or write it anew with 'calibrator calibrate'"
+    return UnfitError(Reason.MALFORMED_PARAMETERS, f"{where}: not a parameter file: {printable(why)}; {advice}")
 
 
 def _why_not(error: Exception, content: bytes) -> str:
     if not isinstance(error, msgspec.ValidationError):
-        return str(error)
+        return json_error(error, content)
     try:
-        return field_error(error, msgspec.json.decode(content), VehicleParameters, quoted_place)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return str(error)
+        document = msgspec.json.decode(content)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as first:
+        return json_error(first, content)
+    if isinstance(document, dict) and {"payload", "payloadType", "signatures"} <= document.keys():
+        return _SIGNED
+    return field_error(error, document, VehicleParameters, quoted_place)
 
 
 def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:

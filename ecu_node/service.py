@@ -8,6 +8,8 @@ import time
 from contextlib import suppress
 from types import FrameType
 
+from ecu_node.errors import printable
+
 __all__ = ["Log", "Requests", "ServiceManager"]
 
 _WHILE_S, _SAME_LINE_TIMES = 10.0, 3
@@ -62,7 +64,7 @@ class Log:
         self._said[text] = (now_s, 1) if is_over else (since_s, times + 1)
         again = f" (and {held_back} times before)" if held_back > 0 else ""
         with suppress(OSError):  # a log that is gone, as when the journal is started anew, must not end the node
-            print(f"ecu-node: {text}{again}", file=sys.stderr, flush=True)
+            print(f"ecu-node: {printable(text)}{again}", file=sys.stderr, flush=True)
 
 
 class ServiceManager:

@@ -4,6 +4,7 @@ A pipe would keep the reader waiting, a device would never end.
 """
 
 import hashlib
+import os
 import stat
 from pathlib import Path
 
@@ -41,7 +42,10 @@ def require_user_file(path: Path, *, largest_bytes: int) -> None:
     OSError
         If there is no such file.
     """
-    found = path.stat()
+    _require_suitable(path.stat(), largest_bytes)
+
+
+def _require_suitable(found: os.stat_result, largest_bytes: int) -> None:
     if not stat.S_ISREG(found.st_mode):
         kind = next((name for is_kind, name in _KINDS if is_kind(found.st_mode)), "no regular file")
         raise UnsuitableFileError(f"it is {kind}; a file is expected")
@@ -52,11 +56,16 @@ def require_user_file(path: Path, *, largest_bytes: int) -> None:
 def read_user_file(path: Path, *, largest_bytes: int) -> bytes:
     """Content of a file; parameters and errors as for :func:`require_user_file`, and OSError if it cannot be read."""
     require_user_file(path, largest_bytes=largest_bytes)
-    with path.open("rb") as file:
+    with open(path, "rb", opener=_open_without_waiting) as file:
+        _require_suitable(os.fstat(file.fileno()), largest_bytes)  # the folder's owner may have put another one there
         content = file.read(largest_bytes + 1)  # the kernel's own files have no size
     if len(content) > largest_bytes:
         raise _too_large(largest_bytes)
     return content
+
+
+def _open_without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def text_digest(content: bytes) -> str:

@@ -5,6 +5,7 @@ it. What is refused leaves everything as it was, but for a line in the audit log
 """
 
 import hashlib
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
@@ -15,8 +16,9 @@ from ecu_node.errors import TrustError, UnfitError
 from ecu_node.trust.audit import REFUSED, add_entry, event_now
 from ecu_node.trust.commit import commit, opened
 from ecu_node.trust.judgement import ALL_KINDS, Accepted, Arrival, judge
+from ecu_node.trust.key_set import KeySet
 from ecu_node.trust.state import TrustState, audit_path, read_state, signed_parameters, write_slot
-from ecu_node.trust.statements import Statement
+from ecu_node.trust.statements import Statement, open_statement
 from ecu_node.trust.storage import locked
 from ecu_node.trust.validity import require_not_expired
 
@@ -31,6 +33,7 @@ def accept(
     now: datetime,
     *,
     kinds: tuple[type[Statement], ...] = ALL_KINDS,
+    on_wait: Callable[[str], None] | None = None,
 ) -> Accepted:
     """Take a signed file: parameters go on trial, a revocation and a key set hold at once.
 
@@ -48,6 +51,8 @@ def accept(
         The time of day.
     kinds : tuple of types
         Statements that are expected; others are refused.
+    on_wait : callable or None
+        Takes one line for the user if another process holds the state for more than a moment.
 
     Returns
     -------
@@ -61,19 +66,29 @@ def accept(
     UserError
         If the state cannot be written: then it is as before; or if it is written, and the audit log cannot be.
     """
-    with locked(folder):
+    with locked(folder, on_wait=on_wait):
         state = opened(folder)
         digest = hashlib.sha256(content).hexdigest()
         try:
             accepted = judge(Arrival(folder, state, content, where, now), database, kinds)
         except UnfitError as error:
-            add_entry(audit_path(folder), event_now(REFUSED, str(error), now=now, sha256=digest))
+            event = event_now(REFUSED, str(error), now=now, sequence=_number(content), sha256=digest)
+            add_entry(audit_path(folder), event)
             raise
         if accepted.slot is not None:
             write_slot(folder, accepted.slot, content)
         event = event_now(accepted.event, accepted.text, now=now, sequence=accepted.sequence, sha256=digest)
         commit(folder, accepted.state, event)
     return accepted
+
+
+def _number(content: bytes) -> int | None:
+    """Number that a file gives itself, whoever wrote it; None if it has none."""
+    try:
+        _, statement = open_statement(content, "")
+    except UnfitError:
+        return None
+    return None if isinstance(statement, KeySet) else statement.sequence
 
 
 def examine(folder: Path, content: bytes, where: str, database: VehicleDatabase, now: datetime) -> Accepted:

@@ -3,10 +3,12 @@
 Each line holds the SHA-256 of the one before, so that a line that was changed or taken out shows. What changes the
 state of the vehicle is written into the state itself first, in one step with the change, and then added to the log:
 after a power cut between the two it is added before anything else is (:func:`tell`). So the log tells of no change that
-was not made, and of each that was.
+was not made, and of each that was. The state holds that line as it is added, with the digest of the one before: so a
+log that is missing, or cut further back than a power cut could do it, shows as well.
 """
 
 from datetime import UTC, datetime
+from enum import Enum
 from pathlib import Path
 
 import msgspec
@@ -15,7 +17,18 @@ from ecu_node.trust.canonical import canonical_bytes
 from ecu_node.trust.log_lines import lines, lines_from_the_end
 from ecu_node.trust.storage import append_line
 
-__all__ = ["REFUSED", "AuditEntry", "Event", "add_entry", "broken_line", "event_now", "is_told", "tell"]
+__all__ = [
+    "REFUSED",
+    "AuditEntry",
+    "End",
+    "Event",
+    "add_entry",
+    "broken_line",
+    "end_of_log",
+    "event_now",
+    "next_entry",
+    "tell",
+]
 
 REFUSED = "refused"
 """The one event that changes nothing."""
@@ -66,6 +79,20 @@ def event_now(event: str, text: str, *, now: datetime, sequence: int | None = No
     )
 
 
+class End(Enum):
+    """How a log ends, as the state knows it."""
+
+    TOLD = "with the last change"
+    LEFT = "before the last change, which a power cut has kept from it"
+    LOST = "somewhere else: lines are missing, or all of it"
+
+
+def next_entry(path: Path, event: Event) -> AuditEntry:
+    """What would be the next line; raises UserError if the log cannot be read."""
+    last = next(lines_from_the_end(path), None)
+    return _after(event, last.digest if last is not None else _FIRST)
+
+
 def add_entry(path: Path, event: Event) -> None:
     """Add a line.
 
@@ -81,22 +108,66 @@ def add_entry(path: Path, event: Event) -> None:
     UserError
         If it cannot be written.
     """
-    last = next(lines_from_the_end(path), None)
-    entry = AuditEntry(**msgspec.structs.asdict(event), before=last.digest if last is not None else _FIRST)
-    append_line(path, canonical_bytes(entry))
+    append_line(path, canonical_bytes(next_entry(path, event)))
 
 
-def tell(path: Path, event: Event | None) -> None:
-    """Add the last change of the state, unless it stands there; parameters and errors as for :func:`add_entry`."""
-    if event is not None and not is_told(path, event):
-        add_entry(path, event)
+def tell(path: Path, made_by: AuditEntry | None) -> None:
+    """Add the last change of the state, unless it stands there.
+
+    Parameters
+    ----------
+    path : Path
+        The log.
+    made_by : AuditEntry or None
+        The change. Where lines before it are lost it is added as it was to stand there: so it shows that they are.
+
+    Raises
+    ------
+    UserError
+        As for :func:`add_entry`.
+    """
+    if made_by is None:
+        return
+    match end_of_log(path, made_by):
+        case End.LEFT:
+            add_entry(path, made_by)
+        case End.LOST:
+            append_line(path, canonical_bytes(made_by))
 
 
-def is_told(path: Path, event: Event) -> bool:
-    """Whether this is the last change of which the log tells."""
-    entries = (_entry(line.text) for line in lines_from_the_end(path))
-    last = next((entry for entry in entries if entry is not None and entry.event != REFUSED), None)
-    return last is not None and last == AuditEntry(**msgspec.structs.asdict(event), before=last.before)
+def end_of_log(path: Path, made_by: AuditEntry) -> End:
+    """How a log ends.
+
+    Parameters
+    ----------
+    path : Path
+        The log.
+    made_by : AuditEntry
+        The last change of the state. The line that is added may have another one before it: what a power cut left.
+
+    Returns
+    -------
+    End
+        As the state knows it. Refusals after the last change may be missing.
+
+    Raises
+    ------
+    UserError
+        If it cannot be read.
+    """
+    for line in lines_from_the_end(path):
+        entry = _entry(line.text)
+        if entry is not None and entry == _after(made_by, entry.before):
+            return End.TOLD
+        if line.digest == made_by.before:
+            return End.LEFT
+        if entry is not None and entry.event != REFUSED:
+            return End.LOST
+    return End.LEFT if made_by.before == _FIRST else End.LOST
+
+
+def _after(event: Event, before: str) -> AuditEntry:
+    return AuditEntry(**{**msgspec.structs.asdict(event), "before": before})
 
 
 def broken_line(path: Path) -> int | None:

@@ -12,6 +12,7 @@ import msgspec
 import rfc8785
 
 from ecu_node.errors import TrustError, printable
+from ecu_node.field_errors import json_error
 from ecu_node.status import Reason
 from ecu_node.user_files import UnsuitableFileError, read_user_file
 
@@ -97,7 +98,7 @@ def read_canonical(content: bytes, kind: type[_Value], where: str, expected: Exp
         value = msgspec.convert(document, kind)
         same = rfc8785.dumps(document) == content
     except (msgspec.DecodeError, msgspec.ValidationError, UnicodeDecodeError, RecursionError) as error:
-        raise malformed(where, str(error), expected) from None
+        raise malformed(where, json_error(error, content), expected) from None
     except (rfc8785.CanonicalizationError, ValueError) as error:
         raise malformed(where, f"no canonical JSON says this: {error}", expected) from None
     if not same:

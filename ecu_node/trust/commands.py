@@ -5,14 +5,10 @@ import os
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ecu_node.errors import printable
 from ecu_node.standard_output import write_output
-
-if TYPE_CHECKING:
-    from ecu_node.parameters import BranchParameters
-    from ecu_node.trust.key_set import KeySet
-    from ecu_node.trust.statements import Statement
 
 __all__ = ["add_trust_commands"]
 
@@ -59,10 +55,14 @@ def add_trust_commands(commands: "argparse._SubParsersAction[Any]") -> None:
     inspect = commands.add_parser(
         "inspect",
         help="show a signed file, or the state of a vehicle",
-        description="Shows what is said there. Of a file no signature is verified; of a state the audit log is.",
-        epilog=_CODES,
+        description="Shows what is said there. Of a file signatures are verified only with --keys. Of a state it is "
+        "verified that the slots and the audit log are as they were written, and that what is in force or on trial "
+        "holds now; whether it fits layout and DBC, 'ecu-node run' says.",
+        epilog="Exit codes: 0 done, 1 what is in force or on trial cannot be used, the audit log is not whole, or with "
+        "--keys not enough signers, 2 wrong use, 130 interrupted.",
     )
     inspect.add_argument("what", type=Path, metavar="FILE|FOLDER", help="signed file, or state of a vehicle")
+    inspect.add_argument("--keys", type=Path, metavar="FILE", help="key set with which signatures are verified")
     inspect.set_defaults(command=_inspect)
 
 
@@ -72,12 +72,17 @@ def _add_state(parser: argparse.ArgumentParser) -> None:
 
 def _vehicle(text: str) -> str:
     if not text.strip() or len(text) > 64:  # as in the parameter file
-        raise argparse.ArgumentTypeError("the vehicle's identity is expected, of at most 64 characters")
+        raise argparse.ArgumentTypeError(
+            f"the vehicle's identity is expected, of at most 64 characters, found {len(text)} characters"
+        )
+    if not text.isprintable():
+        raise argparse.ArgumentTypeError(f"{text!a}: the vehicle's identity is a text without control characters")
     return text
 
 
 def _provision(options: argparse.Namespace) -> int:
-    from ecu_node.trust.canonical import printable, read_bytes, read_canonical  # noqa: PLC0415
+    from ecu_node.trust.canonical import read_bytes, read_canonical  # noqa: PLC0415
+    from ecu_node.trust.inspection import signers_text  # noqa: PLC0415
     from ecu_node.trust.key_set import KEY_SET, KeySet, check_key_set  # noqa: PLC0415
     from ecu_node.trust.provision import provision  # noqa: PLC0415  # cryptography takes time to import
 
@@ -85,7 +90,7 @@ def _provision(options: argparse.Namespace) -> int:
     content = read_bytes(options.keys, KEY_SET).removesuffix(b"\n")
     keys = check_key_set(read_canonical(content, KeySet, where, KEY_SET), where)
     provision(options.state, options.vehicle, keys, _now())
-    write_output(printable(f"{options.state}: vehicle {options.vehicle} trusts {_signers(keys)}"))
+    write_output(printable(f"{options.state}: vehicle {options.vehicle} trusts {signers_text(keys)}"))
     return 0
 
 
@@ -93,7 +98,7 @@ def _take(options: argparse.Namespace) -> int:
     from ecu_node.database import read_database  # noqa: PLC0415
     from ecu_node.layout import read_layout  # noqa: PLC0415
     from ecu_node.trust.activation import accept, examine  # noqa: PLC0415
-    from ecu_node.trust.canonical import printable, read_bytes  # noqa: PLC0415
+    from ecu_node.trust.canonical import read_bytes  # noqa: PLC0415
     from ecu_node.trust.key_set import KeySet  # noqa: PLC0415
     from ecu_node.trust.statements import Revocation, SignedParameters  # noqa: PLC0415
 
@@ -103,7 +108,7 @@ def _take(options: argparse.Namespace) -> int:
         accepted = examine(options.state, content, where, database, _now())
     else:
         kinds = (Revocation,) if options.name == "revoke" else (SignedParameters, KeySet)
-        accepted = accept(options.state, content, where, database, _now(), kinds=kinds)
+        accepted = accept(options.state, content, where, database, _now(), kinds=kinds, on_wait=_say_waiting)
     number = f"number {accepted.sequence}, " if accepted.sequence is not None else ""
     would = "would be accepted: " if options.name == "verify" else ""
     write_output(printable(f"{would}{accepted.event}: {number}{accepted.text}"))
@@ -111,88 +116,23 @@ def _take(options: argparse.Namespace) -> int:
 
 
 def _inspect(options: argparse.Namespace) -> int:
-    return _inspect_state(options.what) if os.path.isdir(options.what) else _inspect_file(options.what)  # noqa: PTH112
+    from ecu_node.trust.inspection import inspect_file, inspect_state  # noqa: PLC0415
+
+    if os.path.isdir(options.what):  # noqa: PTH112  # False where the name is too long for a file
+        if options.keys is not None:
+            print("ecu-node: --keys is for a signed file; a state has keys of its own", file=sys.stderr)
+            return 2
+        found = inspect_state(options.what, _now())
+    else:
+        found = inspect_file(options.what, options.keys)
+    write_output("\n".join(map(printable, found.lines)))
+    for problem in found.problems:
+        print(f"ecu-node: {printable(problem)}", file=sys.stderr)
+    return 1 if found.problems else 0
 
 
-def _inspect_file(path: Path) -> int:
-    from ecu_node.trust.canonical import printable, read_bytes  # noqa: PLC0415
-    from ecu_node.trust.statements import open_statement  # noqa: PLC0415
-
-    envelope, statement = open_statement(read_bytes(path), str(path))
-    lines = [*_statement_lines(statement), "signatures, not verified, of keys:"]
-    lines += [f"  {signature.keyid}" for signature in envelope.signatures]
-    write_output("\n".join(map(printable, lines)))
-    return 0
-
-
-def _statement_lines(statement: "Statement") -> list[str]:
-    from ecu_node.trust.key_set import KeySet  # noqa: PLC0415
-    from ecu_node.trust.statements import Revocation  # noqa: PLC0415
-
-    if isinstance(statement, KeySet):
-        return [f"key set {statement.version}: {_signers(statement)}", *_keys(statement)]
-    if isinstance(statement, Revocation):
-        numbers = ", ".join(map(str, statement.revokes))
-        return [
-            f"revocation number {statement.sequence} for vehicle {statement.vehicle}: {numbers}; {statement.why}",
-            f"made at {statement.created}, before which no vehicle that takes it believes to be any more",
-        ]
-    parameters = statement.parameters
-    lines = [
-        f"parameter set {parameters.number} for vehicle {statement.vehicle}, number {statement.sequence}",
-        f"holds from {statement.not_before} to {statement.expires}",
-        f"layout {parameters.layout.name}, DBC {parameters.dbc.name}; verdict: {parameters.verdict}",
-    ]
-    lines += ["may differ a lot from what is in force"] * statement.allow_large_step
-    for name, branch in parameters.branches.items():
-        applied = "applied" if branch.apply else f"not applied ({branch.held_back or 'no fault'})"
-        lines.append(f"branch {name}: {_drift(branch)}, offset {branch.offset_a:+.4g} A, {applied}")
-    return lines
-
-
-def _drift(branch: "BranchParameters") -> str:
-    from ecu_node.sensor_models import GainBySign, TemperatureDrift  # noqa: PLC0415
-
-    match branch.sensor_model:
-        case GainBySign() as model:
-            return f"drift {model.drift_positive:+.4g} into and {model.drift_negative:+.4g} out of the junction"
-        case TemperatureDrift() as model:
-            return f"drift {branch.drift:+.4g} at {model.reference_c:g} degC, {model.drift_per_k:+.4g} per K"
-        case None:
-            return f"drift {branch.drift:+.4g}"
-
-
-def _inspect_state(folder: Path) -> int:
-    from ecu_node.trust.audit import broken_line, is_told  # noqa: PLC0415
-    from ecu_node.trust.state import audit_path, read_state  # noqa: PLC0415
-
-    state = read_state(folder)
-    lines = [
-        f"vehicle {state.vehicle}, highest number {state.highest_sequence}",
-        f"key set {state.keys.version}: {_signers(state.keys)}",
-        *_keys(state.keys),
-    ]
-    for name, slot in sorted(state.slots.items()):
-        places = {state.in_force: "in force", state.on_trial: "on trial", state.fallback: "in force before"}
-        what = places.get(name, "not used")
-        lines.append(f"slot {name}: number {slot.sequence}, {what}")
-    lines += [f"revoked: {', '.join(map(str, state.revoked))}"] * bool(state.revoked)
-    if state.made_by is not None and not is_told(audit_path(folder), state.made_by):
-        lines.append(f"not in the audit log yet, the next command adds it: {state.made_by.event}")
-    broken = broken_line(audit_path(folder))
-    write_output("\n".join([*lines, "audit log: whole" if broken is None else f"audit log: line {broken} was changed"]))
-    if broken is not None:
-        print(f"ecu-node: {audit_path(folder)}: line {broken} is not what was written there", file=sys.stderr)
-    return 0 if broken is None else 1
-
-
-def _signers(keys: "KeySet") -> str:
-    return f"{keys.threshold} of {', '.join(sorted(key.name for key in keys.keys.values()))}"
-
-
-def _keys(keys: "KeySet") -> list[str]:
-    """Whose key is which, to be compared with what the signers themselves say (NAME.pub)."""
-    return [f"  {key.name}: {key.ed25519}" for key in sorted(keys.keys.values(), key=lambda key: key.name)]
+def _say_waiting(text: str) -> None:
+    print(f"ecu-node: {printable(text)}", file=sys.stderr, flush=True)
 
 
 def _now() -> datetime:

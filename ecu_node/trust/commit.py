@@ -5,7 +5,7 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from ecu_node.errors import UserError
-from ecu_node.trust.audit import Event, add_entry, tell
+from ecu_node.trust.audit import Event, add_entry, next_entry, tell
 from ecu_node.trust.state import TrustState, audit_path, read_state, settle_slots, write_state
 
 __all__ = ["commit", "opened"]
@@ -57,7 +57,7 @@ def commit(folder: Path, state: TrustState, event: Event) -> TrustState:
     UserError
         If it cannot be written: then it is as before; or if it is written, and the audit log cannot be.
     """
-    state = replace(state, made_by=event)
+    state = replace(state, made_by=next_entry(audit_path(folder), event))
     write_state(folder, state)
     try:
         settle_slots(folder, state)

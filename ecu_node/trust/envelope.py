@@ -20,6 +20,7 @@ from ecu_node.errors import TrustError
 from ecu_node.status import Reason
 from ecu_node.trust.canonical import canonical_bytes, malformed, printable, read_canonical
 from ecu_node.trust.key_set import KeyId, KeySet, PublicKey
+from ecu_node.trust.unsigned import UNSIGNED, unsigned_kind
 
 __all__ = [
     "Envelope",
@@ -33,6 +34,8 @@ __all__ = [
     "write_envelope",
 ]
 
+_BEGIN = b'{"payload":'
+"""Of every envelope, as canonical JSON has one order."""
 _Base64 = Annotated[str, msgspec.Meta(pattern="^[A-Za-z0-9+/]*={0,2}$")]
 
 
@@ -107,11 +110,18 @@ def read_envelope(content: bytes, where: str) -> Envelope:
     Raises
     ------
     TrustError
-        With reason MALFORMED_PARAMETERS if it is not an envelope as :func:`write_envelope` writes it.
+        With reason MALFORMED_PARAMETERS if it is not an envelope as :func:`write_envelope` writes it, NOT_SIGNED if it
+        is a file of this project that nobody signed.
     """
-    if not content.endswith(b"\n"):
+    if content.startswith(_BEGIN) and not content.endswith(b"\n"):
         raise malformed(where, "its end is missing")
-    envelope = read_canonical(content[:-1], Envelope, where)
+    try:
+        envelope = read_canonical(content.removesuffix(b"\n"), Envelope, where)
+    except TrustError:
+        kind = unsigned_kind(content)
+        if kind is None:
+            raise
+        raise not_signed(where, UNSIGNED[kind]) from None
     try:
         texts = [envelope.payload, *(signature.sig for signature in envelope.signatures)]
         if any(base64.b64encode(base64.b64decode(text, validate=True)).decode() != text for text in texts):

@@ -26,6 +26,10 @@ _LOOK_EVERY_S = 1.0
 """Between looks whether the state has changed, or what is in force has expired. [s]"""
 _RETRY_EVERY_S = 60.0
 """Between attempts to begin a trial, as before the clock is set, or to keep its end, as on a full disk. [s]"""
+_CHANGING_S = 3.0
+"""So long a slot may be another one than the state knows, as while a command changes both. [s]"""
+_OTHER_FILE = (Reason.NOT_SIGNED, Reason.NO_PARAMETERS)
+"""Why a set on trial is not read if its slot holds another file than the state knows, or none."""
 
 
 class ParameterStore:
@@ -66,6 +70,7 @@ class ParameterStore:
         self._due_s = self._retry_due_s = float("-inf")
         self._trial: Trial | None = None
         self._no_trial: Reason | None = None
+        self._changing_until_s: float | None = None
         self._result: TrialResult | None = None
         self._end: Future[TrustState] | None = None
         self._tried: int | None = None
@@ -73,6 +78,9 @@ class ParameterStore:
         self._read: tuple[Slot, FileSignature | None, SignedParameters] | None = None
         self._seen = signature(state_path(folder))
         self._state: TrustState | None = None
+        self._revoked: set[int] = set()
+        self._number: int | None = None
+        """Of what is in force, as it was signed."""
         self.in_force: InForce
         self.why_not: str | None
         try:
@@ -82,6 +90,8 @@ class ParameterStore:
             self._unread = str(error)
         else:
             self.in_force, self.why_not = self._in_force(self._state)
+            self._number = _number_in_force(self._state, self.in_force)
+            self._revoked.update(self._state.revoked)
 
     def look(self, corrector: Corrector, now_s: float, *, asked: bool = False) -> bool:
         """See whether a trial has ended, the state was changed, or time has passed; to be called now and then.
@@ -123,23 +133,35 @@ class ParameterStore:
 
     def _put_in_force(self, corrector: Corrector, state: TrustState, now_s: float) -> bool:
         in_force, why_not = self._in_force(state)
-        if in_force == self.in_force:
-            return False
-        try:
-            put_in_force(corrector, self._database, in_force, now_s, mode=self._mode)
-        except UserError as error:
-            corrector.counters.reload_failures += 1
-            self._say(f"new parameters are not used, those before stay in force: {error}")
-            return False
-        self.in_force, self.why_not = in_force, why_not
-        corrector.counters.reloads += 1
+        if in_force.reason is Reason.NOT_SIGNED and signature(state_path(self._folder)) != self._seen:
+            return False  # state and slot are changed just now; both are read again
+        number = _number_in_force(state, in_force)
+        self._say_revoked(state, number)
+        is_other, is_other_number = in_force != self.in_force, number != self._number
+        if is_other:
+            try:
+                put_in_force(corrector, self._database, in_force, now_s, mode=self._mode)
+            except UserError as error:
+                corrector.counters.reload_failures += 1
+                self._say(f"new parameters are not used, those before stay in force: {error}")
+                return False
+            corrector.counters.reloads += 1
+        self.in_force, self.why_not, self._number = in_force, why_not, number
         found = in_force.parameters
-        self._say(
-            f"parameter set {found.number} of vehicle {found.vehicle} is in force"
-            if found is not None
-            else f"passing measured values through: {why_not}"
-        )
-        return True
+        if found is not None and (is_other or is_other_number):
+            self._say(f"number {number}: parameter set {found.number} of vehicle {found.vehicle} is in force")
+        elif is_other:
+            self._say(f"passing measured values through: {why_not}")
+        return is_other
+
+    def _say_revoked(self, state: TrustState, number: int | None) -> None:
+        """Say which numbers were revoked since the last time, and what is in force now."""
+        revoked = sorted(set(state.revoked) - self._revoked)
+        if not revoked:
+            return
+        self._revoked.update(revoked)
+        numbers = f"number {revoked[0]} was" if len(revoked) == 1 else f"numbers {', '.join(map(str, revoked))} were"
+        self._say(f"{numbers} revoked; {'nothing' if number is None else f'number {number}'} is in force")
 
     def _in_force(self, state: TrustState) -> tuple[InForce, str | None]:
         """What the state says, and why there are no parameters."""
@@ -174,6 +196,7 @@ class ParameterStore:
         number = self._number_on_trial()
         if number != self._tried:
             self._tried, self._trial, self._no_trial, self._result = number, None, None, None
+            self._changing_until_s = None
             self._retry_due_s = float("-inf")
         if number is None:
             return
@@ -199,7 +222,10 @@ class ParameterStore:
             self._state = end.result()
         except UserError as error:
             self._retry_due_s = now_s + _RETRY_EVERY_S
-            self._say(f"how the trial of number {number} ended cannot be kept, what was in force stays: {error}")
+            self._say(
+                f"how the trial of number {number} ended cannot be kept now, what was in force stays, and it is tried "
+                f"again in {_RETRY_EVERY_S:g} s: {error}"
+            )
             return
         self._result, self._due_s = None, float("-inf")
         self._say(f"number {number} {'has passed' if result.passed else 'has failed'} its trial: {result.text}")
@@ -228,14 +254,32 @@ class ParameterStore:
         try:
             signed = self._fitting(self._state, self._state.on_trial)
         except UnfitError as error:
+            if error.reason in _OTHER_FILE and self._may_be_changing(now_s):
+                return
             self._retry_due_s = now_s + _RETRY_EVERY_S
             if error.reason is not self._no_trial:
                 self._no_trial = error.reason
                 self._say(f"no trial yet: {error}")
             return
-        self._retry_due_s = float("-inf")
+        self._retry_due_s, self._changing_until_s = float("-inf"), None
         self._say(f"number {signed.sequence} is on trial: parameter set {signed.parameters.number}")
         self._trial = begin_trial(signed.parameters, self._database, corrector.branches)
+
+    def _may_be_changing(self, now_s: float) -> bool:
+        """Whether state and slot may be changed by a command just now; then both are read again soon."""
+        if self._changing_until_s is None:
+            self._changing_until_s = now_s + _CHANGING_S
+        if now_s >= self._changing_until_s:
+            return False
+        self._seen, self._due_s = None, float("-inf")
+        self._retry_due_s = now_s + _LOOK_EVERY_S
+        return True
+
+
+def _number_in_force(state: TrustState, in_force: InForce) -> int | None:
+    if in_force.parameters is None or state.in_force is None:
+        return None
+    return state.slots[state.in_force].sequence
 
 
 def _why_nothing(state: TrustState) -> tuple[Reason, str]:

@@ -38,8 +38,8 @@ def provision(folder: Path, vehicle: str, keys: KeySet, now: datetime) -> None:
     if keys.version > MAX_FIRST_VERSION:
         raise TrustError(
             Reason.NONE,
-            f"key set {keys.version}: the first one of a vehicle is at most {MAX_FIRST_VERSION}, so that others can come "
-            f"after it; make one with 'calibrator keys set', without --version",
+            f"key set {keys.version}: the first one of a vehicle is at most {MAX_FIRST_VERSION}, so that others can "
+            f"come after it; make one with 'calibrator keys set', without --version",
         )
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,7 @@ import msgspec
 
 from ecu_node.errors import TrustError
 from ecu_node.status import Reason
-from ecu_node.trust.audit import Event
+from ecu_node.trust.audit import AuditEntry
 from ecu_node.trust.canonical import MAX_BYTES, Expected, canonical_bytes, malformed, read_bytes, read_canonical
 from ecu_node.trust.key_set import KeySet, check_key_set
 from ecu_node.trust.statements import SignedParameters, instant, open_statement
@@ -71,7 +71,9 @@ class TrustState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     on_trial: SlotName | None = None
     fallback: Annotated[SlotName | None, msgspec.Meta(description="what was in force before, for a roll-back")] = None
     revoked: Annotated[list[int], msgspec.Meta(description="sequence numbers, the last ones")] = []
-    made_by: Annotated[Event | None, msgspec.Meta(description="what made it so; it stands in the audit log too")] = None
+    made_by: Annotated[
+        AuditEntry | None, msgspec.Meta(description="what made it so: the line that is added to the audit log")
+    ] = None
 
     def free_slot(self) -> SlotName:
         """The slot for what comes next: that of the trial which it ends, else one that is not in force."""

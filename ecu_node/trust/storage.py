@@ -5,7 +5,7 @@ import fcntl
 import os
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -18,6 +18,8 @@ _CAREFUL = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _MODE = 0o644
 LONGEST_WAIT_S = 30.0
 """For another process; one that was stopped never ends. [s]"""
+MOMENT_S = 1.0
+"""So long it is not told that a process waits. [s]"""
 _ASK_EVERY_S = 0.01
 """[s]"""
 
@@ -127,7 +129,7 @@ def append_line(path: Path, line: bytes) -> None:
 
 
 @contextmanager
-def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
+def locked(folder: Path, *, wait: bool = True, on_wait: Callable[[str], None] | None = None) -> Iterator[None]:
     """Keep other processes from changing a folder.
 
     Parameters
@@ -136,6 +138,8 @@ def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
         It must exist.
     wait : bool
         For a while, until no other process changes it; else that is an error at once.
+    on_wait : callable or None
+        Takes one line for the user, once, if that takes more than a moment.
 
     Raises
     ------
@@ -147,28 +151,37 @@ def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
     except OSError as error:
         raise _unusable(folder, error) from None
     try:
-        _lock(folder, handle, time.monotonic() + (LONGEST_WAIT_S if wait else 0.0))
+        _lock(folder, handle, wait=wait, on_wait=on_wait)
         yield
     finally:
         os.close(handle)
 
 
-def _lock(folder: Path, handle: int, until_s: float) -> None:
+def _lock(folder: Path, handle: int, *, wait: bool, on_wait: Callable[[str], None] | None) -> None:
+    start_s = time.monotonic()
     while True:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            if time.monotonic() >= until_s:
-                raise UserError(f"{folder}: another process changes it now; try again") from None
-            time.sleep(_ASK_EVERY_S)
+            if not wait:
+                raise UserError(f"{folder}: another process changes it now") from None
         except OSError as error:
             raise _unusable(folder, error) from None
         else:
             return
+        waited_s = time.monotonic() - start_s
+        if waited_s >= LONGEST_WAIT_S:
+            raise UserError(f"{folder}: another process changes it now; try again")
+        if on_wait is not None and waited_s >= MOMENT_S:
+            on_wait(f"{folder}: another process changes it now; waiting for it, {LONGEST_WAIT_S:g} s at most")
+            on_wait = None
+        time.sleep(_ASK_EVERY_S)
 
 
 def _unusable(folder: Path, error: OSError) -> UserError:
-    return UserError(f"{folder}: cannot be used as state: {error.strerror}; name a folder made by 'ecu-node provision'")
+    is_none = error.errno in (errno.ENOENT, errno.ENOTDIR)
+    advice = "; name a folder made by 'ecu-node provision'" if is_none else ""
+    return UserError(f"{folder}: cannot be used as state: {error.strerror}{advice}")
 
 
 def _not_written(path: Path, error: OSError) -> UserError:

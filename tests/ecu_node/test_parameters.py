@@ -1,12 +1,15 @@
 """The parameter file: schema and reader agree, and whatever is wrong is one line with a reason."""
 
+import codecs
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jsonschema
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -292,3 +295,35 @@ def test_what_was_not_decided_is_not_applied(database: VehicleDatabase, verdict:
 @pytest.mark.parametrize("verdict", ["no sensor fault", "corrected"])
 def test_what_was_decided_may_be_applied(database: VehicleDatabase, verdict: Verdict) -> None:
     check_fit(replace(parameters_for(database, battery=(0.1, 1.0)), verdict=verdict), database, "v1")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (b'{"schema_version"', codecs.BOM_UTF8 + b'{"schema_version"', "it begins with a byte order mark (BOM)"),
+        (b'"number":300', b'"number":299,"number":300', "'number' stands there twice in one place"),
+        (b'"number":300', b'"number":299,"numbe\\u0072":300', "'number' stands there twice in one place"),
+        (b'"battery":{', b'"battery":{"drift":0.5,', "'drift' stands there twice in one place"),
+        (b'"number":300', b'"number":9007199254740992', "'number': "),
+        (b'"number":300', b'"number":' + b"[" * 9000 + b"]" * 9000, "it is nested too deeply"),
+        (b'"v1"', b'"' + b"v" * 300 + b'"', "at most 64 characters is expected, found"),
+        (b'"v1"', b'"' + b"v" * 300 + b'"', "... (300 characters)"),
+    ],
+)
+def test_mistakes_of_a_file_that_was_written_by_hand_are_told(
+    database: VehicleDatabase, tmp_path: Path, old: bytes, new: bytes, words: str
+) -> None:
+    content = msgspec.json.encode(parameters_for(database, battery=(0.1, -2.5)))
+    assert content.count(old) >= 1
+    (tmp_path / "p.json").write_bytes(content.replace(old, new, 1))
+    with pytest.raises(UnfitError, match=re.escape(words)) as caught:
+        read_parameters(tmp_path / "p.json")
+    assert caught.value.reason is Reason.MALFORMED_PARAMETERS
+    assert str(caught.value).endswith("; correct it, or write it anew with 'calibrator calibrate'")
+    assert str(caught.value).isprintable()
+
+
+def test_a_signed_file_in_the_place_of_one_that_nobody_signed_is_told(tmp_path: Path) -> None:
+    (tmp_path / "p.json").write_bytes(b'{"payload":"","payloadType":"x","signatures":[]}\n')
+    with pytest.raises(UnfitError, match="this file is signed; use 'ecu-node activate' and --state, or name"):
+        read_parameters(tmp_path / "p.json")

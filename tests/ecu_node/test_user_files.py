@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from ecu_node import user_files
 from ecu_node.database import MAX_DBC_BYTES, read_database
 from ecu_node.errors import DatabaseError, UnfitError
 from ecu_node.layout import MAX_LAYOUT_BYTES, read_layout
@@ -82,7 +83,7 @@ def test_files_of_the_largest_size_are_read(tmp_path: Path) -> None:
     with pytest.raises(DatabaseError, match="the DBC is empty"):
         read_database(layout)
     (tmp_path / "p.json").write_bytes(b" " * MAX_FILE_BYTES)
-    with pytest.raises(UnfitError, match="truncated"):
+    with pytest.raises(UnfitError, match="it is empty"):
         read_parameters(tmp_path / "p.json")
 
 
@@ -90,6 +91,23 @@ def test_a_file_that_grows_while_it_is_read_is_not_followed(tmp_path: Path) -> N
     """The kernel's own files tell no size before they are read."""
     with pytest.raises(UnsuitableFileError, match="larger than 10 bytes"):
         read_user_file(Path("/proc/self/status"), largest_bytes=10)
+
+
+def test_a_pipe_that_takes_the_place_of_a_file_keeps_nobody_waiting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the owner of the folder can do it, between a look at the file and its opening."""
+    path, look = tmp_path / "p.json", user_files.require_user_file
+    path.write_bytes(b"{}")
+
+    def look_and_swap(path: Path, *, largest_bytes: int) -> None:
+        look(path, largest_bytes=largest_bytes)
+        path.unlink()
+        os.mkfifo(path)
+
+    monkeypatch.setattr(user_files, "require_user_file", look_and_swap)
+    with pytest.raises(UnsuitableFileError, match="it is a pipe"):
+        read_user_file(path, largest_bytes=10)
 
 
 def test_a_socket_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,12 +1,13 @@
 """The audit log: of any length and any form it takes little memory, holds nobody up, and tells what was changed."""
 
 import hashlib
+import json
 import os
 import subprocess
 import sys
 import tracemalloc
 from collections.abc import Callable
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from random import Random
 
@@ -17,20 +18,25 @@ from ecu_node.errors import UserError
 from ecu_node.parameters import VehicleParameters
 from ecu_node.trust import storage
 from ecu_node.trust.activation import accept, conclude
-from ecu_node.trust.audit import REFUSED, add_entry, broken_line, event_now, is_told
+from ecu_node.trust.audit import REFUSED, End, add_entry, broken_line, end_of_log, event_now, next_entry
 from ecu_node.trust.log_lines import lines, lines_from_the_end
 from ecu_node.trust.state import audit_path, read_state
 from ecu_node.trust.storage import locked
-from tests.trust.damage import a_folder, a_loop, a_pipe
+from tests.trust.damage import a_folder, a_loop, a_pipe, without
 from tests.trust.signing import NOW, Run, Signers, on
 
 LITTLE = 1 << 20
+MISSING = "lines are missing at its end, or all of it: somebody cut or removed it"
 
 
 def filled(path: Path, entries: int) -> None:
     """Refusals, one after the other, as a log that nobody shortens has them."""
     for number in range(entries):
         add_entry(path, event_now(REFUSED, f"{number} {'x' * 500}", now=NOW))
+
+
+def all_but_the_first_line(path: Path) -> None:
+    path.write_bytes(path.read_bytes().partition(b"\n")[0] + b"\n")
 
 
 def peak_bytes(work: Callable[[], object]) -> int:
@@ -64,11 +70,48 @@ def test_an_entry_of_a_long_log_takes_no_more_memory_or_reading_than_of_a_short_
         log.write(line * 40_000)
     assert path.stat().st_size > 20 * LITTLE
     event = event_now("in force", "x", now=NOW)
+    made_by = next_entry(path, event)
+    assert end_of_log(path, made_by) is End.LEFT
     assert peak_bytes(lambda: add_entry(path, event)) < LITTLE
-    assert peak_bytes(lambda: is_told(path, event)) < LITTLE
-    assert is_told(path, event)
+    assert peak_bytes(lambda: end_of_log(path, made_by)) < LITTLE
+    assert end_of_log(path, made_by) is End.TOLD
     assert peak_bytes(lambda: broken_line(path)) < LITTLE
     assert broken_line(path) is not None, "one line after itself"
+
+
+@pytest.mark.parametrize("damage", [without, lambda path: os.truncate(path, 0), all_but_the_first_line])
+def test_a_log_that_is_missing_or_cut_shows_also_after_the_next_change(
+    damage: Callable[[Path], None], two_slots: Path, signers: Signers, database: VehicleDatabase, run: Run
+) -> None:
+    assert run("inspect", two_slots)[::2] == (0, "")
+    damage(audit_path(two_slots))
+    code, out, err = run("inspect", two_slots)
+    assert (code, out.splitlines()[-1]) == (1, "audit log: lines are missing at its end")
+    assert err.splitlines() == [f"ecu-node: {audit_path(two_slots)}: {MISSING}"]
+    accept(two_slots, signers.revocation(7, 5), "f", database, datetime.now(UTC))
+    code, out, err = run("inspect", two_slots)
+    assert (code, len(err.splitlines())) == (1, 1)
+    assert "is not what was written there" in err
+
+
+def test_the_last_change_that_a_power_cut_kept_from_the_log_is_no_alarm(two_slots: Path, run: Run) -> None:
+    path = audit_path(two_slots)
+    whole = path.read_bytes()
+    last = whole[: whole.rindex(b"\n", 0, -1) + 1]
+    for content in (last, whole[: len(last) + 20], whole[:-1], last + bytes(20)):
+        path.write_bytes(content)
+        code, out, err = run("inspect", two_slots)
+        assert (code, err) == (0, ""), content[-80:]
+        assert ("the next command adds it: in force" in out) == (content != whole[:-1])
+
+
+def test_a_refusal_is_kept_with_the_number_that_the_file_gives_itself(
+    in_force: Path, signers: Signers, parameters: VehicleParameters, database: VehicleDatabase
+) -> None:
+    for content, number in ((signers.parameters(parameters, 3), 3), (signers.revocation(4, 5), 4), (b"{}\n", None)):
+        with pytest.raises(UserError):
+            accept(in_force, content, "f", database, NOW)
+        assert json.loads(audit_path(in_force).read_bytes().splitlines()[-1])["sequence"] == number
 
 
 def test_a_log_of_zeros_is_no_matter_of_memory(in_force: Path) -> None:
@@ -132,3 +175,18 @@ def test_a_process_waits_for_another_one_that_is_soon_done(
         assert other.stdout.readline() == b"held\n"
         accept(in_force, signers.revocation(6, 5), "f", database, NOW + timedelta(days=1))
     assert read_state(in_force).in_force is None
+
+
+def test_who_waits_for_another_process_is_told_once(
+    in_force: Path, monkeypatch: pytest.MonkeyPatch, signers: Signers, tmp_path: Path, run: Run
+) -> None:
+    monkeypatch.setattr(storage, "MOMENT_S", 0.02)
+    monkeypatch.setattr(storage, "LONGEST_WAIT_S", 0.1)
+    (tmp_path / "r").write_bytes(signers.revocation(6, 5))
+    with locked(in_force):
+        code, out, err = run("revoke", tmp_path / "r", *on(in_force))
+    assert (code, out) == (1, "")
+    assert err.splitlines() == [
+        f"ecu-node: {in_force}: another process changes it now; waiting for it, 0.1 s at most",
+        f"ecu-node: {in_force}: another process changes it now; try again",
+    ]

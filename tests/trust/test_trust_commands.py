@@ -1,6 +1,7 @@
 """Every refusal through the command line: one line, exit code 1, no traceback, and a state that is as before."""
 
 import base64
+import codecs
 import json
 import os
 import resource
@@ -10,6 +11,7 @@ import time
 from collections.abc import Callable
 from datetime import datetime, timedelta
 from pathlib import Path
+from random import Random
 
 import pytest
 import rfc8785
@@ -94,17 +96,19 @@ def resigned(signers: Signers, file: bytes, old: bytes, new: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("name", "make", "words"),
     [
-        ("empty", lambda file: b"", "its end is missing"),
+        ("empty", lambda file: b"", "not a signed file: it is empty"),
         ("half", lambda file: file[: len(file) // 2], "its end is missing"),
         ("half with an end", lambda file: file[: len(file) // 2] + b"\n", "not a signed file"),
-        ("nested", lambda file: b"[" * 100_000 + b"]" * 100_000 + b"\n", "not a signed file"),
+        ("nested", lambda file: b"[" * 100_000 + b"]" * 100_000 + b"\n", "it is nested too deeply"),
         ("nested field", lambda file: b'{"payload":' * 9000 + b"1" + b"}" * 9000 + b"\n", "not a signed file"),
         ("twice", lambda file: file.replace(b'"payload":', b'"payload":"","payload":', 1), "not canonical JSON"),
         ("NaN", lambda file: file.replace(b'"signatures":', b'"a":NaN,"signatures":'), "not a signed file"),
         ("Infinity", lambda file: file.replace(b'"signatures":', b'"a":Infinity,"signatures":'), "not a signed file"),
         ("not UTF-8", lambda file: file.replace(b'"payloadType":"a', b'"payloadType":"\xff'), "not a signed file"),
         ("UTF-16", lambda file: file.decode().encode("utf-16"), "not a signed file"),
-        ("zeros", lambda file: bytes(5000), "its end is missing"),
+        ("zeros", lambda file: bytes(5000), "not a signed file: JSON is malformed"),
+        ("noise", lambda file: Random(1).randbytes(3000), "not a signed file: JSON is malformed"),
+        ("BOM", lambda file: codecs.BOM_UTF8 + file, "not a signed file: it begins with a byte order mark (BOM)"),
         ("line in a name", lambda file: b'{"a\\nb\\u001b[2J":1}\n', "unknown field `a\\nb\\x1b[2J`"),
         ("long name", lambda file: b'{"' + b"a" * 100_000 + b'":1}\n', "unknown field `aaaa"),
         ("line in a key", lambda file: _keyid(file, "\nb"), "signed with key \\nb, which is not trusted here"),

@@ -119,8 +119,8 @@ def test_a_trial_whose_end_cannot_be_kept_now_is_kept_later(two_slots: Path, end
             ended.store.look(ended.corrector, float(now_s))
     assert (ended.drift, read_state(two_slots).on_trial) == (DRIFT, "a")
     assert ended.said[1:] == [
-        f"how the trial of number 7 ended cannot be kept, what was in force stays: {two_slots}: another process "
-        f"changes it now; try again"
+        f"how the trial of number 7 ended cannot be kept now, what was in force stays, and it is tried again in 60 s: "
+        f"{two_slots}: another process changes it now"
     ]
     for now_s in range(60, 70, 2):
         ended.store.look(ended.corrector, float(now_s))
@@ -180,6 +180,7 @@ def test_a_state_that_could_not_be_read_for_a_moment_is_read_again(
     assert running.corrector.reason is Reason.REVOKED
     assert [line.partition(": ")[0] for line in running.said] == [
         "the state of the vehicle is not read, what was in force stays",
+        "numbers 5, 6 were revoked; nothing is in force",
         "passing measured values through",
     ]
 

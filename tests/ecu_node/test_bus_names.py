@@ -1,0 +1,25 @@
+"""The name of a bus in messages."""
+
+import pytest
+
+from ecu_node.buses import SteadyBus, connect
+from ecu_node.counters import Counters
+from ecu_node.errors import BusError
+
+
+@pytest.mark.parametrize(
+    ("interface", "channel", "name"),
+    [
+        ("virtual", "bench", "Virtual bus channel bench"),
+        ("udp_multicast", "239.74.163.2", "udp_multicast 239.74.163.2"),  # tells nothing of itself
+    ],
+)
+def test_a_bus_is_named_in_messages(interface: str, channel: str, name: str) -> None:
+    try:
+        bus = SteadyBus(lambda: connect(interface, channel), Counters())
+    except BusError as error:
+        pytest.skip(str(error))
+    try:
+        assert bus.channel == name
+    finally:
+        bus.close()
