@@ -60,6 +60,7 @@ def test_a_file_that_was_changed_after_it_was_signed_is_not_signed_by_one_more(
         (b"{}", "not a parameter file"),
         (b"\xff", "not a parameter file"),
         (b"[" * 100_000, "not a parameter file"),
+        (b'{"vehicle": "v1", "vehicle": "v1"}', "not a parameter file"),
         (None, "no such parameter file"),
     ],
 )

@@ -115,6 +115,12 @@ def test_no_parameter_file_is_told(tmp_path: Path) -> None:
         raise refused(tmp_path / "none.json", "--format", "dcm", "--output", tmp_path / "out")
 
 
+def test_a_key_that_stands_twice_is_told(params: Path, tmp_path: Path) -> None:
+    params.write_text(params.read_text().replace('"offset_a":', '"offset_a": 1.0, "offset_a":', 1))
+    with pytest.raises(ParameterError, match=r"offset_a.* twice"):
+        raise refused(params, "--format", "dcm", "--output", tmp_path / "out")
+
+
 def test_the_digest_is_of_what_was_read(
     params: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
