@@ -44,11 +44,13 @@ class BranchTrace:
     published_a: Array
 
     def errors(self, since_s: float = 0.0) -> "BranchErrors":
-        """Root mean square errors from a time on. [s]"""
-        part = self.time_s >= since_s
+        """Root mean square errors of means of one second, from a time on [s]; the sensor's noise apart."""
+        part = (self.time_s >= since_s) & np.isfinite(self.published_a) & np.isfinite(self.measured_a)
+        second = self.time_s[part].astype(int)
 
         def rms(values: Array) -> float:
-            return float(np.sqrt(np.nanmean((values[part] - self.true_a[part]) ** 2)))
+            sums, counts = np.bincount(second, values[part] - self.true_a[part]), np.bincount(second)
+            return float(np.sqrt(np.mean((sums[counts > 0] / counts[counts > 0]) ** 2)))
 
         return BranchErrors(measured_a=rms(self.measured_a), published_a=rms(self.published_a))
 
