@@ -2,7 +2,7 @@
 
     python -m bench.trust_fuzz --files 1000000
 
-Each goes through the whole acceptance: envelope, signatures, statement, order, time, fit, limits, step; nothing is
+Each goes through the whole judgement: envelope, signatures, statement, order, time, fit, limits, step; nothing is
 written. Beside them some statements are changed and then signed anew by the right signers: these may be accepted, and
 must crash nothing either. What is drawn depends on the seed alone.
 """
@@ -32,8 +32,9 @@ from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import UserError
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters
-from ecu_node.trust.activation import accept, conclude, examine
+from ecu_node.trust.activation import accept, conclude
 from ecu_node.trust.envelope import Envelope
+from ecu_node.trust.judgement import Arrival, judge
 from ecu_node.trust.key_set import KeySet, PublicKey
 from ecu_node.trust.provision import provision
 from ecu_node.trust.statements import Revocation, SignedParameters, Statement
@@ -105,12 +106,12 @@ class Vehicle:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._state = folder / "state"
+        self._folder = folder / "state"
         self._database = read_database(read_layout(_LAYOUT))
         self._samples = _samples(self._database)
-        provision(self._state, "bench", self._samples.keys, _NOW)
-        accept(self._state, self._samples.files[0], "first", self._database, _NOW)
-        conclude(self._state, 1, passed=True, text="fuzz", now=_NOW)
+        provision(self._folder, "bench", self._samples.keys, _NOW)
+        accept(self._folder, self._samples.files[0], "first", self._database, _NOW)
+        self._state = conclude(self._folder, 1, passed=True, text="fuzz", now=_NOW)
         self.valid = tuple(self._samples.files)
         for number, file in enumerate(self._samples.files[1:]):
             if not self.answer(file)[0]:
@@ -146,7 +147,7 @@ class Vehicle:
     def answer(self, file: bytes) -> tuple[bool, str]:
         """Whether a file would be accepted, and what is said of it."""
         try:
-            return True, examine(self._state, file, "f", self._database, _NOW).text
+            return True, judge(Arrival(self._folder, self._state, file, "f", _NOW), self._database).text
         except UserError as error:
             return False, str(error)
 
