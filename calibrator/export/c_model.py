@@ -145,8 +145,6 @@ def c_program(checked: Checked) -> CProgram:
         If a temperature signal has too many codes, a signal is too wide, or two names would be one in C.
     """
     database = checked.database
-    if checked.parameters.number >= 1 << 64:
-        raise ExportError(f"{checked.name}: parameter set {checked.parameters.number}: C has no number above 64 bits")
     wire(database, checked.in_force, start_s=0.0, mode=Mode.GATEWAY)
     branches = tuple(_branch(checked, branch) for branch in database.layout.branch)
     messages = tuple(

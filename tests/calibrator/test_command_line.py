@@ -5,7 +5,9 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -259,14 +261,20 @@ def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(delay_s: 
     assert not list(tmp_path.iterdir())
 
 
+@pytest.fixture
+def short_folder() -> Iterator[Path]:
+    """A folder whose path is short, as the names of sockets must be."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
 @pytest.mark.parametrize("delay_s", [0.0, 0.5, 2.0])
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_and_sigterm_while_logs_are_read_end_readers_too_in_one_line(
-    how: signal.Signals, delay_s: float, tmp_path: Path
+    how: signal.Signals, delay_s: float, tmp_path: Path, short_folder: Path
 ) -> None:
-    log, temporary = tmp_path / "V1" / "endless.log.gz", tmp_path / "temporary"
+    log, temporary = tmp_path / "V1" / "endless.log.gz", short_folder
     log.parent.mkdir()
-    temporary.mkdir()
     log.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)
     command = [
         *(sys.executable, "-m", "calibrator", "import", str(log.parent), "--workers", "1"),

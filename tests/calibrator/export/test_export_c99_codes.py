@@ -15,7 +15,7 @@ from calibrator.export.c_model import CBranch, SignRule
 from ecu_node.codes import Codes
 from ecu_node.correction import IntegerPlan
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import LayoutError
+from ecu_node.errors import LayoutError, ParameterError
 from ecu_node.sensor_models import GainBySign, TemperatureDrift
 from tests.calibrator.export.exports import (
     MakeDatabase,
@@ -205,11 +205,12 @@ def test_a_name_ends_where_it_ends(make_database: MakeDatabase) -> None:
         make_database(SMALL_LAYOUT.replace('"battery"', r'"battery\n"'))
 
 
-def test_a_number_that_c_does_not_have_is_refused(database: VehicleDatabase, tmp_path: Path) -> None:
+def test_the_largest_number_of_a_parameter_set_is_one_that_c_has(database: VehicleDatabase, tmp_path: Path) -> None:
     parameters = parameters_for(database, battery=(0.05, 2.3))
-    assert "ULL" in c99_files(checked_with(database, replace(parameters, number=(1 << 64) - 1), tmp_path))[HEADER]
-    with pytest.raises(ExportError, match="parameter set 18446744073709551616: C has no number above 64 bits"):
-        c99_files(checked_with(database, replace(parameters, number=1 << 64), tmp_path))
+    largest = c99_files(checked_with(database, replace(parameters, number=(1 << 53) - 1), tmp_path))[HEADER]
+    assert "9007199254740991ULL" in largest
+    with pytest.raises(ParameterError, match="9007199254740991"):
+        checked_with(database, replace(parameters, number=1 << 53), tmp_path)
 
 
 def test_two_inputs_with_one_name_are_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
