@@ -24,7 +24,7 @@ demo: setup              ## a fleet, its calibration, and the Kirchhoff sum befo
 	$(BIN)/python tools/demo.py --drives $(DRIVES) --out $(OUT)
 
 test: setup              ## all tests; those of SocketCAN on a kernel that has it
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
 	tools/with_vcan --or-skip $(BIN)/python -m pytest tests/vcan
 
 bench: setup             ## how long each step takes, beside its peers; also build/bench.json (long)

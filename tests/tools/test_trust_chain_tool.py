@@ -1,0 +1,43 @@
+"""The whole chain, from the drives of a fleet to corrected vehicles."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import trust_chain
+from tests.ecu_node.vehicles import LAYOUT
+
+pytest.importorskip("fastsim")
+
+
+def short_trials(folder: Path) -> Path:
+    """The project's own layout, with a trial of 60 s."""
+    layout = folder / LAYOUT.name
+    layout.write_text(f"{LAYOUT.read_text()}\n[activation]\ntrial_s = 60\n")
+    dbc = LAYOUT.with_suffix(".dbc")
+    (folder / dbc.name).write_bytes(dbc.read_bytes())
+    return layout
+
+
+def test_no_vehicle_of_500_is_made_worse(tmp_path: Path) -> None:
+    options = ["--layout", str(short_trials(tmp_path)), "--vehicles", "500", "--minutes", "5", "--unseen-minutes", "3"]
+    result = CliRunner().invoke(trust_chain.app, [*options, "--unmeasured", "2", "0.5", "--json"])
+    assert result.exit_code == 0, result.output
+    counts = json.loads(result.stdout)
+    assert counts["vehicles"] == 500
+    assert counts["with corrections"] > 400
+    assert counts["refused"] == 0
+    assert counts["deployed"] >= 0.9 * counts["with corrections"]
+    assert counts["made worse"] == 0
+    assert counts["error, median, published"] < 0.2 * counts["error, median, measured"]
+    for kind in ("signs turned", "of another vehicle"):
+        assert counts[f"wrong sets on trial, {kind}"] > 300
+        assert counts[f"of these passed, {kind}"] < 0.2 * counts[f"wrong sets on trial, {kind}"]
+
+
+def test_a_layout_that_is_not_there_is_told_in_one_line() -> None:
+    result = CliRunner().invoke(trust_chain.app, ["--layout", "missing.toml"])
+    assert result.exit_code != 0
+    assert "missing.toml" in str(result.exception) + result.output
