@@ -11,6 +11,7 @@ from bench.trust_fuzz_mutations import MUTATIONS
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError
 from ecu_node.status import Reason
+from ecu_node.trust.judgement import Arrival
 
 
 def test_five_thousand_changed_files_are_refused_each_in_one_line() -> None:
@@ -67,9 +68,9 @@ def test_a_file_that_is_accepted_is_reported(vehicle: Vehicle) -> None:
 def test_a_crash_and_an_answer_of_two_lines_are_reported(
     vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch, error: Exception, words: str
 ) -> None:
-    def failing(folder: Path, content: bytes, where: str, database: VehicleDatabase, now: object) -> None:
+    def failing(arrival: Arrival, database: VehicleDatabase) -> None:
         raise error
 
-    monkeypatch.setattr(trust_fuzz, "examine", failing)
+    monkeypatch.setattr(trust_fuzz, "judge", failing)
     with pytest.raises(WrongAnswerError, match=words):
         vehicle.require_refused(b"{}", "here")
