@@ -16,6 +16,7 @@ import msgspec
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError, UnfitError, printable
 from ecu_node.field_errors import field_error, json_error, quoted_place
+from ecu_node.layout import Layout
 from ecu_node.sensor_models import GainBySign, SensorModel
 from ecu_node.status import Reason
 from ecu_node.user_files import UnsuitableFileError, read_user_file
@@ -285,6 +286,27 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
     UnfitError
         With the reason that the node then publishes; the message gives both values.
     """
+    _check_belongs(parameters, database, vehicle)
+    layout = database.layout
+    if not abs(parameters.junction_residual.expected_a) <= layout.offset_limit_a:
+        raise UnfitError(
+            Reason.IMPLAUSIBLE_PARAMETERS,
+            f"an expected Kirchhoff sum of {parameters.junction_residual.expected_a:+.4g} A is beyond the layout's "
+            f"limit of offsets, {layout.offset_limit_a:g} A",
+        )
+    applied = [name for name, branch in parameters.branches.items() if branch.apply]
+    if parameters.verdict in _UNDECIDED and applied:
+        raise UnfitError(
+            Reason.IMPLAUSIBLE_PARAMETERS,
+            f"verdict {parameters.verdict!r}, yet branch {', '.join(map(_shown, applied))} has 'apply': true; "
+            f"nothing was found to apply, calibrate with more drives",
+        )
+    for name, branch in parameters.branches.items():
+        _check_branch(name, branch, layout)
+
+
+def _check_belongs(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:
+    """Check that parameters were made for this vehicle, layout and DBC."""
     layout = database.layout
     if vehicle is not None and parameters.vehicle != vehicle:
         raise UnfitError(
@@ -302,42 +324,32 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
             f"parameters were made with DBC {_shown(parameters.dbc.name)} ({parameters.dbc.sha256[:12]}), "
             f"this is {layout.dbc_path} ({database.digest[:12]}); calibrate with this DBC",
         )
-    if not abs(parameters.junction_residual.expected_a) <= layout.offset_limit_a:
+
+
+def _check_branch(name: str, branch: BranchParameters, layout: Layout) -> None:
+    """Check that the layout has a branch, and that what is applied to it is within the limits."""
+    if name not in layout.branch_names:
         raise UnfitError(
-            Reason.IMPLAUSIBLE_PARAMETERS,
-            f"an expected Kirchhoff sum of {parameters.junction_residual.expected_a:+.4g} A is beyond the layout's "
-            f"limit of offsets, {layout.offset_limit_a:g} A",
+            Reason.WRONG_LAYOUT, f"parameters for branch {_shown(name)!r}, which {layout.path} does not have"
         )
-    applied = [name for name, branch in parameters.branches.items() if branch.apply]
-    if parameters.verdict in _UNDECIDED and applied:
+    if abs(branch.delay_s or 0.0) > MAX_DELAY_S:
         raise UnfitError(
-            Reason.IMPLAUSIBLE_PARAMETERS,
-            f"verdict {parameters.verdict!r}, yet branch {', '.join(map(_shown, applied))} has 'apply': true; "
-            f"nothing was found to apply, calibrate with more drives",
+            Reason.IMPLAUSIBLE_PARAMETERS, f"branch {name}: delay {branch.delay_s:g} s is beyond {MAX_DELAY_S:g} s"
         )
-    for name, branch in parameters.branches.items():
-        if name not in layout.branch_names:
-            raise UnfitError(
-                Reason.WRONG_LAYOUT, f"parameters for branch {_shown(name)!r}, which {layout.path} does not have"
-            )
-        if abs(branch.delay_s or 0.0) > MAX_DELAY_S:
-            raise UnfitError(
-                Reason.IMPLAUSIBLE_PARAMETERS, f"branch {name}: delay {branch.delay_s:g} s is beyond {MAX_DELAY_S:g} s"
-            )
-        if not branch.apply:
-            continue
-        for drift in _drifts(branch):
-            if not abs(drift) <= layout.limits.drift:
-                raise UnfitError(
-                    Reason.IMPLAUSIBLE_PARAMETERS,
-                    f"branch {name}: drift {drift:+.4g} is beyond the layout's limit of {layout.limits.drift:g}",
-                )
-        if not abs(branch.offset_a) <= layout.offset_limit_a:
+    if not branch.apply:
+        return
+    for drift in _drifts(branch):
+        if not abs(drift) <= layout.limits.drift:
             raise UnfitError(
                 Reason.IMPLAUSIBLE_PARAMETERS,
-                f"branch {name}: offset {branch.offset_a:+.4g} A is beyond the layout's limit of "
-                f"{layout.offset_limit_a:g} A",
+                f"branch {name}: drift {drift:+.4g} is beyond the layout's limit of {layout.limits.drift:g}",
             )
+    if not abs(branch.offset_a) <= layout.offset_limit_a:
+        raise UnfitError(
+            Reason.IMPLAUSIBLE_PARAMETERS,
+            f"branch {name}: offset {branch.offset_a:+.4g} A is beyond the layout's limit of "
+            f"{layout.offset_limit_a:g} A",
+        )
 
 
 def _shown(name: str) -> str:

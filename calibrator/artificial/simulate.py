@@ -18,7 +18,7 @@ from calibrator.random_streams import Purpose, random_stream
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
-__all__ = ["FleetPlan", "balance_branch", "draw_vehicles", "simulate_fleet"]
+__all__ = ["FleetPlan", "draw_vehicles", "simulate_fleet", "trip_of"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,18 +152,24 @@ def draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) ->
 def _write(
     *, folder: Path, database: VehicleDatabase, vehicle: Vehicle, trips: TripSource, number: int, seed: int
 ) -> VehicleTruth:
-    balance = balance_branch(database.layout, vehicle.branches)
-
-    def trip(purpose: TripPurpose) -> GroundTruth:
-        return with_branches(trips.trip(number, purpose), vehicle.branches, balance)
-
     return write_vehicle(
-        folder, database, vehicle, calibration=trip("calibration"), unseen=trip("unseen"), seed=(seed, number)
+        folder,
+        database,
+        vehicle,
+        calibration=trip_of(trips, vehicle, number, "calibration", database.layout),
+        unseen=trip_of(trips, vehicle, number, "unseen", database.layout),
+        seed=(seed, number),
     )
 
 
-def balance_branch(layout: Layout, branches: tuple[str, ...]) -> str:
-    """Choose the branch that is minus the sum of the others: the layout's, or the last one as in (19) of the paper."""
+def trip_of(trips: TripSource, vehicle: Vehicle, number: int, purpose: TripPurpose, layout: Layout) -> GroundTruth:
+    """Trip of vehicle ``number``, with its branches alone; the layout says which of them takes the balance."""
+    balance = _balance_branch(layout, vehicle.branches)
+    return with_branches(trips.trip(number, purpose), vehicle.branches, balance)
+
+
+def _balance_branch(layout: Layout, branches: tuple[str, ...]) -> str:
+    """The branch that is minus the sum of the others: the layout's, or the last one as in (19) of the paper."""
     marked = [branch.name for branch in layout.branch if branch.balance and branch.name in branches]
     return marked[0] if marked else branches[-1]
 

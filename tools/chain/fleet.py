@@ -6,8 +6,8 @@ from pathlib import Path
 
 from joblib import delayed
 
-from calibrator.artificial.ground_truth import GroundTruth, choose_branches, with_branches
-from calibrator.artificial.simulate import FleetPlan, balance_branch, draw_vehicles
+from calibrator.artificial.ground_truth import GroundTruth, choose_branches
+from calibrator.artificial.simulate import FleetPlan, draw_vehicles, trip_of
 from calibrator.artificial.trips import TripPurpose, TripSource
 from calibrator.artificial.vehicle import Vehicle, vehicle_drive
 from calibrator.drives.store import write_drive
@@ -44,9 +44,7 @@ class ChainFleet:
 
     def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
         """Trip of a vehicle, with its branches alone; an unseen one ends when it is long enough."""
-        branches = self.vehicles[number].branches
-        found = self.trips.trip(number, purpose)
-        whole = with_branches(found, branches, balance_branch(self.database.layout, branches))
+        whole = trip_of(self.trips, self.vehicles[number], number, purpose, self.database.layout)
         return whole.part(0, round(self.unseen_s / whole.period_s)) if purpose == "unseen" else whole
 
     def write_drives(self, store: Path, *, workers: int) -> None:
