@@ -6,7 +6,7 @@ DRIVES ?= builtin
 OUT ?= build/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test bench bench-quick lint types schema constraints clean
+.PHONY: help setup demo test bench bench-quick lint types docs schema constraints clean
 
 help:                    ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -40,6 +40,10 @@ lint: setup              ## ruff, formatting included
 types: setup             ## mypy --strict
 	$(BIN)/mypy
 
+docs: setup              ## the documentation, in build/docs; its examples are run
+	PYTHONPATH=tools $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --conf-dir docs \
+		--doctree-dir build/doctrees . build/docs
+
 schema: setup            ## write the JSON Schema of the parameter file anew
 	$(BIN)/ecu-node schema > ecu_node/parameters.schema.json
 
@@ -48,4 +52,4 @@ constraints:             ## pin the newest versions of all dependencies, with ha
 		--all-extras --upgrade pyproject.toml --output-file constraints.txt
 
 clean:                   ## what the other targets made
-	rm -rf $(VENV) build dist
+	rm -rf $(VENV) build dist docs/reference/api

@@ -1,9 +1,11 @@
 """How well estimated fault parameters agree with the truth of an artificial fleet.
 
-recovered   drift vector and offset vector (offsets / full scale) each within a tolerance of the truth in the Euclidean
-            norm, the truth's norm counted as at least the fleet's smallest fault
-f2          weighted harmonic mean of precision and recall of the hardware classification, footnote 7 of [1]_
-harmed      some branch current corrected by (25) is farther (RMSE) from the true one than as measured
+    recovered   drift vector and offset vector (offsets / full scale) each within a tolerance of the truth in the
+                Euclidean norm, the truth's norm counted as at least the fleet's smallest fault
+    f2          weighted harmonic mean of precision and recall of the hardware classification, footnote 7 of the paper
+    harmed      some branch current corrected by (25) is farther (RMSE) from the true one than as measured
+
+Equation (25) is that of [1]_.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """

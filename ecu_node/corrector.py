@@ -103,7 +103,7 @@ class Corrector:
         parameter_set : int
             Its number as it is published; 0 where there is none.
         expected_a, predicted_worse_a : float
-            See :meth:`JunctionWatch.restart`. [A]
+            See :meth:`~ecu_node.junction_watch.JunctionWatch.restart`. [A]
         """
         self.reason, self.parameter_set = reason, parameter_set
         self.watch.restart(expected_a=expected_a, predicted_worse_a=predicted_worse_a)

@@ -1,18 +1,20 @@
 """Outcome of one method on a trial, vehicle by vehicle, and the figures of merit of many such outcomes together.
 
-recovery_rate, recovery_rate_25      share of vehicles recovered within 10 and 25 %
-confidence                           mean confidence
-sure                                 share of vehicles above a confidence of 0.95
-sure_confidence, sure_recovered      their mean confidence, and the share of them that is recovered
-ece                                  expected calibration error: mean over vehicles of |confidence - share recovered| of
-                                     the tenth of the scale that their confidence lies in [1]_
-ece_by_chance                        what it is expected to be, with so many vehicles, if the confidence is exact
-f2, complexity                       of the hardware classification; share of vehicles held to have hardware faults
-deployed                             share of the vehicles with faulty sensors of which some branch is corrected
-harmed                               share of the vehicles with a corrected branch of which some branch gets worse on an
+    recovery_rate, recovery_rate_25  share of vehicles recovered within 10 and 25 %
+    confidence                       mean confidence
+    sure                             share of vehicles above a confidence of 0.95
+    sure_confidence, sure_recovered  their mean confidence, and the share of them that is recovered
+    ece                              expected calibration error: mean over vehicles of |confidence - share recovered| of
+                                     the tenth of the scale that their confidence lies in
+    ece_by_chance                    what it is expected to be, with so many vehicles, if the confidence is exact
+    f2, complexity                   of the hardware classification; share of vehicles held to have hardware faults
+    deployed                         share of the vehicles with faulty sensors of which some branch is corrected
+    harmed                           share of the vehicles with a corrected branch of which some branch gets worse on an
                                      unseen drive
-failed                               share of vehicles whose optimisation failed
-delay_rmse_ms                        root mean square error of the estimated delays [ms]
+    failed                           share of vehicles whose optimisation failed
+    delay_rmse_ms                    root mean square error of the estimated delays [ms]
+
+The expected calibration error is that of [1]_.
 
 .. [1] M. Naeini, G. Cooper, M. Hauskrecht, "Obtaining well calibrated probabilities using Bayesian binning", AAAI 2015.
 """

@@ -17,8 +17,8 @@ d_k = a_k / t - 1 and o_k = b_k - a_k h_k, which does not depend on t. What is l
    minus the sum of the rest. These (K + 1) 2^(K-2) vertices do not depend on t.
 2. For any h, between two neighbours of the kinks {1, a_1 .. a_K} f is linear in t plus A / t, with A the sum of the a_k
    above less that of those below. If A <= 0 that is concave, and the minimum is at a kink. If A > 0 it is convex, with
-   f' = s + H - A / t^2, s the sign of t - 1 and H = sum_k<K |h_k|: the minimum is at sqrt(A / (s + H)), or at the kink
-   beside it. Beyond the largest kink f rises, and towards t = 0 it grows without bound.
+   f' = s + H - A / t^2, s the sign of t - 1 and ``H = sum_k<K |h_k|``: the minimum is at sqrt(A / (s + H)), or at the
+   kink beside it. Beyond the largest kink f rises, and towards t = 0 it grows without bound.
 
 From any point, moving h to a vertex and then t to a kink or such a stationary point does not raise f; as f is coercive,
 the optimum is among these pairs. The stationary points do matter: slopes (1.3, 1.3, 0.9) with H = 0.1 have one at

@@ -54,7 +54,7 @@ class SensorModelChoice:
     excess, excess_sd : float
         Excess of that family and its standard deviation; 0 for linear. [1], or [1/K] for temperature
     reference : float
-        Of the linear part, see :meth:`Family.linear_reference`.
+        Of the linear part, see :meth:`~calibrator.sensor_models.families.Family.linear_reference`.
     log_bayes_factor : float
         Natural logarithm of the Bayes factor of the likeliest family against everything else for this branch.
     rival_log_bayes_factor : float
