@@ -1,4 +1,4 @@
-"""What the documents name exists: tests in docs/safety.md, reasons and states in docs/node.md, and files in links."""
+"""What the documents name exists: tests in docs/safety.md, reasons and states in docs/node.md."""
 
 import re
 from enum import IntEnum
@@ -9,7 +9,6 @@ import pytest
 from ecu_node.status import Reason, State
 
 ROOT = Path(__file__).parents[2]
-DOCUMENTS = sorted([*(ROOT / "docs").glob("*.md"), *(ROOT / "deploy").glob("*.md"), *ROOT.glob("*.md")])
 FEWEST_HAZARDS = 15
 
 
@@ -37,9 +36,3 @@ def test_every_code_of_the_status_is_documented_with_its_number(kind: type[IntEn
     documented = {pair for names, numbers in rows for pair in zip(names.split(", "), numbers.split(", "), strict=True)}
     in_dbc = {("".join(part.title() for part in code.name.split("_")), str(code.value)) for code in kind}
     assert in_dbc - documented == set()
-
-
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_files_that_a_document_links_to_exist(path: Path) -> None:
-    targets = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", path.read_text())
-    assert [target for target in targets if not (path.parent / target).exists()] == []

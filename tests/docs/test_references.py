@@ -1,0 +1,75 @@
+"""The references of the site have every command and every public name."""
+
+import importlib
+import re
+import subprocess
+import sys
+from inspect import isclass, isroutine
+from pathlib import Path
+
+import pytest
+import typer.main
+from typer.core import TyperGroup
+
+from calibrator.cli import app
+from docs_site.command_reference import PROGRAMS, command_help
+
+ROOT = Path(__file__).parents[2]
+MODULES = re.findall(
+    r"(?m)^   ((?:calibrator|ecu_node)\.[\w.]+)$", (ROOT / "docs" / "reference" / "api.md").read_text()
+)
+FEWEST_MODULES = 70
+
+
+def commands_of(group: TyperGroup, *path: str) -> set[str]:
+    """Names of a group's commands, and of theirs, as the program has them."""
+    found = {" ".join(path)}
+    for name, command in group.commands.items():
+        found |= commands_of(command, *path, name) if isinstance(command, TyperGroup) else {" ".join((*path, name))}
+    return found
+
+
+def test_every_command_of_calibrator_is_in_the_reference() -> None:
+    group = typer.main.get_command(app)
+    assert isinstance(group, TyperGroup)
+    assert [name for name, _ in command_help("calibrator")] != []
+    assert {name for name, _ in command_help("calibrator")} == commands_of(group, "calibrator")
+
+
+def test_every_command_of_the_node_is_in_the_reference() -> None:
+    wrong = subprocess.run(
+        [sys.executable, "-m", "ecu_node", "no-such-command"], capture_output=True, text=True, cwd=ROOT, check=False
+    )
+    known = re.findall(r"[\w-]+", wrong.stderr.partition("choose from")[2])
+    assert "run" in known
+    assert {name for name, _ in command_help("ecu-node")} == {"ecu-node", *(f"ecu-node {name}" for name in known)}
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_help_is_that_of_its_command(program: str) -> None:
+    for name, text in command_help(program):
+        assert text.lower().startswith(f"usage: {name}"), name
+
+
+def test_the_reference_shows_what_the_terminal_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    shown = subprocess.run(
+        [sys.executable, "-m", "ecu_node", "check", "--help"], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert (
+        dict(command_help("ecu-node"))["ecu-node check"].split() == shown.stdout.replace("ecu_node", "ecu-node").split()
+    )
+
+
+def test_no_module_is_listed_twice() -> None:
+    assert len(MODULES) >= FEWEST_MODULES
+    assert len(set(MODULES)) == len(MODULES)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_every_public_function_and_class_of_a_listed_module_is_documented(name: str) -> None:
+    module = importlib.import_module(name)
+    assert module.__doc__
+    public = {each: getattr(module, each) for each in module.__all__}
+    documented = {each: value for each, value in public.items() if isroutine(value) or isclass(value)}
+    assert [each for each, value in documented.items() if not value.__doc__] == []
