@@ -41,7 +41,8 @@ types: setup             ## mypy --strict
 	$(BIN)/mypy
 
 docs: setup              ## the documentation, in build/docs; its examples are run
-	PYTHONPATH=tools $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --conf-dir docs \
+	rm -rf build/docs docs/reference/api
+	PYTHONPATH=tools $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --fresh-env --conf-dir docs \
 		--doctree-dir build/doctrees . build/docs
 
 schema: setup            ## write the JSON Schema of the parameter file anew

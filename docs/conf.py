@@ -25,10 +25,10 @@ extensions = [
 highlight_language = "text"
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
-nb_execution_mode = "cache"
-nb_execution_cache_path = "build/jupyter_cache"
-nb_execution_raise_on_error = True
+nb_execution_mode = "force"
+nb_execution_show_tb = True  # a failure is a warning, and so an error
 nb_execution_timeout = 300  # s; on a busy machine, with the estimator compiled anew
+nb_merge_streams = True
 nb_output_stderr = "remove"  # progress; warnings are errors
 os.environ["PYTHONWARNINGS"] = "error,ignore::PendingDeprecationWarning"  # in examples; the latter is of their kernel
 
