@@ -60,3 +60,18 @@ def test_notebooks_are_kept_without_outputs_and_are_short() -> None:
         code = [cell for cell in cells if cell["cell_type"] == "code"]
         assert len(code) <= 12, path
         assert [cell["id"] for cell in code if cell["outputs"] or cell["execution_count"] is not None] == [], path
+
+
+def notices() -> list[list[str]]:
+    """Wording of each notice that the method explains, without its numbers and names."""
+    section = METHOD.partition("### Notices of a run")[2].partition("\n\nWith `--trusted`")[0]
+    texts = [line.split("|")[1] for line in section.splitlines() if line.startswith("| ")][1:]
+    parts = [re.split(r"\.\.\.|\bN\b|;", text) for text in texts]
+    return [[part.strip(" ,:") for part in each if part.strip(" ,:")] for each in parts]
+
+
+def test_notices_are_explained_in_the_words_of_the_program() -> None:
+    source = "".join(path.read_text() for path in sorted((ROOT / "calibrator").rglob("*.py")))
+    said = re.sub(r'"\n\s*f?"', "", source)
+    assert len(notices()) >= 12
+    assert [part for each in notices() for part in each if part not in said] == []
