@@ -62,6 +62,7 @@ from calibrator.folders import require_new_folder, require_possible_file, requir
 from calibrator.interrupts import importing
 from calibrator.options import Classifier, ExperimentName, Method
 from calibrator.reading_processes import TIME_LIMIT_S
+from calibrator.report.kirchhoff_command import kirchhoff
 from calibrator.report.progress import progress_bar
 from calibrator.report.text import dumps
 from calibrator.signing.command import keys, revoke, sign
@@ -130,6 +131,7 @@ def _root(
 app.add_typer(keys, name="keys")
 app.command()(sign)
 app.command()(revoke)
+app.command()(kirchhoff)
 
 
 @app.command("import")

@@ -20,6 +20,7 @@ __all__ = [
     "ClassifierOption",
     "CommonDriveOption",
     "CurrentsOption",
+    "DbcOption",
     "DelayOption",
     "DrivesOption",
     "ExperimentDrivesOption",
@@ -205,6 +206,7 @@ StoreOption = Annotated[
     typer.Option("--out", callback=_named, help="Store of summaries, path or URL; drives are added to one."),
 ]
 LayoutOption = Annotated[Path, typer.Option("--layout", help="Layout (TOML) that says what the signals mean.")]
+DbcOption = Annotated[Path | None, typer.Option("--dbc", help="DBC to use instead of the one the layout names.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
 WorkersOption = Annotated[int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Number of processes.")]
 SchedulerOption = Annotated[

@@ -97,7 +97,7 @@ def show(drives: str, out: Path) -> None:
     record_live_drive(parameters, vehicle, log=fleet / "unseen" / vehicle / "drive.log.gz", recording=out / "live.log")
     step(5, "the Kirchhoff sum of its currents, before and after")
     run(
-        *(sys.executable, "tools/compare_kirchhoff.py", out / "live.log"),
+        *("calibrator", "kirchhoff", out / "live.log"),
         *("--layout", LAYOUT, "--plot", out / "kirchhoff.png"),
     )
     say(f"picture: {out / 'kirchhoff.png'}")

@@ -1,6 +1,7 @@
-"""Table and picture of a Kirchhoff comparison."""
+"""Text, JSON and picture of a Kirchhoff comparison."""
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -8,17 +9,37 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
+from rich.console import Console
 from rich.table import Table
 
 from calibrator.drive import Array
 from calibrator.errors import DriveError
 from calibrator.report.kirchhoff import SUM, Comparison, Figures, figures_of
 
-__all__ = ["kirchhoff_table", "plot_kirchhoff"]
+__all__ = ["kirchhoff_json", "kirchhoff_table", "kirchhoff_text", "plot_kirchhoff"]
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B", "#999999")
 """Okabe and Ito's colours, which colour-blind readers can tell apart; black is kept for the sum."""
 _RESOLUTION_DPI = 150
+
+
+def kirchhoff_text(comparison: Comparison, notices: Sequence[str]) -> str:
+    """Table, notices, and the line that sums it up; see :func:`kirchhoff_table`."""
+    console = Console()
+    with console.capture() as capture:
+        console.print(kirchhoff_table(comparison))
+    lines = [capture.get().rstrip("\n"), *notices]
+    after = comparison.after
+    if after is not None:
+        before_a, after_a = comparison.before[SUM].rmse_a, after[SUM].rmse_a
+        ratio = f", {before_a / after_a:.1f} times less" if 0.0 < after_a < before_a else ""
+        lines.append(f"RMSE of the sum: {before_a:.2f} A before, {after_a:.2f} A after{ratio}")
+    return "\n".join(lines)
+
+
+def kirchhoff_json(comparison: Comparison, notices: Sequence[str]) -> str:
+    """Everything but the samples, and the notices."""
+    return json.dumps(comparison.as_json() | {"notices": list(notices)}, indent=2)
 
 
 def kirchhoff_table(comparison: Comparison) -> Table:

@@ -32,10 +32,10 @@ def tesla(folder: Path) -> VehicleDatabase:
     return read_database(layout)
 
 
-def test_compare_kirchhoff_prints_the_loads_that_nothing_measures(folder: Path) -> None:
+def test_kirchhoff_prints_the_loads_that_nothing_measures(folder: Path) -> None:
     """4.1 A +- 1.2 A of loads have no sensor on this bus; the other figures are the sensors' own."""
     command = [
-        sys.executable, str(ROOT / "tools" / "compare_kirchhoff.py"), str(folder / "drive.log.gz"),
+        sys.executable, "-m", "calibrator", "kirchhoff", str(folder / "drive.log.gz"),
         "--layout", str(LAYOUT), "--dbc", str(folder / "Model3CAN.dbc"), "--json",
     ]  # fmt: skip
     figures = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)

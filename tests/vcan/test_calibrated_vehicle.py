@@ -89,9 +89,8 @@ def test_kirchhoff_sum_of_a_calibrated_vehicle_falls_tenfold_on_an_unseen_drive(
 
 
 def compare(log: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """What tools/compare_kirchhoff.py says of a log."""
-    tool = LAYOUT.parents[1] / "tools" / "compare_kirchhoff.py"
-    command = [sys.executable, str(tool), str(log), "--layout", str(LAYOUT), "--json"]
+    """What `calibrator kirchhoff` says of a log."""
+    command = [sys.executable, "-m", "calibrator", "kirchhoff", str(log), "--layout", str(LAYOUT), "--json"]
     done = subprocess.run(command, check=True, capture_output=True, timeout=120)
     result: dict[str, dict[str, dict[str, float]]] = json.loads(done.stdout)
     return result

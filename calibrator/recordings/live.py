@@ -1,0 +1,53 @@
+"""Frames from a live bus, as if they came from a log."""
+
+import time
+
+import can
+
+from calibrator.recordings.frame_arrays import FrameCollector, Frames
+from ecu_node.errors import BusError
+
+__all__ = ["listen"]
+
+_POLL_S = 0.1
+"""How often the end of a live recording is checked. [s]"""
+
+
+def listen(interface: str, channel: str | None, duration_s: float) -> Frames:
+    """Take everything that comes over a bus for some time.
+
+    Parameters
+    ----------
+    interface, channel : str, str or None
+        Of python-can, such as ``socketcan`` and ``vcan0``.
+    duration_s : float
+        How long to listen. [s]
+
+    Returns
+    -------
+    Frames
+        At least one frame.
+
+    Raises
+    ------
+    BusError
+        If the bus cannot be opened, or nothing comes.
+    """
+    collector = FrameCollector()
+    try:
+        with can.Bus(interface=interface, channel=channel) as bus:
+            end_s = time.monotonic() + duration_s
+            while (left_s := end_s - time.monotonic()) > 0.0:
+                message = bus.recv(timeout=min(left_s, _POLL_S))
+                if message is not None:
+                    collector.add(message)
+    except (can.CanError, OSError, ValueError, TypeError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise BusError(
+            f"{interface}:{channel}: cannot listen to the bus: {reason}; check --interface and --channel"
+        ) from None
+    if not len(collector):
+        raise BusError(
+            f"{interface}:{channel}: no frame in {duration_s:g} s; check that something is sent, or listen longer"
+        )
+    return collector.frames()
