@@ -56,6 +56,7 @@ from calibrator.command_options import (
     require_own_options,
     require_truth_where_used,
 )
+from calibrator.doctor.command import doctor
 from calibrator.errors import ContradictionError, LogError
 from calibrator.export.command import export
 from calibrator.folders import require_new_folder, require_possible_file, require_possible_folder
@@ -131,6 +132,7 @@ def _root(
 app.add_typer(keys, name="keys")
 app.command()(sign)
 app.command()(revoke)
+app.command()(doctor)
 app.command()(kirchhoff)
 
 

@@ -6,9 +6,20 @@ import msgspec
 
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import DatabaseError
-from ecu_node.layout import read_layout
+from ecu_node.layout import Layout, read_layout
 
-__all__ = ["vehicle_database"]
+__all__ = ["chosen_layout", "vehicle_database"]
+
+
+def chosen_layout(layout: Path, dbc: Path | None = None) -> Layout:
+    """Read a layout, and let it name another DBC if one is given; see :func:`vehicle_database`."""
+    settings = read_layout(layout)
+    if dbc is None:
+        return settings
+    if not dbc.is_file():
+        raise DatabaseError(f"{dbc}: no such DBC; check --dbc")
+    changed: Layout = msgspec.structs.replace(settings, dbc=str(dbc.absolute()))
+    return changed
 
 
 def vehicle_database(layout: Path, dbc: Path | None = None) -> VehicleDatabase:
@@ -31,9 +42,4 @@ def vehicle_database(layout: Path, dbc: Path | None = None) -> VehicleDatabase:
     LayoutError, DatabaseError
         If one of them cannot be used.
     """
-    settings = read_layout(layout)
-    if dbc is not None:
-        if not dbc.is_file():
-            raise DatabaseError(f"{dbc}: no such DBC; check --dbc")
-        settings = msgspec.structs.replace(settings, dbc=str(dbc.absolute()))
-    return read_database(settings)
+    return read_database(chosen_layout(layout, dbc))

@@ -11,7 +11,17 @@ from ecu_node.layout import Layout, split_signal
 from ecu_node.units import AMPERE, CELSIUS, VOLT, WATT, unit_factor
 from ecu_node.user_files import UnsuitableFileError, read_user_file, text_digest
 
-__all__ = ["AMPERE", "CELSIUS", "MAX_DBC_BYTES", "VOLT", "WATT", "VehicleDatabase", "read_database", "unit_factor"]
+__all__ = [
+    "AMPERE",
+    "CELSIUS",
+    "MAX_DBC_BYTES",
+    "VOLT",
+    "WATT",
+    "VehicleDatabase",
+    "look_everything_up",
+    "read_database",
+    "unit_factor",
+]
 
 MAX_DBC_BYTES = 16_000_000
 """The largest DBCs have some megabytes; to read one takes a hundred times its size in memory."""
@@ -99,11 +109,12 @@ def read_database(layout: Layout) -> VehicleDatabase:
     if not database.messages:
         raise DatabaseError(f"{path}: the DBC has no message; check that it is the one that {layout.path} needs")
     vehicle = VehicleDatabase(layout=layout, database=database, digest=text_digest(content))
-    _look_everything_up(vehicle)
+    look_everything_up(vehicle)
     return vehicle
 
 
-def _look_everything_up(vehicle: VehicleDatabase) -> None:
+def look_everything_up(vehicle: VehicleDatabase) -> None:
+    """Look every signal up that the layout names; raises as :func:`read_database` does."""
     layout = vehicle.layout
     for branch in layout.branch:
         where = f"{layout.path}: branch {branch.name}"

@@ -9,6 +9,7 @@ long enough, the raw value has no name that means "not available", and the physi
 """
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ from calibrator.drive import Array, Mask
 from calibrator.recordings.signal_range import signal_range
 from ecu_node.errors import DatabaseError
 
-__all__ = ["Decoded", "decode_signal", "means_not_available", "raw_values"]
+__all__ = ["Decoded", "bad_values", "decode_signal", "means_not_available", "raw_values"]
 
 Raw = NDArray[np.int64] | NDArray[np.uint64] | NDArray[np.float64]
 
@@ -77,17 +78,30 @@ def decode_signal(message: Message, signal: Signal, data: NDArray[np.uint8], len
     """
     present, known = _presence(message, signal, data, length)
     raw, complete = raw_values(signal, data, length)
-    with np.errstate(invalid="ignore"):  # a signalling NaN in a float signal
-        value = np.where(complete, raw.astype(np.float64) * float(signal.scale) + float(signal.offset), np.nan)
-    good = (
-        present
-        & known
-        & complete
-        & np.isfinite(value)
-        & ~_is_named_bad(signal, raw)
-        & signal_range(signal).holds(value)
-    )
-    return Decoded(value=value, present=present, good=good)
+    value = _physical(signal, raw, complete)
+    bad = _bad_values(signal, raw, value, known & complete)
+    return Decoded(value=value, present=present, good=present & ~np.any(list(bad.values()), axis=0))
+
+
+def bad_values(
+    message: Message, signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]
+) -> Mapping[str, Mask]:
+    """Why values of one signal may not be used.
+
+    Parameters
+    ----------
+    message, signal, data, length :
+        As for :func:`decode_signal`.
+
+    Returns
+    -------
+    mapping of str to ndarray of bool, shape (n,)
+        By reason: ``too short``, ``not available`` (a named code), ``out of range`` (of the DBC, or no number); a frame
+        that carries the signal and has none of them is good.
+    """
+    _, known = _presence(message, signal, data, length)
+    raw, complete = raw_values(signal, data, length)
+    return _bad_values(signal, raw, _physical(signal, raw, complete), known & complete)
 
 
 def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]) -> tuple[Raw, Mask]:
@@ -153,6 +167,17 @@ def means_not_available(name: str) -> bool:
     """
     spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+", " ", name)
     return _NOT_AVAILABLE.fullmatch(spaced.strip().lower()) is not None
+
+
+def _physical(signal: Signal, raw: Raw, complete: Mask) -> Array:
+    with np.errstate(invalid="ignore"):  # a signalling NaN in a float signal
+        return np.where(complete, raw.astype(np.float64) * float(signal.scale) + float(signal.offset), np.nan)
+
+
+def _bad_values(signal: Signal, raw: Raw, value: Array, complete: Mask) -> dict[str, Mask]:
+    named = complete & _is_named_bad(signal, raw)
+    held = np.isfinite(value) & signal_range(signal).holds(value)
+    return {"too short": ~complete, "not available": named, "out of range": complete & ~named & ~held}
 
 
 def _bit_run(signal: Signal) -> tuple[list[int], int]:

@@ -6,12 +6,15 @@ profile 1, both bytes of the data identifier included.
 """
 
 import numpy as np
+from cantools.database.can import Message
 from numpy.typing import NDArray
 
 from calibrator.drive import Mask
-from ecu_node.e2e import Protection
+from ecu_node.database import VehicleDatabase
+from ecu_node.e2e import Protection, protection_of
+from ecu_node.layout_e2e import ProfileP01
 
-__all__ = ["is_sound", "p01_is_sound"]
+__all__ = ["is_sound", "message_is_sound", "p01_is_sound"]
 
 _POLYNOMIAL = 0x1D
 _NO_COUNTER = 15
@@ -73,3 +76,31 @@ def is_sound(data: NDArray[np.uint8], length: NDArray[np.uint8], protection: Pro
             counter = payload[protection.counter_byte] >> protection.counter_shift & protection.counter_ones
             sound[index] = counter < protection.modulus and protection.is_sound(payload)
     return sound
+
+
+def message_is_sound(
+    database: VehicleDatabase, message: Message, data: NDArray[np.uint8], length: NDArray[np.uint8]
+) -> Mask:
+    """Check frames of one message as the layout says that it is protected.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        DBC and layout.
+    message : Message
+        That the frames are.
+    data, length :
+        As for :func:`p01_is_sound`.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        True where CRC and counter are possible, and everywhere if the message is not protected.
+    """
+    protection = protection_of(database, message)
+    if protection is None:
+        return np.ones(len(data), np.bool_)
+    entry = database.layout.protection(message.name)
+    if isinstance(entry, ProfileP01) and entry.data_id_mode == "both" and not entry.offset:
+        return p01_is_sound(data, length, entry.data_id.get(message.name, message.frame_id & 0xFFFF))
+    return is_sound(data, length, protection)

@@ -15,15 +15,13 @@ from cantools.database.can import Message
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.errors import LogError
 from calibrator.recordings.decode import decode_signal
-from calibrator.recordings.e2e_profile import is_sound, p01_is_sound
+from calibrator.recordings.e2e_profile import message_is_sound
 from calibrator.recordings.frame_arrays import EXTENDED_BIT, Frames, frame_key
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.log_time import CLOCK_GAP_S, repaired_time
 from calibrator.report.notices import Notice
 from ecu_node.database import AMPERE, VOLT, WATT, VehicleDatabase, unit_factor
-from ecu_node.e2e import protection_of
 from ecu_node.layout import Branch
-from ecu_node.layout_e2e import ProfileP01
 
 __all__ = ["ChannelReport", "Recording", "RecordingReport", "drive_from_frames", "read_drive", "read_recording"]
 
@@ -243,17 +241,9 @@ class _Source:
                     f"{self._where}: {message.name} comes on {len(buses)} buses ({names}); "
                     f"leave one bus in the log, else two sensors are mixed"
                 )
-            self._messages[message.name] = (frames, self.time.time_s[index], self._unspoilt(message, frames))
+            unspoilt = message_is_sound(self._database, message, frames.data, frames.length)
+            self._messages[message.name] = (frames, self.time.time_s[index], unspoilt)
         return self._messages[message.name]
-
-    def _unspoilt(self, message: Message, frames: Frames) -> Mask:
-        protection = protection_of(self._database, message)
-        if protection is None:
-            return np.ones(len(frames), np.bool_)
-        entry = self._database.layout.protection(message.name)
-        if isinstance(entry, ProfileP01) and entry.data_id_mode == "both" and not entry.offset:
-            return p01_is_sound(frames.data, frames.length, entry.data_id.get(message.name, message.frame_id & 0xFFFF))
-        return is_sound(frames.data, frames.length, protection)
 
 
 def _held(channel: Channel, time_s: Array, max_age_s: float) -> tuple[Array, Mask]:

@@ -1,0 +1,1 @@
+"""A layout proposed from a DBC, and from a log where there is one."""

@@ -1,0 +1,44 @@
+"""What the names, comments and senders of a DBC say, in words.
+
+Names of signals are split into words where case, digits or underscores change: ``SmoothBattCurrent132`` is *smooth batt
+current 132*. Abbreviations of several houses stand beside each other.
+"""
+
+import re
+from collections.abc import Iterable
+
+__all__ = ["PLACES", "is_battery", "places_of", "words_of"]
+
+_SPLIT = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+")
+
+PLACES: dict[str, frozenset[str]] = {
+    "battery": frozenset({"battery", "batt", "bat", "bms", "pack", "accu", "hvb", "bdu", "traction"}),
+    "motor": frozenset(
+        {"motor", "mot", "inverter", "inv", "emotor", "machine", "edu", "mcu", "drive", "dif", "dir", "emachine", "tm"}
+    ),
+    "heater": frozenset({"heater", "ptc", "heating", "htr"}),
+    "aircon": frozenset({"compressor", "aircon", "ac", "cmpd", "cmp", "eac", "acc", "hvac", "airconditioning", "evap"}),
+    "dcdc": frozenset({"dcdc", "lv", "apm", "ldc"}),
+    "auxiliary": frozenset({"auxiliary", "aux", "auxiliaries"}),
+    "charger": frozenset({"charger", "obc", "charge", "fc", "fastcharge", "evse", "chg", "cp", "cc"}),
+}
+"""Where a current may flow, and words for it."""
+
+
+def words_of(*texts: str | None) -> tuple[str, ...]:
+    """Words of some names or sentences, in lower case; ``dc dc`` and ``air con`` are joined."""
+    found = [word.lower() for text in texts if text for word in _SPLIT.findall(text)]
+    joined = " ".join(found).replace("dc dc", "dcdc").replace("air con ", "aircon ").replace("e motor", "emotor")
+    return tuple(joined.split())
+
+
+def places_of(words: Iterable[str]) -> set[str]:
+    """Places that some words name."""
+    known = set(words)
+    return {place for place, names in PLACES.items() if names & known}
+
+
+def is_battery(name: str, signal: str) -> bool:
+    """Whether a branch of this name, or else of this signal, is the battery."""
+    named = places_of(words_of(name))
+    return named == {"battery"} if named else "battery" in places_of(words_of(signal))
