@@ -62,6 +62,7 @@ from calibrator.export.command import export
 from calibrator.folders import require_new_folder, require_possible_file, require_possible_folder
 from calibrator.interrupts import importing
 from calibrator.options import Classifier, ExperimentName, Method
+from calibrator.proposal.command import layout as layout_commands
 from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.report.kirchhoff_command import kirchhoff
 from calibrator.report.progress import progress_bar
@@ -130,6 +131,7 @@ def _root(
 
 
 app.add_typer(keys, name="keys")
+app.add_typer(layout_commands, name="layout")
 app.command()(sign)
 app.command()(revoke)
 app.command()(doctor)

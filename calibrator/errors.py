@@ -2,7 +2,7 @@
 
 from ecu_node.errors import UserError
 
-__all__ = ["ContradictionError", "DriveError", "ExportError", "FleetError", "LogError", "SigningError"]
+__all__ = ["ContradictionError", "DriveError", "ExportError", "FleetError", "LogError", "ProposalError", "SigningError"]
 
 
 class LogError(UserError):
@@ -23,6 +23,10 @@ class ContradictionError(UserError):
 
 class SigningError(UserError):
     """Something cannot be signed (no key, another passphrase, a file that is no statement)."""
+
+
+class ProposalError(UserError):
+    """A layout cannot be proposed (nothing that looks like a branch, a file that exists)."""
 
 
 class ExportError(UserError):

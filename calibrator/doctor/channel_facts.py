@@ -9,6 +9,7 @@ from cantools.database.can import Signal
 
 from calibrator.doctor.read_logs import ReadLog
 from calibrator.drive import Array, Channel, Mask
+from calibrator.drives.align import TIME_RESOLUTION_S
 from calibrator.recordings.decode import bad_values, decode_signal
 from calibrator.recordings.e2e_profile import message_is_sound
 from ecu_node.database import VehicleDatabase
@@ -147,7 +148,7 @@ def channel_facts(
         period_s=period_s,
         jitter_s=float(np.quantile(np.abs(step - period_s), 0.95)) if len(step) else np.nan,
         gap_s=float(step.max()) if len(step) else np.nan,
-        late=int(np.sum(step > timeout_s)),
+        late=int(np.sum(step > timeout_s + TIME_RESOLUTION_S)),
         same_time=int(np.sum(step <= 0.0)),
         bad={reason: count for reason, count in bad.items() if count},
         low=float(values.min()) if len(values) else np.nan,

@@ -1,6 +1,7 @@
 """Findings from single branches, inputs and logs: missing, late, spoilt, clipped, constant, stuck."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from calibrator.doctor.channel_facts import ChannelFacts
 from calibrator.doctor.findings import Finding, Severity
 from calibrator.doctor.read_logs import MOST_MINUTES, ReadLog
 from calibrator.doctor.stuck import Stuck
+from calibrator.drives.align import TIME_RESOLUTION_S
 from ecu_node.layout import Layout
 
 __all__ = ["branch_findings", "input_findings", "log_findings", "scale_findings", "stuck_finding"]
@@ -55,7 +57,16 @@ def input_findings(facts: ChannelFacts, *, needed: bool) -> list[Finding]:
                 + (", or name other inputs: without it what is derived from it is left out" if needed else ""),
             )
         ]
-    return [*_bad(facts), *_constant(facts)] if needed else list(_bad(facts))
+    if not needed:
+        return [replace(finding, severity=Severity.HINT) for finding in _bad(facts)]
+    spoilt = [
+        replace(finding, severity=max(finding.severity, Severity.WARNING, key=_MILDER)) for finding in _bad(facts)
+    ]
+    return [*spoilt, *_constant(facts)]
+
+
+_MILDER = list(Severity).index
+"""Of two severities the greater number is the milder one."""
 
 
 def _absent(facts: ChannelFacts) -> Finding:
@@ -69,7 +80,7 @@ def _absent(facts: ChannelFacts) -> Finding:
 
 
 def _late(facts: ChannelFacts, timeout_s: float) -> Iterator[Finding]:
-    if facts.period_s > timeout_s:
+    if facts.period_s > timeout_s + TIME_RESOLUTION_S:
         yield Finding(
             severity=Severity.ERROR,
             kind="rate",

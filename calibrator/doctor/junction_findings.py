@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from calibrator.doctor.findings import Finding, Severity
-from calibrator.doctor.junction import JunctionFacts
+from calibrator.doctor.junction import Gain, JunctionFacts
 from calibrator.doctor.multipliers import LEAST_RATIO
 from calibrator.drive import Array, Mask
 from calibrator.drives.delays import MAX_DELAY_S
@@ -207,25 +207,40 @@ def _usual(delay_s: Array, known: Mask) -> int:
 
 
 def _gains(facts: JunctionFacts) -> Iterator[Finding]:
-    usable: Mapping[str, float] = dict(zip(facts.branches, facts.rms_a * np.abs(facts.best.multipliers), strict=True))
-    greatest = max(usable.values())
-    first = facts.delays.branches[0] if facts.delays is not None else ""
-    for name, gain in facts.gains.items():
-        off = abs(gain.ratio - 1.0)
-        if usable[name] < LEAST_SHARE * greatest or off < max(LEAST_GAIN, SURE * gain.sd) or gain.ratio <= LEAST_RATIO:
-            continue
+    if facts.delays is None or not facts.gains:
+        return
+    first = facts.delays.branches[0]
+    large = {
+        name: gain
+        for name, gain in facts.gains.items()
+        if not _is_small(facts, facts.branches.index(name)) and gain.ratio > LEAST_RATIO
+    }
+    all_gains = {first: Gain(ratio=1.0, sd=0.0)} | large
+    usual = min(all_gains, key=lambda name: len(_off(all_gains, name)))
+    for name, gain in _off(all_gains, usual).items():
         percent, sd = 100.0 * (1.0 / gain.ratio - 1.0), 100.0 * gain.sd / gain.ratio**2
-        far = off > LARGEST_GAIN
+        far = abs(gain.ratio - 1.0) > LARGEST_GAIN
         yield Finding(
             severity=Severity.WARNING if far else Severity.HINT,
             kind="gain",
             subject=name,
-            text=f"it shows {percent:+.1f} +- {sd:.1f} % of the current that {first} leaves for it",
+            text=f"it shows {percent:+.1f} +- {sd:.1f} % of the current that {usual} leaves for it",
             remedy="more than sensors drift: check the scales of both in the DBC, and that no branch is missing"
             if far
             else "which of the two is off, 'calibrate' finds by comparing the vehicle with its fleet",
             figures={"percent": percent, "sd_percent": sd},
         )
+
+
+def _off(gains: Mapping[str, Gain], reference: str) -> dict[str, Gain]:
+    """Branches whose gain differs surely from that of one of them, with their gain beside it."""
+    by = gains[reference]
+    beside = {
+        name: Gain(ratio=gain.ratio / by.ratio, sd=float(np.hypot(gain.sd, by.sd)) / by.ratio)
+        for name, gain in gains.items()
+        if name != reference
+    }
+    return {name: g for name, g in beside.items() if abs(g.ratio - 1.0) > max(LEAST_GAIN, SURE * g.sd)}
 
 
 def _mean(facts: JunctionFacts, layout: Layout) -> Iterator[Finding]:
@@ -236,7 +251,7 @@ def _mean(facts: JunctionFacts, layout: Layout) -> Iterator[Finding]:
         severity=Severity.HINT,
         kind="mean",
         subject="sum",
-        text=f"the sum of all is {total.mean_a:.1f} A in the mean, and varies by {total.sd_a:.1f} A about it",
+        text=f"it is {total.mean_a:.1f} A in the mean, and varies by {total.sd_a:.1f} A about it",
         remedy="loads that no branch measures, or offsets of sensors: 'calibrate' tells them apart by the fleet; "
         "if the load is known, say so in [unmeasured_load]",
         figures={"mean_a": total.mean_a, "sd_a": total.sd_a},

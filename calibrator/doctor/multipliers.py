@@ -23,6 +23,10 @@ LEAST_RATIO = 1e-4
 """V / N below this is as good as nothing: sensors are not better than 1 %. [1]"""
 CHANGE_PRICE = 0.7
 """Each branch that is changed must halve V / N: its variation must then be above that of the sum's rest. [1]"""
+UNIT_PRICE = 0.3
+"""What a slip of a unit costs beyond a wrong sign: where both explain the same, the sign is wrong. [1]"""
+RIVAL_PRICE = 1.5 * CHANGE_PRICE
+"""An explanation that costs less than this beyond the best one is a rival: one change for next to nothing. [1]"""
 PLAUSIBLE_PRICE = 2.0
 """For each branch whose current would be beyond what the layout calls full scale, or almost nothing of it. [1]"""
 ORIENTATION_PRICE = 1.5
@@ -94,6 +98,7 @@ class _Evidence:
         return (
             float(np.log(max(ratio, LEAST_RATIO)))
             + CHANGE_PRICE * _changes(multipliers)
+            + UNIT_PRICE * int(np.sum(np.abs(multipliers) != 1.0))
             + PLAUSIBLE_PRICE * implausible
             + ORIENTATION_PRICE * against
         )
@@ -137,7 +142,7 @@ def explanations(bands: Bands, known: Known, *, factors: Sequence[float] = FACTO
         best = found
     rivals = [_rated(evidence, tried) for tried in _neighbours(best.multipliers, factors)]
     rivals.append(_rated(evidence, -best.multipliers))
-    near = sorted((r for r in rivals if r.price < best.price + CHANGE_PRICE), key=_price)
+    near = sorted((r for r in rivals if r.price < best.price + RIVAL_PRICE), key=_price)
     different = {tuple(r.multipliers.tolist()): r for r in reversed(near)}
     different.pop(tuple(best.multipliers.tolist()), None)
     return [best, *sorted(different.values(), key=_price)]

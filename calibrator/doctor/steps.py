@@ -17,6 +17,8 @@ from ecu_node.wiring import InForce, wire
 
 __all__ = ["NextSteps", "explained_shares", "next_steps"]
 
+LEAST_SHARE = 0.05
+"""Of the greatest branch's variation: that of a smaller one is mostly noise. [1]"""
 FEWEST_INSTANTS = 300
 """Of aligned samples, to say how well inputs explain a current: half a minute at 0.1 s."""
 
@@ -95,12 +97,11 @@ def explained_shares(drives: Sequence[Drive], layout: Layout, branches: Sequence
     Returns
     -------
     dict of str to float
-        By branch, 1 for all of it; empty if the inputs are not recorded or too little is valid.
+        By branch that matters, 1 for all of it; empty if the inputs are not recorded or too little is valid.
     """
-    recorded = [
-        name for name in layout.model_inputs if all(base_inputs(layout, [name]) <= d.inputs.keys() for d in drives)
-    ]
-    if not recorded or not drives:
+    available = set.intersection(*(set(drive.inputs) for drive in drives)) if drives else set()
+    recorded = [name for name in layout.model_inputs if base_inputs(layout, [name]) <= available]
+    if not recorded:
         return {}
     try:
         samples = [align(drive, layout, branches, inputs=recorded) for drive in drives]
@@ -115,7 +116,7 @@ def explained_shares(drives: Sequence[Drive], layout: Layout, branches: Sequence
     rest = currents_a - columns @ np.linalg.lstsq(columns, currents_a, rcond=1e-8)[0]
     power = currents_a.var(axis=0)
     shares = 1.0 - np.divide(rest.var(axis=0), power, out=np.ones(len(power)), where=power > 0.0)
-    return {name: float(shares[k]) for k, name in enumerate(branches) if power[k] > 0.0}
+    return {name: float(shares[k]) for k, name in enumerate(branches) if power[k] > LEAST_SHARE**2 * power.max()}
 
 
 def _for_kirchhoff(branches: Sequence[str], errors: Sequence[Finding]) -> str:

@@ -13,6 +13,8 @@ from calibrator.report.text import counted, dumps, table
 __all__ = ["examination_json", "examination_text"]
 
 _SEVERITY_WIDTH = 9
+_JITTER = 3
+"""Column of the jitter."""
 
 
 def examination_text(found: Examination, width: int | None) -> str:
@@ -75,9 +77,13 @@ def _heading(found: Examination) -> str:
 
 
 def _channels(what: str, facts: Sequence[ChannelFacts], full_scale_a: float | None) -> str:
+    """Table of branches, or of inputs without jitter and with their units."""
     last = "% of scale" if full_scale_a is not None else "unit"
     header = (what, "frames", "Hz", "jitter ms", "gap s", "bad %", "least", "greatest", last)
-    return table(header, [_row(item, full_scale_a) for item in facts])
+    rows = [header, *(_row(item, full_scale_a) for item in facts)]
+    if full_scale_a is None:
+        rows = [(*row[:_JITTER], *row[_JITTER + 1 :]) for row in rows]
+    return table(rows[0], rows[1:])
 
 
 def _row(facts: ChannelFacts, full_scale_a: float | None) -> tuple[str, ...]:

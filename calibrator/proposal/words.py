@@ -7,7 +7,7 @@ current 132*. Abbreviations of several houses stand beside each other.
 import re
 from collections.abc import Iterable
 
-__all__ = ["PLACES", "is_battery", "places_of", "words_of"]
+__all__ = ["PLACES", "is_battery", "places_of", "word_set", "words_of"]
 
 _SPLIT = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+")
 
@@ -25,10 +25,21 @@ PLACES: dict[str, frozenset[str]] = {
 """Where a current may flow, and words for it."""
 
 
+def word_set(text: str) -> frozenset[str]:
+    """Words that stand apart in a text."""
+    return frozenset(text.split())
+
+
+_JOINED = {"dc dc": "dcdc", "air con": "aircon", "air conditioning": "aircon", "e motor": "emotor", "low voltage": "lv"}
+"""Words that mean something else apart."""
+
+
 def words_of(*texts: str | None) -> tuple[str, ...]:
-    """Words of some names or sentences, in lower case; ``dc dc`` and ``air con`` are joined."""
+    """Words of some names or sentences, in lower case; ``dc dc``, ``air con`` and ``low voltage`` are joined."""
     found = [word.lower() for text in texts if text for word in _SPLIT.findall(text)]
-    joined = " ".join(found).replace("dc dc", "dcdc").replace("air con ", "aircon ").replace("e motor", "emotor")
+    joined = f" {' '.join(found)} "
+    for apart, together in _JOINED.items():
+        joined = joined.replace(f" {apart} ", f" {together} ")
     return tuple(joined.split())
 
 

@@ -1,0 +1,63 @@
+"""``calibrator layout init``: a layout to begin with, from a DBC and a log."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibrator.errors import ProposalError
+from calibrator.folders import require_possible_file
+from calibrator.interrupts import importing
+from ecu_node.errors import printable
+from ecu_node.parameters import write_atomically
+from ecu_node.standard_output import write_output
+
+__all__ = ["layout"]
+
+layout = typer.Typer(help="Layouts: which signals of a DBC mean what.", no_args_is_help=True)
+
+
+@layout.callback()
+def _layout() -> None:
+    """Layouts: which signals of a DBC mean what."""
+
+
+@layout.command("init")
+def init(
+    dbc: Annotated[Path, typer.Argument(help="DBC of the vehicle.", metavar="DBC")],
+    out: Annotated[Path | None, typer.Option("--out", help="File to write; without it, standard output.")] = None,
+    log: Annotated[
+        Path | None, typer.Option("--log", help="Log of a drive: only what is in it is proposed, and signs are told.")
+    ] = None,
+) -> None:
+    """Propose a layout by units, names, comments and senders in a DBC, and by what a log shows.
+
+    Whatever is guessed is marked in the file with '# confirm:' and the reason.
+    """
+    with importing():
+        from calibrator.proposal.propose import propose_layout
+        from calibrator.proposal.toml_text import layout_text
+
+    if out is not None:
+        if out.exists() or out.is_symlink():
+            raise ProposalError(f"{out}: exists, and is not overwritten; choose another --out")
+        require_possible_file(out)
+    proposal = propose_layout(dbc, log, _name_of(out or dbc))
+    text = layout_text(proposal, out)
+    if out is None:
+        write_output(text.rstrip("\n"))
+        return
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(out, text.encode())
+    guesses = text.count("# confirm:")
+    names = ", ".join(branch.name for branch in proposal.branches)
+    write_output(f"{printable(str(out))}: branches {names}; {guesses} guesses to confirm")
+    log_option = f"--log {log}" if log is not None else "--log LOG"
+    print(f"next: calibrator doctor --layout {out} {log_option}", file=sys.stderr)
+
+
+def _name_of(path: Path) -> str:
+    """Name of a layout, from that of its file: letters, digits and underscores."""
+    letters = "".join(char if char.isascii() and char.isalnum() else "_" for char in path.name.partition(".")[0])
+    return letters if letters[:1].isalpha() else f"_{letters}"

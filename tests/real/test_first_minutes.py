@@ -1,0 +1,189 @@
+"""The first minutes of somebody with a DBC and a log: a recorded Tesla Model 3, and faults put into the recording."""
+
+import gzip
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from calibrator.doctor.examine import examine
+from calibrator.doctor.findings import Severity
+from calibrator.drives.store import iterate_drives
+from calibrator.layout_files import vehicle_database
+from calibrator.recordings.drive_log import write_drive_log
+from ecu_node.layout import read_layout
+from tests.real.delay_trips import import_trips
+
+ROOT = Path(__file__).parents[2]
+LAYOUT = ROOT / "dbc" / "tesla_model3.toml"
+I3_LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
+
+
+def calibrator(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "calibrator", *arguments]
+    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": str(folder)}
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder, env=environment)
+
+
+@pytest.fixture(scope="module")
+def tesla(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with nothing but the DBC and the log."""
+    folder = tmp_path_factory.mktemp("tesla")
+    for name in ("Model3CAN.dbc", "drive.log.gz"):
+        (folder / name).symlink_to(shared_data / "tesla_model3" / name)
+    return folder
+
+
+def test_three_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -> None:
+    """Those of docs/first_minutes.md."""
+    made = calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "my_car.toml"])
+    assert (made.returncode, made.stdout.partition(";")[0]) == (
+        0,
+        "my_car.toml: branches battery, motor_rear, motor_front",
+    )
+    assert made.stderr == "next: calibrator doctor --layout my_car.toml --log drive.log.gz\n"
+    again = calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--out", "my_car.toml"])
+    assert again.returncode == 1
+    assert again.stderr.startswith("calibrator: my_car.toml: exists, and is not overwritten")
+    told = calibrator(tesla, *["doctor", "--layout", "my_car.toml", "--log", "drive.log.gz"])
+    assert told.returncode == 0, told.stdout
+    assert "ready for: kirchhoff, import, calibrate, ecu-node --gateway" in told.stdout.splitlines()
+    drawn = calibrator(tesla, *["kirchhoff", "drive.log.gz", "--layout", "my_car.toml", "--plot", "sum.png", "--json"])
+    assert drawn.returncode == 0, drawn.stderr
+    total = json.loads(drawn.stdout)["before"]["sum"]
+    assert (round(total["mean_a"], 1), round(total["sd_a"], 1)) == (4.1, 1.2)
+    assert (tesla / "sum.png").read_bytes().startswith(b"\x89PNG")
+    imported = calibrator(tesla, *["import", "drive.log.gz", "--layout", "my_car.toml", "--out", "store"])
+    assert imported.returncode == 0, imported.stderr
+
+
+def test_the_guessed_layout_has_the_branches_and_signs_of_the_one_written_by_hand(tesla: Path) -> None:
+    calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "guessed.toml"])
+    by_hand = read_layout(LAYOUT)
+    guessed = read_layout(tesla / "guessed.toml")
+    for one, other in zip(guessed.branch, by_hand.branch, strict=True):
+        assert (one.name, one.sign, one.source, one.voltage) == (other.name, other.sign, other.source, other.voltage)
+    text = (tesla / "guessed.toml").read_text()
+    assert text.count("\n# confirm:") == len(guessed.branch) * 2 + len(guessed.input) + 1
+    assert len(text.splitlines()) < 160
+
+
+def inverted(name: str) -> Callable[[str], str]:
+    """A layout with the other sign of one branch."""
+
+    def change(layout: str) -> str:
+        changed, count = re.subn(rf'("{name}", sign = )(-?1)', lambda match: match[1] + str(-int(match[2])), layout)
+        assert count == 1
+        return changed
+
+    return change
+
+
+def with_unit(signal: str, unit: str) -> Callable[[str], str]:
+    """A DBC in which a signal has another unit."""
+
+    def change(dbc: str) -> str:
+        changed, count = re.subn(rf'( SG_ {signal} [^"]*)"[^"]*"', rf'\1"{unit}"', dbc)
+        assert count == 1
+        return changed
+
+    return change
+
+
+def errors_of(folder: Path, data: Path, log: Path, change_layout: Any = str, change_dbc: Any = str) -> Any:
+    (folder / "Model3CAN.dbc").write_text(
+        change_dbc((data / "Model3CAN.dbc").read_text(encoding="cp1252")), encoding="cp1252"
+    )
+    (folder / "layout.toml").write_text(change_layout(LAYOUT.read_text()))
+    found = examine(read_layout(folder / "layout.toml"), [log])
+    return found, [(f.kind, f.subject) for f in found.findings if f.severity is Severity.ERROR]
+
+
+def test_nothing_is_complained_of_in_the_recording_as_it_is(tesla: Path, tmp_path: Path) -> None:
+    found, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz")
+    assert errors == []
+    assert [finding.kind for finding in found.findings] == ["mean"]
+    assert found.findings[0].figures["mean_a"] == pytest.approx(4.1, abs=0.1)
+
+
+@pytest.mark.parametrize("branch", ["battery", "motor_rear"])
+def test_an_inverted_sign_is_named(branch: str, tesla: Path, tmp_path: Path) -> None:
+    found, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz", inverted(branch))
+    assert errors == [("sign", branch)]
+    assert found.findings[0].figures["rms_before_a"] > 20.0 * found.findings[0].figures["rms_after_a"]
+
+
+@pytest.mark.parametrize(
+    ("branch", "signal", "unit", "factor"),
+    [
+        ("motor_rear", "RearPower266", "W", 1000.0),
+        ("battery", "SmoothBattCurrent132", "mA", 1000.0),
+        ("battery", "SmoothBattCurrent132", "kA", 0.001),
+        ("motor_front", "FrontPower2E5", "MW", 0.001),
+    ],
+)
+def test_a_factor_of_1000_is_named(
+    branch: str, signal: str, unit: str, factor: float, tesla: Path, tmp_path: Path
+) -> None:
+    found, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz", change_dbc=with_unit(signal, unit))
+    assert errors == [("unit", branch)]
+    assert found.findings[0].figures["factor"] == factor
+
+
+def test_a_sign_and_a_factor_are_named_together(tesla: Path, tmp_path: Path) -> None:
+    changes = (inverted("battery"), with_unit("RearPower266", "W"))
+    _, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz", *changes)
+    assert sorted(errors) == [("sign", "battery"), ("unit", "motor_rear")]
+
+
+def test_a_voltage_ten_times_too_large_is_blamed_and_not_the_branches(tesla: Path, tmp_path: Path) -> None:
+    def change(dbc: str) -> str:
+        return re.sub(r"(BattVoltage132 .*)\(0.01,0\) \[0\|655.35\]", r"\1(0.1,0) [0|6553.5]", dbc)
+
+    _, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz", change_dbc=change)
+    assert errors == [("unit", "ID132HVBattAmpVolt.BattVoltage132")]
+
+
+@pytest.mark.parametrize(("identifier", "late_s"), [("266", 0.2), ("132", -0.2)])
+def test_a_skew_of_200_ms_is_named_and_is_no_error(identifier: str, late_s: float, tesla: Path, tmp_path: Path) -> None:
+    """Time stamps of one message are moved in the log; the battery's the other way round, which is the same skew."""
+    lines = []
+    with gzip.open(tesla / "drive.log.gz", "rt") as file:
+        for line in file:
+            stamp, channel, frame = line.split()
+            time_s = float(stamp.strip("()")) + (late_s if frame.startswith(f"{identifier}#") else 0.0)
+            lines.append((time_s, f"({time_s:.6f}) {channel} {frame}\n"))
+    (tmp_path / "skewed.log").write_text("".join(text for _, text in sorted(lines)))
+    found, errors = errors_of(tmp_path, tesla, tmp_path / "skewed.log")
+    assert errors == []
+    (delay,) = [finding for finding in found.findings if finding.kind == "delay"]
+    assert (delay.subject, delay.severity) == ("motor_rear", Severity.WARNING)
+    assert delay.figures["delay_s"] == pytest.approx(0.2, abs=0.01)
+    assert "late against battery" in delay.text
+
+
+@pytest.mark.parametrize("trip", ["TripA07", "TripA24"])
+def test_trips_of_a_bmw_i3_are_sound_and_an_inverted_motor_is_named(trip: str, i3_store: Path, tmp_path: Path) -> None:
+    """Its motor current is what the others leave, so the sum is exact; the voltage tells motor from battery."""
+    database = vehicle_database(I3_LAYOUT)
+    drive = next(d for d in iterate_drives(i3_store, database.layout) if d.name == trip)
+    write_drive_log(tmp_path / "trip.log.gz", drive, database)
+    right = examine(database.layout, [tmp_path / "trip.log.gz"])
+    assert [finding for finding in right.findings if finding.severity is Severity.ERROR] == []
+    text = I3_LAYOUT.read_text().replace('dbc = "hv', f'dbc = "{ROOT}/dbc/hv')
+    changed = re.sub(r'("HV_Motor.MotorCurrent"\nsign = )-1', r"\g<1>1", text)
+    (tmp_path / "wrong.toml").write_text(changed)
+    wrong = examine(read_layout(tmp_path / "wrong.toml"), [tmp_path / "trip.log.gz"])
+    assert [(f.kind, f.subject) for f in wrong.findings if f.severity is Severity.ERROR] == [("sign", "motor")]
+
+
+@pytest.fixture(scope="module")
+def i3_store(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    store = tmp_path_factory.mktemp("i3") / "store"
+    import_trips(shared_data, store)
+    return store
