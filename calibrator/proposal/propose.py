@@ -15,6 +15,7 @@ from calibrator.proposal.branches import ProposedBranch, propose_branches
 from calibrator.proposal.inputs import ProposedDerived, ProposedInput, propose_derived, propose_inputs
 from calibrator.proposal.signals import QUANTITIES, Candidate, candidates, with_log
 from calibrator.proposal.signs import ProposedSign, propose_signs, usual_signs
+from calibrator.proposal.targets import ProposedTarget, propose_targets
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.readers import drive_from_frames
 from ecu_node.database import AMPERE, VehicleDatabase, read_database
@@ -64,6 +65,8 @@ class Proposal:
         What drives the currents.
     derived : tuple of ProposedDerived
         What is made of them.
+    targets : dict of str to ProposedTarget
+        Where corrected values go, by branch.
     """
 
     name: str
@@ -76,6 +79,7 @@ class Proposal:
     timeouts_s: dict[str, float]
     inputs: tuple[ProposedInput, ...]
     derived: tuple[ProposedDerived, ...]
+    targets: dict[str, ProposedTarget]
 
     @property
     def voltage(self) -> Candidate | None:
@@ -110,7 +114,7 @@ def propose_layout(dbc: Path, log: Path | None, name: str) -> Proposal:
     if not dbc.is_file():
         raise DatabaseError(f"{dbc}: no such DBC")
     database = read_database(_layout(name, dbc, 1.0, [], []))
-    found = candidates(database)
+    everything = found = candidates(database)
     frames = None
     if log is not None:
         frames = read_frames(log)
@@ -142,6 +146,7 @@ def propose_layout(dbc: Path, log: Path | None, name: str) -> Proposal:
         timeouts_s={branch.name: _timeout_s(branch.signal) for branch in usable},
         inputs=tuple(inputs),
         derived=tuple(propose_derived(inputs)),
+        targets=propose_targets(everything, usable),
     )
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from calibrator.proposal.branches import ProposedBranch
 from calibrator.proposal.propose import Proposal
+from calibrator.proposal.targets import checked_messages
 from ecu_node.errors import printable
 
 __all__ = ["layout_text"]
@@ -31,6 +32,8 @@ def layout_text(proposal: Proposal, out: Path | None) -> str:
         A layout; its remarks ``# confirm:`` say what was guessed, and why.
     """
     lines = [*_head(proposal, out)]
+    if checked := checked_messages(proposal.branches):
+        lines += _folded(f"confirm: {', '.join(checked)} seem to be protected end to end: say how in [e2e]")
     for branch in proposal.branches:
         lines += ["", *_branch(proposal, branch)]
     for item in proposal.inputs:
@@ -93,6 +96,10 @@ def _branch(proposal: Proposal, branch: ProposedBranch) -> list[str]:
         lines += _folded(f"or: {_text(item.name)} ({item.about})")
     lines += _guess(sign.reason, f"sign = {sign.sign}")
     lines.append(f"timeout_s = {proposal.timeouts_s[branch.name]:g}")
+    target = proposal.targets.get(branch.name)
+    if target is not None:
+        lines += _guess("that the node alone sends its message", f"corrected = {_text(target.corrected)}")
+        lines += [f"quality = {_text(target.quality)}"] if target.quality is not None else []
     return lines
 
 

@@ -49,6 +49,9 @@ def test_the_power_train_of_this_repository_is_found_whole(tmp_path: Path) -> No
     by_hand = read_layout(DBC / "hv_powertrain.toml")
     found = {branch.source: (branch.sign, branch.timeout_s) for branch in guessed.branch}
     assert found == {branch.source: (branch.sign, branch.timeout_s) for branch in by_hand.branch}
+    assert [(one.corrected, one.quality) for one in sorted(guessed.branch, key=lambda branch: branch.name)] == [
+        (one.corrected, one.quality) for one in sorted(by_hand.branch, key=lambda branch: branch.name)
+    ]
     signals = {item.signal for item in by_hand.input} - {"HV_Battery.ContactorState"}
     assert {item.signal for item in guessed.input} == signals | {"HV_MotorRear.MotorRearTorque"}
     assert set(by_hand.model_inputs) <= set(guessed.model_inputs)
