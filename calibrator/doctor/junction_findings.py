@@ -25,6 +25,8 @@ LEAST_SHARE = 0.05
 """Of the greatest branch's variation; a smaller branch's gain is drawn to 0 by its noise. [1]"""
 LEAST_MEAN_A, LEAST_MEAN = 0.5, 0.001
 """Means of the sum below half an ampere, or this share of full scale, are not worth a line. [A], [1]"""
+LARGE_MEAN = 0.05
+"""Of full scale: more than loads without a sensor usually are. [1]"""
 NO_SUM = 0.3
 """Share of the variation that is left in the sum, above which branches do not belong together. [1]"""
 
@@ -248,7 +250,7 @@ def _mean(facts: JunctionFacts, layout: Layout) -> Iterator[Finding]:
     if total is None or abs(total.mean_a) < max(LEAST_MEAN_A, LEAST_MEAN * layout.full_scale_a):
         return
     yield Finding(
-        severity=Severity.HINT,
+        severity=Severity.WARNING if abs(total.mean_a) > LARGE_MEAN * layout.full_scale_a else Severity.HINT,
         kind="mean",
         subject="sum",
         text=f"it is {total.mean_a:.1f} A in the mean, and varies by {total.sd_a:.1f} A about it",
