@@ -226,7 +226,8 @@ def _gains(facts: JunctionFacts) -> Iterator[Finding]:
             severity=Severity.WARNING if far else Severity.HINT,
             kind="gain",
             subject=name,
-            text=f"it shows {percent:+.1f} +- {sd:.1f} % of the current that {usual} leaves for it",
+            text=f"it shows {abs(percent):.1f} +- {sd:.2g} % {'more' if percent > 0.0 else 'less'} current "
+            f"than {usual} leaves for it",
             remedy="more than sensors drift: check the scales of both in the DBC, and that no branch is missing"
             if far
             else "which of the two is off, 'calibrate' finds by comparing the vehicle with its fleet",
