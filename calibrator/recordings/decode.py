@@ -170,7 +170,7 @@ def means_not_available(name: str) -> bool:
 
 
 def _physical(signal: Signal, raw: Raw, complete: Mask) -> Array:
-    with np.errstate(invalid="ignore"):  # a signalling NaN in a float signal
+    with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN, or too large a number, in a float signal
         return np.where(complete, raw.astype(np.float64) * float(signal.scale) + float(signal.offset), np.nan)
 
 
