@@ -53,9 +53,11 @@ from calibrator.storage import Storage, open_storage
 from calibrator.summaries.identity import read_identity
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.summarise import add_drives, open_store
+from calibrator.summaries.unity import UNITY_FILE, keep_unity_window
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import file_digest
+from ecu_node.parameters import write_atomically
 
 __all__ = ["calibrate_fleet"]
 
@@ -134,6 +136,7 @@ def calibrate_fleet(
             time_limit_s=settings.time_limit_s,
             exactly=since is None,
         )
+        keep_unity_window(store, fleet, database, time_limit_s=settings.time_limit_s)
         find_models, equipment = None, store.identity.equipment
         if settings.sensor_models:
             find_models = partial(
@@ -327,6 +330,7 @@ def _calibrate_store(
         details=run.learnt.details,
         notices=run.learnt.notices,
         summaries=own,
+        window=store.storage.read_if_there(UNITY_FILE),
         buckets=store.identity.buckets,
     )
 
@@ -385,6 +389,7 @@ def _finish(
     details: Mapping[str, object],
     notices: Sequence[str],
     summaries: Path | None = None,
+    window: bytes | None = None,
     buckets: int = 0,
 ) -> CalibrationReport:
     """Put the chunks together."""
@@ -398,6 +403,8 @@ def _finish(
     where = write_parameter_files(folder, {n: chunks.parameters(n) for n in numbers}, vehicles=vehicles)
     if summaries is not None:
         shutil.copytree(summaries, folder / summaries.name, ignore=shutil.ignore_patterns(".*"))
+    if window is not None:
+        write_atomically(folder / UNITY_FILE, window)
     run = RunRecord(
         tool=identity.tool,
         method=identity.method.value,
@@ -413,6 +420,7 @@ def _finish(
         buckets=buckets,
         left_out=left_out,
         left_out_count=left_out_count,
+        full_scale_a=identity.database.layout.full_scale_a,
         layout_sha256=identity.database.layout.digest,
         dbc_sha256=identity.database.digest,
         notices=[*fleet.notices, *notices],

@@ -21,6 +21,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from calibrator.errors import FleetError
+from calibrator.evidence.vehicle_evidence import VehicleEvidence
 from calibrator.summaries.buckets import bucket_of
 from ecu_node.errors import ParameterError
 from ecu_node.parameters import VehicleParameters, encode_parameters, write_atomically
@@ -55,6 +56,9 @@ PARAMETERS_SCHEMA = pa.schema(
         pa.field("vehicle", pa.string(), nullable=False),
         pa.field("drives", pa.string(), nullable=False, metadata={"meaning": "digest of the drives' files"}),
         pa.field("parameters", pa.string(), nullable=False, metadata={"meaning": "text of the parameter file"}),
+        pa.field("evidence_value", pa.list_(pa.float32()), metadata={"meaning": "rows named in run.json"}),
+        pa.field("evidence_sd", pa.list_(pa.float32()), metadata={"meaning": "standard deviation of the same"}),
+        pa.field("evidence_explained", pa.list_(pa.float32()), metadata={"meaning": "what the estimate makes of it"}),
     ]
 )
 
@@ -108,6 +112,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     left_out: dict[str, str]
     """Why vehicles have no parameters; of many the first ones."""
     left_out_count: int = 0
+    full_scale_a: float = 0.0
+    """Of the junction; 0: not known. [A]"""
     layout_sha256: str = ""
     dbc_sha256: str = ""
     notices: list[str]
@@ -139,10 +145,13 @@ class Written:
         Digest of the drives' files; empty if it is not known.
     text : bytes
         Of the parameter file.
+    evidence : VehicleEvidence or None
+        What they were found from; None if it was not kept.
     """
 
     drives: str
     text: bytes
+    evidence: VehicleEvidence | None = None
 
 
 def encode_chunk(
@@ -151,6 +160,7 @@ def encode_chunk(
     *,
     moved: Mapping[tuple[str, str], str] | None = None,
     drives: Mapping[str, str] | None = None,
+    evidence: Mapping[str, VehicleEvidence] | None = None,
 ) -> ChunkResult:
     """Write down what a chunk gave.
 
@@ -164,6 +174,8 @@ def encode_chunk(
         What has moved since an earlier result, by vehicle and branch.
     drives : mapping of str to str, or None
         Digest of the drives' files by vehicle.
+    evidence : mapping of str to VehicleEvidence, or None
+        What the parameters were found from, by vehicle.
 
     Returns
     -------
@@ -179,10 +191,29 @@ def encode_chunk(
         except ParameterError as error:
             reasons[item.vehicle] = f"{error}; look at its recordings"
             continue
-        texts.append({"vehicle": item.vehicle, "drives": (drives or {}).get(item.vehicle, ""), "parameters": text})
+        texts.append(
+            {
+                "vehicle": item.vehicle,
+                "drives": (drives or {}).get(item.vehicle, ""),
+                "parameters": text,
+                **_evidence_columns((evidence or {}).get(item.vehicle)),
+            }
+        )
         rows += [{**row, "moved": (moved or {}).get((item.vehicle, row["branch"]))} for row in _rows(item)]
     rows += left_out_rows(reasons)
     return ChunkResult(rows=_parquet(rows, SCHEMA), parameters=_parquet(texts, PARAMETERS_SCHEMA))
+
+
+def _evidence_columns(evidence: VehicleEvidence | None) -> dict[str, list[float | None] | list[float]]:
+    if evidence is None:
+        return {}
+    return {f"evidence_{name}": values for name, values in vars(evidence).items()}
+
+
+def _evidence_of(row: Mapping[str, Any]) -> VehicleEvidence | None:
+    if row.get("evidence_value") is None:
+        return None
+    return VehicleEvidence(value=row["evidence_value"], sd=row["evidence_sd"], explained=row["evidence_explained"])
 
 
 def left_out_rows(left_out: Mapping[str, str]) -> list[dict[str, Any]]:
@@ -206,7 +237,10 @@ def read_part(path: Path) -> dict[str, Written]:
     """
     try:
         rows = pq.ParquetFile(path).read(use_threads=False).to_pylist()
-        return {row["vehicle"]: Written(drives=row["drives"], text=row["parameters"].encode()) for row in rows}
+        return {
+            row["vehicle"]: Written(drives=row["drives"], text=row["parameters"].encode(), evidence=_evidence_of(row))
+            for row in rows
+        }
     except FileNotFoundError:
         return {}
     except (pa.ArrowException, OSError, KeyError) as error:

@@ -11,6 +11,7 @@ from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.report.text import counted, dumps, left_out_text
 from calibrator.storage import open_storage
 from calibrator.summaries.summarise import add_drives, open_store, require_store_or_nothing
+from calibrator.summaries.unity import keep_unity_window
 from ecu_node.database import VehicleDatabase
 
 __all__ = ["SummariseReport", "summarise_fleet"]
@@ -88,6 +89,8 @@ def summarise_fleet(
     equipment = probe_equipment(source, database, branches, limit_s=time_limit_s)
     store = open_store(storage, equipment, database, source, bank=bank)
     added = add_drives(store, source, database, workers=workers, time_limit_s=time_limit_s, part=part)
+    if part[0] == 1:
+        keep_unity_window(store, source, database, time_limit_s=time_limit_s)
     return SummariseReport(
         store=out,
         vehicles=added.vehicles,

@@ -238,7 +238,7 @@ def calibrate_sensors(
         fleet_size=len(vehicles),
         find_models=find,
     )
-    parameters, _ = learnt.task.calibrate(vehicles)
+    parameters = learnt.task.calibrate(vehicles).parameters
     return {each.vehicle: each for each in parameters}, kept[-1]
 
 

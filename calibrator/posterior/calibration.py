@@ -224,7 +224,7 @@ def estimate_summaries(
         load=reference.load,
     )
     posterior = estimate_vehicles(rows, _moments(fleet), reference.law, full_scale_a=scale_a)
-    return _in_own_order(posterior, reference.health, reference.order)
+    return replace(_in_own_order(posterior, reference.health, reference.order), rows=rows)
 
 
 def _told(

@@ -73,6 +73,8 @@ class FleetPosterior:
         Branches of the states: position of each in the vehicle's own order.
     health : ReferenceHealth or None
         Of the fleet reference, if it was examined.
+    rows : FleetRows or None
+        What it was estimated from, branches in the order ``order``; None if it was not kept.
     """
 
     faults: Faults
@@ -87,6 +89,7 @@ class FleetPosterior:
     states: States
     order: tuple[int, ...]
     health: ReferenceHealth | None = None
+    rows: FleetRows | None = None
 
     def __len__(self) -> int:
         return len(self.confidence)

@@ -14,6 +14,7 @@ from calibrator.calibration_settings import CalibrationSettings, require_learnin
 from calibrator.drive import Array, Mask
 from calibrator.evidence.readings import Readings
 from calibrator.evidence.summary import DriveSummary
+from calibrator.evidence.vehicle_evidence import evidence_names
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.parameter_files import RunIdentity, by_branch
 from calibrator.posterior.bench import contradicted_readings, merge_readings, trust_notices, window_notices
@@ -205,7 +206,9 @@ def _details(reference: FleetReference, branches: Sequence[str]) -> dict[str, ob
             "least_vehicles": health.least_vehicles,
             "unmeasured_a": health.unmeasured_a,
             "doubtful": [branches[k] for k in health.doubtful],
+            "read_out": {name: reference.model.read_out[:, k].tolist() for k, name in enumerate(ordered)},
         },
+        "evidence": evidence_names(ordered),
         "hyperparameters": {
             "hardware_share": prior.hardware_share,
             "drift_magnitude": [prior.relative.low, prior.relative.high],

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from calibrator.evidence.summary import DriveSummary
+from calibrator.evidence.vehicle_evidence import VehicleEvidence
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.bench import merge_readings
@@ -16,6 +17,7 @@ from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.model_decision import JudgedSensor, judge_sensor
 from calibrator.posterior.model_parameters import tell_sensors, with_model_residual
 from calibrator.posterior.second_pass import ModelJudge, with_sensor_models
+from calibrator.posterior.told_evidence import told_evidence
 from calibrator.posterior.vehicle_parameters import impossible_vehicles, vehicle_parameters
 from calibrator.posterior.verdict import Deployment, decide
 from calibrator.sensor_models.choice import SensorModelChoice
@@ -23,10 +25,29 @@ from calibrator.sensor_models.fleet import SensorFindings, all_linear
 from calibrator.sensor_models.modelled import ModelledVehicle
 from ecu_node.parameters import VehicleParameters
 
-__all__ = ["FleetTask"]
+__all__ = ["Calibrated", "FleetTask"]
 
 Judged = Mapping[int, JudgedSensor]
 """Sensors of a vehicle that are not linear, by branch."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibrated:
+    """What was found of some vehicles.
+
+    Attributes
+    ----------
+    parameters : list of VehicleParameters
+        Of those that can be calibrated.
+    left_out : dict of str to str
+        Why the others cannot.
+    evidence : dict of str to VehicleEvidence
+        What the parameters were found from, by vehicle.
+    """
+
+    parameters: list[VehicleParameters]
+    left_out: dict[str, str]
+    evidence: dict[str, VehicleEvidence]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +83,7 @@ class FleetTask:
     fleet_size: int
     not_linear: Mapping[str, tuple[Sequence[SensorModelChoice], ModelledVehicle | None]] = field(default_factory=dict)
 
-    def calibrate(self, vehicles: Sequence[VehicleSummary]) -> tuple[list[VehicleParameters], dict[str, str]]:
+    def calibrate(self, vehicles: Sequence[VehicleSummary]) -> Calibrated:
         """Calibrate some vehicles; what comes out does not depend on which others are among them.
 
         Parameters
@@ -72,13 +93,11 @@ class FleetTask:
 
         Returns
         -------
-        parameters : list of VehicleParameters
-            Of those whose currents a sensor can show.
-        left_out : dict of str to str
-            Why the others have none.
+        Calibrated
+            Parameters of those whose currents a sensor can show.
         """
         if not vehicles:
-            return [], {}
+            return Calibrated(parameters=[], left_out={}, evidence={})
         findings, posterior = self._findings(vehicles), self.estimate(vehicles)
         impossible = impossible_vehicles(posterior, self.branches)
         judged = [
@@ -94,7 +113,12 @@ class FleetTask:
             for j, vehicle in enumerate(vehicles)
             if j not in impossible
         ]
-        return parameters, {vehicles[j].vehicle: why for j, why in impossible.items()}
+        evidence = told_evidence(posterior, full_scale_a=layout.full_scale_a)
+        return Calibrated(
+            parameters=parameters,
+            left_out={vehicles[j].vehicle: why for j, why in impossible.items()},
+            evidence={vehicle.vehicle: found for vehicle, found in zip(vehicles, evidence, strict=True)},
+        )
 
     def estimate(self, vehicles: Sequence[VehicleSummary]) -> FleetPosterior:
         """Posterior of some vehicles, at least one, in their order."""

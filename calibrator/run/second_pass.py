@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from calibrator.errors import DriveError
+from calibrator.evidence.vehicle_evidence import VehicleEvidence
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.posterior.fleet_task import FleetTask
 from calibrator.results import ChunkResult, Written, encode_chunk
@@ -38,6 +39,7 @@ class _Found:
     parameters: list[VehicleParameters] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
     moved: dict[tuple[str, str], str] = field(default_factory=dict)
+    evidence: dict[str, VehicleEvidence] = field(default_factory=dict)
 
 
 def calibrate_bucket(
@@ -69,6 +71,8 @@ def calibrate_bucket(
         earlier = _earlier(name, before.get(name))
         if earlier is not None and (before[name].drives == digests[name] or _not_linear(earlier)):
             found.parameters.append(earlier)
+            if kept := before[name].evidence:
+                found.evidence[name] = kept
             continue
         try:
             todo.append(_what_holds(items, earlier, task, found))
@@ -76,7 +80,7 @@ def calibrate_bucket(
             found.left_out[name] = str(error)
     found.left_out |= dict.fromkeys(before.keys() - records.keys(), NOT_THERE)
     _calibrate(todo, task, found)
-    return encode_chunk(found.parameters, found.left_out, moved=found.moved, drives=digests)
+    return encode_chunk(found.parameters, found.left_out, moved=found.moved, drives=digests, evidence=found.evidence)
 
 
 def _earlier(name: str, written: Written | None) -> VehicleParameters | None:
@@ -132,7 +136,7 @@ def _calibrate(vehicles: Sequence[VehicleSummary], task: FleetTask, found: _Foun
         with np.errstate(
             over="ignore", invalid="ignore", divide="ignore"
         ):  # what comes of it is not finite, and refused
-            parameters, left_out = task.calibrate(vehicles)
+            calibrated = task.calibrate(vehicles)
     except _BAD_VEHICLE as error:
         if len(vehicles) == 1:
             found.left_out[vehicles[0].vehicle] = f"its evidence cannot be used: {error}; look at its recordings"
@@ -140,5 +144,6 @@ def _calibrate(vehicles: Sequence[VehicleSummary], task: FleetTask, found: _Foun
         for vehicle in vehicles:
             _calibrate([vehicle], task, found)
     else:
-        found.parameters += parameters
-        found.left_out |= left_out
+        found.parameters += calibrated.parameters
+        found.left_out |= calibrated.left_out
+        found.evidence |= calibrated.evidence
