@@ -4,7 +4,10 @@ Of each branch the slope a_k and the intercept b_k over the fleet model (15) in 
 window showed of it; of the junction law the gain ratios -g_k and the constant c, see :mod:`calibrator.evidence.rows`:
 
     a_k = (1 + d_k) (1 + d_h)             b_k = o_k + (1 + d_k) o_h,k
-    -g_k = (1 + d_1) / (1 + d_k)          c = (1 + d_1) (sum_k o_k / (1 + d_k) + l)
+    -g_k = (1 + d_1) / (1 + d_k)          c = (1 + d_1) sum_k o_k / (1 + d_k)
+
+about the centres that vehicles without faults have in the same rows: to c belongs the load that no branch measures.
+A standard deviation is that of the reading together with what faultless vehicles differ by.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -42,29 +45,31 @@ def told_evidence(posterior: FleetPosterior, *, full_scale_a: float) -> list[Veh
     order = list(posterior.order)
     gain = 1.0 + posterior.faults.drift[:, order]
     ratios = np.exp(rows.relative)
-    sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
-    known = sd**2 < UNKNOWN_VARIANCE / 2.0
+    spread = posterior.hyperparameters.spread
+    known = np.diagonal(rows.covariance, axis1=1, axis2=2) < UNKNOWN_VARIANCE / 2.0
+    whole = rows.dispersed(spread.dispersion)[0] + spread.covariance
+    sd = np.sqrt(np.diagonal(whole, axis1=1, axis2=2))
     seen = np.concatenate([gain, gain[:, :1], np.ones_like(gain)], axis=1) * full_scale_a
     values = np.concatenate([ratios, rows.constant * full_scale_a], axis=1)
-    spread = sd * np.concatenate([ratios, seen], axis=1)
-    values[~known], spread[~known] = np.nan, np.nan
-    explained = _explained(posterior, gain, order)
+    deviations = sd * np.concatenate([ratios, seen], axis=1)
+    values[~known], deviations[~known] = np.nan, np.nan
+    ratio_centre, constant_centre = np.split(spread.mean, [ratios.shape[1]])
+    relative, constant = _explained(posterior, gain, order)
+    explained = np.concatenate([relative * np.exp(ratio_centre), constant + seen * constant_centre], axis=1)
     return [
-        VehicleEvidence(value=_listed(values[j]), sd=_listed(spread[j]), explained=explained[j].tolist())
+        VehicleEvidence(value=_listed(values[j]), sd=_listed(deviations[j]), explained=explained[j].tolist())
         for j in range(len(values))
     ]
 
 
-def _explained(posterior: FleetPosterior, gain: Array, order: Sequence[int]) -> Array:
-    """What the estimates make of the rows, shape (N, 5K)."""
+def _explained(posterior: FleetPosterior, gain: Array, order: Sequence[int]) -> tuple[Array, Array]:
+    """What the estimates make of the rows, shapes (N, 3K - 1) [1] and (N, 2K + 1) [A]."""
     faults = posterior.faults
     offset_a, hardware_a = faults.offset_a[:, order], faults.hardware_offset_a[:, order]
-    load_a = posterior.health.unmeasured_a if posterior.health is not None else 0.0
     slope = gain * (1.0 + faults.hardware_drift[:, None])
-    constant = gain[:, :1] * ((offset_a / gain).sum(axis=1, keepdims=True) + load_a)
-    return np.concatenate(
-        [slope, gain[:, :1] / gain[:, 1:], gain, offset_a + gain * hardware_a, constant, offset_a], axis=1
-    )
+    junction = gain[:, :1] * (offset_a / gain).sum(axis=1, keepdims=True)
+    relative = np.concatenate([slope, gain[:, :1] / gain[:, 1:], gain], axis=1)
+    return relative, np.concatenate([offset_a + gain * hardware_a, junction, offset_a], axis=1)
 
 
 def _listed(values: Array) -> list[float | None]:
