@@ -59,6 +59,7 @@ from calibrator.command_options import (
 from calibrator.doctor.command import doctor
 from calibrator.errors import ContradictionError, LogError
 from calibrator.export.command import export
+from calibrator.fleet_report.command import report
 from calibrator.folders import require_new_folder, require_possible_file, require_possible_folder
 from calibrator.interrupts import importing
 from calibrator.options import Classifier, ExperimentName, Method
@@ -358,6 +359,7 @@ def params(
 
 
 app.command()(export)
+app.command()(report)
 
 
 @app.command()

@@ -55,6 +55,7 @@ __all__ = [
     "UnseenMinutesOption",
     "VehiclesOption",
     "WorkersOption",
+    "given_options",
     "named_vehicles",
     "number_option",
     "numbered_part",
@@ -367,7 +368,7 @@ def require_own_options(context: typer.Context, method: Method) -> None:
         Naming the first such option.
     """
     for other, names in OWN_OPTIONS.items():
-        given = _given_options(context, names)
+        given = given_options(context, names)
         if other is not method and given:
             raise typer.BadParameter(
                 f"belongs to --method {other.value}, not {method.value}; leave it out or change the method",
@@ -429,7 +430,7 @@ def require_heeded_options(context: typer.Context, name: ExperimentName) -> None
     elif name not in (*RECORDED_EXPERIMENTS, ExperimentName.ALL):
         unheeded = RECORDED_OPTIONS
         reason = f"{name.value} takes the built-in vehicle; this is only for {', '.join(RECORDED_EXPERIMENTS)}"
-    given = _given_options(context, unheeded)
+    given = given_options(context, unheeded)
     if given:
         raise typer.BadParameter(reason, param_hint=given[0])
     if name is ExperimentName.CALIBRATION and context.params["out"] is None:
@@ -440,7 +441,7 @@ def require_heeded_options(context: typer.Context, name: ExperimentName) -> None
         )
 
 
-def _given_options(context: typer.Context, names: Sequence[str]) -> list[str]:
+def given_options(context: typer.Context, names: Sequence[str]) -> list[str]:
     """Those of some parameters that stand on the command line, as they are written there."""
     sources = {name: context.get_parameter_source(name) for name in names}
     given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]

@@ -41,6 +41,7 @@ __all__ = [
     "read_run",
     "write_parameter_files",
     "write_run",
+    "written_of",
 ]
 
 LEFT_OUT = "left out"
@@ -313,7 +314,12 @@ def write_parameter_files(folder: Path, parts: Mapping[int, Path], *, vehicles: 
 
 
 def parameters_of(result: Path, vehicle: str) -> bytes:
-    """Text of the parameter file of one vehicle.
+    """Text of the parameter file of one vehicle, as :func:`written_of`."""
+    return written_of(result, vehicle).text
+
+
+def written_of(result: Path, vehicle: str) -> Written:
+    """Parameters of one vehicle.
 
     Parameters
     ----------
@@ -324,8 +330,8 @@ def parameters_of(result: Path, vehicle: str) -> bytes:
 
     Returns
     -------
-    bytes
-        JSON, as the node reads it.
+    Written
+        With the text as the node reads it.
 
     Raises
     ------
@@ -340,7 +346,7 @@ def parameters_of(result: Path, vehicle: str) -> bytes:
         if why is None:
             raise FleetError(f"{result}: no vehicle {vehicle!r} in it; results.parquet names all that are")
         raise FleetError(f"{result}: no parameters of vehicle {vehicle!r}, it was left out: {why}")
-    return found[vehicle].text
+    return found[vehicle]
 
 
 def _left_out_reason(path: Path, vehicle: str) -> str | None:

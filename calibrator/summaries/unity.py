@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -18,13 +19,14 @@ from calibrator.drive import Array, Drive, DriveFile, Mask
 from calibrator.drives.align import align
 from calibrator.drives.fleet_source import FleetSource, load_drive
 from calibrator.errors import FleetError
+from calibrator.identification.filter_bank import FilterBank
 from calibrator.reading_processes import Unread, read_in_processes
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 
-__all__ = ["UNITY_FILE", "UnityWindow", "decode_window", "keep_unity_window"]
+__all__ = ["UNITY_FILE", "WINDOW_S", "UnityWindow", "decode_window", "keep_unity_window", "liveliest_window"]
 
 UNITY_FILE = "unity.parquet"
 WINDOW_S = 60.0
@@ -52,6 +54,8 @@ class UnityWindow:
         Columns of the filter bank; NaN where not valid.
     voltage_v : float or None
         Median voltage of the junction in it; None if no input tells it. [V]
+    bank : FilterBank
+        Whose columns these are.
     """
 
     vehicle: str
@@ -59,10 +63,16 @@ class UnityWindow:
     time_s: Array
     columns: Array
     voltage_v: float | None
+    bank: FilterBank
 
     def encoded(self) -> bytes:
         """Return the content of the file."""
-        about = {b"vehicle": self.vehicle, b"drive": self.drive, b"voltage_v": f"{self.voltage_v or ''}"}
+        about = {
+            b"vehicle": self.vehicle,
+            b"drive": self.drive,
+            b"voltage_v": f"{self.voltage_v or ''}",
+            b"bank": msgspec.json.encode(self.bank),
+        }
         table = pa.table(
             {"time_s": self.time_s, **{f"column_{k}": values for k, values in enumerate(self.columns.T)}}
         ).replace_schema_metadata(about)
@@ -101,8 +111,9 @@ def decode_window(content: bytes, where: str) -> UnityWindow:
             time_s=table["time_s"].to_numpy(),
             columns=np.column_stack([table[name].to_numpy() for name in table.column_names[1:]]),
             voltage_v=float(voltage) if voltage else None,
+            bank=msgspec.json.decode(about[b"bank"], type=FilterBank),
         )
-    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
+    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError, msgspec.MsgspecError) as error:
         reason = str(error).partition("\n")[0][:120]
         raise FleetError(
             f"{where}: damaged unity window: {reason}; remove it, and summarise or calibrate again"
@@ -149,7 +160,7 @@ def _window_of(
             continue
         period_s = database.layout.period_s
         columns, used = identity.bank.run(samples.inputs, samples.valid, identity.bank.start())
-        start = _start(samples.currents_a, used & samples.valid, round(WINDOW_S / period_s))
+        start = liveliest_window(samples.currents_a, used & samples.valid, round(WINDOW_S / period_s))
         if start is None:
             continue
         window = slice(start, start + round(WINDOW_S / period_s))
@@ -160,12 +171,28 @@ def _window_of(
             time_s=samples.time_s[window] - samples.time_s[start],
             columns=np.where(valid[:, None], columns[window], np.nan),
             voltage_v=_voltage_v(drive, database),
+            bank=identity.bank,
         )
     return Unread(reason="no window of its drives is valid throughout")
 
 
-def _start(currents_a: Array, valid: Mask, length: int) -> int | None:
-    """First instant of the window in which the currents vary most; None if none is valid enough."""
+def liveliest_window(currents_a: Array, valid: Mask, length: int) -> int | None:
+    """Find the window in which the currents vary most.
+
+    Parameters
+    ----------
+    currents_a : ndarray of shape (T, K)
+        Branch currents. [A]
+    valid : ndarray of bool, shape (T,)
+        Instants that may be used.
+    length : int
+        Instants of a window.
+
+    Returns
+    -------
+    int or None
+        Its first instant; None if no window has :data:`LEAST_VALID` of its instants valid.
+    """
     if len(valid) < length:
         return None
     used = np.where(valid[:, None], currents_a, 0.0)

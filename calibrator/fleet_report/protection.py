@@ -1,0 +1,88 @@
+"""What the battery's protection margin costs before and after correction, figure 1 of [1]_.
+
+A controller that may let a current limit I flow must stay below it by what its sensor can be wrong by, or the true
+current passes the limit. Of the sensor model i_m = (1 + d) i + o a vehicle needs at the limit, in both directions, the
+margin
+
+    before:  |d| I + |o| + z s              after:  z s of a branch that is corrected, else as before
+    s^2 = (I s_d)^2 + s_o^2
+
+with d, o and their standard deviations s_d, s_o from the posterior. Today a margin is one for all vehicles and is set
+for the worst sensor. A correction gives back the difference to the margin that one needs with it: one for all again,
+which the worst vehicle that cannot be corrected decides, or one per vehicle, as each has its own parameters.
+
+.. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrator.drive import Array, Mask
+
+__all__ = ["SIGMAS", "Margins", "margins"]
+
+SIGMAS = 3.0
+"""z: standard deviations that a margin covers beyond the estimate; 1 in 370 is beyond if errors are Gaussian. [1]"""
+QUANTILE = 0.999
+"""Share of the fleet that one margin for all must cover; of fewer than a thousand vehicles all of them. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Margins:
+    """Margins that the vehicles of a fleet need.
+
+    Attributes
+    ----------
+    limit_a : float
+        The battery's current limit I. [A]
+    before_a, after_a : ndarray of shape (N,)
+        What each vehicle needs at the limit. [A]
+    """
+
+    limit_a: float
+    before_a: Array
+    after_a: Array
+
+    @property
+    def common_before_a(self) -> float:
+        """One margin for all vehicles as they are. [A]"""
+        return _for_all(self.before_a)
+
+    @property
+    def common_after_a(self) -> float:
+        """One margin for all vehicles after correction. [A]"""
+        return _for_all(self.after_a)
+
+    @property
+    def own_gain_a(self) -> Array:
+        """What each vehicle gets back with a margin of its own, shape (N,). [A]"""
+        return self.common_before_a - self.after_a
+
+
+def margins(
+    drift: Array, offset_a: Array, drift_sd: Array, offset_sd_a: Array, applied: Mask, *, limit_a: float
+) -> Margins:
+    """Margins of one branch.
+
+    Parameters
+    ----------
+    drift, offset_a, drift_sd, offset_sd_a : ndarray of shape (N,)
+        Sensor faults and their standard deviations; NaN of a deviation counts as 0. [1], [A]
+    applied : ndarray of bool, shape (N,)
+        Whether the node corrects the branch.
+    limit_a : float
+        Current limit I. [A]
+
+    Returns
+    -------
+    Margins
+        Before and after correction.
+    """
+    doubt_a = SIGMAS * np.hypot(limit_a * np.nan_to_num(drift_sd), np.nan_to_num(offset_sd_a))
+    before_a = np.abs(drift) * limit_a + np.abs(offset_a) + doubt_a
+    return Margins(limit_a=limit_a, before_a=before_a, after_a=np.where(applied, doubt_a, before_a))
+
+
+def _for_all(needed_a: Array) -> float:
+    return float(np.max(needed_a) if len(needed_a) * (1.0 - QUANTILE) < 1.0 else np.quantile(needed_a, QUANTILE))
