@@ -1,0 +1,227 @@
+"""The fleet report as a user has it before him: opened in Chromium from the disk."""
+
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.select import Select
+from selenium.webdriver.support.wait import WebDriverWait
+
+from calibrator.fleet_report.write import ReportOptions, fleet_report, vehicle_report
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.layout import read_layout
+from tests.calibrator.fleet_report.results_at_hand import six_vehicle_result
+
+LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
+PATIENCE_S = 60.0
+LEAST_CONTRAST = 4.5
+"""Of text to its background, WCAG 2.2 level AA. [1]"""
+
+CONTRAST = """
+const channel = (c) => { c /= 255; return c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4; };
+const light = (rgb) => 0.2126 * channel(rgb[0]) + 0.7152 * channel(rgb[1]) + 0.0722 * channel(rgb[2]);
+const numbers = (text) => text.match(/[0-9.]+/g).map(Number);
+const paper = (node) => {
+  for (let at = node; at; at = at.parentElement) {
+    const colour = numbers(getComputedStyle(at).backgroundColor);
+    if (colour.length < 4 || colour[3] > 0) return colour;
+  }
+  return [255, 255, 255];
+};
+const found = [];
+for (const node of document.querySelectorAll("body *:not(script):not(style)")) {
+  if (node.closest("svg") || !node.getClientRects().length) continue;
+  if (![...node.childNodes].some((child) => child.nodeType === 3 && child.textContent.trim())) continue;
+  if (node.disabled) continue;
+  const [a, b] = [light(numbers(getComputedStyle(node).color)), light(paper(node))].sort((x, y) => y - x);
+  found.push([(a + 0.05) / (b + 0.05), node.tagName, node.textContent.trim().slice(0, 40)]);
+}
+return found;
+"""
+
+
+@pytest.fixture(scope="module")
+def database() -> VehicleDatabase:
+    return read_database(read_layout(LAYOUT))
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase) -> Path:
+    return six_vehicle_result(tmp_path_factory.mktemp("report") / "result", database)
+
+
+@pytest.fixture
+def page(browser: webdriver.Chrome, result: Path, tmp_path: Path) -> webdriver.Chrome:
+    """The report, opened and set up; what the browser logged before is forgotten."""
+    path = tmp_path / "report.html"
+    path.write_text(fleet_report(result, ReportOptions())[0])
+    browser.get_log("browser")
+    browser.get_log("performance")
+    browser.get(f"file://{path}")
+    until(browser, "return document.body.dataset.ready || document.body.dataset.failed")
+    return browser
+
+
+def until(browser: webdriver.Chrome, script: str) -> Any:
+    return WebDriverWait(browser, PATIENCE_S).until(lambda it: it.execute_script(script))
+
+
+def rows(browser: webdriver.Chrome) -> list[list[str]]:
+    found: list[list[str]] = browser.execute_script(
+        "return [...document.querySelectorAll('#table tbody tr')]"
+        ".map((row) => [...row.cells].map((cell) => cell.textContent))"
+    )
+    return found
+
+
+def names(browser: webdriver.Chrome) -> list[str]:
+    return [row[0] for row in rows(browser)]
+
+
+def test_it_opens_without_an_error_and_fetches_nothing(page: webdriver.Chrome) -> None:
+    page.execute_script("document.querySelectorAll('[data-figure]').forEach((at) => at.scrollIntoView())")
+    for name in ("verdicts", "junction", "sensors", "margin", "durations"):
+        page.execute_script(f"document.querySelector('[data-figure={name}]').scrollIntoView()")
+        until(page, f"return document.querySelector('[data-figure={name}]').dataset.drawn")
+    assert page.execute_script("return document.body.dataset.failed") is None
+    assert page.get_log("browser") == []
+    events = [json.loads(entry["message"])["message"] for entry in page.get_log("performance")]
+    asked = [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
+    assert [url for url in asked if not url.startswith(("file://", "data:", "blob:"))] == []
+    assert sum(url.startswith("file://") for url in asked) <= 1
+    assert "run" not in page.title
+
+
+def test_the_table_shows_the_numbers_of_the_result(page: webdriver.Chrome, result: Path) -> None:
+    stored = [row for row in pq.read_table(result / "results.parquet").to_pylist() if row["branch"] == "battery"]
+    shown = {row[0]: row for row in rows(page)}
+    assert set(shown) == {row["vehicle"] for row in stored}
+    for row in stored:
+        cells = shown[row["vehicle"]]
+        assert cells[1] == row["verdict"]
+        assert cells[2] == f"{100 * row['confidence']:.1f} %"
+        assert cells[3] == f"{row['junction_rms_measured_a']:.2f} A"
+        assert cells[4] == f"{row['junction_rms_corrected_a']:.2f} A"
+        assert cells[7] == f"{100 * row['hardware_probability']:.1f} %"
+        assert cells[8] == "30.0 min"
+
+
+def test_the_vehicle_shows_the_numbers_of_its_parameters(page: webdriver.Chrome) -> None:
+    page.execute_script("location.hash = 'vehicle=V1'")
+    until(page, "return document.getElementById('vehicle').dataset.vehicle === 'V1'")
+    text = page.find_element(By.ID, "vehicle").text
+    for told in ("+10.00 ± 0.10", "+4.00 ± 0.10", "99.5 %", "corrects", "24.00 A as measured, 0.50 A after correction"):
+        assert told in text
+    until(page, "return document.querySelectorAll('#vehicle .plot[data-drawn]').length === 2")
+    traces = page.execute_script(
+        "return document.querySelector('#vehicle .plot').data"
+        ".map((t) => [t.name, t.yaxis, Math.max(...t.y), Math.min(...t.y)])"
+    )
+    measured, corrected, ideal = (trace[2] for trace in traces[:3])
+    assert corrected == pytest.approx(ideal, abs=0.02)
+    assert measured == pytest.approx(1.1 * ideal + 4.0, abs=0.05)
+    assert traces[-1][:2] == ["corrected", "y3"]
+    assert max(map(abs, traces[-1][2:])) < 0.05, "the corrected currents sum to nothing"
+
+
+def test_competing_explanations_are_told(page: webdriver.Chrome) -> None:
+    page.execute_script("location.hash = 'vehicle=V4'")
+    until(page, "return document.getElementById('vehicle').dataset.vehicle === 'V4'")
+    text = page.find_element(By.ID, "vehicle").text
+    assert "60.0 % battery sensor: offset +8.00 A" in text
+    assert "a zero-current window (contactors open) would decide" in text
+    assert "passes through: harm limit" in text
+
+
+def test_filters_leave_the_vehicles_that_are_asked_for(page: webdriver.Chrome) -> None:
+    page.find_element(By.ID, "find").send_keys("v1")
+    until(page, "return document.getElementById('count').textContent.startsWith('2 of 6')")
+    assert sorted(names(page)) == ["V1", "V10"]
+    page.find_element(By.ID, "find").send_keys(Keys.BACKSPACE, Keys.BACKSPACE)
+    until(page, "return document.getElementById('count').textContent.startsWith('6 of 6')")
+    verdict = Select(page.find_element(By.ID, "verdict"))
+    verdict.select_by_value("cannot tell")
+    assert sorted(names(page)) == ["V4", "V5"]
+    verdict.select_by_value("")
+    page.find_element(By.ID, "suspected").click()
+    assert names(page) == ["V3"]
+    page.find_element(By.ID, "suspected").click()
+    page.find_element(By.ID, "only-corrected").click()
+    assert sorted(names(page)) == ["V1", "V10"]
+
+
+def test_headings_sort_and_say_so(page: webdriver.Chrome) -> None:
+    heads = {head.text: head for head in page.find_elements(By.CSS_SELECTOR, "#table th button")}
+    heads["vehicle"].click()
+    assert names(page) == ["V1", "V2", "V3", "V4", "V5", "V10"], "numbers in names count as numbers"
+    heads["vehicle"].click()
+    assert names(page) == ["V10", "V5", "V4", "V3", "V2", "V1"]
+    heads["sum before"].click()
+    assert names(page)[:2] == ["V5", "V1"]
+    assert heads["sum before"].find_element(By.XPATH, "..").get_attribute("aria-sort") == "descending"
+    assert heads["vehicle"].find_element(By.XPATH, "..").get_attribute("aria-sort") is None
+
+
+def test_what_is_listed_can_be_saved(page: webdriver.Chrome) -> None:
+    page.execute_script(
+        "URL.createObjectURL = (blob) => { window.saved = blob; return '#'; }; document.getElementById('save').click();"
+    )
+    lines = page.execute_async_script("const end = arguments[0]; window.saved.text().then(end)").splitlines()
+    assert lines[0].startswith('"vehicle","verdict","confidence","junction_rms_measured_a"')
+    assert '"V1","corrected",0.9700,24.000,0.500,0.0100,0.10000,4.000,1,0.00000,0.000,0' in lines
+    assert len(lines) == 7
+
+
+def test_the_keyboard_reaches_a_vehicle(page: webdriver.Chrome) -> None:
+    page.find_element(By.ID, "find").send_keys("V10")
+    until(page, "return document.getElementById('count').textContent.startsWith('1 of 6')")
+    focused = page.switch_to.active_element
+    for _ in range(40):
+        focused.send_keys(Keys.TAB)
+        focused = page.switch_to.active_element
+        if focused.text == "V10":
+            break
+    assert focused.text == "V10"
+    focused.send_keys(Keys.ENTER)
+    until(page, "return document.getElementById('vehicle').dataset.vehicle === 'V10'")
+    assert page.switch_to.active_element.get_attribute("id") == "vehicle"
+
+
+def test_headings_are_in_order_and_controls_have_names(page: webdriver.Chrome) -> None:
+    levels = [int(head.tag_name[1]) for head in page.find_elements(By.CSS_SELECTOR, "h1, h2, h3, h4")]
+    assert levels[0] == 1
+    assert levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in pairwise(levels))
+    controls = page.find_elements(By.CSS_SELECTOR, "input, select, button")
+    assert [control.get_attribute("id") for control in controls if not control.accessible_name] == []
+    assert page.execute_script("return document.documentElement.lang") == "en"
+    assert "at hand" in page.title
+
+
+def test_text_can_be_read_against_its_background(page: webdriver.Chrome) -> None:
+    page.execute_script("location.hash = 'vehicle=V4'")
+    until(page, "return document.getElementById('vehicle').dataset.vehicle === 'V4'")
+    found = page.execute_script(CONTRAST)
+    assert len(found) > 100
+    assert [item for item in found if item[0] < LEAST_CONTRAST] == []
+
+
+def test_the_page_of_a_vehicle_opens_without_an_error(browser: webdriver.Chrome, result: Path, tmp_path: Path) -> None:
+    path = tmp_path / "V1.html"
+    path.write_text(vehicle_report(result, "V1")[0])
+    browser.get_log("browser")
+    browser.get(f"file://{path}")
+    assert browser.get_log("browser") == []
+    assert browser.find_element(By.TAG_NAME, "h1").text == "Vehicle V1"
+    sizes = browser.execute_script(
+        "return [...document.querySelectorAll('svg')].map((drawing) => drawing.getBoundingClientRect().width)"
+    )
+    assert len(sizes) == 2
+    assert min(sizes) > 300
+    assert [item for item in browser.execute_script(CONTRAST) if item[0] < LEAST_CONTRAST] == []

@@ -1,0 +1,69 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.calibrator.test_results import run_command
+
+
+def test_the_page_of_the_fleet_is_written(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "new" / "page.html"
+    assert run_command(["report", str(result), "--out", str(out)]) == 0
+    assert out.read_text().startswith("<!DOCTYPE html>")
+    assert capsys.readouterr().out == f"{out}: {out.stat().st_size / 1e6:.1f} MB; open it in a browser\n"
+
+
+def test_its_numbers_come_as_json(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "page.html"
+    assert run_command(["report", str(result), "--out", str(out), "--json", "--limit", "300"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["bytes"] == out.stat().st_size
+    assert found["overview"]["verdicts"] == {"corrected": 2, "no sensor fault": 2, "cannot tell": 2}
+    assert found["protection"]["limit_a"] == 300.0
+
+
+def test_the_page_of_a_vehicle_is_named_after_it(
+    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run_command(["report", str(result), "--vehicle", "V3", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["page"] == "V3.html"
+    assert found["parameters"]["hardware_fault"]["drift"] == -0.06
+    assert "For the workshop" in (tmp_path / "V3.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--vehicle", "V1", "--limit", "300"], "--limit: belongs to the page of the fleet"),
+        (["--drives", "d", "--layout", "l"], "--drives: belongs to the page of one vehicle"),
+        (["--vehicle", "V1", "--drives", "d"], "drives need the layout"),
+        (["--limit", "-3"], "expected a number from 0.1 to 10000"),
+    ],
+)
+def test_options_that_do_not_belong_together_are_refused(
+    result: Path, tmp_path: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "page.html"
+    assert run_command(["report", str(result), "--out", str(out), *options]) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda folder: folder / "missing", "not a result of 'calibrator calibrate'"),
+        (lambda folder: folder, "not a result of 'calibrator calibrate'"),
+    ],
+)
+def test_what_is_no_result_is_told_in_one_line(
+    tmp_path: Path, make: "object", message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert callable(make)
+    assert run_command(["report", str(make(tmp_path)), "--out", str(tmp_path / "page.html")]) == 1
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert message in told
+    assert not (tmp_path / "page.html").exists()
