@@ -75,6 +75,10 @@ def _codes(texts: NDArray[np.object_], kinds: Sequence[str]) -> Array:
     return np.array([code.get(text, np.nan) for text in texts.ravel()]).reshape(texts.shape)
 
 
+TRIED = 4000
+"""Vehicles whose details tell how much room those of others need."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Details:
     """Evidence and explanations of the first vehicles that are listed.
@@ -112,12 +116,19 @@ def details_within(table: FleetTable, evidence: Evidence, listed: NDArray[np.int
         Of the first of them.
     """
     told = len(listed)
+    if told > TRIED:
+        tried = _details(table, evidence, listed[:TRIED])
+        told = min(told, int(0.98 * TRIED * max(room, 0) / max(_size(tried), 1)))
     while True:
         details = _details(table, evidence, listed[:told])
-        size = len(details.texts) + len(details.evidence.data)
+        size = _size(details)
         if size <= room or not told:
             return details
         told = int(told * min(max(room, 0) / size, 0.95))
+
+
+def _size(details: Details) -> int:
+    return len(details.texts) + len(details.evidence.data)
 
 
 def row_steps(evidence: Evidence) -> Array:
