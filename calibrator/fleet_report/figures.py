@@ -98,7 +98,11 @@ def margin_figure(found: Margins) -> Figure:
         _histogram(found.before_a, edges, "as measured", BEFORE),
         _histogram(found.after_a, edges, "after correction", AFTER),
     ]
-    layout = _layout(height=300, x=f"margin a vehicle needs at {found.limit_a:g} A [A]", y="vehicles")
+    layout = _layout(
+        height=300,
+        x=f"what a sensor is off by, and the margin needed after correction, at {found.limit_a:g} A [A]",
+        y="vehicles",
+    )
     layout |= _marks(
         {
             f"one for all as measured: {found.common_before_a:.1f} A": (found.common_before_a, BEFORE),

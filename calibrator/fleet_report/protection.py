@@ -1,15 +1,17 @@
 """What the battery's protection margin costs before and after correction, figure 1 of [1]_.
 
 A controller that may let a current limit I flow must stay below it by what its sensor can be wrong by, or the true
-current passes the limit. Of the sensor model i_m = (1 + d) i + o a vehicle needs at the limit, in both directions, the
-margin
+current passes the limit. Of the sensor model i_m = (1 + d) i + o it is off by |d| I + |o| at the limit, in one direction
+or the other, and a margin that is one for all vehicles is set for the worst sensor of the fleet:
 
-    before:  |d| I + |o| + z s              after:  z s of a branch that is corrected, else as before
+    as measured:       M = worst of |d| I + |o|
+    after correction:  z s where the branch is corrected or no fault was found, else |d| I + |o| + z s; at most M
     s^2 = (I s_d)^2 + s_o^2
 
-with d, o and their standard deviations s_d, s_o from the posterior. Today a margin is one for all vehicles and is set
-for the worst sensor. A correction gives back the difference to the margin that one needs with it: one for all again,
-which the worst vehicle that cannot be corrected decides, or one per vehicle, as each has its own parameters.
+with d, o and their standard deviations s_d, s_o from the posterior. Its doubt counts only against the correction, so what
+is given back is not made larger by what is not known. It is the difference of M to the margin that one needs then: one
+for all again, which the worst vehicle that cannot be corrected decides, or one per vehicle, as each has its own
+parameters.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -36,8 +38,10 @@ class Margins:
     ----------
     limit_a : float
         The battery's current limit I. [A]
-    before_a, after_a : ndarray of shape (N,)
-        What each vehicle needs at the limit. [A]
+    before_a : ndarray of shape (N,)
+        What each sensor is off by at the limit. [A]
+    after_a : ndarray of shape (N,)
+        Margin that each vehicle needs after correction. [A]
     """
 
     limit_a: float
@@ -80,8 +84,9 @@ def margins(
         Before and after correction.
     """
     doubt_a = SIGMAS * np.hypot(limit_a * np.nan_to_num(drift_sd), np.nan_to_num(offset_sd_a))
-    before_a = np.abs(drift) * limit_a + np.abs(offset_a) + doubt_a
-    return Margins(limit_a=limit_a, before_a=before_a, after_a=np.where(applied, doubt_a, before_a))
+    off_a = np.abs(drift) * limit_a + np.abs(offset_a)
+    needed_a = doubt_a + np.where(applied, 0.0, off_a)
+    return Margins(limit_a=limit_a, before_a=off_a, after_a=np.minimum(needed_a, _for_all(off_a)))
 
 
 def _for_all(needed_a: Array) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from bench import fleet_run, identification, ingest, node, posterior
+from bench import fleet_report, fleet_run, identification, ingest, node, posterior
 from bench.row import Row
 
 GROUPS: dict[str, Callable[..., list[Row]]] = {
@@ -18,6 +18,7 @@ GROUPS: dict[str, Callable[..., list[Row]]] = {
     "ingest": ingest.rows,
     "fleet run": fleet_run.rows,
     "node": node.rows,
+    "fleet report": fleet_report.rows,
 }
 OUT = Path("build") / "bench.json"
 

@@ -16,7 +16,7 @@ def of(applied: list[bool], *, sd: float = 0.0, limit_a: float = 400.0, scale: f
 def test_a_vehicle_needs_what_its_sensor_is_off_by_at_the_limit() -> None:
     found = of([False] * 4)
     np.testing.assert_allclose(found.before_a, [44.0, 44.0, 0.0, 9.0])
-    np.testing.assert_array_equal(found.before_a, found.after_a)
+    np.testing.assert_array_equal(found.after_a, found.before_a)
     np.testing.assert_allclose(found.own_gain_a, [0.0, 0.0, 44.0, 35.0])
 
 
@@ -24,7 +24,18 @@ def test_a_corrected_sensor_needs_its_uncertainty_alone() -> None:
     found = of([True] * 4, sd=0.001)
     expected = SIGMAS * np.hypot(0.4, 0.1)
     np.testing.assert_allclose(found.after_a, expected)
-    np.testing.assert_allclose(found.before_a, np.array([44.0, 44.0, 0.0, 9.0]) + expected)
+    np.testing.assert_allclose(found.before_a, [44.0, 44.0, 0.0, 9.0])
+
+
+def test_doubt_gives_nothing_back() -> None:
+    found = of([False] * 4, sd=0.01)
+    doubt_a = SIGMAS * np.hypot(4.0, 1.0)
+    np.testing.assert_allclose(found.after_a, [44.0, 44.0, doubt_a, 9.0 + doubt_a])
+    assert found.common_before_a - found.common_after_a == 0.0
+
+
+def test_no_vehicle_needs_more_than_what_is_set_for_the_worst() -> None:
+    np.testing.assert_allclose(of([True, False, True, False], sd=0.5).after_a, 44.0)
 
 
 def test_one_margin_for_all_falls_no_lower_than_the_worst_that_is_not_corrected() -> None:

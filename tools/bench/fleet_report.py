@@ -1,0 +1,221 @@
+"""The page of a large fleet: how long it takes to write, how large it is, and how soon a browser has it ready."""
+
+import argparse
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from msgspec.structs import replace
+from selenium import webdriver
+from selenium.webdriver.chrome.options import Options
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.support.wait import WebDriverWait
+
+from bench.row import Row
+from calibrator.evidence.vehicle_evidence import VehicleEvidence, evidence_names
+from calibrator.fleet_report.write import ReportOptions, fleet_report
+from calibrator.identification.filter_bank import plain_bank
+from calibrator.results import RunRecord, encode_chunk, join_rows, write_parameter_files, write_run
+from calibrator.summaries.unity import UNITY_FILE, UnityWindow
+from ecu_node.parameters import (
+    BranchParameters,
+    Explanation,
+    FileReference,
+    HardwareFault,
+    JunctionResidual,
+    Provenance,
+    VehicleParameters,
+)
+
+__all__ = ["rows"]
+
+FLEET, QUICK_FLEET = 100_000, 2_000
+BRANCHES = ("battery", "motor", "auxiliary")
+FULL_SCALE_A = 400.0
+READ_OUT_A = {"battery": [60.0, 10.0, 1.0], "motor": [-50.0, -5.0, 0.0], "auxiliary": [-10.0, -5.0, -1.0]}
+FAULTY, UNDECIDED, SUSPECTED = 0.2, 0.1, 0.02
+"""Share of the sensors with a fault, of the vehicles of which it cannot be told, and with a hardware fault. [1]"""
+OPENED = 5
+"""How often the page is opened; the median counts."""
+PATIENCE_S = 120.0
+NOTHING = FileReference(name="none", sha256="0" * 64)
+
+
+def rows(*, quick: bool) -> list[Row]:
+    """Measure.
+
+    Parameters
+    ----------
+    quick : bool
+        A small fleet.
+
+    Returns
+    -------
+    list of Row
+        Seconds to write the page, its size, and seconds from opening it to its being ready.
+    """
+    vehicles = QUICK_FLEET if quick else FLEET
+    with tempfile.TemporaryDirectory() as folder:
+        result, page = make_result(Path(folder) / "result", vehicles), Path(folder) / "report.html"
+        started = time.perf_counter()
+        text, _ = fleet_report(result, ReportOptions())
+        page.write_text(text)
+        written_s = time.perf_counter() - started
+        ready_s = ready_times_s(page)
+        what = f"report of {vehicles} vehicles"
+        return [
+            Row(name=f"{what}: written", value=written_s, unit="s"),
+            Row(name=f"{what}: size", value=page.stat().st_size / 1e6, unit="MB"),
+            Row(name=f"{what}: ready in Chromium, median of {OPENED}", value=float(np.median(ready_s)), unit="s"),
+        ]
+
+
+def make_result(folder: Path, vehicles: int) -> Path:
+    """Write a result as a calibration does, with faults drawn as in the paper."""
+    rng = np.random.default_rng(0)
+    items = [drawn_vehicle(rng, f"WVW{number:014d}", vehicles) for number in range(vehicles)]
+    folder.mkdir()
+    evidence = {item.vehicle: drawn_evidence(rng, item) for item in items}
+    chunk = encode_chunk(items, {}, evidence=evidence)
+    rows_file, part = folder / "rows", folder / "part"
+    rows_file.write_bytes(chunk.rows)
+    part.write_bytes(chunk.parameters)
+    join_rows(folder, [rows_file], {})
+    write_parameter_files(folder, {0: part}, vehicles=10**9)  # in parts, as of every large fleet
+    rows_file.unlink()
+    part.unlink()
+    (folder / UNITY_FILE).write_bytes(window().encoded())
+    write_run(folder, replace(RUN, vehicles=vehicles))
+    return folder
+
+
+def drawn_vehicle(rng: np.random.Generator, name: str, vehicles: int) -> VehicleParameters:
+    """Parameters of one vehicle."""
+    undecided, suspected = bool(rng.random() < UNDECIDED), bool(rng.random() < SUSPECTED)
+    branches = {branch: drawn_sensor(rng, apply=not undecided) for branch in BRANCHES}
+    found = any(branch.drift or branch.offset_a for branch in branches.values())
+    explanations = [
+        Explanation(probability=p, drift={"battery": rng.normal(0.0, 0.1)}, offset_a={"motor": rng.normal()})
+        for p in ((0.5, 0.4, 0.1) if undecided else ())
+    ]
+    hardware_drift = 0.1 * rng.normal() if suspected else 0.0
+    return VehicleParameters(
+        vehicle=name,
+        layout=NOTHING,
+        dbc=NOTHING,
+        verdict="cannot tell" if undecided else "corrected" if found else "no sensor fault",
+        confidence=rng.uniform(0.3, 1.0),
+        branches=branches,
+        hardware_fault=HardwareFault(suspected=suspected, probability=rng.random(), drift=hardware_drift),
+        explanations=explanations,
+        deciding_evidence=f"a zero-current window would decide: {rng.normal():+.1f} A" if undecided else "",
+        junction_residual=JunctionResidual(measured_a=rng.exponential(20.0), corrected_a=rng.exponential(1.0)),
+        provenance=Provenance(
+            tool="bench",
+            method="posterior",
+            created="2026-01-01T00:00:00Z",
+            fleet="bench",
+            fleet_size=vehicles,
+            drives=["d"],
+            duration_s=rng.uniform(600.0, 36000.0),
+        ),
+    )
+
+
+def drawn_sensor(rng: np.random.Generator, *, apply: bool) -> BranchParameters:
+    """One sensor, with a fault or not."""
+    drift, offset = (
+        float(rng.choice([-1.0, 1.0])) * rng.uniform(0.05, 0.25) if rng.random() < FAULTY else 0.0 for _ in range(2)
+    )
+    faulty = drift != 0.0 or offset != 0.0
+    return BranchParameters(
+        drift=drift,
+        offset_a=offset * FULL_SCALE_A,
+        drift_sd=rng.exponential(0.002),
+        offset_sd_a=rng.exponential(0.3),
+        apply=apply and faulty,
+        held_back="harm limit" if faulty and not apply else None,
+        delay_s=rng.normal(0.0, 0.02),
+        fault_probability=rng.random(),
+        harm_probability=0.001 * rng.random(),
+    )
+
+
+def drawn_evidence(rng: np.random.Generator, item: VehicleParameters) -> VehicleEvidence:
+    """Rows as full of digits as real ones."""
+    drift = [branch.drift for branch in item.branches.values()]
+    count = 5 * len(BRANCHES)
+    value = rng.normal(0.0, 10.0, count)
+    value[: len(drift)] = 1.0 + np.array(drift)
+    unread = {5, 6, 7, 12, 13, 14}
+    sd = rng.exponential(0.1, count)
+    return VehicleEvidence(
+        value=[None if r in unread else float(value[r]) for r in range(count)],
+        sd=[None if r in unread else float(sd[r]) for r in range(count)],
+        explained=(value + sd * rng.normal(size=count)).tolist(),
+    )
+
+
+def window() -> UnityWindow:
+    """A minute of two inputs."""
+    time_s = 0.1 * np.arange(600)
+    columns = np.column_stack([np.sin(0.2 * time_s), np.cos(0.5 * time_s)])
+    bank = plain_bank(("a", "b"), period_s=0.1)
+    return UnityWindow(vehicle="v", drive="d", time_s=time_s, columns=columns, voltage_v=360.0, bank=bank)
+
+
+RUN = RunRecord(
+    tool="bench",
+    method="posterior",
+    fleet="bench",
+    layout="bench",
+    branches=list(BRANCHES),
+    model_inputs=[],
+    settings={},
+    created="2026-01-01T00:00:00Z",
+    details={
+        "evidence": evidence_names(BRANCHES),
+        "reference": {"read_out": READ_OUT_A},
+    },
+    vehicles=1,
+    full_scale_a=FULL_SCALE_A,
+    left_out={},
+    notices=[],
+)
+
+
+def ready_times_s(page: Path) -> list[float]:
+    """From opening the page in Chromium to its table and first figures being ready, as the page itself tells. [s]"""
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        raise SystemExit("bench: no chromium and chromedriver here (Debian: apt-get install chromium chromium-driver)")
+    options = Options()
+    options.binary_location = chromium
+    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,1000"):
+        options.add_argument(argument)
+    browser = webdriver.Chrome(options=options, service=Service(driver))
+    try:
+        found = []
+        for _ in range(OPENED):
+            browser.get(f"file://{page}")
+            ready = WebDriverWait(browser, PATIENCE_S).until(
+                lambda it: it.execute_script("return document.body.dataset.ready || document.body.dataset.failed")
+            )
+            found.append(float(ready) / 1e3)
+        return found
+    finally:
+        browser.quit()
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="a small fleet")
+    for row in rows(quick=parser.parse_args().quick):
+        print(f"{row.name}: {row.value:.3g} {row.unit}")
+
+
+if __name__ == "__main__":
+    main()
