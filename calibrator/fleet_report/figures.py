@@ -100,7 +100,7 @@ def margin_figure(found: Margins) -> Figure:
     ]
     layout = _layout(
         height=300,
-        x=f"what a sensor is off by, and the margin needed after correction, at {found.limit_a:g} A [A]",
+        x=f"off by as measured, margin needed after correction, at {found.limit_a:g} A [A]",
         y="vehicles",
     )
     layout |= _marks(

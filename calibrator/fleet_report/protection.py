@@ -1,17 +1,17 @@
 """What the battery's protection margin costs before and after correction, figure 1 of [1]_.
 
 A controller that may let a current limit I flow must stay below it by what its sensor can be wrong by, or the true
-current passes the limit. Of the sensor model i_m = (1 + d) i + o it is off by |d| I + |o| at the limit, in one direction
+current passes the limit. By the model i_m = (1 + d) i + o it is off by |d| I + |o| at the limit in one direction
 or the other, and a margin that is one for all vehicles is set for the worst sensor of the fleet:
 
     as measured:       M = worst of |d| I + |o|
     after correction:  z s where the branch is corrected or no fault was found, else |d| I + |o| + z s; at most M
     s^2 = (I s_d)^2 + s_o^2
 
-with d, o and their standard deviations s_d, s_o from the posterior. Its doubt counts only against the correction, so what
-is given back is not made larger by what is not known. It is the difference of M to the margin that one needs then: one
-for all again, which the worst vehicle that cannot be corrected decides, or one per vehicle, as each has its own
-parameters.
+with d, o and their standard deviations s_d, s_o from the posterior. Its doubt counts only against the correction, so
+what is given back is not made larger by what is not known. It is the difference of M to the margin that one needs
+then: one for all again, which the worst vehicle that cannot be corrected decides, or one per vehicle, as each has its
+own parameters.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
