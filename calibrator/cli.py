@@ -56,8 +56,9 @@ from calibrator.command_options import (
     require_own_options,
     require_truth_where_used,
 )
+from calibrator.commands import command_app, run_app
 from calibrator.doctor.command import doctor
-from calibrator.errors import ContradictionError, LogError
+from calibrator.errors import LogError
 from calibrator.export.command import export
 from calibrator.fleet_report.command import report
 from calibrator.folders import require_new_folder, require_possible_file, require_possible_folder
@@ -71,49 +72,23 @@ from calibrator.report.text import dumps
 from calibrator.signing.command import keys, revoke, sign
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.errors import UserError
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_atomically
-from ecu_node.standard_output import flush_output, write_output
+from ecu_node.standard_output import write_output
 
 if TYPE_CHECKING:
     from calibrator.artificial.truth import FleetTruth
 
 __all__ = ["app", "main"]
 
-app = typer.Typer(
-    help="Learn from recorded drives what each vehicle's high-voltage current sensors do wrong.",
-    epilog="Exit codes: 0 done, 1 failed, 2 wrong use, 130 interrupted.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
+app = command_app(
+    help="Learn from recorded drives what each vehicle's high-voltage current sensors do wrong.", no_args_is_help=True
 )
 
 
 def main() -> int:
-    """Run the command line and return its exit code: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
-    debug = "--debug" in sys.argv[1:]
-    try:
-        app(args=[argument for argument in sys.argv[1:] if argument != "--debug"], prog_name="calibrator")
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else 0
-    except BrokenPipeError:
-        raise
-    except (UserError, OSError) as error:
-        if debug:
-            raise
-        flush_output()  # if it was standard output that failed, this says so
-        print(f"calibrator: {_words(error)}", file=sys.stderr)
-        return 2 if isinstance(error, ContradictionError) else 1
-    return 0
-
-
-def _words(error: UserError | OSError) -> str:
-    if isinstance(error, UserError):
-        return str(error)
-    return f"{error.filename or 'file or standard output'}: {error.strerror or error}"
+    """Run the command line and return its exit code, see :data:`calibrator.commands.EXIT_CODES`."""
+    return run_app(app, "calibrator", sys.argv[1:])
 
 
 def _version(wanted: bool) -> None:
@@ -127,6 +102,7 @@ def _root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error; may stand anywhere.")] = False,
 ) -> None:
     """Learn from recorded drives what each vehicle's high-voltage current sensors do wrong."""
 

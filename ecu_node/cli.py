@@ -1,7 +1,8 @@
 """Command line of the node: ``ecu-node run``, ``ecu-node monitor``, ``ecu-node check``, ``ecu-node template``.
 
 Results go to standard output, what happens to standard error. Exit code 0: done, 1: failed, 2: wrong use,
-130: interrupted by Ctrl-C before the node was at work (at work, Ctrl-C and SIGTERM end it with 0).
+70: a fault of the program itself, 130: interrupted by Ctrl-C before the node was at work (at work, Ctrl-C and SIGTERM
+end it with 0). Errors are one line; ``--debug``, anywhere, shows the traceback as well.
 """
 
 import argparse
@@ -13,16 +14,14 @@ import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ecu_node import __version__
-from ecu_node.errors import UserError, printable
+from ecu_node.command_parser import CommandParser
+from ecu_node.errors import printable
+from ecu_node.failures import DEBUG, DEBUG_HELP, DEBUG_HINT, end_of, split_debug
 from ecu_node.interrupts import ending_at_interrupt, ignoring_hangups
 from ecu_node.standard_output import drop_output, flush_output, write_output
 from ecu_node.template import add_template_command
-
-if TYPE_CHECKING:
-    from _typeshed import SupportsWrite
 from ecu_node.trust.commands import add_trust_commands
 
 __all__ = ["main"]
@@ -31,7 +30,10 @@ _VEHICLE_VARIABLE = "ECU_NODE_VEHICLE"
 _LONGEST_ONCE_S = 86400.0
 """For ``monitor --once``. [s]"""
 _LARGEST_PORT = 65535
-_EXIT_CODES = "Exit codes: 0 done (also when ended by a signal), 1 failed, 2 wrong use, 130 interrupted at start."
+_EXIT_CODES = (
+    "Exit codes: 0 done (also when ended by a signal), 1 failed, 2 wrong use, 70 internal error, 130 interrupted at "
+    "start."
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -45,46 +47,39 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0 done, 1 failed. Wrong use ends in SystemExit(2), Ctrl-C during start-up ends the process with 130.
+        Exit code: 0 done, 1 failed, 70 a fault of the program itself. Wrong use ends in SystemExit(2), Ctrl-C during
+        start-up ends the process with 130.
     """
+    arguments, debug = split_debug(sys.argv[1:] if argv is None else argv)
     try:
         with ending_at_interrupt("ecu-node: interrupted"):
             try:
-                return _main(argv)
+                return _main(arguments)
             finally:
                 flush_output()
-    except UserError as error:
-        _say(str(error))
     except BrokenPipeError:
         drop_output()
-    return 1
+        return 1
+    except Exception as error:  # noqa: BLE001 (each is told, and ends the program)
+        return end_of("ecu-node", error, debug=debug)
 
 
-def _main(argv: Sequence[str] | None) -> int:
-    options = _parser().parse_args(argv)
+def _main(arguments: Sequence[str]) -> int:
+    options = _parser().parse_args(arguments)
     with ignoring_hangups() if options.command is _run else nullcontext():
         logging.getLogger("can").addHandler(logging.NullHandler())
         _load_python_can()
         return int(options.command(options))
 
 
-class _Parser(argparse.ArgumentParser):
-    """Says that help cannot be written, where argparse would end as if it were."""
-
-    def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
-        if file is not None and file is sys.stdout:
-            write_output(message.removesuffix("\n"))
-        else:
-            super()._print_message(message, file)
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = CommandParser(
         prog="ecu-node",
         description="Corrects the high-voltage currents on a CAN bus with the parameters of this vehicle.",
         epilog=_EXIT_CODES,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    parser.add_argument(DEBUG, action="store_true", help=DEBUG_HELP)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     run = commands.add_parser(
         "run",
@@ -121,7 +116,7 @@ def _parser() -> argparse.ArgumentParser:
         help="would these parameters be applied?",
         description="Checks parameters against layout, DBC and vehicle, and shows the integer plan of each branch. "
         "What it accepts, 'ecu-node run' accepts.",
-        epilog="Exit codes: 0 they fit, 1 they do not, 2 wrong use, 130 interrupted.",
+        epilog="Exit codes: 0 they fit, 1 they do not, 2 wrong use, 70 internal error, 130 interrupted.",
     )
     _add_files(check)
     check.add_argument("--gateway", action="store_true", help="as a gateway would apply them")
@@ -130,10 +125,12 @@ def _parser() -> argparse.ArgumentParser:
     add_template_command(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of the parameter file")
     schema.set_defaults(command=_schema)
+    for command in commands.choices.values():
+        command.epilog = f"{command.epilog or _EXIT_CODES} {DEBUG_HINT}"
     return parser
 
 
-def _add_monitor(commands: "argparse._SubParsersAction[_Parser]") -> None:
+def _add_monitor(commands: "argparse._SubParsersAction[CommandParser]") -> None:
     monitor = commands.add_parser(
         "monitor",
         help="show the branches, their sum and the node, live",
@@ -141,7 +138,7 @@ def _add_monitor(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "Kirchhoff sum, and what the node says of itself. A table in a terminal (needs rich), else a block of text "
         "per second.",
         epilog="Exit codes: 0 done (also when ended by a signal), 1 failed, or with --once no branch was seen, "
-        "2 wrong use, 130 interrupted at start.",
+        "2 wrong use, 70 internal error, 130 interrupted at start.",
     )
     _add_layout(monitor)
     _add_bus(monitor)

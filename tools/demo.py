@@ -21,6 +21,7 @@ import can
 import typer
 
 from calibrator.artificial.truth import FleetTruth, read_truth
+from calibrator.commands import command_app, run_tool
 from calibrator.errors import FleetError
 from calibrator.report.progress import progress_bar
 from ecu_node.buses import SteadyBus
@@ -46,12 +47,7 @@ SECONDS = 40.0
 MARKER = ".made-by-demo"
 
 
-app = typer.Typer(
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+app = command_app()
 
 
 @app.command()
@@ -65,10 +61,7 @@ def main(
 ) -> None:
     """Simulate a fleet, calibrate it, drive one vehicle through the node, and show the Kirchhoff sum."""
     started = time.monotonic()
-    try:
-        show(drives, out)
-    except UserError as error:
-        fail(str(error))
+    show(drives, out)
     say(f"done in {time.monotonic() - started:.0f} s; everything is in {out}")
 
 
@@ -107,7 +100,7 @@ def show(drives: str, out: Path) -> None:
 def make_empty(out: Path) -> None:
     """Empty the folder of an earlier demo, and no other."""
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / MARKER).exists())):
-        fail(f"{out}: is not empty and was not made by the demo; choose another folder")
+        raise UserError(f"{out}: is not empty and was not made by the demo; choose another folder")
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     (out / MARKER).touch()
@@ -117,7 +110,7 @@ def import_recordings(folder: str, out: Path) -> str:
     """Import BMW i3 recordings into a store and return its path."""
     files = sorted([*Path(folder).glob("*.csv"), *Path(folder).glob("*.csv.gz")])
     if not files:
-        fail(f"{folder}: no .csv or .csv.gz in it; give the folder of the BMW i3 recordings, or leave DRIVES out")
+        raise UserError(f"{folder}: no .csv or .csv.gz in it; give that of the BMW i3 recordings, or leave DRIVES out")
     step(0, f"{len(files)} recorded trips of a BMW i3 become drives")
     run(
         *(sys.executable, "tools/import_bmw_i3.py", *files, "--layout", LAYOUT, "--out", out / "store"),
@@ -187,13 +180,13 @@ def node_process(parameters: Path, vehicle: str, interface: str, channel: str) -
             assert process.stderr is not None
             while "running on" not in (line := process.stderr.readline()):
                 if not line:
-                    fail("the node ended at once")
+                    raise UserError("the node ended at once")
                 say(line.rstrip())
             yield
         finally:
             process.terminate()
     if process.returncode:
-        fail(f"the node ended with exit code {process.returncode}")
+        raise UserError(f"the node ended with exit code {process.returncode}")
 
 
 @contextmanager
@@ -202,7 +195,7 @@ def node_thread(parameters: Path, vehicle: str, interface: str, channel: str) ->
     database = read_database(read_layout(ROOT / LAYOUT))
     in_force, why_not = choose_parameters(parameters, database, vehicle)
     if why_not is not None:
-        fail(why_not)
+        raise UserError(why_not)
     stop = threading.Event()
     corrector = wire(database, in_force, time.monotonic())
     bus = SteadyBus(
@@ -269,11 +262,5 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
-def fail(text: str) -> None:
-    """Print one line and stop."""
-    print(f"demo: {text}", file=sys.stderr)
-    raise SystemExit(1)
-
-
 if __name__ == "__main__":
-    app()
+    run_tool(app, "demo")

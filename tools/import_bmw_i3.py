@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from calibrator.commands import command_app, run_tool
 from calibrator.drives.store import has_drive, require_plain_name, write_drive
 from calibrator.errors import LogError
 from calibrator.folders import require_possible_folder
@@ -25,12 +26,7 @@ from ecu_node.layout import read_layout
 _SUFFIXES = (".csv", ".csv.gz")
 
 
-app = typer.Typer(
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+app = command_app()
 
 
 @app.command()
@@ -153,4 +149,4 @@ def _print_account(account: Account, *, as_json: bool) -> None:
 
 
 if __name__ == "__main__":
-    app()
+    run_tool(app, "import_bmw_i3")

@@ -20,13 +20,15 @@ from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import CLASSIC_BYTES, EXTENDED_BIT, Frames
 from calibrator.recordings.frames import LOG_SUFFIXES, read_frames
 from ecu_node.buses import connect
-from ecu_node.errors import BusError, UserError
+from ecu_node.command_parser import CommandParser
+from ecu_node.errors import BusError
+from ecu_node.failures import DEBUG, DEBUG_HELP, end_of, split_debug
 
 __all__ = ["main", "read_log", "replay"]
 
 _INTERRUPTED = 130
 """Exit code that shells give to a program ended by SIGINT."""
-_EXIT_CODES = "Exit codes: 0 done, 1 failed, 2 wrong use, 130 interrupted."
+_EXIT_CODES = "Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted."
 _SEND_LIMIT_S = 1.0
 """A bus that takes nothing for this long has nobody listening, or is off. [s]"""
 _SEND_PAUSE_S = 0.0005
@@ -118,7 +120,8 @@ def replay(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code: 0 done, 1 failed, 130 interrupted. Wrong use ends in SystemExit(2)."""
-    options = _parser().parse_args(argv)
+    arguments, debug = split_debug(sys.argv[1:] if argv is None else argv)
+    options = _parser().parse_args(arguments)
     logging.getLogger("can").addHandler(logging.NullHandler())
     show = _Progress()
     try:
@@ -126,10 +129,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         show.start()
         with connect(options.interface, options.channel, fd=options.fd) as bus:
             sent = replay(messages, bus, speed=options.speed, progress=show)
-    except UserError as error:
+    except Exception as error:  # noqa: BLE001 (each is told, and ends the program)
         show.close()
-        print(f"replay: {error}", file=sys.stderr)
-        return 1
+        return end_of("replay", error, debug=debug)
     except KeyboardInterrupt:
         show.close()
         print(f"replay: interrupted after {show.sent} frames", file=sys.stderr)
@@ -140,12 +142,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="replay.py", description="Plays a CAN log onto a bus.", epilog=_EXIT_CODES)
+    parser = CommandParser(prog="replay.py", description="Plays a CAN log onto a bus.", epilog=_EXIT_CODES)
     parser.add_argument("log", type=Path, metavar="LOG", help=f"log file: {' '.join(LOG_SUFFIXES)}, each also .gz")
     parser.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
     parser.add_argument("--channel", required=True, help="channel of the interface, such as vcan0")
     parser.add_argument("--speed", type=_speed, default=1.0, help="1: as recorded (default), 0: as fast as it goes")
     parser.add_argument("--fd", action="store_true", help="open the bus for CAN FD")
+    parser.add_argument(DEBUG, action="store_true", help=DEBUG_HELP)
     return parser
 
 

@@ -1,25 +1,19 @@
 #!/usr/bin/env python3
 """How well sensors that are not linear are corrected: a fleet is drawn, calibrated, and judged on unseen drives."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from calibrator.commands import command_app, run_tool
 from calibrator.experiments.recorded_fleet import builtin_fleet, read_fleet
 from calibrator.experiments.sensor_fleet import SensorCase, calibrate_sensors, draw_sensors
 from calibrator.experiments.sensor_score import score_sensors
 from ecu_node.database import read_database
-from ecu_node.errors import UserError
 from ecu_node.layout import read_layout
 
-app = typer.Typer(
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+app = command_app()
 
 
 @app.command()
@@ -37,16 +31,13 @@ def main(
     as_json: Annotated[bool, typer.Option("--json", help="Print the counts as JSON.")] = False,
 ) -> None:
     """Draw a fleet with sensors that are not linear, calibrate it, and count what became of them."""
-    try:
-        database = read_database(read_layout(layout))
-        recorded = builtin_fleet(database) if drives is None else read_fleet(drives, database)
-        case = SensorCase(vehicles=vehicles, branches=branches, share=share, sparsity=sparsity)
-        fleet = draw_sensors(recorded, case, seed)
-        score = score_sensors(fleet, *calibrate_sensors(fleet, database), database)
-    except UserError as error:
-        sys.exit(f"{Path(sys.argv[0]).name}: {error}")
+    database = read_database(read_layout(layout))
+    recorded = builtin_fleet(database) if drives is None else read_fleet(drives, database)
+    case = SensorCase(vehicles=vehicles, branches=branches, share=share, sparsity=sparsity)
+    fleet = draw_sensors(recorded, case, seed)
+    score = score_sensors(fleet, *calibrate_sensors(fleet, database), database)
     typer.echo(score.as_json() if as_json else score.as_text())
 
 
 if __name__ == "__main__":
-    app()
+    run_tool(app, "sensor_models")

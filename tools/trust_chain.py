@@ -6,7 +6,6 @@ node takes its signed file, tries it, and corrects a drive that nobody has seen.
 are on trial: with signs turned, and of another vehicle.
 """
 
-import sys
 import tempfile
 from pathlib import Path
 from typing import Annotated
@@ -15,19 +14,14 @@ import typer
 
 from calibrator.artificial.simulate import FleetPlan
 from calibrator.artificial.trips import choose_trips
+from calibrator.commands import command_app, run_tool
 from calibrator.report.text import dumps
 from chain.fleet import draw_fleet
 from chain.whole import drive_chain
 from ecu_node.database import read_database
-from ecu_node.errors import UserError
 from ecu_node.layout import read_layout
 
-app = typer.Typer(
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+app = command_app()
 
 
 @app.command()
@@ -50,33 +44,30 @@ def main(
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
     """Drive a fleet through the whole chain, and count what became of its vehicles."""
-    try:
-        database = read_database(read_layout(layout))
-        trips = choose_trips(
-            drives,
-            database.layout,
-            vehicles=vehicles,
-            seed=seed,
-            duration_s=60.0 * minutes,
-            unseen_s=60.0 * unseen_minutes,
-            common=False,
-        )
-        plan = FleetPlan(
-            vehicles=vehicles,
-            currents=currents,
-            sparsity=sparsity,
-            magnitude=(0.02, 0.1),
-            delay_max_s=0.1,
-            unmeasured_a=unmeasured,
-            seed=seed,
-        )
-        fleet = draw_fleet(plan, trips, database, unseen_s=60.0 * unseen_minutes)
-        with tempfile.TemporaryDirectory(prefix="chain-") as folder:
-            score = drive_chain(fleet, Path(folder), workers=workers)
-    except UserError as error:
-        sys.exit(f"{Path(sys.argv[0]).name}: {error}")
+    database = read_database(read_layout(layout))
+    trips = choose_trips(
+        drives,
+        database.layout,
+        vehicles=vehicles,
+        seed=seed,
+        duration_s=60.0 * minutes,
+        unseen_s=60.0 * unseen_minutes,
+        common=False,
+    )
+    plan = FleetPlan(
+        vehicles=vehicles,
+        currents=currents,
+        sparsity=sparsity,
+        magnitude=(0.02, 0.1),
+        delay_max_s=0.1,
+        unmeasured_a=unmeasured,
+        seed=seed,
+    )
+    fleet = draw_fleet(plan, trips, database, unseen_s=60.0 * unseen_minutes)
+    with tempfile.TemporaryDirectory(prefix="chain-") as folder:
+        score = drive_chain(fleet, Path(folder), workers=workers)
     typer.echo(dumps({**score.counts(), **score.errors_a()}) if as_json else score.as_text())
 
 
 if __name__ == "__main__":
-    app()
+    run_tool(app, "trust_chain")

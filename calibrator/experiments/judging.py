@@ -11,6 +11,7 @@ from calibrator.experiments.outcome import Outcome, confidence_bins, figures_of,
 from calibrator.experiments.result import Figure, Row
 from calibrator.experiments.trial import Trial
 from calibrator.interrupts import in_processes
+from calibrator.report.progress import shown
 
 __all__ = ["Effort", "PaperFigures", "Setting", "run_settings"]
 
@@ -55,7 +56,12 @@ class Effort:
 
 
 def run_settings(
-    settings: Sequence[Setting], methods: Sequence[Method], effort: Effort, *, paper: PaperFigures | None = None
+    settings: Sequence[Setting],
+    methods: Sequence[Method],
+    effort: Effort,
+    *,
+    paper: PaperFigures | None = None,
+    label: str = "experiment",
 ) -> tuple[Row, ...]:
     """Run every method on the same trials of every setting.
 
@@ -69,6 +75,8 @@ def run_settings(
         How many trials.
     paper : mapping or None
         Figures of the paper.
+    label : str
+        Name of the experiment, beside the bar of its progress.
 
     Returns
     -------
@@ -77,13 +85,15 @@ def run_settings(
     """
     seeds = range(effort.seed, effort.seed + effort.repetitions)
     tasks = (delayed(_run_trial)(setting.make_trial, methods, seed) for setting in settings for seed in seeds)
-    judged = iter(in_processes(tasks, workers=effort.jobs))
+    total = len(settings) * len(seeds)
+    judged = iter(shown(in_processes(tasks, workers=effort.jobs), label, total, "trials"))
     rows = []
     for setting in settings:
         trials = [next(judged) for _ in seeds]
         for k, method in enumerate(methods):
             known = (paper or {}).get((setting.x, method.name), {})
             rows.append(_row(setting, method.name, [trial[k] for trial in trials], known))
+    next(judged, None)  # the bar is done
     return tuple(rows)
 
 

@@ -12,7 +12,7 @@ from ecu_node.standard_output import write_output
 
 __all__ = ["add_trust_commands"]
 
-_CODES = "Exit codes: 0 done, 1 refused or failed, 2 wrong use, 130 interrupted."
+_CODES = "Exit codes: 0 done, 1 refused or failed, 2 wrong use, 70 internal error, 130 interrupted."
 
 
 def add_trust_commands(commands: "argparse._SubParsersAction[Any]") -> None:
@@ -59,7 +59,7 @@ def add_trust_commands(commands: "argparse._SubParsersAction[Any]") -> None:
         "verified that the slots and the audit log are as they were written, and that what is in force or on trial "
         "holds now; whether it fits layout and DBC, 'ecu-node run' says.",
         epilog="Exit codes: 0 done, 1 what is in force or on trial cannot be used, the audit log is not whole, or with "
-        "--keys not enough signers, 2 wrong use, 130 interrupted.",
+        "--keys not enough signers, 2 wrong use, 70 internal error, 130 interrupted.",
     )
     inspect.add_argument("what", type=Path, metavar="FILE|FOLDER", help="signed file, or state of a vehicle")
     inspect.add_argument("--keys", type=Path, metavar="FILE", help="key set with which signatures are verified")

@@ -1,0 +1,124 @@
+"""What all command lines made with typer share: how they are set up, and how they end.
+
+Wrong use and errors are one line on standard error, with what to do; ``--debug`` shows the traceback of an error.
+"""
+
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import typer
+
+from calibrator.errors import ContradictionError
+from ecu_node.errors import printable
+from ecu_node.failures import DEBUG_HINT, end_of, split_debug
+from ecu_node.standard_output import drop_output, flush_output
+
+__all__ = ["EXIT_CODES", "command_app", "run_app", "run_tool"]
+
+EXIT_CODES = (
+    f"Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted, 143 ended by SIGTERM. {DEBUG_HINT}"
+)
+INTERRUPTED = 130
+WRONG_USE = 2
+_UsageError: Any = typer.BadParameter.__base__
+"""What wrong use of any kind is derived from; typer gives it no public name."""
+
+
+def command_app(**settings: Any) -> typer.Typer:
+    """Make a command line.
+
+    Parameters
+    ----------
+    **settings
+        Of ``typer.Typer``, beside those that all command lines share.
+
+    Returns
+    -------
+    typer.Typer
+        Without commands; to be run by :func:`run_app`.
+    """
+    return typer.Typer(
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
+        **settings,
+    )
+
+
+def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
+    """Run a command line.
+
+    Parameters
+    ----------
+    app : typer.Typer
+        Made by :func:`command_app`.
+    program : str
+        Its name.
+    arguments : sequence of str
+        Without the program's name; ``--debug`` may stand anywhere.
+
+    Returns
+    -------
+    int
+        Exit code, see :data:`EXIT_CODES`.
+
+    Raises
+    ------
+    BrokenPipeError
+        If the reader of standard output has left.
+    """
+    others, debug = split_debug(arguments)
+    command = typer.main.get_command(app)
+    for each in _all_commands(command):
+        each.epilog = EXIT_CODES
+        each.short_help = (each.help or "").partition("\n\n")[0]  # whole in the list of commands, not cut
+    try:
+        code = command.main(args=others, prog_name=program, standalone_mode=False)
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 0
+    except _UsageError as error:
+        return _end_of_wrong_use(error)
+    except BrokenPipeError:
+        raise
+    except Exception as error:  # noqa: BLE001 (each is told, and ends the program)
+        flush_output()  # if it was standard output that failed, this says so
+        code = end_of(program, error, debug=debug)
+        return WRONG_USE if isinstance(error, ContradictionError) else code
+    return code if isinstance(code, int) else 0
+
+
+def run_tool(app: typer.Typer, program: str) -> None:
+    """Run a command line that is a program of its own, and end it with its exit code."""
+    try:
+        code = run_app(app, program, sys.argv[1:])
+        flush_output()
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    except BrokenPipeError:
+        drop_output()
+        code = 1
+    except Exception as error:  # noqa: BLE001 (standard output that cannot be written)
+        code = end_of(program, error, debug=False)
+    if code == INTERRUPTED:
+        print(f"{program}: interrupted", file=sys.stderr)
+    sys.exit(code)
+
+
+def _all_commands(command: Any) -> Iterator[Any]:
+    """A command, and the commands in it."""
+    yield command
+    for each in getattr(command, "commands", {}).values():
+        yield from _all_commands(each)
+
+
+def _end_of_wrong_use(error: Any) -> int:
+    """Say what is wrong, and where help is; nothing at all but the program's name asks for help."""
+    if type(error).__name__ == "NoArgsIsHelpError":
+        error.show()
+        return WRONG_USE
+    path = error.ctx.command_path if error.ctx is not None else "the command"
+    text = " ".join(error.format_message().split()).replace(": Value error, ", ": ").rstrip(".")
+    print(f"{path}: {printable(text)}; see '{path} --help'", file=sys.stderr)
+    return WRONG_USE

@@ -1,0 +1,28 @@
+"""Command lines made with argparse: wrong use is one line, and help that cannot be written says so."""
+
+import argparse
+import sys
+from typing import TYPE_CHECKING, NoReturn
+
+from ecu_node.errors import printable
+from ecu_node.failures import one_line
+from ecu_node.standard_output import write_output
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
+
+__all__ = ["CommandParser"]
+
+
+class CommandParser(argparse.ArgumentParser):
+    """Says wrong use in one line, and that help cannot be written, where argparse would end as if it were."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, and where help is."""
+        self.exit(2, f"{self.prog}: {printable(one_line(message))}; see '{self.prog} --help'\n")
+
+    def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
+        if file is not None and file is sys.stdout:
+            write_output(message.removesuffix("\n"))
+        else:
+            super()._print_message(message, file)

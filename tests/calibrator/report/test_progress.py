@@ -1,0 +1,138 @@
+"""What a bar shows, at any width, and what goes to a log instead."""
+
+import os
+import pty
+import re
+import subprocess
+import sys
+
+import pytest
+
+from calibrator.report import progress
+from calibrator.report.progress import bar_line, numbered_passes, progress_bar, rate_text, shown
+
+
+@pytest.mark.parametrize(
+    ("per_s", "text"),
+    [
+        (12345.6, "12346/s"),
+        (12.34, "12/s"),
+        (1.26, "1.3/s"),
+        (0.5, "30/min"),
+        (0.1, "6.0/min"),
+        (0.01, "36/h"),
+        (0.0001, "0.4/h"),
+    ],
+)
+def test_rates_have_few_digits_and_a_fitting_time(per_s: float, text: str) -> None:
+    assert rate_text(per_s) == text
+
+
+def line(width: int, *, label: str = "2/4 summarise drives", done: float = 120, total: float | None = 1000) -> str:
+    return bar_line(label, done, total, "vehicles", per_s=12.3, elapsed_s=10.0, width=width)
+
+
+def test_a_line_has_bar_count_rate_time_and_time_left() -> None:
+    found = re.fullmatch(r"2/4 summarise drives (━+)(╌+) 120/1000 vehicles, 12/s, 0:10, 1:12 left", line(80))
+    assert found is not None
+    assert len(line(80)) == 80
+    assert len(found[1]) / (len(found[1]) + len(found[2])) == pytest.approx(0.12, abs=0.06)
+
+
+@pytest.mark.parametrize("total", [None, 1, 1000, 10_000_000])
+def test_a_line_fits_every_terminal(total: float | None) -> None:
+    for width in range(10, 121):
+        assert len(line(width, done=1, total=total)) <= width
+
+
+def test_what_has_no_room_is_left_out_the_time_left_last() -> None:
+    assert line(58) == "2/4 summarise drives 120/1000, 12/s, 0:10, 1:12 left"
+    assert line(48) == "2/4 summarise drives 120/1000, 12/s, 1:12 left"
+    assert line(42) == "2/4 summarise drives 120/1000, 1:12 left"
+
+
+def test_an_empty_step_is_done() -> None:
+    assert "━╌" not in line(100, done=0, total=0)
+
+
+def test_a_log_gets_lines_with_rate_and_time_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter([0.0, 5.0, 11.0, 12.0, 40.0, 41.0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
+    with progress_bar("read drives", 8, "vehicles") as done:
+        for number in (1, 2, 3, 8, 8):
+            done(number)
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.splitlines() == [
+        "read drives: 2 of 8 vehicles, 11/min, 11 s, 33 s left",
+        "read drives: 8 of 8 vehicles, 12/min, 40 s, 0 s left",
+    ]
+
+
+def test_passes_are_numbered_and_a_later_command_is_not(capsys: pytest.CaptureFixture[str]) -> None:
+    with numbered_passes(2):
+        with progress_bar("learn the fleet", None):
+            pass
+        assert list(shown("ab", "calibrate", 2, "vehicles")) == ["a", "b"]
+    with progress_bar("import", 1, "logs") as done:
+        done(1)
+    starts = [text.partition(",")[0] for text in capsys.readouterr().err.splitlines()]
+    assert starts == ["1/2 learn the fleet", "2/2 calibrate: 2 of 2 vehicles", "import: 1 of 1 logs"]
+
+
+IN_TERMINAL = """
+from calibrator.report.progress import progress_bar
+with progress_bar("read drives", 4, "vehicles") as done:
+    done(2)
+    if {interrupt}:
+        raise KeyboardInterrupt
+    done(4)
+"""
+
+
+def in_terminal(*, interrupt: bool = False, **environment: str) -> bytes:
+    ours, theirs = pty.openpty()
+    run = subprocess.Popen(
+        [sys.executable, "-c", IN_TERMINAL.format(interrupt=interrupt)],
+        stderr=theirs,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "80", **environment},
+    )
+    os.close(theirs)
+    text = b""
+    try:
+        while part := os.read(ours, 65536):
+            text += part
+    except OSError:  # EIO: the other end is closed
+        pass
+    os.close(ours)
+    out, _ = run.communicate()
+    assert out == b""
+    return text
+
+
+def test_a_terminal_gets_a_bar_with_colour() -> None:
+    text = in_terminal()
+    assert "read drives" in text.decode()
+    assert "4/4 vehicles" in text.decode()
+    assert b"\x1b[32m" in text or b"\x1b[36m" in text
+
+
+def test_no_color_is_respected() -> None:
+    text = in_terminal(NO_COLOR="1")
+    assert "4/4 vehicles" in text.decode()
+    assert re.search(rb"\x1b\[[0-9;]*3[0-9]m", text) is None
+
+
+def test_a_dumb_terminal_gets_lines() -> None:
+    text = in_terminal(TERM="dumb").decode()
+    assert text.replace("\r\n", "\n").startswith("read drives: 4 of 4 vehicles, ")
+    assert "\x1b" not in text
+
+
+def test_ctrl_c_leaves_the_cursor_and_a_new_line() -> None:
+    before, _, _ = in_terminal(interrupt=True).partition(b"Traceback")
+    assert before.rindex(b"\x1b[?25h") > before.rindex(b"\x1b[?25l")
+    assert before.rstrip(b"\x1b[?25h").endswith(b"\n")

@@ -1,0 +1,96 @@
+"""What command lines made with typer share."""
+
+from typing import Annotated
+
+import pytest
+import typer
+
+from calibrator.commands import command_app, run_app, run_tool
+from calibrator.errors import ContradictionError, FleetError
+from ecu_node.standard_output import write_output
+
+app = command_app(no_args_is_help=True)
+NUMBER = Annotated[int, typer.Option("--number", min=1, help="A number.")]
+
+
+@app.command()
+def fail(kind: str, number: NUMBER = 1) -> None:
+    """Raise something. And so on, with a first paragraph that is far too long for one line of a list of commands.
+
+    The second paragraph is for the command's own help.
+    """
+    errors = {"user": FleetError("no fleet"), "contradiction": ContradictionError("both"), "bug": KeyError(number)}
+    raise errors[kind]
+
+
+@app.command()
+def hello() -> None:
+    """Print."""
+    write_output("hello")
+
+
+def test_a_command_that_is_done(capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_app(app, "prog", ["hello"]) == 0
+    assert capfd.readouterr() == ("hello\n", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (["fail", "user"], 1, "prog: no fleet"),
+        (["fail", "contradiction"], 2, "prog: both"),
+        (["fail", "bug"], 70, "prog: internal error: KeyError: 1"),
+        (["fail"], 2, "prog fail: Missing argument 'KIND'; see 'prog fail --help'"),
+        (["fail", "user", "--number", "0"], 2, "prog fail: Invalid value for '--number': "),
+        (["fail", "user", "--numbre", "0"], 2, "prog fail: No such option: --numbre"),
+        (["fail", "user", "more\nlines"], 2, "prog fail: Got unexpected extra argument"),
+        (["fly"], 2, "prog: No such command 'fly'; see 'prog --help'"),
+    ],
+)
+def test_every_error_is_one_line(
+    arguments: list[str], code: int, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_app(app, "prog", arguments) == code
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    (line,) = printed.err.splitlines()
+    assert line.lower().startswith(text.lower())
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--debug", "fail", "user"], ["fail", "--debug", "user"], ["fail", "user", "--debug"]]
+)
+def test_debug_shows_the_traceback_wherever_it_stands(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(app, "prog", arguments) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "Traceback (most recent call last):"
+    assert lines[-1] == "prog: no fleet"
+
+
+def test_help_is_not_cut_and_tells_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(app, "prog", ["--help"]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert "too long for one line of a list of commands." in words
+    assert "..." not in words.partition("Commands:")[2]
+    assert "second paragraph" not in words
+    for text in ("70 internal error", "--debug shows the traceback of an error"):
+        assert text in words
+
+
+def test_nothing_but_the_name_shows_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(app, "prog", []) == 2
+    assert "Usage: prog" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_a_tool_with_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    tool = command_app()
+
+    @tool.command()
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sys.argv", ["tool.py"])
+    with pytest.raises(SystemExit) as end:
+        run_tool(tool, "tool")
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "tool: interrupted\n"

@@ -1,0 +1,83 @@
+"""One line for every error, the traceback only with --debug."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ecu_node import cli
+from ecu_node.cli import main
+from ecu_node.errors import LayoutError, UserError
+from ecu_node.failures import FAILED, INTERNAL_ERROR, end_of, split_debug
+from tests.ecu_node.vehicles import LAYOUT
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (LayoutError("my.toml: a field is wrong"), FAILED, "prog: my.toml: a field is wrong"),
+        (UserError("a name\nwith a line end\x1b[31m"), FAILED, "prog: a name with a line end\\x1b[31m"),
+        (PermissionError(13, "Permission denied", "out/x"), FAILED, "prog: out/x: Permission denied; see that it is "),
+        (MemoryError(), FAILED, "prog: there is not enough memory; give it less at a time"),
+        (TypeError("a\nb"), INTERNAL_ERROR, "prog: internal error: TypeError: a b; run again with --debug and report "),
+    ],
+)
+def test_each_error_is_one_line(error: Exception, code: int, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert end_of("prog", error, debug=False) == code
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(text)
+
+
+def main_of_nothing() -> None:
+    raise UserError("wrong")
+
+
+def test_debug_shows_the_traceback_before_the_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UserError) as raised:
+        main_of_nothing()
+    assert end_of("prog", raised.value, debug=True) == FAILED
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "Traceback (most recent call last):"
+    assert lines[-1] == "prog: wrong"
+
+
+def test_debug_is_taken_from_anywhere_before_two_dashes() -> None:
+    assert split_debug(["run", "--debug", "x"]) == (["run", "x"], True)
+    assert split_debug(["--debug", "run", "--", "--debug"]) == (["run", "--", "--debug"], True)
+    assert split_debug(["run", "--", "--debug"]) == (["run", "--", "--debug"], False)
+
+
+def test_a_fault_of_the_node_names_its_place_and_ends_with_70(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("nobody thought of that")
+
+    monkeypatch.setattr(cli, "_load_python_can", broken)
+    assert main(["schema"]) == INTERNAL_ERROR
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("ecu-node: internal error: ZeroDivisionError: nobody thought of that (cli.py, line ")
+    assert main(["schema", "--debug"]) == INTERNAL_ERROR
+    assert "in broken" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["--debug", "check"], ["check", "--debug"]])
+def test_the_node_takes_debug_before_and_after_the_command(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    missing = str(tmp_path / "none.toml")
+    assert main([*arguments, "--params", "p.json", "--layout", missing]) == FAILED
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "Traceback (most recent call last):"
+    assert lines[-1].startswith(f"ecu-node: {missing}: cannot read the layout")
+
+
+def test_a_file_that_must_not_be_read_is_no_internal_error(tmp_path: Path) -> None:
+    # The state is a file where a folder is expected: the operating system's own words, in one line.
+    (tmp_path / "state").write_text("")
+    command = [sys.executable, "-m", "ecu_node", "verify", str(LAYOUT), "--state", str(tmp_path / "state")]
+    run = subprocess.run([*command, "--layout", str(LAYOUT)], capture_output=True, text=True, check=False, timeout=60)
+    assert run.returncode == FAILED
+    (line,) = run.stderr.splitlines()
+    assert str(tmp_path / "state") in line
