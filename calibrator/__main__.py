@@ -8,13 +8,14 @@ import sys
 
 from calibrator.interrupts import INTERRUPTED, MESSAGE, ending_at_sigterm, importing
 from ecu_node.errors import UserError
+from ecu_node.failures import say_error
 from ecu_node.standard_output import drop_output, flush_output
 
 __all__ = ["main"]
 
 
 def main() -> None:
-    """Run the command line; exit code 0 done, 1 failed, 2 wrong use, 130 interrupted, 143 ended by SIGTERM."""
+    """Run the command line; exit code 0 done, 1 failed, 2 wrong use, 70 internal, 130 interrupted, 143 SIGTERM."""
     ending_at_sigterm()
     try:
         code = _run()
@@ -22,7 +23,7 @@ def main() -> None:
     except KeyboardInterrupt:
         code = INTERRUPTED
     except UserError as error:
-        print(f"calibrator: {error}", file=sys.stderr)
+        say_error(f"calibrator: {error}")
         code = 1
     except BrokenPipeError:
         drop_output()
@@ -38,10 +39,7 @@ def _run() -> int:
         with importing():
             from calibrator.cli import main as run  # noqa: PLC0415
     except ModuleNotFoundError as error:
-        print(
-            f"calibrator: {error.name} is not installed; pip install 'hv-current-correction[calibrator]'",
-            file=sys.stderr,
-        )
+        say_error(f"calibrator: {error.name} is not installed; pip install 'hv-current-correction[calibrator]'")
         return 1
     return run()
 

@@ -68,13 +68,13 @@ from calibrator.proposal.command import layout as layout_commands
 from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.report.kirchhoff_command import kirchhoff
 from calibrator.report.progress import progress_bar
-from calibrator.report.text import dumps
+from calibrator.report.text import dumps, print_report
 from calibrator.signing.command import keys, revoke, sign
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_atomically
-from ecu_node.standard_output import write_output
+from ecu_node.standard_output import write_output, write_text
 
 if TYPE_CHECKING:
     from calibrator.artificial.truth import FleetTruth
@@ -130,7 +130,7 @@ def import_(
 
     require_possible_folder(out)
     report = import_logs(logs, _database(layout), out, workers=workers, limit_s=time_limit)
-    write_output(report.as_json() if json else report.as_text())
+    print_report(report, json=json)
     if not report.drives and not report.already_there:
         raise LogError(f"none of the logs could be used; {out} was not changed")
 
@@ -217,7 +217,7 @@ def summarise(
         time_limit_s=time_limit,
         part=numbered_part(part),
     )
-    write_output(report.as_json() if json else report.as_text())
+    print_report(report, json=json)
 
 
 @app.command()
@@ -252,7 +252,7 @@ def identify(
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, report.bank.to_json())
-    write_output(report.as_json() if json else report.as_text())
+    print_report(report, json=json)
 
 
 @app.command()
@@ -313,7 +313,7 @@ def calibrate(
     )
     where = Workers(processes=workers, scheduler=scheduler)
     report = calibrate_fleet(fleet, _database(layout), out, settings, workers=where, since=since)
-    write_output(report.as_json() if json else report.as_text())
+    print_report(report, json=json)
 
 
 @app.command()
@@ -321,6 +321,7 @@ def params(
     result: Annotated[Path, typer.Argument(help="Folder that 'calibrator calibrate' wrote.")],
     vehicles: Annotated[list[str], typer.Argument(help="Vehicles.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for VEHICLE.json; files of that name are replaced.")],
+    json: JsonOption = False,
 ) -> None:
     """Write the parameter files of some vehicles, of a fleet too large for a file each in one folder."""
     with importing():
@@ -329,9 +330,11 @@ def params(
     texts = {vehicle: parameters_of(result, vehicle) for vehicle in vehicles}
     require_possible_folder(out)
     out.mkdir(parents=True, exist_ok=True)
+    files = {vehicle: out / f"{vehicle}.json" for vehicle in texts}
     for vehicle, text in texts.items():
-        write_atomically(out / f"{vehicle}.json", text)
-    write_output("\n".join(str(out / f"{vehicle}.json") for vehicle in texts))
+        write_atomically(files[vehicle], text)
+    names = {vehicle: str(path) for vehicle, path in files.items()}
+    write_output(dumps({"files": names}) if json else "\n".join(names.values()))
 
 
 app.command()(export)
@@ -349,7 +352,7 @@ def score(
         from calibrator.result_score import score_result
 
     figures = score_result(result, truth)
-    write_output(figures.as_json() if json else figures.as_text())
+    print_report(figures, json=json)
 
 
 @app.command()
@@ -405,4 +408,7 @@ def _database(layout: Path) -> VehicleDatabase:
 def _print_fleet(truth: "FleetTruth", out: Path, notices: Sequence[str], *, json: bool) -> None:
     figures = {"vehicles": len(truth.vehicles), "branches": truth.branches, "out": str(out), "notices": notices}
     lines = [f"{out}: {len(truth.vehicles)} vehicles with branches {', '.join(truth.branches)}"]
-    write_output(dumps(figures) if json else "\n".join([*lines, *(f"notice: {notice}" for notice in notices)]))
+    if json:
+        write_output(dumps(figures))
+    else:
+        write_text("\n".join([*lines, *(f"notice: {notice}" for notice in notices)]))

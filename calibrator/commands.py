@@ -10,8 +10,7 @@ from typing import Any
 import typer
 
 from calibrator.errors import ContradictionError
-from ecu_node.errors import printable
-from ecu_node.failures import DEBUG_HINT, end_of, split_debug
+from ecu_node.failures import DEBUG_HINT, end_of, say_error, split_debug
 from ecu_node.standard_output import drop_output, flush_output
 
 __all__ = ["EXIT_CODES", "command_app", "run_app", "run_tool"]
@@ -120,5 +119,5 @@ def _end_of_wrong_use(error: Any) -> int:
         return WRONG_USE
     path = error.ctx.command_path if error.ctx is not None else "the command"
     text = " ".join(error.format_message().split()).replace(": Value error, ", ": ").rstrip(".")
-    print(f"{path}: {printable(text)}; see '{path} --help'", file=sys.stderr)
+    say_error(f"{path}: {text}; see '{path} --help'")
     return WRONG_USE

@@ -10,11 +10,11 @@ state of source, Python, numba and processor. Of several processes that need it 
 
 import fcntl
 import hashlib
+import multiprocessing
 import os
 import pickle
 import platform
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -23,6 +23,8 @@ from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar, cast
 
 import llvmlite.binding
 import numba as _numba
+
+from ecu_node.failures import say_error
 
 __all__ = ["compiled", "in_place", "inlined", "inner"]
 
@@ -142,8 +144,10 @@ def _cached_dispatcher(plan: _Plan, folder: Path) -> Any:
 
 @cache
 def _say(when: str) -> None:
-    """Tell the user what takes time; once per process."""
-    print(f"calibrator: compiling the estimator (about half a minute, {when})", file=sys.stderr, flush=True)
+    """Tell the user what takes time; once, and workers say nothing, which would tear the bar of who started them."""
+    if multiprocessing.current_process().name != "MainProcess":
+        return
+    say_error(f"calibrator: compiling the estimator (about half a minute, {when})")
 
 
 @contextmanager

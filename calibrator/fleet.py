@@ -34,6 +34,7 @@ from calibrator.posterior.bench import read_bench
 from calibrator.posterior.fleet import FindModels
 from calibrator.published.fleet import calibrate_fleet_published
 from calibrator.report.calibration import MOST_NAMED, CalibrationReport, report_of
+from calibrator.report.progress import numbered_passes, progress_bar
 from calibrator.report.text import few, few_reasons
 from calibrator.results import (
     RunRecord,
@@ -60,6 +61,11 @@ from ecu_node.layout import file_digest
 from ecu_node.parameters import write_atomically
 
 __all__ = ["calibrate_fleet"]
+
+PASSES_OF_STORE = 4
+"""Look at the vehicles, learn the fleet, calibrate, write the result."""
+PASSES_PUBLISHED = 3
+"""Read the drives, estimate the faults, write the result."""
 
 
 def calibrate_fleet(
@@ -111,12 +117,12 @@ def calibrate_fleet(
         _require_summaries_alone(storage)
         _require_drives_unneeded(settings, storage.url)
         store = SummaryStore(storage=storage, identity=stored)
-        with unfinished_run(out) as unfinished:
+        with unfinished_run(out) as unfinished, numbered_passes(PASSES_OF_STORE):
             return _calibrate_store(
                 unfinished, store, _Fleet.of_store(store), database, settings, workers=workers, since=since
             )
     fleet = _find_drives(Path(storage.url), settings, everyone=since is None)
-    with unfinished_run(out) as unfinished:
+    with unfinished_run(out) as unfinished, numbered_passes(_passes(settings)):
         if settings.method is Method.PUBLISHED:
             return _calibrate_published(unfinished, fleet, database, settings, workers=workers)
         store = _summaries_of(unfinished, fleet, database, settings, since)
@@ -229,6 +235,13 @@ def _require_drives_unneeded(settings: CalibrationSettings, where: str) -> None:
     for option, wanted in needs.items():
         if wanted:
             raise FleetError(f"{where}: a store of summaries, and {option} needs the drives; give the drive store")
+
+
+def _passes(settings: CalibrationSettings) -> int:
+    """Passes of a calibration from drives, for who waits for it."""
+    if settings.method is Method.PUBLISHED:
+        return PASSES_PUBLISHED
+    return PASSES_OF_STORE + 1 + settings.sensor_models
 
 
 def _find_drives(path: Path, settings: CalibrationSettings, *, everyone: bool) -> FleetSource:
@@ -400,7 +413,8 @@ def _finish(
     if not vehicles:
         why = next(iter(left_out.values()), "there is none")
         raise FleetError(f"{fleet.name}: no vehicle can be calibrated; the first: {why}")
-    where = write_parameter_files(folder, {n: chunks.parameters(n) for n in numbers}, vehicles=vehicles)
+    with progress_bar("write the result", None):
+        where = write_parameter_files(folder, {n: chunks.parameters(n) for n in numbers}, vehicles=vehicles)
     if summaries is not None:
         shutil.copytree(summaries, folder / summaries.name, ignore=shutil.ignore_patterns(".*"))
     if window is not None:

@@ -26,6 +26,8 @@ __all__ = [
 
 TERMINATED = 143
 """Exit code that shells give to a program ended by SIGTERM."""
+SHOW_CURSOR = "\x1b[?25h"
+"""A bar hides the cursor of a terminal."""
 _GOES_ON = "the same command, run again, goes on with what it had read or computed"
 MESSAGE = f"calibrator: interrupted; {_GOES_ON}"
 TERMINATED_MESSAGE = f"calibrator: ended by SIGTERM; {_GOES_ON}"
@@ -35,7 +37,8 @@ def ending_at_sigterm() -> None:
     """From now on SIGTERM ends the program with one line and :data:`TERMINATED`, unless that is handled already."""
 
     def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
-        os.write(sys.stderr.fileno(), f"{TERMINATED_MESSAGE}\n".encode())
+        shown = f"{SHOW_CURSOR}\n" if os.isatty(sys.stderr.fileno()) else ""
+        os.write(sys.stderr.fileno(), f"{shown}{TERMINATED_MESSAGE}\n".encode())
         os._exit(TERMINATED)
 
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:

@@ -29,6 +29,7 @@ def read_vehicles(
     *,
     workers: int,
     limit_s: float = TIME_LIMIT_S,
+    label: str = "read drives",
 ) -> tuple[list[Vehicle], dict[str, str]]:
     """Read every vehicle.
 
@@ -46,6 +47,8 @@ def read_vehicles(
         Number of processes.
     limit_s : float
         Longest time for one vehicle; one that takes longer is left out. [s]
+    label : str
+        What stands beside the bar of the progress.
 
     Returns
     -------
@@ -60,7 +63,7 @@ def read_vehicles(
         If no vehicle can be used.
     """
     readers = dict.fromkeys(fleet.vehicles, read)
-    found, errors = read_each(readers, fleet, equipment, database, workers=workers, limit_s=limit_s)
+    found, errors = read_each(readers, fleet, equipment, database, workers=workers, limit_s=limit_s, label=label)
     left_out = {**fleet.left_out, **errors}
     if not found:
         reason = next(iter(left_out.values()), "")
@@ -76,6 +79,7 @@ def read_each(
     *,
     workers: int,
     limit_s: float = TIME_LIMIT_S,
+    label: str = "read drives",
 ) -> tuple[dict[str, Vehicle], dict[str, str]]:
     """Read some vehicles, each in its own way.
 
@@ -83,7 +87,7 @@ def read_each(
     ----------
     readers : mapping of str to callable
         Makes what is needed of a vehicle from its drives, by name of the vehicle; each can go to another process.
-    fleet, equipment, database, workers, limit_s
+    fleet, equipment, database, workers, limit_s, label
         As for :func:`read_vehicles`.
 
     Returns
@@ -98,7 +102,7 @@ def read_each(
     found: dict[str, Vehicle] = {}
     errors: dict[str, str] = {}
     reading = read_in_processes(read_one, sources, workers=workers, limit_s=limit_s)
-    with progress_bar("read drives", len(readers), "vehicles") as progress, closing(reading) as outcomes:
+    with progress_bar(label, len(readers), "vehicles") as progress, closing(reading) as outcomes:
         for done, (name, outcome) in enumerate(zip(readers, outcomes, strict=True), start=1):
             if isinstance(outcome, Unread):
                 errors[name] = outcome.reason

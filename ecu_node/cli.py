@@ -17,10 +17,9 @@ from pathlib import Path
 
 from ecu_node import __version__
 from ecu_node.command_parser import CommandParser
-from ecu_node.errors import printable
-from ecu_node.failures import DEBUG, DEBUG_HELP, DEBUG_HINT, end_of, split_debug
+from ecu_node.failures import DEBUG, DEBUG_HELP, DEBUG_HINT, end_of, say_error, split_debug
 from ecu_node.interrupts import ending_at_interrupt, ignoring_hangups
-from ecu_node.standard_output import drop_output, flush_output, write_output
+from ecu_node.standard_output import drop_output, flush_output, write_output, write_text
 from ecu_node.template import add_template_command
 from ecu_node.trust.commands import add_trust_commands
 
@@ -221,10 +220,7 @@ def _run(options: argparse.Namespace) -> int:
     from ecu_node.run import RunOptions, run_node  # noqa: PLC0415  # after _load_python_can
 
     if options.gateway == options.channel:
-        print(
-            f"ecu-node: --gateway {options.gateway} is the bus of the sensors itself; two buses are expected",
-            file=sys.stderr,
-        )
+        say_error(f"ecu-node: --gateway {options.gateway} is the bus of the sensors itself; two buses are expected")
         return 2
     if (options.params is not None) != options.unsigned:
         _say(
@@ -273,7 +269,10 @@ def _check(options: argparse.Namespace) -> int:
 
     mode = Mode.GATEWAY if options.gateway else Mode.OVERLAY
     report = check_report(options.params, options.layout, options.vehicle, mode)
-    write_output(json.dumps(report, indent=2) if options.json else report_text(report))
+    if options.json:
+        write_output(json.dumps(report, indent=2))
+    else:
+        write_text(report_text(report))
     return 0 if report["fit"] else 1
 
 
@@ -285,4 +284,4 @@ def _schema(options: argparse.Namespace) -> int:  # noqa: ARG001
 
 
 def _say(text: str) -> None:
-    print(f"ecu-node: {printable(text)}", file=sys.stderr, flush=True)
+    say_error(f"ecu-node: {text}")

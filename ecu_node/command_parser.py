@@ -4,8 +4,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, NoReturn
 
-from ecu_node.errors import printable
-from ecu_node.failures import one_line
+from ecu_node.failures import say_error
 from ecu_node.standard_output import write_output
 
 if TYPE_CHECKING:
@@ -19,7 +18,8 @@ class CommandParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong, and where help is."""
-        self.exit(2, f"{self.prog}: {printable(one_line(message))}; see '{self.prog} --help'\n")
+        say_error(f"{self.prog}: {message}; see '{self.prog} --help'")
+        self.exit(2)
 
     def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
         if file is not None and file is sys.stdout:

@@ -11,8 +11,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ecu_node.errors import UserError, printable
+from ecu_node.wrapping import fitted
 
-__all__ = ["DEBUG", "DEBUG_HELP", "DEBUG_HINT", "FAILED", "INTERNAL_ERROR", "end_of", "one_line", "split_debug"]
+__all__ = [
+    "DEBUG",
+    "DEBUG_HELP",
+    "DEBUG_HINT",
+    "FAILED",
+    "INTERNAL_ERROR",
+    "end_of",
+    "one_line",
+    "say_error",
+    "split_debug",
+]
 
 FAILED = 1
 INTERNAL_ERROR = 70
@@ -65,13 +76,18 @@ def end_of(program: str, error: Exception, *, debug: bool) -> int:
         traceback.print_exception(error)
     known = _known(error)
     text = f"internal error: {_place(error)}; run again with {DEBUG} and report it" if known is None else known
-    print(f"{program}: {printable(one_line(text))}", file=sys.stderr, flush=True)
+    say_error(f"{program}: {text}")
     return INTERNAL_ERROR if known is None else FAILED
 
 
 def one_line(text: str) -> str:
     """A text without line ends."""
     return " ".join(text.splitlines())
+
+
+def say_error(text: str) -> None:
+    """Say something on standard error in one line, which a terminal gets broken at words."""
+    print(fitted(printable(one_line(text)), sys.stderr), file=sys.stderr, flush=True)
 
 
 def _known(error: Exception) -> str | None:

@@ -15,6 +15,7 @@ from ecu_node.clocks import steady_time_s
 from ecu_node.counters import Counters
 from ecu_node.database import read_database
 from ecu_node.errors import UserError
+from ecu_node.failures import say_error
 from ecu_node.guard import Mode
 from ecu_node.layout import read_layout
 from ecu_node.monitor_model import BusMonitor, View
@@ -108,7 +109,7 @@ def run_monitor(options: MonitorOptions) -> int:
         finally:
             bus.close()
     if options.once_s is not None and not view.is_any_branch_seen:
-        print(f"ecu-node: {where}: no branch of {options.layout} was seen", file=sys.stderr)
+        say_error(f"ecu-node: {where}: no branch of {options.layout} was seen; see that the bus is the right one")
         return 1
     return 0
 

@@ -7,12 +7,18 @@ import os
 import sys
 
 from ecu_node.errors import UserError
+from ecu_node.wrapping import fitted
 
-__all__ = ["drop_output", "flush_output", "write_output"]
+__all__ = ["drop_output", "flush_output", "write_output", "write_text"]
+
+
+def write_text(text: str) -> None:
+    """Print a text for people, which a terminal gets broken at words; errors as for :func:`write_output`."""
+    write_output(fitted(text, sys.stdout))
 
 
 def write_output(text: str) -> None:
-    """Print a text with a line end, and see that it is written.
+    """Print a text with a line end as it is, and see that it is written.
 
     Parameters
     ----------

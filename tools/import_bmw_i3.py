@@ -2,7 +2,6 @@
 """Recordings of a BMW i3 (CSV) as drives, and as CAN logs where asked. Each trip counts as a vehicle of its own."""
 
 import json
-import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,10 +17,13 @@ from calibrator.recordings.bmw_i3 import BRANCHES, INPUTS, ImportedTrip, trip_fr
 from calibrator.recordings.csv_table import read_csv_table
 from calibrator.recordings.drive_log import write_drive_log
 from calibrator.recordings.signal_range import signal_ranges
+from calibrator.report.progress import shown
 from calibrator.report.text import told_once
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError, UserError
+from ecu_node.failures import say_error
 from ecu_node.layout import read_layout
+from ecu_node.standard_output import write_output, write_text
 
 _SUFFIXES = (".csv", ".csv.gz")
 
@@ -46,7 +48,8 @@ def main(
                 require_possible_folder(folder)
         database = read_database(read_layout(layout))
         _require_names(database)
-        for name, paths in _trips(csv).items():
+        trips = _trips(csv)
+        for name, paths in shown(trips.items(), "import", len(trips), "trips"):
             try:
                 trip = _import_trip(name, paths, database, out, logs)
             except UserError as error:
@@ -135,17 +138,17 @@ def _print_account(account: Account, *, as_json: bool) -> None:
             "already_there": account.already_there,
             "failed": failed,
         }
-        typer.echo(json.dumps(values, indent=2))
+        write_output(json.dumps(values, indent=2))
     else:
-        for line in told_once((name, notice) for name, trip in done.items() for notice in trip.notices):
-            typer.echo(line)
-        typer.echo(
+        lines = told_once((name, notice) for name, trip in done.items() for notice in trip.notices)
+        summary = (
             f"{len(done)} trips imported, {duration_h:.1f} h; {len(account.already_there)} already there; "
             f"{len(failed)} left out"
         )
-        typer.echo("motor is minus the sum of battery and auxiliary: not independent of the battery's sensor")
+        origin = "motor is minus the sum of battery and auxiliary: not independent of the battery's sensor"
+        write_text("\n".join([*lines, summary, origin]))
     for text in failed.values():
-        print(f"import_bmw_i3: {text}", file=sys.stderr)
+        say_error(f"import_bmw_i3: {text}")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ remote frames are left out. A frame goes out as CAN FD where its payload is long
 """
 
 import argparse
+import json
 import logging
 import math
 import sys
@@ -19,10 +20,12 @@ import can
 from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import CLASSIC_BYTES, EXTENDED_BIT, Frames
 from calibrator.recordings.frames import LOG_SUFFIXES, read_frames
+from calibrator.report.progress import progress_bar
 from ecu_node.buses import connect
 from ecu_node.command_parser import CommandParser
 from ecu_node.errors import BusError
 from ecu_node.failures import DEBUG, DEBUG_HELP, end_of, split_debug
+from ecu_node.standard_output import write_output
 
 __all__ = ["main", "read_log", "replay"]
 
@@ -32,8 +35,6 @@ _EXIT_CODES = "Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130
 _SEND_LIMIT_S = 1.0
 """A bus that takes nothing for this long has nobody listening, or is off. [s]"""
 _SEND_PAUSE_S = 0.0005
-_PROGRESS_PERIOD_S = {True: 0.5, False: 10.0}
-"""Time between lines of progress, on a terminal and elsewhere. [s]"""
 
 
 def read_log(path: Path) -> Iterator[can.Message]:
@@ -54,9 +55,13 @@ def read_log(path: Path) -> Iterator[can.Message]:
     LogError
         If the file is missing, a folder, of an unknown format, damaged or empty.
     """
+    return _messages(_frames(path))
+
+
+def _frames(path: Path) -> Frames:
     if path.is_dir():
         raise LogError(f"{path}: a folder; give one log file ({' '.join(LOG_SUFFIXES)}, each also .gz)")
-    return _messages(read_frames(path))
+    return read_frames(path)
 
 
 def _messages(frames: Frames) -> Iterator[can.Message]:
@@ -123,21 +128,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments, debug = split_debug(sys.argv[1:] if argv is None else argv)
     options = _parser().parse_args(arguments)
     logging.getLogger("can").addHandler(logging.NullHandler())
-    show = _Progress()
+    sent = 0
+
+    def count(so_far: int, _: float) -> None:
+        nonlocal sent
+        sent = so_far
+        progress(so_far)
+
     try:
-        messages = read_log(options.log)
-        show.start()
-        with connect(options.interface, options.channel, fd=options.fd) as bus:
-            sent = replay(messages, bus, speed=options.speed, progress=show)
+        frames = _frames(options.log)
+        with (
+            progress_bar("replay", len(frames.time_ns), "frames") as progress,
+            connect(options.interface, options.channel, fd=options.fd) as bus,
+        ):
+            begin_s = time.monotonic()
+            replay(_messages(frames), bus, speed=options.speed, progress=count)
+            duration_s = time.monotonic() - begin_s
+        facts = {"frames": sent, "duration_s": duration_s}
+        write_output(json.dumps(facts, indent=2) if options.json else f"{sent} frames in {duration_s:.1f} s")
     except Exception as error:  # noqa: BLE001 (each is told, and ends the program)
-        show.close()
         return end_of("replay", error, debug=debug)
     except KeyboardInterrupt:
-        show.close()
-        print(f"replay: interrupted after {show.sent} frames", file=sys.stderr)
+        print(f"replay: interrupted after {sent} frames", file=sys.stderr)
         return _INTERRUPTED
-    show.close()
-    print(f"{sent} frames in {time.monotonic() - show.begin_s:.1f} s")
     return 0
 
 
@@ -148,6 +161,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--channel", required=True, help="channel of the interface, such as vcan0")
     parser.add_argument("--speed", type=_speed, default=1.0, help="1: as recorded (default), 0: as fast as it goes")
     parser.add_argument("--fd", action="store_true", help="open the bus for CAN FD")
+    parser.add_argument("--json", action="store_true", help="print the account as JSON")
     parser.add_argument(DEBUG, action="store_true", help=DEBUG_HELP)
     return parser
 
@@ -173,36 +187,6 @@ def _send(bus: can.BusABC, message: can.Message) -> None:
             time.sleep(_SEND_PAUSE_S)
         else:
             return
-
-
-class _Progress:
-    """Shows on standard error how far it is: one line kept up to date on a terminal, a line now and then elsewhere."""
-
-    def __init__(self) -> None:
-        self.sent = 0
-        self._terminal = sys.stderr.isatty()
-        self._line_open = False
-        self.start()
-
-    def start(self) -> None:
-        """Count the time from here."""
-        self.begin_s = time.monotonic()
-        self._due_s = self.begin_s + _PROGRESS_PERIOD_S[self._terminal]
-
-    def __call__(self, sent: int, age_s: float) -> None:
-        self.sent = sent
-        now_s = time.monotonic()
-        if now_s >= self._due_s:
-            self._due_s = now_s + _PROGRESS_PERIOD_S[self._terminal]
-            begin, end = ("\r", "") if self._terminal else ("", "\n")
-            print(f"{begin}replay: {sent} frames, {age_s:.0f} s of the log", end=end, file=sys.stderr, flush=True)
-            self._line_open = self._terminal
-
-    def close(self) -> None:
-        """End the line on a terminal, before anything else is said."""
-        if self._line_open:
-            print(file=sys.stderr)
-            self._line_open = False
 
 
 if __name__ == "__main__":

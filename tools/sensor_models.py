@@ -10,6 +10,7 @@ from calibrator.commands import command_app, run_tool
 from calibrator.experiments.recorded_fleet import builtin_fleet, read_fleet
 from calibrator.experiments.sensor_fleet import SensorCase, calibrate_sensors, draw_sensors
 from calibrator.experiments.sensor_score import score_sensors
+from calibrator.report.text import print_report
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 
@@ -36,7 +37,7 @@ def main(
     case = SensorCase(vehicles=vehicles, branches=branches, share=share, sparsity=sparsity)
     fleet = draw_sensors(recorded, case, seed)
     score = score_sensors(fleet, *calibrate_sensors(fleet, database), database)
-    typer.echo(score.as_json() if as_json else score.as_text())
+    print_report(score, json=as_json)
 
 
 if __name__ == "__main__":

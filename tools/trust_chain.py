@@ -15,7 +15,7 @@ import typer
 from calibrator.artificial.simulate import FleetPlan
 from calibrator.artificial.trips import choose_trips
 from calibrator.commands import command_app, run_tool
-from calibrator.report.text import dumps
+from calibrator.report.text import print_report
 from chain.fleet import draw_fleet
 from chain.whole import drive_chain
 from ecu_node.database import read_database
@@ -66,7 +66,7 @@ def main(
     fleet = draw_fleet(plan, trips, database, unseen_s=60.0 * unseen_minutes)
     with tempfile.TemporaryDirectory(prefix="chain-") as folder:
         score = drive_chain(fleet, Path(folder), workers=workers)
-    typer.echo(dumps({**score.counts(), **score.errors_a()}) if as_json else score.as_text())
+    print_report(score, json=as_json)
 
 
 if __name__ == "__main__":

@@ -49,7 +49,10 @@ def delay_experiment(
         trial = partial(delayed_trial, fleet, RecordedCase(), compensate=compensate)
         return [Setting(x=x, make_trial=partial(trial, delay_max_s=x / 1e3)) for x in delays_ms]
 
-    rows = [*run_settings(settings(True), methods, effort), *run_settings(settings(False), [LEFT_IN], effort)]
+    rows = [
+        *run_settings(settings(True), methods, effort, label="delays taken out"),
+        *run_settings(settings(False), [LEFT_IN], effort, label="delays left in"),
+    ]
     return ExperimentResult(
         name="delay",
         title="Delays between the branches",

@@ -60,8 +60,8 @@ def run_settings(
     methods: Sequence[Method],
     effort: Effort,
     *,
+    label: str,
     paper: PaperFigures | None = None,
-    label: str = "experiment",
 ) -> tuple[Row, ...]:
     """Run every method on the same trials of every setting.
 
@@ -73,10 +73,10 @@ def run_settings(
         What to compare.
     effort : Effort
         How many trials.
+    label : str
+        What stands beside the bar of its progress.
     paper : mapping or None
         Figures of the paper.
-    label : str
-        Name of the experiment, beside the bar of its progress.
 
     Returns
     -------

@@ -81,7 +81,7 @@ def classifier_experiment(
         title="Effect of the classifier (table 1)",
         x_label=SPARSITY_LABEL,
         settings=_record(drive, law, effort),
-        rows=run_settings([setting], methods, effort, paper=TABLE_1),
+        rows=run_settings([setting], methods, effort, paper=TABLE_1, label="classifier"),
     )
 
 
@@ -113,7 +113,7 @@ def snr_experiment(
         title="Effect of the simulation noise (figure 7)",
         x_label="SNR [dB]",
         settings=_record(drive, law, effort, "snr_db"),
-        rows=run_settings(settings, methods, effort, paper=FIGURE_7),
+        rows=run_settings(settings, methods, effort, paper=FIGURE_7, label="snr"),
     )
 
 
@@ -145,7 +145,7 @@ def sparsity_experiment(
         title="Effect of the sparsity level (figure 8)",
         x_label=SPARSITY_LABEL,
         settings=_record(drive, law, effort, "sparsity"),
-        rows=run_settings(settings, methods, effort, paper=FIGURE_8),
+        rows=run_settings(settings, methods, effort, paper=FIGURE_8, label="sparsity"),
     )
 
 
@@ -179,7 +179,7 @@ def statespace_experiment(
         title="End to end with state-space models (table 2)",
         x_label=SPARSITY_LABEL,
         settings=_record(drive, law, effort, "sparsity"),
-        rows=run_settings(settings, methods, effort, paper=TABLE_2),
+        rows=run_settings(settings, methods, effort, paper=TABLE_2, label="statespace"),
     )
 
 
@@ -219,7 +219,7 @@ def asymmetry_experiment(
         x_label="vehicles",
         series_label="sign bias",
         settings=_record(drive, replace(law, symmetric=False), effort, "vehicles"),
-        rows=run_settings(settings, methods, effort),
+        rows=run_settings(settings, methods, effort, label="asymmetry"),
     )
 
 

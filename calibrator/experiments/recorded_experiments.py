@@ -71,7 +71,7 @@ def real_experiment(
         x_label=SPARSITY_LABEL,
         series_label="branches, faults",
         settings=recorded_settings(fleet, effort),
-        rows=run_settings(settings, methods, effort),
+        rows=run_settings(settings, methods, effort, label="real"),
     )
 
 
@@ -111,7 +111,7 @@ def phase_experiment(
         x_label=SPARSITY_LABEL,
         series_label="faults [% of full scale]",
         settings=recorded_settings(fleet, effort),
-        rows=run_settings(settings, methods, effort),
+        rows=run_settings(settings, methods, effort, label="phase"),
     )
 
 
@@ -150,7 +150,7 @@ def data_experiment(
         x_label="minutes per vehicle",
         series_label="vehicles",
         settings={**recorded_settings(fleet, effort), "vehicles": "as named", "sparsity": DATA_CASE.sparsity},
-        rows=run_settings(settings, methods, effort),
+        rows=run_settings(settings, methods, effort, label="data"),
     )
 
 

@@ -14,6 +14,7 @@ from calibrator.drives.align import base_inputs, choose_inputs
 from calibrator.drives.derived import evaluate_formula
 from calibrator.errors import FleetError
 from calibrator.random_streams import Purpose, random_stream
+from calibrator.report.progress import shown
 from ecu_node.database import VehicleDatabase
 from ecu_node.formula import parse_formula
 from ecu_node.layout import Layout
@@ -160,7 +161,7 @@ def builtin_fleet(
     """
     made = (
         builtin_trip(random_stream(Purpose.CALIBRATION_TRIP, 0, k), duration_s=duration_s, name=f"builtin-{k}")
-        for k in range(trips)
+        for k in shown(range(trips), "make trips", trips, "trips")
     )
     return RecordedFleet(
         name=f"{trips} built-in trips, no recordings", trips=tuple(made), database=database, recorded=False

@@ -26,6 +26,7 @@ from calibrator.experiments.records import read_results, write_result
 from calibrator.experiments.result import ExperimentResult
 from calibrator.experiments.table import result_table
 from calibrator.experiments.trial import FleetLaw
+from calibrator.report.progress import one_pass
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 
@@ -177,8 +178,9 @@ def run_experiments(
     if any(isinstance(EXPERIMENTS.get(name), Recorded) for name in names):
         options = replace(options, fleet=options.fleet or _recorded_fleet(options))
     done: list[ExperimentResult] = []
-    for name in names:
-        result = _calibration(done, out) if name == CALIBRATION else EXPERIMENTS[name](options)
+    for number, name in enumerate(names, start=1):
+        with one_pass(number, len(names)):
+            result = _calibration(done, out) if name == CALIBRATION else EXPERIMENTS[name](options)
         done.append(result)
         if console is not None:
             console.print(result_table(result))

@@ -25,6 +25,7 @@ from calibrator.options import Method
 from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.fleet import learn_fleet
 from calibrator.random_streams import Purpose, random_stream
+from calibrator.report.progress import progress_bar, shown
 from calibrator.sensor_models.families import GainBySign, SensorModel, TemperatureDrift
 from calibrator.sensor_models.fleet import SensorFindings, findings_of, summaries_about_zeros
 from ecu_node.database import VehicleDatabase
@@ -211,8 +212,10 @@ def calibrate_sensors(
     findings : SensorFindings
         Of the search.
     """
-    samples = [_samples(fleet, j) for j in range(len(fleet.learnt))]
-    vehicles = [_summary(fleet, name, drive) for name, drive in zip(fleet.names, samples, strict=True)]
+    count = len(fleet.learnt)
+    samples = [_samples(fleet, j) for j in shown(range(count), "take samples", count, "vehicles")]
+    drives = shown(zip(fleet.names, samples, strict=True), "summarise drives", count, "vehicles")
+    vehicles = [_summary(fleet, name, drive) for name, drive in drives]
     kept: list[SensorFindings] = []
 
     def find(vehicles: Sequence[VehicleSummary], zero_a: Array, learning: Mask, trusted: Mask) -> SensorFindings:
@@ -229,16 +232,17 @@ def calibrate_sensors(
         kept.append(findings_of(vehicles, found, learning=learning, trusted=trusted))
         return kept[-1]
 
-    learnt = learn_fleet(
-        vehicles,
-        CalibrationSettings(sensor_models=True),
-        {},
-        branches=fleet.branches,
-        identity=RunIdentity(database=database, method=Method.POSTERIOR, fleet="drawn", created=""),
-        fleet_size=len(vehicles),
-        find_models=find,
-    )
-    parameters = learnt.task.calibrate(vehicles).parameters
+    with progress_bar("calibrate", None):
+        learnt = learn_fleet(
+            vehicles,
+            CalibrationSettings(sensor_models=True),
+            {},
+            branches=fleet.branches,
+            identity=RunIdentity(database=database, method=Method.POSTERIOR, fleet="drawn", created=""),
+            fleet_size=len(vehicles),
+            find_models=find,
+        )
+        parameters = learnt.task.calibrate(vehicles).parameters
     return {each.vehicle: each for each in parameters}, kept[-1]
 
 

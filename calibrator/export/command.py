@@ -1,6 +1,5 @@
 """``calibrator export``: from parameter files to files of other formats, each written whole or not at all."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +7,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from calibrator.command_options import LayoutOption
+from calibrator.command_options import JsonOption, LayoutOption
 from calibrator.errors import ContradictionError, ExportError
 from calibrator.export.c99 import c99_files
 from calibrator.export.cdfx import cdfx_document
@@ -17,10 +16,14 @@ from calibrator.export.csv_table import csv_text
 from calibrator.export.dcm import dcm_text
 from calibrator.folders import require_possible_file, require_possible_folder
 from calibrator.options import ExportFormat
+from calibrator.report.progress import shown
+from calibrator.report.text import dumps
 from calibrator.whole_files import made_folder, remove_abandoned, require_own_file, write_files
 from ecu_node.database import read_database
 from ecu_node.errors import printable
+from ecu_node.failures import say_error
 from ecu_node.layout import read_layout
+from ecu_node.standard_output import write_output
 
 __all__ = ["export", "exported_files"]
 
@@ -32,6 +35,7 @@ def export(
     output: Annotated[Path, typer.Option("--output", "--out", help="File to write; for c99 a folder.")],
     vehicle: Annotated[str | None, typer.Option("--vehicle", help="Refuse parameters of another vehicle.")] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace files that exist.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Take parameters to other tools, and to control units without Python.
 
@@ -39,16 +43,21 @@ def export(
     source that correct as 'ecu-node run' does as a gateway. Parameters that the node would not apply are refused.
     """
     database = read_database(read_layout(layout))
-    tables = [read_checked(path, database, vehicle) for path in params]
+    reading = shown(params, "read parameters", len(params), "files") if len(params) > 1 else params
+    tables = [read_checked(path, database, vehicle) for path in reading]
     files = exported_files(tables, format_, output)
     is_folder = format_ is ExportFormat.C99
     _require_possible(files, output, is_folder=is_folder, replace=replace)
     with made_folder(output if is_folder else output.parent):
         remove_abandoned(files)
         write_files(files)
-    for text in (text for checked in tables for text in checked.notices()):
-        print(f"notice: {text}", file=sys.stderr)
-    sys.stdout.write("".join(f"{printable(str(path))}\n" for path in files))
+    notices = [text for checked in tables for text in checked.notices()]
+    if json:
+        write_output(dumps({"format": format_.value, "files": list(map(str, files)), "notices": notices}))
+        return
+    for text in notices:
+        say_error(f"notice: {text}")
+    write_output("\n".join(printable(str(path)) for path in files))
 
 
 def exported_files(tables: Sequence[Checked], format_: ExportFormat, output: Path) -> dict[Path, bytes]:

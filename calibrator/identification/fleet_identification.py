@@ -80,11 +80,12 @@ class IdentificationReport:
         figures = {
             "bank": {"identity": self.bank.identity, "file": self.bank, "described": self.bank.described()},
             "branches": {name: vars(row) for name, row in self._rows().items()},
-            "vehicles": {
-                name: dict(zip(self.branches, snr.tolist(), strict=True)) for name, snr in self.snr_db.items()
-            },
+            "snr_db": {name: dict(zip(self.branches, snr.tolist(), strict=True)) for name, snr in self.snr_db.items()},
             "own_models": {
-                name: {"order": own.model.order, **dict(zip(self.branches, own.snr_db.tolist(), strict=True))}
+                name: {
+                    "order": own.model.order,
+                    "snr_db": dict(zip(self.branches, own.snr_db.tolist(), strict=True)),
+                }
                 for name, own in self.own.items()
             },
             "left_out": self.left_out,
@@ -161,7 +162,11 @@ def identify_fleet(
     snr_db = {vehicle.vehicle: read_outs.snr_db[j] for j, vehicle in enumerate(vehicles)}
     different = [vehicle.vehicle for vehicle, far in zip(vehicles, far_below_fleet(read_outs), strict=True) if far]
     readers = {name: partial(_read_own_model, shared_db=snr_db[name]) for name in different}
-    own, _ = read_each(readers, fleet, equipment, database, workers=workers) if different else ({}, {})
+    own, _ = (
+        read_each(readers, fleet, equipment, database, workers=workers, label="look again at some")
+        if different
+        else ({}, {})
+    )
     return IdentificationReport(
         bank=chosen,
         branches=equipment.branches,
@@ -236,7 +241,9 @@ def _bank(
         return low_pass_bank(equipment.fleet_inputs, time_constants_s, period_s=period_s)
     names = list(fleet.vehicles)
     some = [names[j] for j in np.unique(np.linspace(0, len(names) - 1, POOLED_VEHICLES).round().astype(int))]
-    read, errors = read_each(dict.fromkeys(some, read_samples), fleet, equipment, database, workers=workers)
+    read, errors = read_each(
+        dict.fromkeys(some, read_samples), fleet, equipment, database, workers=workers, label="read some drives"
+    )
     if not read:
         raise DriveError(f"none of {len(some)} vehicles can be read to choose a filter bank; {errors[some[0]]}")
     return pooled_bank(list(read.values()), period_s=period_s)

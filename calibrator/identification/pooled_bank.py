@@ -21,6 +21,7 @@ from calibrator.identification.filter_bank import FilterBank, Poles, low_passes
 from calibrator.identification.identify import observability, standardised_moments, subspace_modes
 from calibrator.identification.read_out import fit_read_outs
 from calibrator.identification.state_space import Complex
+from calibrator.report.progress import shown
 
 __all__ = ["pooled_bank"]
 
@@ -70,7 +71,9 @@ def pooled_bank(vehicles: Sequence[Sequence[Samples]], *, period_s: float) -> Fi
         for poles in dict.fromkeys(_candidates(vehicles, period_s))
     ]
     settling = max(bank.settling for bank in candidates)
-    errors = [_error_db(bank, vehicles, settling) for bank in candidates]
+    errors = [
+        _error_db(bank, vehicles, settling) for bank in shown(candidates, "try filter banks", len(candidates), "banks")
+    ]
     if not np.isfinite(errors).any():
         raise DriveError(
             f"none of {len(vehicles)} vehicles has three blocks of varied, valid samples to choose a filter bank by, "

@@ -17,6 +17,7 @@ from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_m
 from calibrator.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.published.calibration import ExpectedFaults, calibrate_published
 from calibrator.published.recovery import Recovery
+from calibrator.report.progress import progress_bar
 from calibrator.vehicles import read_vehicles
 from ecu_node.parameters import BranchParameters, HardwareFault, VehicleParameters, Verdict
 
@@ -63,7 +64,8 @@ def calibrate_fleet_published(
     vehicles = _without_misfits(vehicles, settings.hold_out, equipment, left_out)
     learning = require_learning([vehicle.vehicle for vehicle in vehicles], settings, left_out)
     unity = _unity_vehicle([v for v, used in zip(vehicles, learning, strict=True) if used], settings.unity)
-    recovery = _recover(vehicles, unity, equipment, identity, settings)
+    with progress_bar("estimate the faults", None):
+        recovery = _recover(vehicles, unity, equipment, identity, settings)
     left_out |= {vehicles[j].vehicle: reason for j, reason in recovery.failed.items()}
     parameters = [
         _parameters(

@@ -16,12 +16,18 @@ from rich.console import Console
 from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
 
-__all__ = ["bar_line", "numbered_passes", "progress_bar", "rate_text", "shown"]
+__all__ = ["bar_line", "numbered_passes", "one_pass", "progress_bar", "rate_text", "shown"]
 
 LINE_EVERY_S = 10.0
+DRAWN_EVERY_S = 0.1
+"""A bar is moved no more often: a step may have millions of units. [s]"""
+WORTH_A_LINE_S = 1.0
+"""A step that is done sooner is not told in a log. [s]"""
 LEAST_BAR = 6
 """A bar that is shorter than this many characters tells nothing, and is left out. [1]"""
 _Item = TypeVar("_Item")
+_active: ContextVar[Progress | None] = ContextVar("active", default=None)
+"""The bars on the terminal; a step within a step adds its own to them."""
 _number: ContextVar[Callable[[], str]] = ContextVar("number", default=str)
 """What stands before the label of the next pass; nothing outside of numbered passes."""
 
@@ -38,7 +44,17 @@ def numbered_passes(total: int) -> Iterator[None]:
 
 
 @contextmanager
-def progress_bar(label: str, total: int | None, unit: str = "") -> Iterator[Callable[[float], None]]:
+def one_pass(number: int, total: int) -> Iterator[None]:
+    """Within the block every bar belongs to the same pass; a single one has no number."""
+    before = _number.set(lambda: f"{number}/{total} " if total > 1 else "")
+    try:
+        yield
+    finally:
+        _number.reset(before)
+
+
+@contextmanager
+def progress_bar(label: str, total: int | None, unit: str = "", *, begun: int = 0) -> Iterator[Callable[[float], None]]:
     """Show how far a long step is.
 
     Parameters
@@ -49,6 +65,8 @@ def progress_bar(label: str, total: int | None, unit: str = "") -> Iterator[Call
         How many units there are; None for a step of which nobody knows how long it is.
     unit : str
         What is counted, in the plural.
+    begun : int
+        Units that were done before, by a run that was stopped.
 
     Yields
     ------
@@ -57,18 +75,48 @@ def progress_bar(label: str, total: int | None, unit: str = "") -> Iterator[Call
     """
     label, console = f"{_number.get()()}{label}", Console(stderr=True)
     if console.is_terminal and not console.is_dumb_terminal:
-        with Progress(_Line(unit, console), console=console, redirect_stdout=False) as bar:
-            task = bar.add_task(label, total=total)
-            yield lambda done: bar.update(task, completed=done)
+        with _bars(console) as bars:
+            yield _Bar(bars, label, total, unit, begun)
     elif total is None:
         print(label, file=sys.stderr, flush=True)
-        yield lambda done: None  # noqa: ARG005
+        yield lambda _: None
     else:
-        yield _Lines(label, total, unit)
+        yield _Lines(label, total, unit, begun)
+
+
+@contextmanager
+def _bars(console: Console) -> Iterator[Progress]:
+    """The bars that are on the terminal, or new ones."""
+    if (bars := _active.get()) is not None:
+        yield bars
+        return
+    with Progress(_Line(console), console=console, redirect_stdout=False) as bars:
+        before = _active.set(bars)
+        try:
+            yield bars
+        finally:
+            _active.reset(before)
+
+
+class _Bar:
+    """A bar on the terminal."""
+
+    def __init__(self, bars: Progress, label: str, total: float | None, unit: str, begun: int) -> None:
+        self._bars, self._total, self._moved_s = bars, total, -math.inf
+        self._task = bars.add_task(label, total=total, completed=begun, unit=unit, begun=begun)
+
+    def __call__(self, done: float) -> None:
+        now_s = time.monotonic()
+        if now_s - self._moved_s >= DRAWN_EVERY_S or done == self._total:
+            self._moved_s = now_s
+            self._bars.update(self._task, completed=done)
 
 
 def shown(items: Iterable[_Item], label: str, total: int, unit: str) -> Iterator[_Item]:
-    """Items as they come, with a bar that counts those that were taken and dealt with; see :func:`progress_bar`."""
+    """Items as they come, with a bar that counts those that were dealt with; a single one needs no bar."""
+    if total <= 1:
+        yield from items
+        return
     with progress_bar(label, total, unit) as progress:
         for done, item in enumerate(items, start=1):
             yield item
@@ -138,20 +186,22 @@ def bar_line(
 class _Line(ProgressColumn):
     """The whole line of a bar."""
 
-    def __init__(self, unit: str, console: Console) -> None:
+    def __init__(self, console: Console) -> None:
         super().__init__()
-        self._unit, self._console = unit, console
+        self._console = console
         self._strokes = "━╌" if console.encoding.startswith("utf") else "#."
 
     def render(self, task: Task) -> Text:
         """Draw the line as long as the terminal is wide."""
+        elapsed_s = (task.finished_time if task.finished else task.elapsed) or 0.0
+        begun, unit = task.fields["begun"], task.fields["unit"]
         text = bar_line(
             task.description,
             task.completed,
             task.total,
-            self._unit,
-            per_s=task.finished_speed or task.speed,
-            elapsed_s=(task.finished_time if task.finished else task.elapsed) or 0.0,
+            unit,
+            per_s=(task.completed - begun) / elapsed_s if elapsed_s else None,
+            elapsed_s=elapsed_s,
             width=self._console.width - 1,
             strokes=self._strokes,
         )
@@ -163,21 +213,22 @@ class _Line(ProgressColumn):
 class _Lines:
     """A line now and then, for a log."""
 
-    def __init__(self, label: str, total: int, unit: str) -> None:
-        self._label, self._total, self._unit = label, total, unit
+    def __init__(self, label: str, total: int, unit: str, begun: int) -> None:
+        self._label, self._total, self._unit, self._begun = label, total, unit, begun
         self._started_s = self._printed_s = time.monotonic()
 
     def __call__(self, done: float) -> None:
         now_s = time.monotonic()
         finished = done >= self._total
-        if self._printed_s == math.inf or not (finished or now_s - self._printed_s >= LINE_EVERY_S):
+        due_s = WORTH_A_LINE_S if finished else LINE_EVERY_S
+        if now_s - self._printed_s < due_s:  # never again after the last line
             return
         self._printed_s = math.inf if finished else now_s
         elapsed_s = max(now_s - self._started_s, 1e-3)  # a millisecond: no step is shorter
-        left_s = elapsed_s / max(done, 1) * (self._total - done)
+        per_s = (done - self._begun) / elapsed_s
+        left = f"{(self._total - done) / per_s:.0f} s left" if per_s > 0.0 else "time left unknown"
         print(
-            f"{self._label}: {done:.0f} of {self._total} {self._unit}, {rate_text(done / elapsed_s)}, "
-            f"{elapsed_s:.0f} s, {left_s:.0f} s left",
+            f"{self._label}: {done:.0f} of {self._total} {self._unit}, {rate_text(per_s)}, {elapsed_s:.0f} s, {left}",
             file=sys.stderr,
             flush=True,
         )

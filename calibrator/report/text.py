@@ -1,16 +1,46 @@
 """Reports as text or JSON for standard output."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 
-__all__ = ["counted", "dumps", "few", "few_reasons", "left_out_text", "reasons_text", "table", "told_once"]
+from ecu_node.standard_output import write_output, write_text
+
+__all__ = [
+    "counted",
+    "dumps",
+    "few",
+    "few_reasons",
+    "left_out_text",
+    "print_report",
+    "reasons_text",
+    "table",
+    "told_once",
+]
 
 MOST_NAMES = 6
 """Names told on one line: half a line of a terminal."""
 MOST_REASONS = 5
 """Vehicles whose reasons are told in one message."""
+
+
+class Report(Protocol):
+    """What a command found, for people and for programs."""
+
+    def as_text(self) -> str:
+        """The report for people."""
+
+    def as_json(self) -> str:
+        """The report as JSON."""
+
+
+def print_report(report: Report, *, json: bool) -> None:
+    """Print a report on standard output: one JSON document, or text that a terminal gets broken at words."""
+    if json:
+        write_output(report.as_json())
+    else:
+        write_text(report.as_text())
 
 
 def dumps(value: Any) -> str:

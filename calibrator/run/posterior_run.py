@@ -84,7 +84,7 @@ def calibrate_store(
     todo = [bucket for bucket in census.usable if not chunks.done(bucket)]
     calibrate = partial(calibrate_bucket, store=store, task=learnt.task, previous=previous)
     seen = census.size - sum(census.usable[bucket] for bucket in todo)
-    with progress_bar("calibrate", census.size, "vehicles") as progress:
+    with progress_bar("calibrate", census.size, "vehicles", begun=seen) as progress:
         progress(seen)
         for bucket, result in zip(todo, workers.map(calibrate, todo), strict=True):
             chunks.put(bucket, result)
@@ -115,7 +115,7 @@ def _learn(
         full_scale_a=identity.database.layout.full_scale_a,
     )
     checked = {vehicle for vehicle, _ in bench}
-    with threadpool_limits(1):
+    with threadpool_limits(1), progress_bar("learn the fleet", None):
         return learn_fleet(
             read_sample(store, census, settings, checked, everyone=find_models is not None),
             settings,

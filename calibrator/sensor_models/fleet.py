@@ -118,7 +118,9 @@ def find_sensor_models(
         )
         for j, vehicle in enumerate(vehicles)
     }
-    found, errors = read_each(readers, fleet, equipment, database, workers=workers, limit_s=limit_s)
+    found, errors = read_each(
+        readers, fleet, equipment, database, workers=workers, limit_s=limit_s, label="read drives again"
+    )
     notices += [f"sensor models: {name} counts as linear: {reason}" for name, reason in errors.items()]
     findings = findings_of(vehicles, found, learning=learning, trusted=trusted)
     return replace(findings, notices=(*notices, *findings.notices))

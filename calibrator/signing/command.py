@@ -2,22 +2,26 @@
 
 import os
 import re
-import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from calibrator.command_options import JsonOption
 from calibrator.errors import ContradictionError, SigningError
 from calibrator.folders import require_possible_folder
+from calibrator.report.progress import shown
+from calibrator.report.text import dumps
 from calibrator.signing.key_files import PASSPHRASE_VARIABLE, new_key, read_public_key, read_signer
 from calibrator.signing.numbers import require_near_number, signing_time, time_text
 from calibrator.signing.orders import Order
 from calibrator.signing.statements import signed_statement
 from calibrator.whole_files import made_folder, remove_abandoned, require_own_file, write_files
 from ecu_node.errors import printable
+from ecu_node.failures import say_error
+from ecu_node.standard_output import write_output
 from ecu_node.trust.canonical import Expected, canonical_bytes, read_canonical
 from ecu_node.trust.key_set import SIGNER_NAME, KeySet, check_key_set
 from ecu_node.trust.statements import LAST_SEQUENCE, MAX_SEQUENCE, Revocation
@@ -55,6 +59,7 @@ def new(
     name: Annotated[str, typer.Argument(help="Name of the signer.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for NAME.key (private) and NAME.pub.")],
     plain: Annotated[bool, typer.Option("--no-passphrase", help="Do not encrypt the private key.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Make the key of one signer."""
     passphrase = _passphrase()
@@ -67,7 +72,8 @@ def new(
     require_possible_folder(out)
     with made_folder(out):
         made = new_key(name, out, passphrase)
-    sys.stdout.write("".join(f"{printable(str(path))}\n" for path in made))
+    private, public = made
+    _tell({"signer": name, "private_key": str(private), "public_key": str(public)}, made, json=json)
 
 
 @keys.command("set")
@@ -79,6 +85,7 @@ def make_set(
         int, typer.Option(min=1, max=_HIGHEST_VERSION, help="One more than that of the set before.")
     ] = 1,
     key: KeyOption = [],  # noqa: B006
+    json: JsonOption = False,
 ) -> None:
     """Say whom vehicles trust. The first set is not signed; a later one by enough of the set before and of its own."""
     named = [read_public_key(path) for path in public]
@@ -94,6 +101,8 @@ def make_set(
     plain = canonical_bytes(found)
     read_canonical(plain, KeySet, "key set", _KEY_SET)
     _write_one(out, signed_statement(found, signers) if signers else plain + b"\n")
+    facts = {"version": version, "threshold": threshold, "signers": sorted(item.key.name for item in named)}
+    _tell({"file": str(out), **facts}, [out], json=json)
 
 
 def sign(
@@ -109,6 +118,7 @@ def sign(
     ] = False,
     far_sequence: FarOption = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace files that exist.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Sign parameter files, one signed file per vehicle; 'ecu-node activate' takes them.
 
@@ -127,8 +137,10 @@ def sign(
     places = {out / path.name: path for path in params}
     if len(places) < len(params):
         raise SigningError(f"files of one name would overwrite each other in {out}; sign them one after the other")
-    done = set() if replace else {place for place, path in places.items() if order.is_done(path, place)}
-    files = {place: None if place in done else order.signed(path) for place, path in places.items()}
+    files: dict[Path, bytes | None] = {}
+    for place, path in shown(places.items(), "sign", len(places), "files"):
+        files[place] = None if not replace and order.is_done(path, place) else order.signed(path)
+    done = {place for place, content in files.items() if content is None}
     for place in places.keys() - done:
         require_own_file(place)
     there = sorted(place for place in places.keys() - done if place.exists())
@@ -138,6 +150,10 @@ def sign(
             f"or replace it with --replace"
         )
     _write_all(files, out)
+    if done and not json:
+        say_error(f"notice: {len(done)} of {len(files)} were signed before by the same command, and are kept")
+    signed = [str(place) for place in files if place not in done]
+    _tell({"signed": signed, "kept": sorted(map(str, done))}, list(files), json=json)
 
 
 def revoke(
@@ -148,6 +164,7 @@ def revoke(
     out: OutFileOption,
     sequence: Annotated[int | None, typer.Option(min=1, max=LAST_SEQUENCE, help=_SEQUENCE)] = None,
     far_sequence: FarOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Take signed parameters of a vehicle back; 'ecu-node revoke' takes the file."""
     now = signing_time(datetime.now(UTC))
@@ -161,6 +178,8 @@ def revoke(
     )
     read_canonical(canonical_bytes(statement), Revocation, "revocation", _REVOCATION)
     _write_one(out, signed_statement(statement, [read_signer(path, _passphrase()) for path in key]))
+    facts = {"vehicle": vehicle, "sequence": statement.sequence, "revokes": statement.revokes}
+    _tell({"file": str(out), **facts}, [out], json=json)
 
 
 def _write_one(path: Path, content: bytes) -> None:
@@ -169,20 +188,20 @@ def _write_one(path: Path, content: bytes) -> None:
         raise SigningError(f"{path}: there is a file already; name another one")
     remove_abandoned([path])
     write_files({path: content})
-    print(printable(str(path)))
 
 
 def _write_all(files: Mapping[Path, bytes | None], out: Path) -> None:
     """Write files one by one, so that none of them waits for the others; None: it is there already."""
-    kept = sum(content is None for content in files.values())
     with made_folder(out):
         remove_abandoned(files)
         for path, content in files.items():
             if content is not None:
                 write_files({path: content})
-            print(printable(str(path)))
-    if kept:
-        print(f"notice: {kept} of {len(files)} were signed before by the same command, and are kept", file=sys.stderr)
+
+
+def _tell(facts: Mapping[str, object], paths: Sequence[Path], *, json: bool) -> None:
+    """Print what was made: the files, a line each, or all of it as JSON."""
+    write_output(dumps(facts) if json else "\n".join(printable(str(path)) for path in paths))
 
 
 def _passphrase() -> str | None:

@@ -1,14 +1,15 @@
 """Commands of ``ecu-node`` for signed parameters: provision, activate, revoke, verify, inspect."""
 
 import argparse
+import json
 import os
-import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from ecu_node.errors import printable
-from ecu_node.standard_output import write_output
+from ecu_node.failures import say_error
+from ecu_node.standard_output import write_output, write_text
 
 __all__ = ["add_trust_commands"]
 
@@ -33,6 +34,7 @@ def add_trust_commands(commands: "argparse._SubParsersAction[Any]") -> None:
     provision.add_argument("--vehicle", required=True, type=_vehicle, metavar="ID", help="identity of this vehicle")
     provision.add_argument("--keys", required=True, type=Path, metavar="FILE", help="first key set ('calibrator keys')")
     _add_state(provision)
+    _add_json(provision)
     provision.set_defaults(command=_provision)
     for name, what, details in (
         ("activate", "take signed parameters, or a signed key set", "Parameters go on trial in the running node."),
@@ -51,6 +53,7 @@ def add_trust_commands(commands: "argparse._SubParsersAction[Any]") -> None:
         command.add_argument(
             "--layout", type=Path, required=True, metavar="FILE", help="layout (TOML), which names the DBC"
         )
+        _add_json(command)
         command.set_defaults(command=_take, name=name)
     inspect = commands.add_parser(
         "inspect",
@@ -63,11 +66,16 @@ def add_trust_commands(commands: "argparse._SubParsersAction[Any]") -> None:
     )
     inspect.add_argument("what", type=Path, metavar="FILE|FOLDER", help="signed file, or state of a vehicle")
     inspect.add_argument("--keys", type=Path, metavar="FILE", help="key set with which signatures are verified")
+    _add_json(inspect)
     inspect.set_defaults(command=_inspect)
 
 
 def _add_state(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--state", required=True, type=Path, metavar="FOLDER", help="state of this vehicle")
+
+
+def _add_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _vehicle(text: str) -> str:
@@ -82,7 +90,7 @@ def _vehicle(text: str) -> str:
 
 def _provision(options: argparse.Namespace) -> int:
     from ecu_node.trust.canonical import read_bytes, read_canonical  # noqa: PLC0415
-    from ecu_node.trust.inspection import signers_text  # noqa: PLC0415
+    from ecu_node.trust.inspection import signers_text, statement_facts  # noqa: PLC0415
     from ecu_node.trust.key_set import KEY_SET, KeySet, check_key_set  # noqa: PLC0415
     from ecu_node.trust.provision import provision  # noqa: PLC0415  # cryptography takes time to import
 
@@ -90,7 +98,11 @@ def _provision(options: argparse.Namespace) -> int:
     content = read_bytes(options.keys, KEY_SET).removesuffix(b"\n")
     keys = check_key_set(read_canonical(content, KeySet, where, KEY_SET), where)
     provision(options.state, options.vehicle, keys, _now())
-    write_output(printable(f"{options.state}: vehicle {options.vehicle} trusts {signers_text(keys)}"))
+    if options.json:
+        facts = {"state": str(options.state), "vehicle": options.vehicle, "key_set": statement_facts(keys)}
+        write_output(json.dumps(facts, indent=2))
+    else:
+        write_text(printable(f"{options.state}: vehicle {options.vehicle} trusts {signers_text(keys)}"))
     return 0
 
 
@@ -109,9 +121,18 @@ def _take(options: argparse.Namespace) -> int:
     else:
         kinds = (Revocation,) if options.name == "revoke" else (SignedParameters, KeySet)
         accepted = accept(options.state, content, where, database, _now(), kinds=kinds, on_wait=_say_waiting)
+    if options.json:
+        facts = {
+            "taken": options.name != "verify",
+            "event": accepted.event,
+            "sequence": accepted.sequence,
+            "text": accepted.text,
+        }
+        write_output(json.dumps(facts, indent=2))
+        return 0
     number = f"number {accepted.sequence}, " if accepted.sequence is not None else ""
     would = "would be accepted: " if options.name == "verify" else ""
-    write_output(printable(f"{would}{accepted.event}: {number}{accepted.text}"))
+    write_text(printable(f"{would}{accepted.event}: {number}{accepted.text}"))
     return 0
 
 
@@ -120,19 +141,22 @@ def _inspect(options: argparse.Namespace) -> int:
 
     if os.path.isdir(options.what):  # noqa: PTH112  # False where the name is too long for a file
         if options.keys is not None:
-            print("ecu-node: --keys is for a signed file; a state has keys of its own", file=sys.stderr)
+            say_error("ecu-node: --keys is for a signed file; a state has keys of its own; leave --keys out")
             return 2
         found = inspect_state(options.what, _now())
     else:
         found = inspect_file(options.what, options.keys)
-    write_output("\n".join(map(printable, found.lines)))
+    if options.json:
+        write_output(found.as_json())
+    else:
+        write_text("\n".join(map(printable, found.lines)))
     for problem in found.problems:
-        print(f"ecu-node: {printable(problem)}", file=sys.stderr)
+        say_error(f"ecu-node: {problem}")
     return 1 if found.problems else 0
 
 
 def _say_waiting(text: str) -> None:
-    print(f"ecu-node: {printable(text)}", file=sys.stderr, flush=True)
+    say_error(f"ecu-node: {text}")
 
 
 def _now() -> datetime:

@@ -1,8 +1,13 @@
 """What ``ecu-node inspect`` shows: a signed file, a key set, or the state of a vehicle, and what is wrong with it."""
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from ecu_node.errors import UnfitError
 from ecu_node.parameters import BranchParameters
@@ -15,15 +20,20 @@ from ecu_node.trust.statements import Revocation, SignedParameters, Statement, o
 from ecu_node.trust.unsigned import unsigned_kind
 from ecu_node.trust.validity import require_time
 
-__all__ = ["Inspection", "inspect_file", "inspect_state", "signers_text"]
+__all__ = ["Inspection", "inspect_file", "inspect_state", "signers_text", "statement_facts"]
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """What is shown, and what is wrong; a line each."""
+    """What is shown, and what is wrong, a line each; and the same for programs."""
 
     lines: list[str]
     problems: list[str] = field(default_factory=list)
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def as_json(self) -> str:
+        """Facts and problems as JSON."""
+        return json.dumps({**self.facts, "problems": self.problems}, indent=2)
 
 
 def inspect_file(path: Path, keys: Path | None) -> Inspection:
@@ -49,18 +59,27 @@ def inspect_file(path: Path, keys: Path | None) -> Inspection:
     content, where = read_bytes(path), str(path)
     trusted = _key_set(keys) if keys is not None else None
     if unsigned_kind(content) == "key set":
-        lines = [*_statement_lines(_plain_key_set(content, where)), "not signed: a vehicle may begin with it"]
-        return Inspection(lines, [f"{where}: nobody signed this key set"] * (trusted is not None))
+        plain = _plain_key_set(content, where)
+        lines = [*_statement_lines(plain), "not signed: a vehicle may begin with it"]
+        problems = [f"{where}: nobody signed this key set"] * (trusted is not None)
+        return Inspection(lines, problems, statement_facts(plain) | _signatures(()))
     envelope, statement = open_statement(content, where)
-    lines = _statement_lines(statement)
+    lines, keyids = _statement_lines(statement), [signature.keyid for signature in envelope.signatures]
+    facts = statement_facts(statement)
     if trusted is None:
-        lines += ["signatures, not verified, of keys:", *(f"  {signature.keyid}" for signature in envelope.signatures)]
-        return Inspection(lines)
+        lines += ["signatures, not verified, of keys:", *(f"  {keyid}" for keyid in keyids)]
+        return Inspection(lines, facts=facts | _signatures(keyids))
     try:
         names = verify(content, trusted, where).signers
     except UnfitError as error:
-        return Inspection(lines, [str(error)])
-    return Inspection([*lines, f"signed by {', '.join(names)}; enough, {signers_text(trusted)} are needed"])
+        return Inspection(lines, [str(error)], facts | _signatures(keyids, signers=[]))
+    lines.append(f"signed by {', '.join(names)}; enough, {signers_text(trusted)} are needed")
+    return Inspection(lines, facts=facts | _signatures(keyids, signers=names))
+
+
+def _signatures(keyids: Sequence[str], signers: Sequence[str] | None = None) -> dict[str, Any]:
+    """Whose keys have signed, and which signers were verified to be enough; None: nothing was verified."""
+    return {"signed_by_keyids": list(keyids), "verified_signers": None if signers is None else list(signers)}
 
 
 def _key_set(path: Path) -> KeySet:
@@ -136,7 +155,15 @@ def inspect_state(folder: Path, now: datetime) -> Inspection:
             f"vehicle {state.vehicle}, highest number {state.highest_sequence}",
             f"key set {state.keys.version}: {signers_text(state.keys)}",
             *_keys(state.keys),
-        ]
+        ],
+        facts={
+            "kind": "state",
+            "vehicle": state.vehicle,
+            "highest_sequence": state.highest_sequence,
+            "key_set": statement_facts(state.keys),
+            "slots": {},
+            "revoked": list(state.revoked),
+        },
     )
     for name in sorted(state.slots):
         _show_slot(found, folder, state, name, now)
@@ -148,6 +175,7 @@ def inspect_state(folder: Path, now: datetime) -> Inspection:
 
 def _show_slot(found: Inspection, folder: Path, state: TrustState, name: SlotName, now: datetime) -> None:
     places = {state.in_force: "in force", state.on_trial: "on trial", state.fallback: "in force before"}
+    facts = {"sequence": state.slots[name].sequence, "place": places.get(name, "not used")}
     shown = f"slot {name}: number {state.slots[name].sequence}, {places.get(name, 'not used')}"
     where = str(slot_path(folder, name))
     try:
@@ -156,10 +184,16 @@ def _show_slot(found: Inspection, folder: Path, state: TrustState, name: SlotNam
         found.lines.append(f"{shown}; damaged, it is not used")
         why: str | None = str(error)
     else:
+        facts |= {
+            "parameter_set": signed.parameters.number,
+            "not_before": signed.not_before,
+            "expires": signed.expires,
+        }
         why = _why_not_now(state, signed, where, now)
         dates = f"parameter set {signed.parameters.number}, holds from {signed.not_before} to {signed.expires}"
         early = "does not hold yet" if now.strftime("%Y-%m-%dT%H:%M:%SZ") < signed.not_before else "expired"
         found.lines.append(f"{shown}; {dates}" + (f"; {early}, it is not used" if why is not None else ""))
+    found.facts["slots"][name] = {**facts, "why_not_used": why}
     if why is not None and name in (state.in_force, state.on_trial):
         found.problems.append(why)
 
@@ -177,6 +211,7 @@ def _show_log(found: Inspection, path: Path, state: TrustState) -> None:
     end = end_of_log(path, state.made_by) if state.made_by is not None else End.TOLD
     if end is End.LEFT and state.made_by is not None:
         found.lines.append(f"not in the audit log yet, the next command adds it: {state.made_by.event}")
+    found.facts["audit_log"] = "changed" if broken is not None else "cut" if end is End.LOST else "whole"
     if broken is not None:
         found.lines.append(f"audit log: line {broken} was changed")
         found.problems.append(f"{path}: line {broken} is not what was written there")
@@ -185,6 +220,35 @@ def _show_log(found: Inspection, path: Path, state: TrustState) -> None:
         found.problems.append(f"{path}: lines are missing at its end, or all of it: somebody cut or removed it")
     else:
         found.lines.append("audit log: whole")
+
+
+def statement_facts(statement: Statement) -> dict[str, Any]:
+    """What a statement says, for programs: numbers with their units in the names, times as ISO 8601."""
+    if isinstance(statement, KeySet):
+        keys = sorted(statement.keys.values(), key=lambda key: key.name)
+        return {
+            "kind": "key set",
+            "version": statement.version,
+            "threshold": statement.threshold,
+            "signers": {key.name: key.ed25519 for key in keys},
+        }
+    if isinstance(statement, Revocation):
+        facts = msgspec.structs.asdict(statement)
+        return {"kind": "revocation", **{name: value for name, value in facts.items() if name != "schema_version"}}
+    parameters = statement.parameters
+    return {
+        "kind": "parameters",
+        "vehicle": statement.vehicle,
+        "sequence": statement.sequence,
+        "parameter_set": parameters.number,
+        "not_before": statement.not_before,
+        "expires": statement.expires,
+        "layout": parameters.layout.name,
+        "dbc": parameters.dbc.name,
+        "verdict": parameters.verdict,
+        "allow_large_step": statement.allow_large_step,
+        "branches": msgspec.to_builtins(parameters.branches),
+    }
 
 
 def signers_text(keys: KeySet) -> str:

@@ -74,7 +74,7 @@ def test_the_pole_that_is_given_is_used_and_the_vehicle_that_has_another_is_name
     assert list(figures["own_models"]) == [SLUGGISH]
     assert figures["branches"]["motor"]["worst_vehicle"] == SLUGGISH
     assert figures["branches"]["motor"]["median_db"] > 30.0
-    assert figures["own_models"][SLUGGISH]["motor"] > figures["vehicles"][SLUGGISH]["motor"] + 3.0
+    assert figures["own_models"][SLUGGISH]["snr_db"]["motor"] > figures["snr_db"][SLUGGISH]["motor"] + 3.0
     assert read_bank(bank).described() == "2 s"
     again = identify(store, "--bank", bank, "--json")
     assert json.loads(again.stdout) == figures

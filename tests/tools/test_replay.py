@@ -1,6 +1,7 @@
 """Playing logs onto a bus: formats, order, timing, and logs that cannot be played."""
 
 import gzip
+import json
 import re
 import struct
 import time
@@ -182,11 +183,21 @@ def test_ctrl_c_ends_the_line_of_progress_first_and_the_replay_with_130(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(VirtualBus, "send", send)
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    monkeypatch.setattr("replay._PROGRESS_PERIOD_S", {True: 0.0, False: 0.0})
+    monkeypatch.setattr("calibrator.report.progress.LINE_EVERY_S", 0.0)
     assert main([str(log), "--interface", "virtual", "--channel", "c"]) == 130
-    last = capsys.readouterr().err.rpartition("\r")[2]
-    assert last == "replay: 3 frames, 0 s of the log\nreplay: interrupted after 3 frames\n"
+    *_, progress, last = capsys.readouterr().err.splitlines()
+    assert progress.startswith(f"replay: 3 of {len(FRAMES)} frames, ")
+    assert last == "replay: interrupted after 3 frames"
+
+
+def test_the_account_as_json_is_all_that_stands_on_standard_output(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with VirtualBus("json"):
+        assert main([str(log), "--interface", "virtual", "--channel", "json", "--speed", "0", "--json"]) == 0
+    account = json.loads(capsys.readouterr().out)
+    assert account.keys() == {"frames", "duration_s"}
+    assert account["frames"] == 60
 
 
 def test_long_payloads_are_played_as_can_fd(tmp_path: Path) -> None:

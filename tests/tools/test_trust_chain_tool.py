@@ -27,14 +27,14 @@ def test_no_vehicle_of_500_is_made_worse(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     counts = json.loads(result.stdout)
     assert counts["vehicles"] == 500
-    assert counts["with corrections"] > 400
+    assert counts["with_corrections"] > 400
     assert counts["refused"] == 0
-    assert counts["deployed"] >= 0.9 * counts["with corrections"]
-    assert counts["made worse"] == 0
-    assert counts["error, median, published"] < 0.2 * counts["error, median, measured"]
-    for kind in ("signs turned", "of another vehicle"):
-        assert counts[f"wrong sets on trial, {kind}"] > 300
-        assert counts[f"of these passed, {kind}"] < 0.2 * counts[f"wrong sets on trial, {kind}"]
+    assert counts["deployed"] >= 0.9 * counts["with_corrections"]
+    assert counts["made_worse"] == 0
+    assert counts["error_median_published_a"] < 0.2 * counts["error_median_measured_a"]
+    for kind in ("signs_turned", "of_another_vehicle"):
+        assert counts[f"wrong_sets_on_trial_{kind}"] > 300
+        assert counts[f"of_these_passed_{kind}"] < 0.2 * counts[f"wrong_sets_on_trial_{kind}"]
 
 
 def test_a_layout_that_is_not_there_is_told_in_one_line() -> None:

@@ -13,6 +13,7 @@ from calibrator.artificial.vehicle import Vehicle, vehicle_drive
 from calibrator.drives.store import write_drive
 from calibrator.interrupts import in_processes
 from calibrator.random_streams import Purpose, random_stream
+from calibrator.report.progress import shown
 from ecu_node.database import VehicleDatabase
 
 __all__ = ["ChainFleet", "draw_fleet"]
@@ -49,9 +50,9 @@ class ChainFleet:
 
     def write_drives(self, store: Path, *, workers: int) -> None:
         """Write the drives to learn from into a store."""
-        for _ in in_processes(
-            (delayed(self.write_drive)(store, number) for number in range(len(self.vehicles))), workers=workers
-        ):
+        count = len(self.vehicles)
+        written = in_processes((delayed(self.write_drive)(store, number) for number in range(count)), workers=workers)
+        for _ in shown(written, "drive, to learn from", count, "vehicles"):
             pass
 
     def write_drive(self, store: Path, number: int) -> None:

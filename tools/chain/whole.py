@@ -9,7 +9,8 @@ from pathlib import Path
 from joblib import delayed
 
 from calibrator.interrupts import in_processes
-from calibrator.report.text import table
+from calibrator.report.progress import shown
+from calibrator.report.text import dumps, table
 from chain.fleet import ChainFleet
 from chain.one_vehicle import SignedFile, VehicleOutcome, drive_vehicle
 from ecu_node.errors import UserError
@@ -59,12 +60,21 @@ class ChainScore:
             "error, worst, published": after[-1],
         }
 
+    def as_json(self) -> str:
+        """Return the score as JSON: the same names, in one word."""
+        counts = {_key(name): count for name, count in self.counts().items()}
+        return dumps({**counts, **{f"{_key(name)}_a": value for name, value in self.errors_a().items()}})
+
     def as_text(self) -> str:
         """Return the score for people, with a line for each vehicle that did not come to its end."""
         rows = [(name, f"{count}") for name, count in self.counts().items()]
         rows += [(f"{name} [A]", f"{value:.2f}") for name, value in self.errors_a().items()]
         ends = [f"{found.vehicle}: {_end(found)}" for found in self.outcomes if _end(found)]
         return "\n".join([table(("", ""), rows), *ends])
+
+
+def _key(name: str) -> str:
+    return name.replace(",", "").replace(" ", "_")
 
 
 def _end(found: VehicleOutcome) -> str:
@@ -105,6 +115,7 @@ def drive_chain(fleet: ChainFleet, folder: Path, *, workers: int) -> ChainScore:
     _run(
         *("calibrator", "calibrate", folder / "drives", "--layout", layout),
         *("--out", folder / "result", "--workers", workers),
+        progress=True,
     )
     files = [folder / "result" / "params" / f"{vehicle.name}.json" for vehicle in fleet.vehicles]
     _sign(folder, [path for path in files if path.exists()])
@@ -114,7 +125,8 @@ def drive_chain(fleet: ChainFleet, folder: Path, *, workers: int) -> ChainScore:
         delayed(_drive)(fleet, number, folder, keys, calibrated[(place + 1) % len(calibrated)])
         for place, number in enumerate(calibrated)
     )
-    return ChainScore(list(in_processes(tasks, workers=workers)))
+    driven = in_processes(tasks, workers=workers)
+    return ChainScore(list(shown(driven, "drive, corrected", len(calibrated), "vehicles")))
 
 
 def _sign(folder: Path, files: Sequence[Path]) -> None:
@@ -139,10 +151,11 @@ def _drive(fleet: ChainFleet, number: int, folder: Path, keys: KeySet, other: in
     return drive_vehicle(fleet, number, file, others, folder / "states" / name)
 
 
-def _run(*words: object) -> None:
-    """Run a command of the project; its last line if it fails."""
+def _run(*words: object, progress: bool = False) -> None:
+    """Run a command of the project, perhaps with its own progress; its last line if it fails."""
     command = [sys.executable, "-m", *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    errors = None if progress else subprocess.PIPE
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=errors, text=True, check=False)
     if done.returncode:
-        last = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()[-1]
+        last = ((done.stderr or "").strip() or done.stdout.strip() or "it said why").splitlines()[-1]
         raise UserError(f"{words[0]} {words[1]}: ended with {done.returncode}: {last}")
