@@ -15,6 +15,7 @@ import os
 import pickle
 import platform
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -23,8 +24,6 @@ from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar, cast
 
 import llvmlite.binding
 import numba as _numba
-
-from ecu_node.failures import say_error
 
 __all__ = ["compiled", "in_place", "inlined", "inner"]
 
@@ -147,7 +146,7 @@ def _say(when: str) -> None:
     """Tell the user what takes time; once, and workers say nothing, which would tear the bar of who started them."""
     if multiprocessing.current_process().name != "MainProcess":
         return
-    say_error(f"calibrator: compiling the estimator (about half a minute, {when})")
+    print(f"calibrator: compiling the estimator (about half a minute, {when})", file=sys.stderr, flush=True)
 
 
 @contextmanager

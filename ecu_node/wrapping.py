@@ -44,11 +44,13 @@ def wrapped(text: str, columns: int) -> str:
 def _wrapped_line(line: str, columns: int) -> str:
     if len(line) <= columns:
         return line
-    indent = len(line) - len(line.lstrip())
+    words = line.lstrip()
+    indent = " " * (len(line) - len(words))
     return textwrap.fill(
-        line,
+        words,
         columns,
-        subsequent_indent=" " * (indent + _MORE_INDENT),
+        initial_indent=indent,
+        subsequent_indent=f"{indent}{' ' * _MORE_INDENT}",
         break_long_words=False,
         break_on_hyphens=False,
         expand_tabs=False,
