@@ -132,7 +132,7 @@ def import_(
     report = import_logs(logs, _database(layout), out, workers=workers, limit_s=time_limit)
     print_report(report, json=json)
     if not report.drives and not report.already_there:
-        raise LogError(f"none of the logs could be used; {out} was not changed")
+        raise LogError(f"none of the logs could be used, for the reasons given above; {out} was not changed")
 
 
 @app.command()

@@ -63,6 +63,7 @@ __all__ = [
     "require_one_bank",
     "require_own_options",
     "require_truth_where_used",
+    "whole_option",
 ]
 
 OWN_OPTIONS = {
@@ -124,6 +125,17 @@ def number_option(name: str, low: float, high: float, meaning: str) -> Any:
         return value
 
     return typer.Option(name, parser=parse, metavar="NUMBER", help=f"{meaning}, {low:g} to {high:g}.")
+
+
+def whole_option(name: str, low: int, high: int, meaning: str) -> Any:
+    """Make an option that is a whole number between bounds; parameters and result as for :func:`number_option`."""
+
+    def parse(given: str | int) -> int:
+        if not re.fullmatch(r"[+-]?[0-9]{1,20}", str(given)) or not low <= int(given) <= high:
+            raise typer.BadParameter(f"{given}: expected a whole number from {low} to {high}")
+        return int(given)
+
+    return typer.Option(name, parser=parse, metavar="NUMBER", help=f"{meaning}, {low} to {high}.")
 
 
 def _magnitude(value: tuple[float, float]) -> tuple[float, float]:
@@ -209,7 +221,7 @@ StoreOption = Annotated[
 LayoutOption = Annotated[Path, typer.Option("--layout", help="Layout (TOML) that says what the signals mean.")]
 DbcOption = Annotated[Path | None, typer.Option("--dbc", help="DBC to use instead of the one the layout names.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
-WorkersOption = Annotated[int, typer.Option("--workers", min=1, max=MAX_WORKERS, help="Number of processes.")]
+WorkersOption = Annotated[int, whole_option("--workers", 1, MAX_WORKERS, "Number of processes")]
 SchedulerOption = Annotated[
     str | None,
     typer.Option(
@@ -220,9 +232,9 @@ TimeLimitOption = Annotated[
     float,
     number_option("--time-limit", 1, MAX_TIME_LIMIT_S, "Longest time to read one log, or one vehicle of a fleet [s]"),
 ]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, max=MAX_SEED, help="Seed of everything random.")]
-VehiclesOption = Annotated[int, typer.Option("--vehicles", min=1, max=MAX_VEHICLES, help="Number of vehicles N.")]
-CurrentsOption = Annotated[int, typer.Option("--currents", min=2, max=MAX_CURRENTS, help="Number of branches K.")]
+SeedOption = Annotated[int, whole_option("--seed", 0, MAX_SEED, "Seed of everything random")]
+VehiclesOption = Annotated[int, whole_option("--vehicles", 1, MAX_VEHICLES, "Number of vehicles N")]
+CurrentsOption = Annotated[int, whole_option("--currents", 2, MAX_CURRENTS, "Number of branches K")]
 BranchesOption = Annotated[
     str | None, typer.Option("--branches", callback=_branches, help="Branches to use, with commas.")
 ]
@@ -309,9 +321,7 @@ PolesOption = Annotated[
 QuickOption = Annotated[bool, typer.Option("--quick", help="Small and fast: shows that it runs, not the figures.")]
 RepetitionsOption = Annotated[
     int | None,
-    typer.Option(
-        "--repetitions", min=1, max=MAX_REPETITIONS, help="Trials per setting; without it 10, with --quick 2."
-    ),
+    whole_option("--repetitions", 1, MAX_REPETITIONS, "Trials per setting (without it 10, with --quick 2)"),
 ]
 ExperimentDrivesOption = Annotated[
     Path | None,

@@ -263,11 +263,11 @@ def read_layout(path: Path) -> Layout:
         document = tomllib.loads(content.decode())
     except (OSError, UnsuitableFileError) as error:
         why = error.strerror if isinstance(error, OSError) else error
-        raise LayoutError(f"{path}: cannot read the layout: {why}") from None
+        raise LayoutError(f"{path}: cannot read the layout: {why}; name the layout (TOML) of this vehicle") from None
     except UnicodeDecodeError:
-        raise LayoutError(f"{path}: not a layout: the file is not UTF-8 text") from None
+        raise LayoutError(f"{path}: not a layout: the file is not UTF-8 text; see docs/layout.md") from None
     except (ValueError, RecursionError) as error:  # not only TOMLDecodeError: numbers and nesting have limits, too
-        raise LayoutError(f"{path}: not TOML: {error}") from None
+        raise LayoutError(f"{path}: not TOML: {error}; a layout is expected, see docs/layout.md") from None
     _require_profiles(document, path)
     try:
         keys = msgspec.convert(document, LayoutKeys)

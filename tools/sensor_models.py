@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from calibrator.command_options import MAX_CURRENTS, MAX_VEHICLES, SeedOption, number_option, whole_option
 from calibrator.commands import command_app, run_tool
 from calibrator.experiments.recorded_fleet import builtin_fleet, read_fleet
 from calibrator.experiments.sensor_fleet import SensorCase, calibrate_sensors, draw_sensors
@@ -22,13 +23,13 @@ def main(
     *,
     layout: Annotated[Path, typer.Option(help="Layout that names a temperature.")] = Path("dbc/hv_powertrain.toml"),
     drives: Annotated[Path | None, typer.Option(help="Drive store; none: built-in trips.")] = None,
-    vehicles: Annotated[int, typer.Option(min=8, help="Vehicles of the fleet.")] = SensorCase().vehicles,
-    branches: Annotated[int, typer.Option(min=2, help="Branches of each.")] = SensorCase().branches,
-    share: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share with a bent sensor.")] = SensorCase().share,
-    sparsity: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Of the other faults [%].")
-    ] = SensorCase().sparsity,
-    seed: Annotated[int, typer.Option(min=0, help="Of the fleet.")] = 0,
+    vehicles: Annotated[
+        int, whole_option("--vehicles", 8, MAX_VEHICLES, "Vehicles of the fleet")
+    ] = SensorCase().vehicles,
+    branches: Annotated[int, whole_option("--branches", 2, MAX_CURRENTS, "Branches of each")] = SensorCase().branches,
+    share: Annotated[float, number_option("--share", 0, 1, "Share with a bent sensor")] = SensorCase().share,
+    sparsity: Annotated[float, number_option("--sparsity", 0, 100, "Of the other faults [%]")] = SensorCase().sparsity,
+    seed: SeedOption = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the counts as JSON.")] = False,
 ) -> None:
     """Draw a fleet with sensors that are not linear, calibrate it, and count what became of them."""

@@ -14,6 +14,17 @@ import typer
 
 from calibrator.artificial.simulate import FleetPlan
 from calibrator.artificial.trips import choose_trips
+from calibrator.command_options import (
+    MAX_MINUTES,
+    MAX_VEHICLES,
+    CurrentsOption,
+    SeedOption,
+    SparsityOption,
+    UnmeasuredOption,
+    WorkersOption,
+    number_option,
+    whole_option,
+)
 from calibrator.commands import command_app, run_tool
 from calibrator.report.text import print_report
 from chain.fleet import draw_fleet
@@ -29,18 +40,18 @@ def main(
     *,
     layout: Annotated[Path, typer.Option(help="Layout of the vehicles.")] = Path("dbc/hv_powertrain.toml"),
     drives: Annotated[str, typer.Option(help="Drive store with the trips to drive, or 'builtin'.")] = "builtin",
-    vehicles: Annotated[int, typer.Option(min=8, help="Vehicles of the fleet.")] = 500,
-    currents: Annotated[int, typer.Option(min=2, max=16, help="Branches of each.")] = 3,
-    sparsity: Annotated[float, typer.Option(min=0.0, max=100.0, help="Share of parameters without a fault [%].")] = 80,
-    unmeasured: Annotated[
-        tuple[float, float], typer.Option(help="Load without a sensor: mean and sd over vehicles [A].")
-    ] = (0.0, 0.0),
-    minutes: Annotated[float, typer.Option(min=2.0, help="Least length of each trip to learn from [min].")] = 10.0,
-    unseen_minutes: Annotated[
-        float, typer.Option(min=2.0, help="Length of each unseen trip, with trial [min].")
+    vehicles: Annotated[int, whole_option("--vehicles", 8, MAX_VEHICLES, "Vehicles of the fleet")] = 500,
+    currents: CurrentsOption = 3,
+    sparsity: SparsityOption = 80,
+    unmeasured: UnmeasuredOption = (0.0, 0.0),
+    minutes: Annotated[
+        float, number_option("--minutes", 2, MAX_MINUTES, "Least length of each trip to learn from [min]")
     ] = 10.0,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
-    workers: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 2,
+    unseen_minutes: Annotated[
+        float, number_option("--unseen-minutes", 2, MAX_MINUTES, "Length of each unseen trip, with trial [min]")
+    ] = 10.0,
+    seed: SeedOption = 0,
+    workers: WorkersOption = 2,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
     """Drive a fleet through the whole chain, and count what became of its vehicles."""

@@ -220,8 +220,8 @@ class _Lines:
     def __call__(self, done: float) -> None:
         now_s = time.monotonic()
         finished = done >= self._total
-        due_s = WORTH_A_LINE_S if finished else LINE_EVERY_S
-        if now_s - self._printed_s < due_s:  # never again after the last line
+        since_s, due_s = (self._started_s, WORTH_A_LINE_S) if finished else (self._printed_s, LINE_EVERY_S)
+        if self._printed_s == math.inf or now_s - since_s < due_s:  # nothing is said after the last line
             return
         self._printed_s = math.inf if finished else now_s
         elapsed_s = max(now_s - self._started_s, 1e-3)  # a millisecond: no step is shorter

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from calibrator.command_options import JsonOption
+from calibrator.command_options import JsonOption, whole_option
 from calibrator.errors import ContradictionError, SigningError
 from calibrator.folders import require_possible_folder
 from calibrator.report.progress import shown
@@ -29,6 +29,7 @@ from ecu_node.trust.statements import LAST_SEQUENCE, MAX_SEQUENCE, Revocation
 __all__ = ["keys", "revoke", "sign"]
 
 _LONGEST_DAYS = 3650
+MOST_SIGNERS = 16
 _HIGHEST_VERSION = 1_000_000
 """Of a key set."""
 _REVOCATION = Expected(what="a revocation that a vehicle would take", advice="change the options")
@@ -42,7 +43,7 @@ KeyOption = Annotated[
     typer.Option("--key", help=f"Private key of a signer; repeat for several. Its passphrase: ${PASSPHRASE_VARIABLE}."),
 ]
 OutFileOption = Annotated[Path, typer.Option("--out", help="File to write.")]
-_SEQUENCE = "Number, above all that the vehicle accepted (default: time in seconds, UTC)."
+_SEQUENCE = "Number, above all that the vehicle accepted (default: time in seconds, UTC)"
 FarOption = Annotated[
     bool,
     typer.Option(
@@ -50,7 +51,7 @@ FarOption = Annotated[
     ),
 ]
 RevokedOption = Annotated[
-    list[int], typer.Option("--number", min=1, max=LAST_SEQUENCE, help="Number that was signed; repeat for several.")
+    list[int], whole_option("--number", 1, LAST_SEQUENCE, "Number that was signed, repeat for several")
 ]
 
 
@@ -79,11 +80,9 @@ def new(
 @keys.command("set")
 def make_set(
     public: Annotated[list[Path], typer.Argument(help="Public keys (NAME.pub) of all signers.")],
-    threshold: Annotated[int, typer.Option(min=1, max=16, help="So many of them must sign.")],
+    threshold: Annotated[int, whole_option("--threshold", 1, MOST_SIGNERS, "So many of them must sign")],
     out: OutFileOption,
-    version: Annotated[
-        int, typer.Option(min=1, max=_HIGHEST_VERSION, help="One more than that of the set before.")
-    ] = 1,
+    version: Annotated[int, whole_option("--version", 1, _HIGHEST_VERSION, "One more than that of the set before")] = 1,
     key: KeyOption = [],  # noqa: B006
     json: JsonOption = False,
 ) -> None:
@@ -109,9 +108,9 @@ def sign(
     params: Annotated[list[Path], typer.Argument(help="Parameter files, or signed files to be signed by one more.")],
     key: KeyOption,
     out: Annotated[Path, typer.Option("--out", help="Folder for the signed files.")],
-    sequence: Annotated[int | None, typer.Option(min=1, max=MAX_SEQUENCE, help=_SEQUENCE)] = None,
+    sequence: Annotated[int | None, whole_option("--sequence", 1, MAX_SEQUENCE, _SEQUENCE)] = None,
     days: Annotated[
-        int | None, typer.Option(min=1, max=_LONGEST_DAYS, help="How long they hold, from now on. [d] (default: 365)")
+        int | None, whole_option("--days", 1, _LONGEST_DAYS, "How long they hold, from now on [d] (default: 365)")
     ] = None,
     allow_large_step: Annotated[
         bool, typer.Option("--allow-large-step", help="They may differ a lot from what is in force, as after a repair.")
@@ -162,7 +161,7 @@ def revoke(
     why: Annotated[str, typer.Option(help="Reason, for the vehicle's audit log.")],
     key: KeyOption,
     out: OutFileOption,
-    sequence: Annotated[int | None, typer.Option(min=1, max=LAST_SEQUENCE, help=_SEQUENCE)] = None,
+    sequence: Annotated[int | None, whole_option("--sequence", 1, LAST_SEQUENCE, _SEQUENCE)] = None,
     far_sequence: FarOption = False,
     json: JsonOption = False,
 ) -> None:
