@@ -4,7 +4,6 @@ All that takes time is imported inside a function, so that Ctrl-C and a closed p
 """
 
 import signal
-import sys
 
 from calibrator.interrupts import INTERRUPTED, MESSAGE, ending_at_sigterm, importing
 from ecu_node.errors import UserError
@@ -30,7 +29,7 @@ def main() -> None:
         code = 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done or undone; threads only have to be joined
     if code == INTERRUPTED:
-        print(MESSAGE, file=sys.stderr)
+        say_error(MESSAGE)
     raise SystemExit(code)
 
 

@@ -78,7 +78,7 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0
     except _UsageError as error:
-        return _end_of_wrong_use(error)
+        return _end_of_wrong_use(program, error)
     except BrokenPipeError:
         raise
     except Exception as error:  # noqa: BLE001 (each is told, and ends the program)
@@ -101,7 +101,7 @@ def run_tool(app: typer.Typer, program: str) -> None:
     except Exception as error:  # noqa: BLE001 (standard output that cannot be written)
         code = end_of(program, error, debug=False)
     if code == INTERRUPTED:
-        print(f"{program}: interrupted", file=sys.stderr)
+        say_error(f"{program}: interrupted")
     sys.exit(code)
 
 
@@ -112,12 +112,12 @@ def _all_commands(command: Any) -> Iterator[Any]:
         yield from _all_commands(each)
 
 
-def _end_of_wrong_use(error: Any) -> int:
+def _end_of_wrong_use(program: str, error: Any) -> int:
     """Say what is wrong, and where help is; nothing at all but the program's name asks for help."""
     if type(error).__name__ == "NoArgsIsHelpError":
         error.show()
         return WRONG_USE
-    path = error.ctx.command_path if error.ctx is not None else "the command"
+    path = error.ctx.command_path if error.ctx is not None else program
     text = " ".join(error.format_message().split()).replace(": Value error, ", ": ").rstrip(".")
     say_error(f"{path}: {text}; see '{path} --help'")
     return WRONG_USE

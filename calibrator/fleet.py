@@ -253,7 +253,8 @@ def _find_drives(path: Path, settings: CalibrationSettings, *, everyone: bool) -
         unknown = sorted(names - fleet.vehicles.keys()) if everyone else []
         if unknown:
             reasons = few_reasons({name: fleet.left_out[name] for name in unknown if name in fleet.left_out})
-            raise FleetError(f"{path}: no vehicle {few(unknown)} to {what}{reasons}")
+            there = few(sorted(fleet.vehicles))
+            raise FleetError(f"{path}: no vehicle {few(unknown)} to {what}{reasons}; there are {there}")
     return fleet
 
 

@@ -13,6 +13,7 @@ from types import FrameType
 from typing import Any
 
 from ecu_node.interrupts import INTERRUPTED, ending_at_interrupt
+from ecu_node.wrapping import fitted
 
 __all__ = [
     "INTERRUPTED",
@@ -38,7 +39,7 @@ def ending_at_sigterm() -> None:
 
     def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
         shown = f"{SHOW_CURSOR}\n" if os.isatty(sys.stderr.fileno()) else ""
-        os.write(sys.stderr.fileno(), f"{shown}{TERMINATED_MESSAGE}\n".encode())
+        os.write(sys.stderr.fileno(), f"{shown}{fitted(TERMINATED_MESSAGE, sys.stderr)}\n".encode())
         os._exit(TERMINATED)
 
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:

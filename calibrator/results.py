@@ -90,6 +90,8 @@ SCHEMA = pa.schema(
     ]
 )
 
+_REMEDY = "name a folder that 'calibrator calibrate --out' wrote"
+
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """How a result was made."""
@@ -383,7 +385,7 @@ def read_results(result: Path) -> list[dict[str, Any]]:
         table = pq.read_table(path)
     except (OSError, pa.ArrowInvalid) as error:
         first_line = str(error).splitlines()[0]
-        raise FleetError(f"{path}: not a result of 'calibrator calibrate': {first_line}") from None
+        raise FleetError(f"{path}: not a result of 'calibrator calibrate': {first_line}; {_REMEDY}") from None
     missing = [name for name in SCHEMA.names if name not in table.column_names]
     if missing:
         raise FleetError(f"{path}: column {', '.join(missing)} is missing; write the result anew with this version")
@@ -397,7 +399,7 @@ def read_run(result: Path) -> RunRecord:
     try:
         return msgspec.json.decode(path.read_bytes(), type=RunRecord)
     except OSError as error:
-        raise FleetError(f"{path}: not a result of 'calibrator calibrate': {error.strerror}") from None
+        raise FleetError(f"{path}: not a result of 'calibrator calibrate': {error.strerror}; {_REMEDY}") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise FleetError(f"{path}: not a run of 'calibrator calibrate': {error}; calibrate again") from None
 

@@ -1,6 +1,7 @@
 """``ecu-node monitor``: bus, clock and terminal around :mod:`ecu_node.monitor_model`; it listens, and never sends."""
 
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -23,10 +24,12 @@ from ecu_node.monitor_table import picture
 from ecu_node.monitor_text import as_json, plain_block
 from ecu_node.node import open_bus
 from ecu_node.service import Log, Requests
-from ecu_node.standard_output import write_output
+from ecu_node.standard_output import write_output, write_text
 
 __all__ = ["MonitorOptions", "listen", "run_monitor"]
 
+_WITHOUT_CURSOR = ("dumb", "unknown")
+"""Terminals on which nothing can be drawn anew."""
 _LIVE_PERIOD_S, _PLAIN_PERIOD_S = 0.25, 1.0
 """Between two pictures. [s]"""
 _LONGEST_WAIT_S = 0.25
@@ -151,14 +154,16 @@ def _bus_notes(counters: Counters) -> list[str]:
 @contextmanager
 def _display(options: MonitorOptions, where: str) -> Iterator[tuple[_Show, float]]:
     """How views are shown, and after how long the first and each further one. [s]"""
-    if options.once_s is None and sys.stdout.isatty():
+    if options.once_s is None and sys.stdout.isatty() and os.environ.get("TERM") not in _WITHOUT_CURSOR:
         with _live_table(where) as show:
             yield show, _LIVE_PERIOD_S
         return
 
     def show_plainly(view: View, more: list[str]) -> None:
-        text = json.dumps(as_json(view), indent=2) if options.as_json else plain_block(view, where, more)
-        write_output(text if options.once_s is not None else f"{text}\n")
+        if options.as_json:
+            write_output(json.dumps(as_json(view), indent=2))
+        else:
+            write_text(f"{plain_block(view, where, more)}{'' if options.once_s is not None else chr(10)}")
 
     yield show_plainly, options.once_s or _PLAIN_PERIOD_S
 

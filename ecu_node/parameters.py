@@ -218,9 +218,10 @@ def parameter_bytes(path: Path) -> bytes:
     try:
         return read_user_file(path, largest_bytes=MAX_FILE_BYTES)
     except FileNotFoundError:
-        raise UnfitError(Reason.NO_PARAMETERS, f"{path}: no such parameter file") from None
+        raise UnfitError(Reason.NO_PARAMETERS, f"{path}: no such parameter file; name one that is there") from None
     except OSError as error:
-        raise UnfitError(Reason.NO_PARAMETERS, f"{path}: cannot read the parameter file: {error.strerror}") from None
+        why = f"{path}: cannot read the parameter file: {error.strerror}; name one that may be read"
+        raise UnfitError(Reason.NO_PARAMETERS, why) from None
     except UnsuitableFileError as error:
         raise UnfitError(Reason.MALFORMED_PARAMETERS, f"{path}: not a parameter file: {error}") from None
 

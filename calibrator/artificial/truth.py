@@ -17,6 +17,8 @@ TRUTH_FILE = "truth.json"
 ID_DIGITS = 16
 """Of SHA-256; two fleets agree in them by chance once in 10^19."""
 
+_REMEDY = "name the truth.json that 'calibrator simulate' wrote beside the logs"
+
 
 class VehicleTruth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What was put into one vehicle; branch values are positive into the junction."""
@@ -72,9 +74,9 @@ def read_truth(path: Path) -> FleetTruth:
     try:
         return msgspec.json.decode(path.read_bytes(), type=FleetTruth)
     except OSError as error:
-        raise FleetError(f"{path}: cannot read the truth: {error.strerror}") from None
+        raise FleetError(f"{path}: cannot read the truth: {error.strerror}; {_REMEDY}") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise FleetError(f"{path}: not a truth.json of 'calibrator simulate': {error}") from None
+        raise FleetError(f"{path}: not a truth.json of 'calibrator simulate': {error}; {_REMEDY}") from None
 
 
 def faults_of(truth: FleetTruth, vehicles: list[str]) -> Faults:

@@ -62,7 +62,7 @@ def read_bench_readings(
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise FleetError(f"{path}: cannot read the bench readings: {error.strerror}") from None
+        raise FleetError(f"{path}: cannot read the bench readings: {error.strerror}; give a CSV table") from None
     except UnicodeDecodeError:
         raise FleetError(f"{path}: not a table of bench readings: the file is not UTF-8 text") from None
     table = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)

@@ -18,6 +18,7 @@ from calibrator.parameter_files import RunIdentity, by_branch, current_moments, 
 from calibrator.published.calibration import ExpectedFaults, calibrate_published
 from calibrator.published.recovery import Recovery
 from calibrator.report.progress import progress_bar
+from calibrator.report.text import few
 from calibrator.vehicles import read_vehicles
 from ecu_node.parameters import BranchParameters, HardwareFault, VehicleParameters, Verdict
 
@@ -146,7 +147,8 @@ def _unity_vehicle(vehicles: Sequence[VehicleModel], wanted: str | None) -> Vehi
     for vehicle in vehicles:
         if vehicle.vehicle == wanted:
             return vehicle
-    raise FleetError(f"no usable vehicle {wanted!r} to take the unity drive from")
+    there = few([vehicle.vehicle for vehicle in vehicles])
+    raise FleetError(f"no usable vehicle {wanted!r} to take the unity drive from; there are {there}")
 
 
 def _recover(

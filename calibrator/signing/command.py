@@ -90,7 +90,7 @@ def make_set(
     named = [read_public_key(path) for path in public]
     found = KeySet(version=version, threshold=threshold, keys={item.keyid: item.key for item in named})
     if len(found.keys) < len(named):
-        raise SigningError("one key is given twice; each signer has one of their own")
+        raise SigningError("one key is given twice; each signer has one of their own, give each once")
     check_key_set(found, "key set")
     if bool(key) != (version > 1):
         raise ContradictionError(

@@ -21,6 +21,7 @@ from calibrator.errors import SigningError
 from calibrator.signing.encryption import encrypted_pem, is_whole_pem
 from ecu_node.errors import TrustError
 from ecu_node.parameters import write_atomically
+from ecu_node.status import Reason
 from ecu_node.trust.canonical import canonical_bytes, read_bytes, read_canonical
 from ecu_node.trust.key_set import PublicKey
 from ecu_node.user_files import UnsuitableFileError, read_user_file
@@ -142,7 +143,9 @@ def read_public_key(path: Path) -> NamedKey:
     """
     try:
         return read_canonical(read_bytes(path).removesuffix(b"\n"), NamedKey, str(path))
-    except TrustError:
+    except TrustError as error:
+        if error.reason is Reason.NO_PARAMETERS:  # there is no such file, or it may not be read
+            raise SigningError(str(error)) from None
         raise SigningError(f"{path}: not a public key; one from 'calibrator keys new' is expected") from None
 
 
@@ -191,7 +194,9 @@ def _private_bytes(path: Path) -> bytes:
     except UnsuitableFileError as error:
         raise SigningError(f"{path}: not a private key: {error}") from None
     except OSError as error:
-        raise SigningError(f"{path}: cannot read the private key: {error.strerror}") from None
+        raise SigningError(
+            f"{path}: cannot read the private key: {error.strerror}; give NAME.key of a signer"
+        ) from None
     if _PRIVATE_KEY.search(content) is None:
         raise SigningError(f"{path}: not a private key (PEM); NAME.key of 'calibrator keys new' is expected")
     if rights & _OTHERS:

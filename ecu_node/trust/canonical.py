@@ -131,7 +131,8 @@ def read_bytes(path: Path, expected: Expected = SIGNED_FILE) -> bytes:
     except UnsuitableFileError as error:
         raise malformed(str(path), str(error), expected) from None
     except OSError as error:
-        raise TrustError(Reason.NO_PARAMETERS, f"{path}: cannot read the file: {error.strerror}") from None
+        why = f"{path}: cannot read the file: {error.strerror}; name one that is there"
+        raise TrustError(Reason.NO_PARAMETERS, why) from None
 
 
 def malformed(where: str, why: str, expected: Expected = SIGNED_FILE) -> TrustError:

@@ -77,6 +77,8 @@ def check_key_set(keys: KeySet, where: str) -> KeySet:
         )
     if keys.threshold > len(values):
         raise TrustError(
-            Reason.NOT_SIGNED, f"{where}: {keys.threshold} signers are needed, and {len(values)} keys are there"
+            Reason.NOT_SIGNED,
+            f"{where}: {keys.threshold} signers are needed, and {len(values)} keys are there; name more signers, or "
+            f"need fewer",
         )
     return keys

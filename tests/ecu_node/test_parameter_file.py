@@ -76,7 +76,7 @@ def test_a_file_that_is_gone_changes_nothing(path: Path, database: VehicleDataba
     path.unlink()
     running.file.look(running.corrector, 2.0)
     assert running.drift == 0.25
-    assert running.said[0].endswith("no such parameter file")
+    assert running.said[0].endswith("no such parameter file; name one that is there")
 
 
 def test_parameters_of_another_vehicle_change_nothing(path: Path, database: VehicleDatabase) -> None:

@@ -1,0 +1,119 @@
+"""Mistakes of a user, over all commands: one line each, which says what, where, and what to do; never a traceback."""
+
+from pathlib import Path
+
+import pytest
+
+from calibrator.cli import app
+from calibrator.commands import run_app
+from ecu_node import cli as node_cli
+from ecu_node.database import read_database
+from ecu_node.layout import read_layout
+from ecu_node.parameters import write_parameters
+from tests.calibrator.export.exports import parameters_for
+from tests.ecu_node.vehicles import LAYOUT
+
+MISTAKES = [
+    # layouts
+    ("calibrator import logs --layout none.toml --out x", 1, "none.toml: cannot read the layout: No such file"),
+    ("calibrator import logs --layout folder --out x", 1, "folder: cannot read the layout: it is a folder; a file is"),
+    ("calibrator import logs --layout empty --out x", 1, "empty: 'schema' is missing; see docs/layout.md"),
+    ("calibrator import logs --layout noise --out x", 1, "noise: not a layout: the file is not UTF-8 text; see docs"),
+    ("calibrator import logs --layout cut.json --out x", 1, "cut.json: not TOML: "),
+    ("ecu-node template --layout DBC --vehicle v", 1, "hv_powertrain.dbc: not TOML: "),
+    # numbers
+    ("calibrator simulate --vehicles 0 LAYOUT --out x", 2, "'--vehicles': 0: expected a whole number from 1 to 100000"),
+    ("calibrator simulate --vehicles two LAYOUT --out x", 2, "'--vehicles': two: expected a whole number from 1 to"),
+    ("calibrator simulate --vehicles 1e3 LAYOUT --out x", 2, "'--vehicles': 1e3: expected a whole number from 1 to"),
+    ("calibrator sign v1.json --key a --out x --days 0", 2, "'--days': 0: expected a whole number from 1 to 3650"),
+    ("calibrator experiment snr --repetitions -1", 2, "'--repetitions': -1: expected a whole number from 1 to 1000"),
+    ("calibrator identify logs LAYOUT --poles 0", 2, "'--poles': 0: expected time constants with commas"),
+    ("ecu-node monitor LAYOUT --channel c --once 0", 2, "--once: '0': expected a number of seconds above 0"),
+    ("ecu-node run LAYOUT --channel c --state s --metrics-port 0", 2, "a TCP port from 1 to 65535 is expected"),
+    # options and commands
+    ("calibrator fly", 2, "No such command 'fly'; see 'calibrator --help'"),
+    ("calibrator calibrate LAYOUT --out x", 2, "Missing argument 'fleet'; see 'calibrator calibrate --help'"),
+    ("calibrator calibrate a b LAYOUT --out x", 2, "unexpected extra argument"),
+    ("calibrator calibrate a LAYOUT --out x --method both", 2, "'both' is not one of 'posterior', 'published'"),
+    ("calibrator score folder --truth", 2, "--truth"),
+    ("ecu-node fly", 2, "invalid choice: 'fly'"),
+    ("ecu-node run LAYOUT", 2, "required: --channel; see 'ecu-node run --help'"),
+    ("ecu-node run LAYOUT --channel c --params v1.json", 2, "--params names a file that nobody signed"),
+    ("ecu-node inspect folder --keys v1.json", 2, "a state has keys of its own; leave --keys out"),
+    # fleets, results, truth
+    ("calibrator calibrate none LAYOUT --out x", 1, "none: no such folder, store of drives or store of summaries"),
+    ("calibrator calibrate empty LAYOUT --out x", 1, "empty: is a file; give a store of drives or of summaries"),
+    ("calibrator calibrate folder LAYOUT --out folder/x --since folder", 1, "folder: "),
+    ("calibrator params folder v1 --out x", 1, "run.json: not a result of 'calibrator calibrate': No such file"),
+    ("calibrator params folder v1 --out x", 1, "; name a folder that 'calibrator calibrate --out' wrote"),
+    ("calibrator score folder --truth none.json", 1, "; name the truth.json that 'calibrator simulate' wrote"),
+    ("calibrator score folder --truth cut.json", 1, "cut.json: not a truth.json of 'calibrator simulate': "),
+    ("calibrator summarise logs LAYOUT --out empty", 1, "empty: is a file; name a folder for the summaries, or a URL"),
+    ("calibrator summarise logs LAYOUT --out x --bank cut.json", 1, "cut.json: no filter bank"),
+    ("calibrator identify logs LAYOUT --out folder", 1, "folder: is a folder; name a file in it"),
+    ("calibrator import none LAYOUT --out x", 1, "none of the logs could be used, for the reasons given above"),
+    # parameter files
+    ("calibrator export none.json LAYOUT --format dcm --out x", 1, "no such parameter file; name one that is there"),
+    ("calibrator export empty LAYOUT --format dcm --out x", 1, "empty: not a parameter file: it is empty; correct it"),
+    ("calibrator export noise LAYOUT --format dcm --out x", 1, "noise: not a parameter file: "),
+    ("calibrator export cut.json LAYOUT --format dcm --out x", 1, "cut.json: not a parameter file: "),
+    ("calibrator export v1.json LAYOUT --format xls --out x", 2, "'xls' is not one of 'dcm', 'cdfx', 'csv', 'c99'"),
+    ("calibrator export v1.json LAYOUT --format dcm --out folder", 1, "folder: is "),
+    ("calibrator export v1.json v1.json LAYOUT --format csv --out x", 2, "give each parameter set once"),
+    ("calibrator export v1.json LAYOUT --format csv --out x --vehicle v2", 1, "v2"),
+    # keys and signatures
+    ("calibrator keys new a/b --no-passphrase --out x", 1, "'a/b': a name of letters, digits, '.', '_' and '-' is"),
+    ("calibrator keys set none.pub --threshold 1 --out x", 1, "none.pub: cannot read the file: No such file"),
+    ("calibrator keys set empty --threshold 1 --out x", 1, "empty: not a public key; one from 'calibrator keys new'"),
+    ("calibrator sign v1.json --key none.key --out x", 1, "none.key: cannot read the private key: No such file"),
+    ("calibrator sign v1.json --key empty --out x", 1, "empty: not a private key (PEM); NAME.key of 'calibrator keys"),
+    ("ecu-node provision --vehicle v1 --keys none.json --state s", 1, "none.json: cannot read the file: No such file"),
+    ("ecu-node provision --vehicle v1 --keys cut.json --state s", 1, "cut.json: "),
+    ("ecu-node activate v1.json --state none LAYOUT", 1, "none: cannot be used as state: No such file or"),
+    ("ecu-node inspect none.json", 1, "none.json: cannot read the file: No such file or directory; name one that is"),
+    ("ecu-node inspect v1.json", 1, "v1.json: "),
+    ("ecu-node inspect noise", 1, "noise: not a signed file: JSON is malformed"),
+    ("ecu-node run LAYOUT --channel c --interface pigeon --params v1.json --unsigned", 1, "pigeon c: cannot open"),
+]
+"""Command, exit code, and some of the words."""
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with what a user may name by mistake, in which the commands run."""
+    write_parameters(parameters_for(read_database(read_layout(LAYOUT)), battery=(0.05, 2.3)), tmp_path / "v1.json")
+    (tmp_path / "empty").touch()
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "logs" / "v1").mkdir(parents=True)
+    (tmp_path / "logs" / "v1" / "drive.log").touch()
+    (tmp_path / "noise").write_bytes(bytes(range(128, 256)))
+    (tmp_path / "cut.json").write_bytes((tmp_path / "v1.json").read_bytes()[:200])
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(command: str) -> int:
+    words = command.replace("LAYOUT", f"--layout {LAYOUT}").replace("DBC", str(LAYOUT.with_suffix(".dbc"))).split()
+    if words[0] == "calibrator":
+        return run_app(app, "calibrator", words[1:])
+    try:
+        return node_cli.main(words[1:])
+    except SystemExit as end:
+        return int(end.code or 0)
+
+
+@pytest.mark.usefixtures("place")
+@pytest.mark.parametrize(("command", "code", "words"), MISTAKES)
+def test_a_mistake_is_one_line(command: str, code: int, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(command) == code
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(command.partition(" ")[0])
+    assert words in line
+
+
+def test_a_mistake_writes_nothing(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = sorted(path.name for path in place.rglob("*"))
+    for command, code, _ in MISTAKES:
+        assert run(command) == code
+    assert sorted(path.name for path in place.rglob("*")) == before
+    assert "Traceback" not in capsys.readouterr().err
