@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager
 from types import FrameType
 from typing import Any
 
+from calibrator.errors import FleetError
 from ecu_node.interrupts import INTERRUPTED, ending_at_interrupt
 from ecu_node.wrapping import fitted
 
@@ -65,6 +66,11 @@ def in_processes(tasks: Iterable[Any], *, workers: int) -> Iterator[Any]:
     ------
     object
         What the calls return.
+
+    Raises
+    ------
+    FleetError
+        If a process died.
     """
     from joblib import Parallel  # noqa: PLC0415 (this module is imported before anything that takes time)
 
@@ -75,4 +81,17 @@ def in_processes(tasks: Iterable[Any], *, workers: int) -> Iterator[Any]:
         results: Iterator[Any] = parallel(tasks)  # starts the workers, which inherit that SIGINT is ignored
     finally:
         signal.signal(signal.SIGINT, before)
-    return results
+    return _of_living_workers(results)
+
+
+def _of_living_workers(results: Iterator[Any]) -> Iterator[Any]:
+    """Results; a worker that died is told in words."""
+    from joblib.externals.loky.process_executor import TerminatedWorkerError  # noqa: PLC0415 (slow to import)
+
+    try:
+        yield from results
+    except TerminatedWorkerError:
+        raise FleetError(
+            "a worker process was killed, as by a lack of memory; run the same command again, with fewer --workers if "
+            "it was memory"
+        ) from None

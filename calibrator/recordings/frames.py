@@ -72,7 +72,7 @@ def read_frames(path: Path) -> Frames:
     if reader is None:
         raise LogError(f"{path}: not a known log format; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
     if not path.is_file():
-        raise LogError(f"{path}: no such file")
+        raise LogError(f"{path}: no such file; give a log that is there")
     try:
         _require_text(path)
         with _quiet() as complaints:

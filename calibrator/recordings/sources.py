@@ -70,7 +70,7 @@ def _logs_of(argument: Path) -> list[Path]:
     if argument.is_file():
         return [argument]
     if not argument.is_dir():
-        raise LogError(f"{argument}: no such file or folder")
+        raise LogError(f"{argument}: no such file or folder; give logs that are there")
     paths = sorted(path for path in argument.rglob("*") if path.is_file() and is_log(path))
     if not paths:
         raise LogError(f"{argument}: no logs in this folder; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")

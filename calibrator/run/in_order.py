@@ -69,15 +69,7 @@ class Workers:
         if self.scheduler is not None:
             yield from _on_cluster(self.scheduler, function, items)
             return
-        from joblib.externals.loky.process_executor import TerminatedWorkerError  # noqa: PLC0415 (slow to import)
-
-        try:
-            yield from in_processes((delayed(_alone)(function, item) for item in items), workers=self.processes)
-        except TerminatedWorkerError:
-            raise FleetError(
-                "a worker process was killed, as by a lack of memory; run the same command again to go on, "
-                "with fewer --workers if it was memory"
-            ) from None
+        yield from in_processes((delayed(_alone)(function, item) for item in items), workers=self.processes)
 
 
 def _alone(function: Callable[[Any], Any], item: Any) -> Any:

@@ -44,7 +44,7 @@ def provision(folder: Path, vehicle: str, keys: KeySet, now: datetime) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"{folder}: cannot be made: {error.strerror}") from None
+        raise UserError(f"{folder}: cannot be made: {error.strerror}; choose another --state") from None
     with locked(folder):
         if state_path(folder).exists():
             raise TrustError(

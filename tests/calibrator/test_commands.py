@@ -1,12 +1,17 @@
 """What command lines made with typer share."""
 
+import os
+import signal
 from typing import Annotated
 
 import pytest
 import typer
+from joblib import delayed
 
 from calibrator.commands import command_app, run_app, run_tool
 from calibrator.errors import ContradictionError, FleetError
+from calibrator.interrupts import in_processes
+from calibrator.reading_processes import read_in_processes
 from ecu_node.standard_output import write_output
 
 app = command_app(no_args_is_help=True)
@@ -94,3 +99,30 @@ def test_ctrl_c_ends_a_tool_with_one_line(monkeypatch: pytest.MonkeyPatch, capsy
         run_tool(tool, "tool")
     assert end.value.code == 130
     assert capsys.readouterr().err == "tool: interrupted\n"
+
+
+@app.command()
+def work(where: str) -> None:
+    """Fail in a worker process."""
+    if where == "joblib":
+        list(in_processes((delayed(int)(text) for text in ("1", "one")), workers=2))
+    else:
+        list(read_in_processes(int, ["1", "one"], workers=1))
+
+
+@pytest.mark.parametrize("where", ["joblib", "reading"])
+def test_a_fault_in_a_worker_process_is_one_line_too(where: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_app(app, "prog", ["work", where]) == 70
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("prog: internal error: ValueError: invalid literal for int() with base 10: 'one'")
+    assert run_app(app, "prog", ["work", where, "--debug"]) == 70
+    assert "Traceback (most recent call last)" in capfd.readouterr().err
+
+
+def die(_: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_is_killed_is_told_in_words() -> None:
+    with pytest.raises(FleetError, match="a worker process was killed, as by a lack of memory; run the same command"):
+        list(in_processes((delayed(die)(number) for number in range(2)), workers=2))
