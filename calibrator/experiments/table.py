@@ -112,7 +112,7 @@ def result_table(result: ExperimentResult) -> Group:
     for number, heading in enumerate(header):
         first = number == 0 and bool(result.series_label)
         text = escape(heading).replace("/", "/\n").replace(", ", ",\n")
-        table.add_column(text, justify="left" if first else "right", no_wrap=first)
+        table.add_column(text, justify="left" if first else "right", no_wrap=first, overflow="fold")
     for row in rows:
         table.add_row(*row)
     settings = result.settings

@@ -57,9 +57,9 @@ def kirchhoff_table(comparison: Comparison) -> Table:
     """
     table = Table(box=None, pad_edge=False, title_justify="left", title_style="")
     table.title = f"Branch currents and their sum; % of the full scale of {comparison.full_scale_a:g} A"
-    table.add_column("")
+    table.add_column("", overflow="fold")
     for heading in ("RMSE A", "%", "max A", "%", "mean A", "%", "sd A", "%"):
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", no_wrap=True)
     sections = {"before": comparison.before, "after": comparison.after, "change": comparison.change}
     for title, figures in sections.items():
         if figures is None:

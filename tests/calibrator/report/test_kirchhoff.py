@@ -1,4 +1,5 @@
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -129,6 +130,16 @@ def test_the_table_fits_80_columns_with_the_longest_names_and_largest_figures(la
         "after",
         "change",
     ]
+
+
+def test_a_name_that_has_no_room_is_broken_and_no_figure_is_cut(layout: Layout) -> None:
+    measured, corrected = faulty(0.1, 2.0)
+    comparison = compare_kirchhoff(recording(measured, corrected), layout)
+    long = "x" * 64
+    lines = printed(replace(comparison, branches=(long, *comparison.branches[1:])))
+    assert "…" not in "".join(lines)
+    assert sum(line.count("x") for line in lines if "max" not in line) == 3 * len(long)  # before, after, change
+    assert max(map(len, lines)) <= 80
 
 
 def test_the_picture_is_written_with_one_panel_or_two(layout: Layout, tmp_path: Path) -> None:
