@@ -87,7 +87,10 @@ def test_once_as_json(database: VehicleDatabase, capsys: pytest.CaptureFixture[s
 def test_a_bus_without_any_branch_ends_in_1(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*MONITOR, "--once", "0.1"]) == 1
     captured = capsys.readouterr()
-    assert captured.err == f"ecu-node: virtual {CHANNEL}: no branch of {LAYOUT} was seen\n"
+    assert (
+        captured.err
+        == f"ecu-node: virtual {CHANNEL}: no branch of {LAYOUT} was seen; see that the bus is the right one\n"
+    )
     assert captured.out.splitlines()[-1].startswith("no frame of any branch")
 
 
