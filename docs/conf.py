@@ -22,7 +22,6 @@ extensions = [
     "docs_site.self_contained",
 ]
 
-suppress_warnings = ["toc.not_readable"]  # a page may be listed before it is there; one that is not listed is an error
 highlight_language = "text"
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4

@@ -84,6 +84,7 @@ def show(drives: str, out: Path) -> None:
     vehicle = corrected_vehicle(result, held_out)
     step(3, "because this fleet is artificial, the truth is known")
     run("calibrator", "score", result, "--truth", fleet / "truth.json")
+    run("calibrator", "report", result, "--out", out / "report.html")
     step(4, f"vehicle {vehicle} drives a trip that nobody has seen, with its node on the bus")
     parameters = result / "params" / f"{vehicle}.json"
     run("ecu-node", "check", "--params", parameters, "--layout", LAYOUT, "--vehicle", vehicle)

@@ -6,9 +6,11 @@ from typing import Annotated
 
 import typer
 
+from calibrator.command_options import JsonOption
 from calibrator.errors import ProposalError
 from calibrator.folders import require_possible_file
 from calibrator.interrupts import importing
+from calibrator.report.text import dumps
 from ecu_node.errors import printable
 from ecu_node.parameters import write_atomically
 from ecu_node.standard_output import write_output
@@ -30,6 +32,7 @@ def init(
     log: Annotated[
         Path | None, typer.Option("--log", help="Log of a drive: only what is in it is proposed, and signs are told.")
     ] = None,
+    json: JsonOption = False,
 ) -> None:
     """Propose a layout by units, names, comments and senders in a DBC, and by what a log shows.
 
@@ -45,14 +48,18 @@ def init(
         require_possible_file(out)
     proposal = propose_layout(dbc, log, _name_of(out or dbc))
     text = layout_text(proposal, out)
+    names, guesses = [branch.name for branch in proposal.branches], text.count("# confirm:")
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(out, text.encode())
+    if json:
+        file = None if out is None else str(out)
+        write_output(dumps({"file": file, "branches": names, "guesses": guesses, "layout": text}))
+        return
     if out is None:
         write_output(text.rstrip("\n"))
         return
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(out, text.encode())
-    guesses = text.count("# confirm:")
-    names = ", ".join(branch.name for branch in proposal.branches)
-    write_output(f"{printable(str(out))}: branches {names}; {guesses} guesses to confirm")
+    write_output(f"{printable(str(out))}: branches {', '.join(names)}; {guesses} guesses to confirm")
     log_option = f"--log {log}" if log is not None else "--log LOG"
     print(f"next: calibrator doctor --layout {out} {log_option}", file=sys.stderr)
 
