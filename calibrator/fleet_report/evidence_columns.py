@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.fleet_report.fleet_table import FleetTable
+from calibrator.report.progress import shown
 from calibrator.results import PARTS
 from ecu_node.parameters import Explanation
 
@@ -79,7 +80,7 @@ def read_evidence(result: Path, table: FleetTable) -> Evidence:
         raise FleetError(
             f"{result / PARTS}: no parameters there; give the whole folder that 'calibrator calibrate' wrote"
         )
-    for part in parts:
+    for part in shown(parts, "read evidence", len(parts), "files"):
         rows = _read(part)
         where = [place.get(name, -1) for name in rows["vehicle"].to_pylist()]
         for j, text in zip(where, rows["parameters"].to_pylist(), strict=True):

@@ -33,8 +33,8 @@ def share(part: int, whole: int) -> str:
 
 
 def with_sd(value: float, sd: float | None, *, factor: float, unit: str) -> str:
-    """A value with its standard deviation, both multiplied by a factor."""
-    told = _number(factor * value, 2, sign=True, unit="")
+    """A value with its standard deviation, both multiplied by a factor; exactly 0 is no fault, and has no sign."""
+    told = _number(factor * value, 2, sign=True, unit="") if value else "0"
     known = sd is not None and math.isfinite(sd)
     return f"{told} ± {factor * sd:.2f}{unit}" if known and sd is not None else f"{told}{unit}"
 

@@ -62,7 +62,7 @@
   const amperes = (value, sign = false) => fixed(value, 2, " A", sign);
   const percent = (value, digits = 2, sign = false) => fixed(100 * value, digits, " %", sign);
   const withSd = (value, sd, unit, factor = 1) =>
-    fixed(factor * value, 2, "", true) + (Number.isNaN(sd) ? "" : ` ± ${(factor * sd).toFixed(2)}`) + unit;
+    (value === 0 ? "0" : fixed(factor * value, 2, "", true)) + (Number.isNaN(sd) ? "" : ` ± ${(factor * sd).toFixed(2)}`) + unit;
 
   function element(tag, attributes = {}, ...children) {
     const made = document.createElement(tag);
@@ -257,7 +257,7 @@
     }
     const rivals = told ? found.explanations[j] : [];
     if (rivals.length) parts.push(element("h4", {}, "Competing explanations"), table(["probability", "<explanation"], rivals.map(([p, text]) => [percent(p, 1), text])));
-    if (told && found.reasons[j]) parts.push(element("p", {}, element("b", {}, "What would decide: "), found.reasons[j], "."));
+    if (told && found.reasons[j]) parts.push(element("p", { class: "decides" }, `${found.reasons[j]}.`));
     if (!told) parts.push(element("p", { class: "soft" }, "The evidence of this vehicle is not part of this page, which would be too large."));
     parts.push(element("p", { class: "soft" }, `Its own page, to print: calibrator report RESULT --vehicle ${names[j]}`));
     place.replaceChildren(...parts);
