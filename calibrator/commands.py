@@ -10,7 +10,7 @@ from typing import Any
 import typer
 
 from calibrator.errors import ContradictionError
-from ecu_node.failures import DEBUG_HINT, end_of, say_error, split_debug
+from ecu_node.failures import DEBUG_HINT, FAILED, end_of, say_error, split_debug
 from ecu_node.standard_output import drop_output, flush_output
 
 __all__ = ["EXIT_CODES", "command_app", "run_app", "run_tool"]
@@ -76,7 +76,10 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
     try:
         code = command.main(args=others, prog_name=program, standalone_mode=False)
     except SystemExit as end:
-        return end.code if isinstance(end.code, int) else 0
+        if isinstance(end.code, str):
+            say_error(f"{program}: {end.code}")
+            return FAILED
+        return end.code or 0
     except _UsageError as error:
         return _end_of_wrong_use(program, error)
     except BrokenPipeError:

@@ -24,6 +24,8 @@ def require_possible_file(out: Path) -> None:
     """Raise FleetError, before any work is done, if a file cannot be written or replaced."""
     if out.is_dir():
         raise FleetError(f"{out}: is a folder; name a file in it")
+    if out.exists() and not out.is_file():
+        raise FleetError(f"{out}: is no file but a device, pipe or socket, which would be replaced; name a file")
     require_possible_folder(out.absolute().parent)
 
 

@@ -8,7 +8,8 @@ import os
 import signal
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -30,7 +31,7 @@ TERMINATED = 143
 """Exit code that shells give to a program ended by SIGTERM."""
 SHOW_CURSOR = "\x1b[?25h"
 """A bar hides the cursor of a terminal."""
-_GOES_ON = "the same command, run again, goes on with what it had read or computed"
+_GOES_ON = "run the same command again; import, summarise and calibrate go on with what they had read or computed"
 MESSAGE = f"calibrator: interrupted; {_GOES_ON}"
 TERMINATED_MESSAGE = f"calibrator: ended by SIGTERM; {_GOES_ON}"
 
@@ -41,10 +42,22 @@ def ending_at_sigterm() -> None:
     def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
         shown = f"{SHOW_CURSOR}\n" if os.isatty(sys.stderr.fileno()) else ""
         os.write(sys.stderr.fileno(), f"{shown}{fitted(TERMINATED_MESSAGE, sys.stderr)}\n".encode())
+        for child in _children():
+            with suppress(ProcessLookupError):
+                os.kill(child, signal.SIGKILL)  # a worker that lost its parent would wait for minutes
         os._exit(TERMINATED)
 
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, end)
+
+
+def _children() -> list[int]:
+    """Processes that this one has started and that still run, as far as the system tells."""
+    found: list[int] = []
+    for task in Path("/proc/self/task").glob("*/children"):
+        with suppress(OSError):
+            found += map(int, task.read_text().split())
+    return found
 
 
 def importing() -> AbstractContextManager[None]:

@@ -344,6 +344,8 @@ def written_of(result: Path, vehicle: str) -> Written:
     number = bucket_of(vehicle, run.buckets) if run.buckets else 0
     found = read_part(result / PARTS / f"{number:05d}.parquet")
     if vehicle not in found:
+        if not (result / PARTS).is_dir():
+            raise FleetError(f"{result / PARTS}: no such folder; give all that 'calibrator calibrate' wrote")
         why = _left_out_reason(result / "results.parquet", vehicle)
         if why is None:
             raise FleetError(f"{result}: no vehicle {vehicle!r} in it; results.parquet names all that are")

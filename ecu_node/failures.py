@@ -87,7 +87,8 @@ def one_line(text: str) -> str:
 
 def say_error(text: str) -> None:
     """Say something on standard error in one line, which a terminal gets broken at words."""
-    print(fitted(printable(one_line(text)), sys.stderr), file=sys.stderr, flush=True)
+    if sys.stderr is not None:  # closed by who started the program
+        print(fitted(printable(one_line(text)), sys.stderr), file=sys.stderr, flush=True)
 
 
 def _known(error: Exception) -> str | None:

@@ -151,7 +151,7 @@ def _with_voltage(database: VehicleDatabase) -> VehicleDatabase:
 def _right_voltage(drives: Sequence[Drive], database: VehicleDatabase) -> tuple[list[Drive], list[Finding]]:
     """Drives with the currents that a slip of the voltage spoils put right, and what is to be said of it."""
     signal = _voltage_signal(database)
-    divided = [branch.name for branch in database.layout.branch if branch.voltage is not None]
+    divided = [branch.name for branch in database.layout.branch if branch.voltage == signal]
     if signal is None or database.signal(signal)[1].unit != "V":
         return list(drives), []
     slip = voltage_slip(drives, VOLTAGE, signal)

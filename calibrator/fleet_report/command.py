@@ -79,7 +79,7 @@ def report(
     write_atomically(target, text.encode())
     size = len(text.encode())
     about = {"page": str(target), "bytes": size, **vars(found)}
-    write_output(dumps(about) if json else f"{target}: {size / 1e6:.1f} MB; open it in a browser")
+    write_output(dumps(about) if json else f"{target}: {size / 1e6:.2f} MB; open it in a browser")
 
 
 def _require_own_options(context: typer.Context, vehicle: str | None) -> None:

@@ -7,7 +7,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from calibrator.drive import Array
 from calibrator.errors import FleetError
@@ -29,7 +31,7 @@ class _Explained(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """Evidence of N vehicles.
+    """Evidence of n vehicles.
 
     Attributes
     ----------
@@ -37,7 +39,7 @@ class Evidence:
         Of the R rows: ratios [1], then constants [A].
     ratios : int
         How many of them are ratios.
-    value, sd, explained : ndarray of shape (N, R)
+    value, sd, explained : ndarray of shape (n, R)
         What was found, its standard deviation, and what the estimate explains of it; NaN where nothing is told.
     explanations : sequence of sequence of Explanation
         Competing ones, most probable first; mostly none.
@@ -51,8 +53,8 @@ class Evidence:
     explanations: Sequence[Sequence[Explanation]]
 
 
-def read_evidence(result: Path, table: FleetTable) -> Evidence:
-    """Read the evidence of all vehicles of a result.
+def read_evidence(result: Path, table: FleetTable, listed: NDArray[np.int64]) -> Evidence:
+    """Read the evidence of some vehicles of a result.
 
     Parameters
     ----------
@@ -60,11 +62,13 @@ def read_evidence(result: Path, table: FleetTable) -> Evidence:
         Its folder.
     table : FleetTable
         Its vehicles.
+    listed : ndarray of int of shape (n,)
+        Which of them.
 
     Returns
     -------
     Evidence
-        In the order of the table. A method that keeps none has no rows.
+        In this order. A method that keeps none has no rows.
 
     Raises
     ------
@@ -72,9 +76,9 @@ def read_evidence(result: Path, table: FleetTable) -> Evidence:
         If the parameters of the result are missing or damaged.
     """
     names = table.run.details.get("evidence", [])
-    place = {name: j for j, name in enumerate(table.vehicle)}
-    found = np.full((3, len(table), len(names)), np.nan)
-    explanations: list[Sequence[Explanation]] = [()] * len(table)
+    place = {name: j for j, name in enumerate(table.vehicle[listed])}
+    found = np.full((3, len(listed), len(names)), np.nan)
+    explanations: list[Sequence[Explanation]] = [()] * len(listed)
     parts = sorted((result / PARTS).glob("[0-9]*.parquet"))
     if not parts:
         raise FleetError(
@@ -82,12 +86,10 @@ def read_evidence(result: Path, table: FleetTable) -> Evidence:
         )
     for part in shown(parts, "read evidence", len(parts), "files"):
         rows = _read(part)
-        where = [place.get(name, -1) for name in rows["vehicle"].to_pylist()]
-        for j, text in zip(where, rows["parameters"].to_pylist(), strict=True):
-            if j >= 0:
-                explanations[j] = _explanations(text, part)
-        if not names:
-            continue
+        where = np.array([place.get(name, -1) for name in rows["vehicle"].to_pylist()], np.int64)
+        rows, where = rows.filter(pa.array(where >= 0)), where[where >= 0]
+        for j, text in zip(where.tolist(), rows["parameters"].to_pylist(), strict=True):
+            explanations[j] = _explanations(text, part)
         for values, column in zip(found, _COLUMNS, strict=True):
             _put(rows[column], where, values)
     return Evidence(
@@ -125,7 +127,7 @@ def _fault(drift: float | None, offset_a: float | None) -> str:
 
 def _read(part: Path) -> pa.Table:
     try:
-        table = pq.read_table(part)
+        table = pq.ParquetFile(part).read(use_threads=False)
         missing = [name for name in ("vehicle", "parameters") if name not in table.column_names]
     except (pa.ArrowException, OSError) as error:
         reason = str(error).partition("\n")[0][:120]
@@ -145,8 +147,10 @@ def _explanations(text: str, part: Path) -> Sequence[Explanation]:
         raise FleetError(f"{part}: damaged part of a result: {error}; calibrate again") from None
 
 
-def _put(column: pa.ChunkedArray, where: Sequence[int], values: Array) -> None:
+def _put(column: pa.ChunkedArray, where: NDArray[np.int64], values: Array) -> None:
     """Lists of numbers into the rows of their vehicles; a list of another length tells nothing."""
-    for j, found in zip(where, column.to_pylist(), strict=True):
-        if j >= 0 and found is not None and len(found) == values.shape[1]:
-            values[j] = [np.nan if value is None else value for value in found]
+    lists = column.combine_chunks()
+    fits = np.asarray(pc.fill_null(pc.equal(pc.list_value_length(lists), values.shape[1]), False))
+    if fits.any() and values.shape[1]:
+        numbers = lists.filter(pa.array(fits)).flatten().to_numpy(zero_copy_only=False)
+        values[where[fits]] = numbers.reshape(-1, values.shape[1])

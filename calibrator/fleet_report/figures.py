@@ -29,9 +29,12 @@ COLOURS = {
 }
 """Of Okabe and Ito's, which colour-blind readers can tell apart."""
 BEFORE, AFTER, OTHER = "#D55E00", "#0072B2", "#767676"
+BRANCH_COLOURS = (AFTER, BEFORE, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
 BINS = 60
 MOST_POINTS = 1000
 """Sensors drawn one by one in each branch: those with the largest faults. A browser draws some thousand at once."""
+MOST_BESIDE = 4
+"""Panels beside each other: more leave no room for their titles."""
 SMALLEST_A = 1e-3
 """Below what any sensor resolves; where a logarithmic axis begins. [A]"""
 
@@ -64,7 +67,8 @@ def junction_figure(sums: Mapping[str, Array], *, expected_a: float | None) -> F
     """Distributions of the Kirchhoff sum's root mean square over vehicles, on a logarithmic axis."""
     colours = dict(zip(sums, (BEFORE, AFTER, OTHER), strict=False))
     known = {name: np.maximum(values[np.isfinite(values)], SMALLEST_A) for name, values in sums.items()}
-    low, high = min(float(v.min()) for v in known.values()), max(float(v.max()) for v in known.values())
+    everything = np.concatenate([[SMALLEST_A] if not any(map(len, known.values())) else [], *known.values()])
+    low, high = float(everything.min()), float(everything.max())
     edges = np.geomspace(low / 1.05, high * 1.05, BINS + 1)
     traces = [_histogram(values, edges, name, colours[name]) for name, values in known.items()]
     layout = _layout(height=300, x="RMS of the Kirchhoff sum of a vehicle [A]", y="vehicles")
@@ -78,13 +82,15 @@ def junction_figure(sums: Mapping[str, Array], *, expected_a: float | None) -> F
 def sensor_figure(table: FleetTable) -> Figure:
     """Drift over offset of the sensors with the largest faults, one panel per branch, with standard deviations."""
     K, traces = len(table.branches), []
-    layout = _layout(height=360, x="", y="")
-    layout |= {"grid": {"rows": 1, "columns": K, "pattern": "independent"}, "yaxis": {}}
+    rows = -(-K // MOST_BESIDE)
+    layout = _layout(height=360 * rows, x="", y="")
+    grid = {"rows": rows, "columns": -(-K // rows), "pattern": "independent", "ygap": 0.25}
+    layout |= {"grid": grid, "yaxis": {}}
     for k, name in enumerate(table.branches):
         first, axis = k == 0, "" if k == 0 else str(k + 1)
         for label, colour, of in (("corrected", AFTER, True), ("held back", BEFORE, False)):
-            rows = _largest(table, k, table.applied[:, k] == of)
-            traces.append(_points(table, k, rows) | _point_style(label, colour, axis, first=first))
+            drawn = _largest(table, k, table.applied[:, k] == of)
+            traces.append(_points(table, k, drawn) | _point_style(label, colour, axis, first=first))
         drift, offset_a = (_about_zero(values[:, k]) for values in (100.0 * table.drift, table.offset_a))
         layout[f"xaxis{axis}"] = {"title": {"text": f"{name}: drift [%]"}, "range": drift, **_GRID}
         layout[f"yaxis{axis}"] = {"title": {"text": "offset [A]" if first else ""}, "range": offset_a, **_GRID}
@@ -121,14 +127,14 @@ def duration_figure(duration_s: Array) -> Figure:
 
 
 def ageing_figure(changes: Mapping[str, Array]) -> Figure:
-    """By how much the full-scale error of sensors has changed since an earlier result, by branch. [A]"""
+    """By how much what sensors show at full scale has changed since an earlier result, by branch. [A]"""
     largest = max((float(np.abs(values).max(initial=SMALLEST_A)) for values in changes.values()), default=SMALLEST_A)
     edges = np.linspace(-1.02 * largest, 1.02 * largest, BINS + 1)
-    colours = [AFTER, BEFORE, *COLOURS.values()]
     traces = [
-        _histogram(values, edges, name, colours[k % len(colours)]) for k, (name, values) in enumerate(changes.items())
+        _histogram(values, edges, name, BRANCH_COLOURS[k % len(BRANCH_COLOURS)])
+        for k, (name, values) in enumerate(changes.items())
     ]
-    layout = _layout(height=240, x="change of what a sensor is off by at full scale [A]", y="sensors")
+    layout = _layout(height=240, x="change of what a sensor shows at full scale [A]", y="sensors")
     return {"data": traces, "layout": layout}
 
 

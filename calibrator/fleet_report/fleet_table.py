@@ -145,7 +145,9 @@ def read_fleet_table(result: Path) -> FleetTable:
     """
     run, path = read_run(result), result / "results.parquet"
     try:
-        table = pq.read_table(path)
+        table = pq.ParquetFile(path).read(use_threads=False)
+    except FileNotFoundError:
+        raise FleetError(f"{path}: is missing; give the whole folder that 'calibrator calibrate' wrote") from None
     except (OSError, pa.ArrowException) as error:
         first_line = str(error).partition("\n")[0]
         raise FleetError(
@@ -154,8 +156,10 @@ def read_fleet_table(result: Path) -> FleetTable:
     missing = [name for name in SCHEMA.names if name not in table.column_names]
     if missing:
         raise FleetError(f"{path}: no column {', '.join(missing)}; calibrate again with this version")
-    rows = table.filter(pc.field("branch").is_valid())
-    others = table.filter(pc.field("branch").is_null())
+    if not run.full_scale_a:
+        raise FleetError(f"{result / 'run.json'}: no full_scale_a, it is of an older version; calibrate again")
+    rows = table.filter(pc.is_valid(table["branch"]))
+    others = table.filter(pc.is_null(table["branch"]))
     branches, K = run.branches, len(run.branches)
     if not K or rows["branch"].to_pylist() != list(branches) * (rows.num_rows // K):
         raise FleetError(

@@ -130,9 +130,11 @@ def workshop_list(table: FleetTable) -> Workshop:
 
 
 def holding_up(table: FleetTable, found: Margins | None) -> list[HoldingUp]:
-    """Vehicles that need the largest margins after correction; none if none needs more than the fleet's median."""
-    if found is None or len(table) < 2 or np.ptp(found.after_a) == 0.0:
+    """Vehicles that need more than half of the margin that is one for all after correction, the largest first."""
+    if found is None:
         return []
+    holding = np.argsort(-found.after_a, kind="stable")[:MOST_HOLDING]
+    holding = holding[found.after_a[holding] > found.common_after_a / 2.0]
     return [
         HoldingUp(
             vehicle=str(table.vehicle[j]),
@@ -140,7 +142,7 @@ def holding_up(table: FleetTable, found: Margins | None) -> list[HoldingUp]:
             verdict=str(table.verdict[j]),
             reason=str(table.reason[j] or ""),
         )
-        for j in np.argsort(-found.after_a, kind="stable")[:MOST_HOLDING].tolist()
+        for j in holding.tolist()
     ]
 
 
@@ -163,12 +165,12 @@ def moved_texts(table: FleetTable) -> list[str]:
 
 
 def changes_since(table: FleetTable, earlier: FleetTable | None) -> dict[str, Array]:
-    """By how much the error of sensors at full scale has changed since an earlier result.
+    """By how much what sensors show at full scale has changed since an earlier result.
 
     Parameters
     ----------
     table, earlier : FleetTable, FleetTable or None
-        Results of the same fleet.
+        Results of the same fleet, with the same branches.
 
     Returns
     -------
@@ -180,10 +182,9 @@ def changes_since(table: FleetTable, earlier: FleetTable | None) -> dict[str, Ar
     place = earlier.places(table.vehicle.tolist())
     both = place >= 0
     found: dict[str, Array] = {}
-    for name in (name for name in table.branches if name in earlier.branches):
-        new, old = table.branches.index(name), earlier.branches.index(name)
-        drift = table.drift[both, new] - earlier.drift[place[both], old]
-        offset_a = table.offset_a[both, new] - earlier.offset_a[place[both], old]
+    for k, name in enumerate(table.branches):
+        drift = table.drift[both, k] - earlier.drift[place[both], k]
+        offset_a = table.offset_a[both, k] - earlier.offset_a[place[both], k]
         changed = (drift != 0.0) | (offset_a != 0.0)
         found[name] = (drift * table.run.full_scale_a + offset_a)[changed]
     return found if any(map(len, found.values())) else {}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrator.drive import Array
+from calibrator.drive import Array, Mask
 from calibrator.fleet_report.fleet_table import FleetTable
 from calibrator.fleet_report.protection import Margins
 
@@ -61,8 +61,11 @@ class Protection:
         One margin for all vehicles. [A]
     own_median_a : float
         Median of the margins that vehicles need of their own, after correction. [A]
-    common_gain_a, own_gain_a : float
-        What the correction gives back: with one margin for all, and median with a margin per vehicle. [A]
+    corrected : int
+        Vehicles of which the branch is corrected.
+    common_gain_a, own_gain_a : float, float or None
+        What the correction gives back: with one margin for all; and with a margin per vehicle, the median of the
+        vehicles that are corrected, None if there is none. [A]
     common_gain_kw, own_gain_kw : float or None
         The same at the voltage. [kW]
     """
@@ -73,8 +76,9 @@ class Protection:
     common_before_a: float
     common_after_a: float
     own_median_a: float
+    corrected: int
     common_gain_a: float
-    own_gain_a: float
+    own_gain_a: float | None
     common_gain_kw: float | None
     own_gain_kw: float | None
 
@@ -169,13 +173,15 @@ def overview_of(table: FleetTable) -> Overview:
     )
 
 
-def protection_of(found: Margins, *, branch: str, voltage_v: float | None) -> Protection:
+def protection_of(found: Margins, corrected: Mask, *, branch: str, voltage_v: float | None) -> Protection:
     """Put the margins of a fleet into numbers.
 
     Parameters
     ----------
     found : Margins
         Of the battery's branch.
+    corrected : ndarray of bool, shape (N,)
+        Vehicles of which it is corrected.
     branch : str
         Its name.
     voltage_v : float or None
@@ -187,7 +193,7 @@ def protection_of(found: Margins, *, branch: str, voltage_v: float | None) -> Pr
         In A and kW.
     """
     common_a = found.common_before_a - found.common_after_a
-    own_a = float(np.median(found.own_gain_a))
+    own_a = float(np.median(found.own_gain_a[corrected])) if corrected.any() else None
     return Protection(
         branch=branch,
         limit_a=found.limit_a,
@@ -195,16 +201,18 @@ def protection_of(found: Margins, *, branch: str, voltage_v: float | None) -> Pr
         common_before_a=found.common_before_a,
         common_after_a=found.common_after_a,
         own_median_a=float(np.median(found.after_a)),
+        corrected=int(corrected.sum()),
         common_gain_a=common_a,
         own_gain_a=own_a,
         common_gain_kw=None if voltage_v is None else common_a * voltage_v / 1e3,
-        own_gain_kw=None if voltage_v is None else own_a * voltage_v / 1e3,
+        own_gain_kw=None if voltage_v is None or own_a is None else own_a * voltage_v / 1e3,
     )
 
 
 def spread_of(values: Array) -> Spread:
-    """Median and 5th and 95th percentile of some values, at least one."""
-    low, middle, high = np.quantile(values, [0.05, 0.5, 0.95]).tolist()
+    """Median and 5th and 95th percentile of the values that are known; NaN if none is."""
+    known = values[np.isfinite(values)]
+    low, middle, high = np.quantile(known, [0.05, 0.5, 0.95]).tolist() if len(known) else (np.nan,) * 3
     return Spread(median=middle, p05=low, p95=high)
 
 

@@ -1,6 +1,6 @@
 """The page of a fleet: everything that it shows, in one HTML file."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 from plotly.offline import get_plotlyjs
 
 from calibrator.drive import Array
@@ -36,11 +37,11 @@ from calibrator.fleet_report.packing import as_text
 from calibrator.fleet_report.protection import SIGMAS, Margins
 from calibrator.fleet_report.templates import asset, template
 from calibrator.fleet_report.vehicle_data import (
+    columns_within,
     details_within,
     kinds_of,
     most_to_say_first,
     row_steps,
-    vehicle_columns,
 )
 from calibrator.fleet_report.window import IdealWindow
 from calibrator.fleet_report.words import moment
@@ -53,6 +54,8 @@ REST_BYTES = 500_000
 """Of the text and the tables around the data. [byte]"""
 MOST_LISTED = 100_000
 """Vehicles that a page lists one by one."""
+LISTED_SHARE = 0.8
+"""Of the room that they may take, so that some is left for their evidence. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +64,10 @@ class FleetPage:
 
     Attributes
     ----------
-    table, overview, evidence : FleetTable, Overview, Evidence
+    table, overview : FleetTable, Overview
         The result.
+    evidence_of : callable
+        Reads the evidence of some of its vehicles.
     window : IdealWindow or None
         For the currents of single vehicles; None: they are not drawn.
     margins, protection : Margins and Protection, or None
@@ -75,7 +80,7 @@ class FleetPage:
 
     table: FleetTable
     overview: Overview
-    evidence: Evidence
+    evidence_of: Callable[[NDArray[np.int64]], Evidence]
     window: IdealWindow | None
     margins: Margins | None
     protection: Protection | None
@@ -98,17 +103,15 @@ def fleet_page(page: FleetPage) -> str:
         HTML. Of more than :data:`MOST_LISTED` vehicles those are listed of which there is most to say; where the page
         would be larger than :data:`MOST_BYTES`, the evidence of the others is left out.
     """
-    table = page.table
-    listed = most_to_say_first(table)[:MOST_LISTED]
-    plotly, columns, names = (
-        _plotly(),
-        vehicle_columns(table, page.beside, listed),
-        as_text(msgspec.json.encode(table.vehicle[listed].tolist())),
-    )
+    table, plotly = page.table, _plotly()
     changes = changes_since(table, page.earlier)
     figures = _figures(page, changes)
-    room = MOST_BYTES - len(plotly) - len(columns.data) - len(names) - len(msgspec.json.encode(figures)) - REST_BYTES
-    details = details_within(table, page.evidence, listed, room)
+    room = MOST_BYTES - REST_BYTES - len(plotly) - len(msgspec.json.encode(figures))
+    order = most_to_say_first(table)[:MOST_LISTED]
+    listed, columns = columns_within(table, page.beside, order, int(LISTED_SHARE * room))
+    names = as_text(msgspec.json.encode(table.vehicle[listed].tolist()))
+    evidence = page.evidence_of(listed)
+    details = details_within(table.reason[listed], evidence, room - len(columns.data) - len(names))
     facts = {
         "branches": table.branches,
         "vehicles": len(listed),
@@ -116,32 +119,17 @@ def fleet_page(page: FleetPage) -> str:
         "verdicts": kinds_of(table.verdict),
         "held_back": kinds_of(table.held_back),
         "columns": columns.columns,
-        "evidence": page.evidence.names,
+        "evidence": evidence.names,
         "evidence_columns": details.evidence.columns,
-        "evidence_steps": row_steps(page.evidence).tolist(),
-        "ratios": page.evidence.ratios,
+        "evidence_steps": row_steps(evidence).tolist(),
+        "ratios": evidence.ratios,
         "told": details.told,
         "window": _window_facts(page.window),
         "beside": page.beside.run.method if page.beside is not None else None,
         "figures": figures,
     }
     return template("fleet.html").render(
-        run=table.run,
-        overview=page.overview,
-        beside=_beside(page),
-        ranked=largest_faults(table),
-        drawn_limited=bool((table.faulty.sum(axis=0) > MOST_POINTS).any()),
-        most_points=MOST_POINTS,
-        moved=moved_texts(table),
-        ageing=_ageing_caption(changes, page.earlier),
-        listed_limited=_listed_notice(len(listed), len(table)),
-        workshop=workshop_list(table),
-        protection=page.protection,
-        no_protection=page.no_protection,
-        holding_up=holding_up(table, page.margins),
-        sigmas=f"{SIGMAS:g}",
-        left_out=left_out_rows(table, page.overview),
-        left_out_more=_left_out_more(page.overview),
+        **_texts(page, changes, listed=len(listed)),
         facts=_script_json(facts),
         columns=Markup(columns.data),  # noqa: S704 (base64)
         names=Markup(names),  # noqa: S704 (base64)
@@ -151,6 +139,30 @@ def fleet_page(page: FleetPage) -> str:
         style=Markup(asset("page.css")),  # noqa: S704 (of this package)
         script=Markup(asset("fleet.js")),  # noqa: S704 (of this package)
     )
+
+
+def _texts(page: FleetPage, changes: Mapping[str, Array], *, listed: int) -> dict[str, Any]:
+    """What stands in the page as text and tables."""
+    table = page.table
+    return {
+        "run": table.run,
+        "overview": page.overview,
+        "beside": _beside(page),
+        "doubtful": [name for name, branch in page.overview.reference.items() if branch.doubtful],
+        "ranked": largest_faults(table),
+        "drawn_limited": bool((table.faulty.sum(axis=0) > MOST_POINTS).any()),
+        "most_points": MOST_POINTS,
+        "moved": moved_texts(table),
+        "ageing": _ageing_caption(changes, page.earlier),
+        "listed_limited": _listed_notice(listed, len(table)),
+        "workshop": workshop_list(table),
+        "protection": page.protection,
+        "no_protection": page.no_protection,
+        "holding_up": holding_up(table, page.margins),
+        "sigmas": f"{SIGMAS:g}",
+        "left_out": left_out_rows(table, page.overview),
+        "left_out_more": _left_out_more(page.overview),
+    }
 
 
 def _figures(page: FleetPage, changes: Mapping[str, Array]) -> dict[str, Any]:

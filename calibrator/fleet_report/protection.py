@@ -9,9 +9,10 @@ or the other, and a margin that is one for all vehicles is set for the worst sen
     s^2 = (I s_d)^2 + s_o^2
 
 with d, o and their standard deviations s_d, s_o from the posterior. Its doubt counts only against the correction, so
-what is given back is not made larger by what is not known. It is the difference of M to the margin that one needs
-then: one for all again, which the worst vehicle that cannot be corrected decides, or one per vehicle, as each has its
-own parameters.
+what is given back is not made larger by what is not known. With one margin for all, the correction gives back the
+difference of M to the largest that is needed then, which the worst vehicle that is not corrected decides. With a
+margin per vehicle, as each has its own parameters, it gives back the difference to what the same vehicle needs where
+its sensor is known but not corrected: |d| I + |o| + z s, at most M.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -40,12 +41,13 @@ class Margins:
         The battery's current limit I. [A]
     before_a : ndarray of shape (N,)
         What each sensor is off by at the limit. [A]
-    after_a : ndarray of shape (N,)
-        Margin that each vehicle needs after correction. [A]
+    known_a, after_a : ndarray of shape (N,)
+        Margin that each vehicle needs where its sensor is known but not corrected; and after correction. [A]
     """
 
     limit_a: float
     before_a: Array
+    known_a: Array
     after_a: Array
 
     @property
@@ -60,8 +62,8 @@ class Margins:
 
     @property
     def own_gain_a(self) -> Array:
-        """What each vehicle gets back with a margin of its own, shape (N,). [A]"""
-        return self.common_before_a - self.after_a
+        """What the correction gives back to each vehicle that has a margin of its own, shape (N,). [A]"""
+        return self.known_a - self.after_a
 
 
 def margins(
@@ -72,7 +74,7 @@ def margins(
     Parameters
     ----------
     drift, offset_a, drift_sd, offset_sd_a : ndarray of shape (N,)
-        Sensor faults and their standard deviations; NaN of a deviation counts as 0. [1], [A]
+        Sensor faults and their standard deviations. [1], [A]
     applied : ndarray of bool, shape (N,)
         Whether the node corrects the branch.
     limit_a : float
@@ -83,10 +85,15 @@ def margins(
     Margins
         Before and after correction.
     """
-    doubt_a = SIGMAS * np.hypot(limit_a * np.nan_to_num(drift_sd), np.nan_to_num(offset_sd_a))
+    doubt_a = SIGMAS * np.hypot(limit_a * drift_sd, offset_sd_a)
     off_a = np.abs(drift) * limit_a + np.abs(offset_a)
-    needed_a = doubt_a + np.where(applied, 0.0, off_a)
-    return Margins(limit_a=limit_a, before_a=off_a, after_a=np.minimum(needed_a, _for_all(off_a)))
+    worst_a = _for_all(off_a)
+    return Margins(
+        limit_a=limit_a,
+        before_a=off_a,
+        known_a=np.minimum(off_a + doubt_a, worst_a),
+        after_a=np.minimum(np.where(applied, doubt_a, off_a + doubt_a), worst_a),
+    )
 
 
 def _for_all(needed_a: Array) -> float:

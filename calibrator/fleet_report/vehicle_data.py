@@ -12,10 +12,18 @@ from calibrator.fleet_report.evidence_columns import Evidence, explanation_text
 from calibrator.fleet_report.fleet_table import FleetTable
 from calibrator.fleet_report.packing import Packed, as_text, pack
 
-__all__ = ["Details", "details_within", "kinds_of", "most_to_say_first", "row_steps", "vehicle_columns"]
+__all__ = [
+    "Details",
+    "columns_within",
+    "details_within",
+    "kinds_of",
+    "most_to_say_first",
+    "row_steps",
+]
 
-GAIN_STEP, CURRENT_STEP_A, SHARE_STEP = 1e-5, 1e-3, 1e-4
-"""What columns are rounded to: a thousandth of a percent, a milliampere, a hundredth of a percent."""
+DURATION_STEP_S = 0.1
+GAIN_STEP, CURRENT_STEP_A, SHARE_STEP = 1e-5, 1e-3, 1e-5
+"""What columns are rounded to: a thousandth of a percent, a milliampere, a thousandth of a percent again."""
 
 
 def most_to_say_first(table: FleetTable) -> NDArray[np.int64]:
@@ -25,7 +33,7 @@ def most_to_say_first(table: FleetTable) -> NDArray[np.int64]:
     return np.lexsort((-error_a, plain))
 
 
-def vehicle_columns(table: FleetTable, beside: FleetTable | None, listed: NDArray[np.int64]) -> Packed:
+def _vehicle_columns(table: FleetTable, beside: FleetTable | None, listed: NDArray[np.int64]) -> Packed:
     """Columns of the vehicles that are listed."""
     columns: dict[str, tuple[Array, float]] = {
         "verdict": (_codes(table.verdict, kinds_of(table.verdict)), 1.0),
@@ -36,7 +44,7 @@ def vehicle_columns(table: FleetTable, beside: FleetTable | None, listed: NDArra
         "hardware_drift": (table.hardware_drift, GAIN_STEP),
         "measured_a": (table.measured_a, CURRENT_STEP_A),
         "deployed_a": (table.deployed_a, CURRENT_STEP_A),
-        "duration_s": (table.duration_s, 1.0),
+        "duration_s": (table.duration_s, DURATION_STEP_S),
         "drift": (table.drift, GAIN_STEP),
         "drift_sd": (table.drift_sd, GAIN_STEP),
         "offset_a": (table.offset_a, CURRENT_STEP_A),
@@ -54,6 +62,35 @@ def vehicle_columns(table: FleetTable, beside: FleetTable | None, listed: NDArra
             "beside_offset_a": (_at(beside.offset_a, place), CURRENT_STEP_A),
         }
     return pack({name: (values[listed], step) for name, (values, step) in columns.items()})
+
+
+def columns_within(
+    table: FleetTable, beside: FleetTable | None, order: NDArray[np.int64], room: int
+) -> tuple[NDArray[np.int64], Packed]:
+    """Columns of as many vehicles as there is room for.
+
+    Parameters
+    ----------
+    table, beside : FleetTable, FleetTable or None
+        The result, and that of another method.
+    order : ndarray of int of shape (n,)
+        Vehicles, those with most to say first.
+    room : int
+        For so much text. [byte]
+
+    Returns
+    -------
+    listed : ndarray of int
+        The first of them.
+    packed : Packed
+        Their columns.
+    """
+    listed = order
+    while True:
+        packed = _vehicle_columns(table, beside, listed)
+        if len(packed.data) <= room or not len(listed):
+            return listed, packed
+        listed = listed[: int(len(listed) * min(room / len(packed.data), 0.95))]
 
 
 def _at(values: Array, place: NDArray[np.int64]) -> Array:
@@ -98,15 +135,15 @@ class Details:
     evidence: Packed
 
 
-def details_within(table: FleetTable, evidence: Evidence, listed: NDArray[np.int64], room: int) -> Details:
+def details_within(reasons: NDArray[np.object_], evidence: Evidence, room: int) -> Details:
     """Details of as many vehicles as there is room for.
 
     Parameters
     ----------
-    table, evidence : FleetTable, Evidence
-        The result.
-    listed : ndarray of int of shape (n,)
-        Vehicles in the order of the page.
+    reasons : ndarray of str of shape (n,)
+        What would decide on each vehicle that is listed, in the order of the page.
+    evidence : Evidence
+        Of the same.
     room : int
         For so much text. [byte]
 
@@ -115,12 +152,12 @@ def details_within(table: FleetTable, evidence: Evidence, listed: NDArray[np.int
     Details
         Of the first of them.
     """
-    told = len(listed)
+    told = len(reasons)
     if told > TRIED:
-        tried = _details(table, evidence, listed[:TRIED])
+        tried = _details(reasons, evidence, TRIED)
         told = min(told, int(0.98 * TRIED * max(room, 0) / max(_size(tried), 1)))
     while True:
-        details = _details(table, evidence, listed[:told])
+        details = _details(reasons, evidence, told)
         size = _size(details)
         if size <= room or not told:
             return details
@@ -136,14 +173,14 @@ def row_steps(evidence: Evidence) -> Array:
     return np.where(np.arange(len(evidence.names)) < evidence.ratios, GAIN_STEP, CURRENT_STEP_A)
 
 
-def _details(table: FleetTable, found: Evidence, told: NDArray[np.int64]) -> Details:
+def _details(reasons: NDArray[np.object_], found: Evidence, told: int) -> Details:
     texts = {
         "explanations": [
-            [[round(each.probability, 4), explanation_text(each)] for each in found.explanations[j]]
-            for j in told.tolist()
+            [[round(each.probability, 4), explanation_text(each)] for each in rivals]
+            for rivals in found.explanations[:told]
         ],
-        "reasons": table.reason[told].tolist(),
+        "reasons": reasons[:told].tolist(),
     }
     rows = {"value": found.value, "sd": found.sd, "explained": found.explained}
-    packed = pack({name: (values[told] / row_steps(found), 1.0) for name, values in rows.items()})
-    return Details(told=len(told), texts=as_text(msgspec.json.encode(texts)), evidence=packed)
+    packed = pack({name: (values[:told] / row_steps(found), 1.0) for name, values in rows.items()})
+    return Details(told=told, texts=as_text(msgspec.json.encode(texts)), evidence=packed)

@@ -9,6 +9,7 @@ from calibrator.fleet_report.drawings import draw_evidence, draw_traces
 from calibrator.fleet_report.evidence_columns import explanation_text
 from calibrator.fleet_report.templates import asset, template
 from calibrator.fleet_report.traces import Traces
+from calibrator.posterior.verdict import SUSPECTED
 from calibrator.report.text import few
 from ecu_node.parameters import VehicleParameters
 
@@ -47,8 +48,12 @@ def vehicle_page(
         HTML.
     """
     expected_a = parameters.junction_residual.expected_a
+    residual, hardware = parameters.junction_residual, parameters.hardware_fault
+    held_back = [name for name, branch in parameters.branches.items() if branch.held_back]
     return template("vehicle.html").render(
         parameters=parameters,
+        grows=held_back if residual.corrected_a > residual.measured_a else [],
+        in_doubt=not hardware.suspected and (hardware.probability or 0.0) > SUSPECTED,
         drawn=[{"title": each.title, "svg": draw_traces(each, expected_a=expected_a)} for each in traces],
         evidence=None if evidence is None else draw_evidence(evidence, names, ratios=ratios),
         explanations=[(each.probability, explanation_text(each)) for each in parameters.explanations],

@@ -1,7 +1,10 @@
 """From a result folder to its pages."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from calibrator.errors import FleetError
 from calibrator.fleet_report.evidence_columns import ratio_count, read_evidence
@@ -79,12 +82,19 @@ def fleet_report(result: Path, options: ReportOptions) -> tuple[str, FleetReport
     """
     table = read_fleet_table(result)
     beside, earlier = (_other(path, table) for path in (options.beside, options.earlier))
+    if beside is not None and beside.run.method == table.run.method:
+        raise FleetError(f"{options.beside}: of method {table.run.method} too; expected one of another for --beside")
+    if earlier is not None and (earlier.run.method != table.run.method or earlier.run.created >= table.run.created):
+        raise FleetError(
+            f"{options.earlier}: of method {earlier.run.method}, made {earlier.run.created}; expected one of method "
+            f"{table.run.method} from before {table.run.created} for --earlier"
+        )
     overview, unity = overview_of(table), read_unity(result)
     found, protection, why = _protection(table, options, unity)
     page = FleetPage(
         table=table,
         overview=overview,
-        evidence=read_evidence(result, table),
+        evidence_of=partial(read_evidence, result, table),
         window=ideal_window(unity, table.run),
         margins=found,
         protection=protection,
@@ -132,6 +142,8 @@ def vehicle_report(
     """
     written, run = written_of(result, vehicle), read_run(result)
     parameters = decode_parameters(written.text, f"{result}: parameters of {vehicle}")
+    if database is not None:
+        _require_made_with(database, parameters)
     names, unity = run.details.get("evidence", []), read_unity(result)
     window = ideal_window(unity, run)
     traces = []
@@ -150,15 +162,34 @@ def vehicle_report(
     return page, VehicleReport(parameters=parameters)
 
 
+def _require_made_with(database: VehicleDatabase, parameters: VehicleParameters) -> None:
+    """Refuse a layout or DBC with which the parameters do not belong together, as the node does."""
+    layout = database.layout
+    for path, digest, expected in (
+        (layout.path, layout.digest, parameters.layout.sha256),
+        (layout.dbc_path, database.digest, parameters.dbc.sha256),
+    ):
+        if digest != expected:
+            raise FleetError(
+                f"{path}: not the file that vehicle {parameters.vehicle} was calibrated with (SHA-256 {digest[:12]}, "
+                f"expected {expected[:12]}); give the one it was"
+            )
+
+
 def _other(path: Path | None, table: FleetTable) -> FleetTable | None:
     """Another result of the same fleet."""
     if path is None:
         return None
     other = read_fleet_table(path)
-    if other.branches != table.branches or not set(other.vehicle) & set(table.vehicle):
+    if other.branches != table.branches:
         raise FleetError(
-            f"{path}: a result of {len(other)} vehicles with branches {', '.join(other.branches)}, none of which is "
-            f"among the {len(table)} with branches {', '.join(table.branches)}; expected another result of this fleet"
+            f"{path}: a result with branches {', '.join(other.branches)}, and this one has "
+            f"{', '.join(table.branches)}; expected another result of this fleet"
+        )
+    if not set(other.vehicle) & set(table.vehicle):
+        raise FleetError(
+            f"{path}: none of its {len(other)} vehicles is among the {len(table)} of this result; expected another "
+            f"result of this fleet"
         )
     return other
 
@@ -173,9 +204,9 @@ def _protection(
             raise FleetError(f"--battery {branch}: no such branch; expected one of {few(list(table.branches))}")
         return None, None, f"No branch is called {BATTERY!r}; name the battery's with --battery to see its margin."
     limit_a = options.limit_a or table.run.full_scale_a
-    if not limit_a:
-        return None, None, "The result does not tell the full scale of the junction; give the battery's --limit."
     k = table.branches.index(branch)
+    if not np.isfinite(table.drift_sd[:, k]).all() or not np.isfinite(table.offset_sd_a[:, k]).all():
+        return None, None, f"Method {table.run.method} does not say how sure its estimates are, so no margin follows."
     found = margins(
         table.drift[:, k],
         table.offset_a[:, k],
@@ -185,4 +216,5 @@ def _protection(
         limit_a=limit_a,
     )
     voltage_v = options.voltage_v or (None if unity is None else unity.voltage_v)
-    return found, protection_of(found, branch=branch, voltage_v=voltage_v), ""
+    corrected = table.applied[:, k] & table.faulty[:, k]
+    return found, protection_of(found, corrected, branch=branch, voltage_v=voltage_v), ""

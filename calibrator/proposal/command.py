@@ -1,6 +1,6 @@
 """``calibrator layout init``: a layout to begin with, from a DBC and a log."""
 
-import sys
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +12,7 @@ from calibrator.folders import require_possible_file
 from calibrator.interrupts import importing
 from calibrator.report.text import dumps
 from ecu_node.errors import printable
+from ecu_node.failures import say_error
 from ecu_node.parameters import write_atomically
 from ecu_node.standard_output import write_output
 
@@ -60,8 +61,8 @@ def init(
         write_output(text.rstrip("\n"))
         return
     write_output(f"{printable(str(out))}: branches {', '.join(names)}; {guesses} guesses to confirm")
-    log_option = f"--log {log}" if log is not None else "--log LOG"
-    print(f"next: calibrator doctor --layout {out} {log_option}", file=sys.stderr)
+    shown_log = "LOG" if log is None else shlex.quote(str(log))
+    say_error(f"next: calibrator doctor --layout {shlex.quote(str(out))} --log {shown_log}")
 
 
 def _name_of(path: Path) -> str:

@@ -117,4 +117,4 @@ def _folded(text: str) -> list[str]:
 
 
 def _text(value: str) -> str:
-    return json.dumps(value)
+    return json.dumps(value, ensure_ascii=False)

@@ -9,7 +9,7 @@ RMSE is the root mean square of the current itself; what the correction did to i
 (corrected - measured).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -186,7 +186,7 @@ def compare_kirchhoff(recording: Recording, layout: Layout) -> Comparison:
     corrected = {name: channel for name, channel in _usable(recording.corrected).items() if name in measured}
     names = tuple(name for name in layout.branch_names if name in measured)
     if len(names) < 2:
-        raise DriveError(f"{where}: usable frames of {', '.join(names) or 'no branch'} only; a sum needs two branches")
+        raise DriveError(f"{where}: {_usable_text(names)}; a sum needs two branches")
     timeouts_s = {branch.name: branch.timeout_s for branch in layout.branch}
     channels = measured | {_after(name): channel for name, channel in corrected.items()}
     limits_s = {name: timeouts_s[name] for name in names} | {_after(name): timeouts_s[name] for name in corrected}
@@ -206,6 +206,10 @@ def compare_kirchhoff(recording: Recording, layout: Layout) -> Comparison:
         valid=valid,
         masked={reason: int(mask.sum()) for reason, mask in reasons.items()},
     )
+
+
+def _usable_text(names: Sequence[str]) -> str:
+    return f"usable frames of {', '.join(names)} only" if names else "no branch has usable frames"
 
 
 def _usable(channels: Mapping[str, Channel]) -> dict[str, Channel]:

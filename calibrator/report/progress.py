@@ -73,6 +73,9 @@ def progress_bar(label: str, total: int | None, unit: str = "", *, begun: int = 
     callable
         To be called with the number of units done.
     """
+    if sys.stderr is None:  # closed by who started the program
+        yield lambda _: None
+        return
     label, console = f"{_number.get()()}{label}", Console(stderr=True)
     if console.is_terminal and not console.is_dumb_terminal:
         with _bars(console) as bars:

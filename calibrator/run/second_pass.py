@@ -70,9 +70,7 @@ def calibrate_bucket(
     for name, items in records.items():
         earlier = _earlier(name, before.get(name))
         if earlier is not None and (before[name].drives == digests[name] or _not_linear(earlier)):
-            found.parameters.append(earlier)
-            if kept := before[name].evidence:
-                found.evidence[name] = kept
+            found.parameters.append(earlier)  # its evidence was found against another reference, and is not kept
             continue
         try:
             todo.append(_what_holds(items, earlier, task, found))

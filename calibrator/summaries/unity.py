@@ -33,7 +33,7 @@ WINDOW_S = 60.0
 """Length of the window: an acceleration, a recuperation and some rest fit in. [s]"""
 LEAST_VALID = 0.95
 """Share of its instants that must be valid. [1]"""
-MOST_TRIED = 10
+MOST_TRIED = 4
 """Vehicles that are looked at for a window; the first that has one gives it."""
 VOLTAGE_UNITS = {"V": 1.0, "kV": 1000.0}
 HIGH_VOLTAGE_V = (60.0, 2000.0)
@@ -154,7 +154,7 @@ def _window_of(
         try:
             drive = load_drive(entry, database)
             samples = align(drive, database.layout, identity.branches, inputs=identity.fleet_inputs)
-        except UserError:
+        except (UserError, ArithmeticError, LookupError, ValueError):  # a picture is no reason to end a run
             continue
         if samples.input_names != identity.bank.input_names:
             continue
@@ -170,7 +170,7 @@ def _window_of(
             drive=entry.name,
             time_s=samples.time_s[window] - samples.time_s[start],
             columns=np.where(valid[:, None], columns[window], np.nan),
-            voltage_v=_voltage_v(drive, database),
+            voltage_v=_voltage_v(drive, database, first_s=samples.time_s[start], length_s=WINDOW_S),
             bank=identity.bank,
         )
     return Unread(reason="no window of its drives is valid throughout")
@@ -208,12 +208,15 @@ def liveliest_window(currents_a: Array, valid: Mask, length: int) -> int | None:
     return int(np.argmax(np.where(enough, variance, -1.0)))
 
 
-def _voltage_v(drive: Drive, database: VehicleDatabase) -> float | None:
-    """Median of the one recorded input that is a high voltage; None if there is none, or more than one."""
+def _voltage_v(drive: Drive, database: VehicleDatabase, *, first_s: float, length_s: float) -> float | None:
+    """Median in the window of the one recorded input that is a high voltage; None if there is none, or several."""
     found = []
     for item in database.layout.input:
         unit, channel = database.signal(item.signal)[1].unit or "", drive.inputs.get(item.name)
-        if unit in VOLTAGE_UNITS and channel is not None and channel.good.any():
-            median_v = VOLTAGE_UNITS[unit] * float(np.median(channel.value[channel.good]))
+        if unit not in VOLTAGE_UNITS or channel is None:
+            continue
+        inside = channel.good & (channel.time_s >= first_s) & (channel.time_s <= first_s + length_s)
+        if inside.any():
+            median_v = VOLTAGE_UNITS[unit] * float(np.median(channel.value[inside]))
             found += [median_v] if HIGH_VOLTAGE_V[0] <= median_v <= HIGH_VOLTAGE_V[1] else []
     return found[0] if len(found) == 1 else None

@@ -139,6 +139,14 @@ def test_competing_explanations_are_told(page: webdriver.Chrome) -> None:
     assert "passes through: harm limit" in text
 
 
+def test_a_place_that_there_is_not_changes_nothing(page: webdriver.Chrome) -> None:
+    page.execute_script("location.hash = 'vehicle=%E0%A4%A'")
+    page.execute_script("location.hash = 'vehicle=V99'")
+    assert not page.find_element(By.ID, "vehicle").is_displayed()
+    assert page.execute_script("return document.body.dataset.failed") is None
+    assert page.get_log("browser") == []
+
+
 def test_filters_leave_the_vehicles_that_are_asked_for(page: webdriver.Chrome) -> None:
     page.find_element(By.ID, "find").send_keys("v1")
     until(page, "return document.getElementById('count').textContent.startsWith('2 of 6')")

@@ -221,8 +221,9 @@
     $("save").addEventListener("click", save);
     refresh();
     const follow = () => {
-      const asked = decodeURIComponent(location.hash).match(/^#vehicle=(.*)$/);
-      if (asked && names.includes(asked[1])) show(names.indexOf(asked[1]), names, columns, true);
+      const asked = location.hash.match(/^#vehicle=(.*)$/);
+      const j = asked ? names.findIndex((name) => asked[1] === name || asked[1] === encodeURIComponent(name)) : -1;
+      if (j >= 0) show(j, names, columns, true);
     };
     window.addEventListener("hashchange", follow);
     follow();
@@ -247,24 +248,27 @@
         fixed(100 * columns.beside_drift[j * K + k], 2, "", true), fixed(columns.beside_offset_a[j * K + k], 2, "", true)]), `Method ${facts.beside}`));
     }
     const currents = element("div", { class: "plot" }), evidence = element("div", { class: "plot" });
-    if (facts.window && told && facts.evidence.length) {
+    const known = told && facts.evidence.length > 0 && !Number.isNaN(found.evidence.explained[j * facts.evidence.length]);
+    if (facts.window && known) {
       parts.push(element("h4", {}, "Currents on the unity window, and their sum"), element("figure", {}, currents, element("figcaption", {},
-        `${facts.window.seconds} s of the inputs of vehicle ${facts.window.vehicle}: what this vehicle's sensors show there by its own slopes and intercepts, corrected by what the node applies, and the ideal current of the fleet.`)));
+        `${facts.window.seconds} s of the inputs of vehicle ${facts.window.vehicle}: what this vehicle's sensors show there by its own slopes and intercepts, corrected by what the node applies (of a sensor that is not linear by its linear part), and the ideal current of the fleet.`)));
     }
-    if (told && facts.evidence.length) {
+    if (known) {
       parts.push(element("h4", {}, "Evidence"), element("figure", {}, evidence, element("figcaption", {},
-        "What the recordings say, with standard deviations, and what the estimate explains. Zero is a vehicle without faults.")));
+        "What the recordings say, with standard deviations, and what the estimate explains. Zero is a perfect vehicle; a load without a sensor moves the junction constant and an intercept of all.")));
     }
     const rivals = told ? found.explanations[j] : [];
-    if (rivals.length) parts.push(element("h4", {}, "Competing explanations"), table(["probability", "<explanation"], rivals.map(([p, text]) => [percent(p, 1), text])));
+    if (rivals.length) parts.push(element("h4", {}, rivals.length > 1 ? "Competing explanations" : "Explanation"), table(["probability", "<explanation"], rivals.map(([p, text]) => [percent(p, 1), text])));
     if (told && found.reasons[j]) parts.push(element("p", { class: "decides" }, `${found.reasons[j]}.`));
+    if (known && !facts.window) parts.push(element("p", { class: "soft" }, "No currents are drawn: the result has no unity window."));
+    if (told && !known) parts.push(element("p", { class: "soft" }, "No evidence was kept of this vehicle: its parameters are of an earlier run, or the method keeps none."));
     if (!told) parts.push(element("p", { class: "soft" }, "The evidence of this vehicle is not part of this page, which would be too large."));
-    parts.push(element("p", { class: "soft" }, `Its own page, to print: calibrator report RESULT --vehicle ${names[j]}`));
+    parts.push(element("p", { class: "soft" }, `Its own page, to print: calibrator report RESULT --vehicle "${names[j]}"`));
     place.replaceChildren(...parts);
     place.hidden = false;
     place.dataset.vehicle = names[j];
     if (move) place.scrollIntoView({ block: "start" }), place.focus({ preventScroll: true });
-    if (!told || !facts.evidence.length) return;
+    if (!known) return;
     if (facts.window) await draw(currents, currentFigure(j, columns, found.evidence));
     await draw(evidence, evidenceFigure(j, found.evidence));
   }
@@ -273,8 +277,11 @@
     const confidence = columns.confidence[j], hardware = columns.suspected[j] === 1;
     return `Verdict: ${facts.verdicts[columns.verdict[j]]}${Number.isNaN(confidence) ? "" : `, confidence ${percent(confidence, 1)}`}. `
       + `Kirchhoff sum ${amperes(columns.measured_a[j])} as measured, ${amperes(columns.deployed_a[j])} after correction (RMS over ${fixed(columns.duration_s[j] / 60, 1, " min")}). `
+      + (columns.deployed_a[j] > columns.measured_a[j] && heldBack(j, columns) ? `The sum grows as a fault of ${heldBack(j, columns)} is held back. ` : "")
       + (hardware ? `A hardware fault is suspected, probability ${percent(columns.hardware_probability[j], 1)}: all currents ${percent(columns.hardware_drift[j], 2, true)}.` : "");
   }
+
+  const heldBack = (j, columns) => facts.branches.filter((_, k) => !Number.isNaN(columns.held_back[j * K + k])).join(", ");
 
   function row(evidence, j, name) {
     const r = facts.evidence.indexOf(name), R = facts.evidence.length;
@@ -338,6 +345,5 @@
     await loadPlotly();
     document.body.dataset.ready = String(Math.round(performance.now()));
   }
-  window.addEventListener("unhandledrejection", (event) => fail(event.reason));
   start().catch(fail);
 })();

@@ -151,6 +151,7 @@ def write_result(
     method: str = "posterior",
     window: UnityWindow | None = WINDOW,
     evidence: bool = True,
+    created: str = "2026-01-01T00:00:00+00:00",
 ) -> Path:
     """A result folder as ``calibrator calibrate`` writes it."""
     folder.mkdir()
@@ -165,7 +166,8 @@ def write_result(
     parameters.unlink()
     if window is not None:
         (folder / UNITY_FILE).write_bytes(window.encoded())
-    write_run(folder, run_of(len(vehicles), left_out or {}, method=method, evidence=evidence))
+    run = run_of(len(vehicles), left_out or {}, method=method, evidence=evidence)
+    write_run(folder, replace(run, created=created))
     return folder
 
 

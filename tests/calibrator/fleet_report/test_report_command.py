@@ -1,8 +1,10 @@
 import json
+import os
 from pathlib import Path
 
 import pytest
 
+from tests.calibrator.conftest import LAYOUT
 from tests.calibrator.test_results import run_command
 
 
@@ -10,7 +12,7 @@ def test_the_page_of_the_fleet_is_written(result: Path, tmp_path: Path, capsys: 
     out = tmp_path / "new" / "page.html"
     assert run_command(["report", str(result), "--out", str(out)]) == 0
     assert out.read_text().startswith("<!DOCTYPE html>")
-    assert capsys.readouterr().out == f"{out}: {out.stat().st_size / 1e6:.1f} MB; open it in a browser\n"
+    assert capsys.readouterr().out == f"{out}: {out.stat().st_size / 1e6:.2f} MB; open it in a browser\n"
 
 
 def test_its_numbers_come_as_json(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -49,6 +51,24 @@ def test_options_that_do_not_belong_together_are_refused(
     assert run_command(["report", str(result), "--out", str(out), *options]) == 2
     assert message in " ".join(capsys.readouterr().err.split())
     assert not out.exists()
+
+
+def test_a_pipe_is_not_replaced_by_a_page(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    assert run_command(["report", str(result), "--out", str(pipe)]) == 1
+    assert "is no file but a device, pipe or socket" in capsys.readouterr().err
+    assert pipe.is_fifo()
+
+
+def test_drives_are_read_with_the_layout_of_the_calibration_alone(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = LAYOUT.read_text().replace("sign = 1 ", "sign = -1 ", 1).replace('"hv_pow', f'"{LAYOUT.parent}/hv_pow', 2)
+    (tmp_path / "other.toml").write_text(text.replace(f'name = "{LAYOUT.parent}/', 'name = "'))
+    options = ["--vehicle", "V1", "--drives", str(tmp_path), "--layout", str(tmp_path / "other.toml")]
+    assert run_command(["report", str(result), *options, "--out", str(tmp_path / "page.html")]) == 1
+    assert "other.toml: not the file that vehicle V1 was calibrated with" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,10 @@ from ecu_node.parameters import decode_parameters
 from tests.calibrator.fleet_report.results_at_hand import (
     EVIL,
     WINDOW,
+    sensor,
     six_vehicle_result,
     six_vehicles,
+    vehicle,
     write_result,
 )
 
@@ -62,7 +64,7 @@ def visible(page: str) -> str:
 def test_every_figure_is_one_that_plotly_takes(result: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     earlier = six_vehicles(database)[1:]
     earlier[-1] = replace(earlier[-1], branches=earlier[0].branches)
-    options = ReportOptions(earlier=write_result(tmp_path / "earlier", earlier))
+    options = ReportOptions(earlier=write_result(tmp_path / "earlier", earlier, created="2025-06-01T00:00:00+00:00"))
     page, _ = fleet_report(result, options)
     figures = facts_of(page)["figures"]
     assert isinstance(figures, dict)
@@ -129,7 +131,7 @@ def test_results_of_another_fleet_are_refused(result: Path, tmp_path: Path, data
     other = write_result(
         tmp_path / "other", [replace(item, vehicle=f"X{item.vehicle}") for item in six_vehicles(database)]
     )
-    with pytest.raises(FleetError, match=r"none of which is among the 6 .* expected another result of this fleet"):
+    with pytest.raises(FleetError, match=r"none of its 6 vehicles is among the 6 of this result; expected another"):
         fleet_report(result, ReportOptions(earlier=other))
 
 
@@ -171,6 +173,28 @@ def test_the_vehicle_page_tells_its_parameters_evidence_and_currents(result: Pat
     assert "intercept battery" in page
     assert "<script" not in page
     assert report.parameters.vehicle == "V4"
+
+
+def test_without_deviations_no_margin_is_told(tmp_path: Path, database: VehicleDatabase) -> None:
+    unsure = replace(sensor(0.1, 4.0, apply=True), drift_sd=None, offset_sd_a=None)
+    page, report = fleet_report(write_result(tmp_path / "r", [vehicle(database, "V1", unsure, sensor())]), PLAIN)
+    assert report.protection is None
+    assert "does not say how sure its estimates are" in visible(page)
+
+
+def test_many_branches_are_listed_as_far_as_there_is_room(result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, _ = fleet_report(result, PLAIN)
+    size = len(re.search(r'id="columns">(.*?)</script>', whole, re.DOTALL)[1])  # type: ignore[index]
+    monkeypatch.setattr(page_module, "LISTED_SHARE", 0.9 * size / (page_module.MOST_BYTES - len(whole)))
+    page, _ = fleet_report(result, PLAIN)
+    assert 0 < facts_of(page)["vehicles"] < 6  # type: ignore[operator]
+
+
+def test_a_result_of_an_older_version_is_told_to_be_one(result: Path) -> None:
+    text = (result / "run.json").read_text()
+    (result / "run.json").write_text(text.replace('"full_scale_a": 400.0', '"full_scale_a": 0.0'))
+    with pytest.raises(FleetError, match="no full_scale_a, it is of an older version; calibrate again"):
+        fleet_report(result, PLAIN)
 
 
 def test_a_vehicle_that_was_left_out_is_told_why(result: Path) -> None:

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from calibrator.drive import Array
 from calibrator.fleet_report.overview import protection_of
 from calibrator.fleet_report.protection import SIGMAS, Margins, margins
 
@@ -17,7 +16,7 @@ def test_a_vehicle_needs_what_its_sensor_is_off_by_at_the_limit() -> None:
     found = of([False] * 4)
     np.testing.assert_allclose(found.before_a, [44.0, 44.0, 0.0, 9.0])
     np.testing.assert_array_equal(found.after_a, found.before_a)
-    np.testing.assert_allclose(found.own_gain_a, [0.0, 0.0, 44.0, 35.0])
+    np.testing.assert_array_equal(found.own_gain_a, 0.0)
 
 
 def test_a_corrected_sensor_needs_its_uncertainty_alone() -> None:
@@ -45,15 +44,29 @@ def test_one_margin_for_all_falls_no_lower_than_the_worst_that_is_not_corrected(
 
 
 def test_without_correction_nothing_is_given_back() -> None:
-    found = protection_of(of([False] * 4), branch="battery", voltage_v=350.0)
-    assert (found.common_gain_a, found.common_gain_kw) == (0.0, 0.0)
+    none_applied = np.zeros(4, bool)
+    found = protection_of(of([False] * 4, sd=0.01), none_applied, branch="battery", voltage_v=350.0)
+    assert (found.common_gain_a, found.common_gain_kw, found.corrected) == (0.0, 0.0, 0)
+    assert (found.own_gain_a, found.own_gain_kw) == (None, None)
+    np.testing.assert_array_equal(of([False] * 4, sd=0.01).own_gain_a, 0.0)
+
+
+def test_with_a_margin_per_vehicle_a_correction_gives_back_what_it_takes_away() -> None:
+    applied = [True, False, False, True]
+    found = of(applied, sd=0.001)
+    doubt_a = SIGMAS * np.hypot(0.4, 0.1)
+    np.testing.assert_allclose(found.own_gain_a, [44.0 - doubt_a, 0.0, 0.0, 9.0])
+    told = protection_of(found, np.array(applied), branch="battery", voltage_v=350.0)
+    assert told.own_gain_a == pytest.approx((44.0 - doubt_a + 9.0) / 2.0)
+    assert told.corrected == 2
 
 
 def test_gains_are_told_in_kilowatts_where_the_voltage_is_known() -> None:
-    found = protection_of(of([True] * 4), branch="battery", voltage_v=350.0)
+    every = np.ones(4, bool)
+    found = protection_of(of([True] * 4), every, branch="battery", voltage_v=350.0)
     assert found.common_gain_kw == pytest.approx(44.0 * 0.35)
-    assert found.own_gain_kw == pytest.approx(44.0 * 0.35)
-    assert protection_of(of([True] * 4), branch="battery", voltage_v=None).own_gain_kw is None
+    assert found.own_gain_kw == pytest.approx(26.5 * 0.35)
+    assert protection_of(of([True] * 4), every, branch="battery", voltage_v=None).own_gain_kw is None
 
 
 def test_twice_the_faults_take_twice_the_margin() -> None:
@@ -61,15 +74,6 @@ def test_twice_the_faults_take_twice_the_margin() -> None:
 
 
 def test_of_a_large_fleet_one_in_a_thousand_may_need_more() -> None:
-    needed_a = np.concatenate([np.full(9995, 5.0), np.full(5, 500.0)])
-    found = margins(np.zeros(10_000), needed_a, none(10_000), none(10_000), np.zeros(10_000, bool), limit_a=400.0)
+    needed_a, nothing = np.concatenate([np.full(9995, 5.0), np.full(5, 500.0)]), np.zeros(10_000)
+    found = margins(nothing, needed_a, nothing, nothing, np.zeros(10_000, bool), limit_a=400.0)
     assert found.common_before_a == pytest.approx(5.0)
-
-
-def test_a_method_without_deviations_counts_as_sure() -> None:
-    found = margins(DRIFT, OFFSET_A, none(4), none(4), np.ones(4, bool), limit_a=400.0)
-    np.testing.assert_array_equal(found.after_a, 0.0)
-
-
-def none(count: int) -> Array:
-    return np.full(count, np.nan)
