@@ -135,6 +135,16 @@ def test_results_of_another_fleet_are_refused(result: Path, tmp_path: Path, data
         fleet_report(result, ReportOptions(earlier=other))
 
 
+def test_results_that_are_neither_of_another_method_nor_of_before_are_refused(
+    result: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
+    later = write_result(tmp_path / "later", six_vehicles(database), created="2026-02-01T00:00:00+00:00")
+    with pytest.raises(FleetError, match=r"of method posterior too; expected one of another for --beside"):
+        fleet_report(result, ReportOptions(beside=later))
+    with pytest.raises(FleetError, match=r"made 2026-02-01.*; expected one of method posterior from before 2026-01-01"):
+        fleet_report(result, ReportOptions(earlier=later))
+
+
 def test_a_battery_that_there_is_not_is_refused(result: Path) -> None:
     with pytest.raises(FleetError, match="--battery rear: no such branch; expected one of battery, motor"):
         fleet_report(result, ReportOptions(battery="rear"))
