@@ -36,7 +36,7 @@ def test_rows_stand_in_the_table_and_in_the_file(tmp_path: Path) -> None:
 
 
 def test_every_step_has_its_group() -> None:
-    assert list(GROUPS) == ["identification", "posterior", "ingest", "fleet run", "node"]
+    assert list(GROUPS) == ["identification", "posterior", "ingest", "fleet run", "node", "fleet report"]
 
 
 def test_memory_is_that_of_the_process_and_its_children() -> None:

@@ -13,5 +13,6 @@ def run(*command: str) -> "subprocess.CompletedProcess[str]":
 def test_the_script_is_the_command() -> None:
     script, command = run("tools/compare_kirchhoff.py", *MISSING), run("-m", "calibrator", "kirchhoff", *MISSING)
     assert (script.returncode, script.stdout, script.stderr) == (1, "", command.stderr)
-    assert script.stderr == "calibrator: none.toml: cannot read the layout: No such file or directory\n"
+    cause = "cannot read the layout: No such file or directory; name the layout (TOML) of this vehicle"
+    assert script.stderr == f"calibrator: none.toml: {cause}\n"
     assert run("tools/compare_kirchhoff.py").returncode == 2

@@ -43,7 +43,11 @@ def test_json_has_facts_findings_and_steps(log: Path, tmp_path: Path) -> None:
 
 def test_a_missing_log_and_a_missing_dbc_are_one_line(tmp_path: Path) -> None:
     done = doctor("--layout", write_layout(tmp_path), "--log", "none.log")
-    assert (done.returncode, done.stdout, done.stderr) == (1, "", "calibrator: none.log: no such file\n")
+    assert (done.returncode, done.stdout, done.stderr) == (
+        1,
+        "",
+        "calibrator: none.log: no such file; give a log that is there\n",
+    )
     (tmp_path / "hv_powertrain.dbc").unlink()
     done = doctor("--layout", tmp_path / "layout.toml", "--log", "none.log")
     assert done.returncode == 1
