@@ -280,7 +280,7 @@ def join_rows(folder: Path, parts: Sequence[Path], left_out: Mapping[str, str]) 
             writer.write_table(table)
         writer.write_table(pa.Table.from_pylist(left_out_rows(others), schema=SCHEMA))
     if rows <= MOST_SORTED:
-        found = pq.read_table(path, schema=SCHEMA).to_pylist()
+        found = pq.read_table(path, schema=SCHEMA, use_threads=False).to_pylist()
         found.sort(key=lambda row: (row["verdict"] == LEFT_OUT, row["vehicle"]))  # stable: branches keep their order
         path.write_bytes(_parquet(found, SCHEMA))
     return calibrated
@@ -356,7 +356,8 @@ def written_of(result: Path, vehicle: str) -> Written:
 def _left_out_reason(path: Path, vehicle: str) -> str | None:
     """Why a vehicle has no parameters; None if nothing is said of it."""
     try:
-        rows = pq.read_table(path, columns=["reason"], filters=[("vehicle", "==", vehicle)]).to_pylist()
+        table = pq.ParquetFile(path).read(columns=["vehicle", "reason"], use_threads=False)
+        rows = table.filter(pc.equal(table["vehicle"], vehicle)).to_pylist()
     except (pa.ArrowException, OSError):
         return None
     return str(rows[0]["reason"]) if rows else None
@@ -384,7 +385,7 @@ def read_results(result: Path) -> list[dict[str, Any]]:
     """Rows of ``results.parquet`` of a result folder; FleetError if it is none."""
     path = result / "results.parquet"
     try:
-        table = pq.read_table(path)
+        table = pq.read_table(path, use_threads=False)
     except (OSError, pa.ArrowInvalid) as error:
         first_line = str(error).splitlines()[0]
         raise FleetError(f"{path}: not a result of 'calibrator calibrate': {first_line}; {_REMEDY}") from None

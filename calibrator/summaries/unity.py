@@ -102,7 +102,7 @@ def decode_window(content: bytes, where: str) -> UnityWindow:
         If it is none.
     """
     try:
-        table = pq.read_table(io.BytesIO(content))
+        table = pq.ParquetFile(io.BytesIO(content)).read(use_threads=False)
         about = table.schema.metadata
         voltage = about[b"voltage_v"].decode()
         return UnityWindow(
