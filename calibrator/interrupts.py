@@ -42,21 +42,22 @@ def ending_at_sigterm() -> None:
     def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
         shown = f"{SHOW_CURSOR}\n" if os.isatty(sys.stderr.fileno()) else ""
         os.write(sys.stderr.fileno(), f"{shown}{fitted(TERMINATED_MESSAGE, sys.stderr)}\n".encode())
-        for child in _children():
+        for process in _descendants():
             with suppress(ProcessLookupError):
-                os.kill(child, signal.SIGKILL)  # a worker that lost its parent would wait for minutes
+                os.kill(process, signal.SIGKILL)  # a worker that lost its parent would wait, or print a traceback
         os._exit(TERMINATED)
 
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, end)
 
 
-def _children() -> list[int]:
-    """Processes that this one has started and that still run, as far as the system tells."""
+def _descendants(process: str = "self") -> list[int]:
+    """Processes that a process has started, and those that these have, as far as the system tells."""
     found: list[int] = []
-    for task in Path("/proc/self/task").glob("*/children"):
+    for task in Path(f"/proc/{process}/task").glob("*/children"):
         with suppress(OSError):
-            found += map(int, task.read_text().split())
+            for child in task.read_text().split():
+                found += [int(child), *_descendants(child)]
     return found
 
 
