@@ -125,39 +125,46 @@ def calibrate_fleet(
     with unfinished_run(out) as unfinished, numbered_passes(_passes(settings)):
         if settings.method is Method.PUBLISHED:
             return _calibrate_published(unfinished, fleet, database, settings, workers=workers)
-        store = _summaries_of(unfinished, fleet, database, settings, since)
-        if since is None:  # a slip is told before the drives are read
-            read_bench(
-                settings,
-                fleet.vehicles.keys(),
-                store.identity.branches,
-                left_out=fleet.left_out,
-                full_scale_a=database.layout.full_scale_a,
-            )
-        add_drives(
-            store,
-            fleet,
-            database,
-            workers=workers.processes,
-            time_limit_s=settings.time_limit_s,
-            exactly=since is None,
-        )
-        keep_unity_window(store, fleet, database, time_limit_s=settings.time_limit_s)
-        find_models, equipment = None, store.identity.equipment
-        if settings.sensor_models:
-            find_models = partial(
-                _find_models, fleet=fleet, database=database, settings=settings, store=store, workers=workers
-            )
-        return _calibrate_store(
-            unfinished,
-            store,
-            _Fleet.of_drives(fleet, equipment),
-            database,
+        return _calibrate_drives(unfinished, fleet, database, settings, workers=workers, since=since)
+
+
+def _calibrate_drives(
+    unfinished: Unfinished,
+    fleet: FleetSource,
+    database: VehicleDatabase,
+    settings: CalibrationSettings,
+    *,
+    workers: Workers,
+    since: Path | None,
+) -> CalibrationReport:
+    """Summarise drives, and calibrate from the summaries."""
+    store = _summaries_of(unfinished, fleet, database, settings, since)
+    if since is None:  # a slip is told before the drives are read
+        read_bench(
             settings,
-            workers=workers,
-            find_models=find_models,
-            since=since,
+            fleet.vehicles.keys(),
+            store.identity.branches,
+            left_out=fleet.left_out,
+            full_scale_a=database.layout.full_scale_a,
         )
+    limit_s = settings.time_limit_s
+    add_drives(store, fleet, database, workers=workers.processes, time_limit_s=limit_s, exactly=since is None)
+    keep_unity_window(store, fleet, database, time_limit_s=limit_s)
+    find_models = None
+    if settings.sensor_models:
+        find_models = partial(
+            _find_models, fleet=fleet, database=database, settings=settings, store=store, workers=workers
+        )
+    return _calibrate_store(
+        unfinished,
+        store,
+        _Fleet.of_drives(fleet, store.identity.equipment),
+        database,
+        settings,
+        workers=workers,
+        find_models=find_models,
+        since=since,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -80,6 +80,19 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     parser.add_argument(DEBUG, action="store_true", help=DEBUG_HELP)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    _add_run(commands)
+    _add_monitor(commands)
+    add_trust_commands(commands)
+    _add_check(commands)
+    add_template_command(commands)
+    schema = commands.add_parser("schema", help="print the JSON Schema of the parameter file")
+    schema.set_defaults(command=_schema)
+    for command in commands.choices.values():
+        command.epilog = f"{command.epilog or _EXIT_CODES} {DEBUG_HINT}"
+    return parser
+
+
+def _add_run(commands: "argparse._SubParsersAction[CommandParser]") -> None:
     run = commands.add_parser(
         "run",
         help="correct until SIGTERM or SIGINT",
@@ -108,8 +121,9 @@ def _parser() -> argparse.ArgumentParser:
         "--metrics-port", type=_port, metavar="PORT", help="let Prometheus ask here (needs prometheus-client)"
     )
     run.set_defaults(command=_run)
-    _add_monitor(commands)
-    add_trust_commands(commands)
+
+
+def _add_check(commands: "argparse._SubParsersAction[CommandParser]") -> None:
     check = commands.add_parser(
         "check",
         help="would these parameters be applied?",
@@ -121,12 +135,6 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--gateway", action="store_true", help="as a gateway would apply them")
     check.add_argument("--json", action="store_true", help="print JSON")
     check.set_defaults(command=_check)
-    add_template_command(commands)
-    schema = commands.add_parser("schema", help="print the JSON Schema of the parameter file")
-    schema.set_defaults(command=_schema)
-    for command in commands.choices.values():
-        command.epilog = f"{command.epilog or _EXIT_CODES} {DEBUG_HINT}"
-    return parser
 
 
 def _add_monitor(commands: "argparse._SubParsersAction[CommandParser]") -> None:

@@ -124,11 +124,13 @@ def channel_facts(
         frames, time_s = log.of_message(message)
         decoded = decode_signal(message, signal, frames.data, frames.length)
         present = decoded.present
-        left = present & ~message_is_sound(database, message, frames.data, frames.length)
-        bad[PROTECTION] += int(left.sum())
-        counted = left.copy()
-        for reason, mask in bad_values(message, signal, frames.data, frames.length).items():
-            bad[reason] += int((present & mask & ~counted).sum())
+        reasons = {
+            PROTECTION: ~message_is_sound(database, message, frames.data, frames.length),
+            **bad_values(message, signal, frames.data, frames.length),
+        }
+        counted = ~present
+        for reason, mask in reasons.items():
+            bad[reason] += int((mask & ~counted).sum())
             counted |= mask
         steps.append(np.diff(time_s[present]))
         frames_of.append(int(present.sum()))

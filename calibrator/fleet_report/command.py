@@ -25,39 +25,46 @@ OF_VEHICLE = ("drives", "layout")
 MAX_LIMIT_A, MAX_VOLTAGE_V = 10_000.0, 2000.0
 """Beyond any battery of a road vehicle. [A], [V]"""
 
+ResultArgument = Annotated[Path, typer.Argument(help="Folder that 'calibrator calibrate' wrote.")]
+PageOption = Annotated[
+    Path | None, typer.Option("--out", help="HTML file to write; report.html, or VEHICLE.html, without it.")
+]
+VehicleOption = Annotated[str | None, typer.Option("--vehicle", help="A page of this vehicle alone, to be printed.")]
+BesideOption = Annotated[
+    Path | None, typer.Option("--beside", help="Result of the same fleet by another method, laid beside.")
+]
+EarlierOption = Annotated[
+    Path | None, typer.Option("--earlier", help="Earlier result of the same fleet, to see how sensors age.")
+]
+BatteryOption = Annotated[
+    str | None, typer.Option("--battery", help="Branch whose protection margin is told; without it 'battery'.")
+]
+LimitOption = Annotated[
+    float | None,
+    number_option("--limit", 0.1, MAX_LIMIT_A, "Current limit of the battery [A]; full scale without it"),
+]
+VoltageOption = Annotated[
+    float | None,
+    number_option("--voltage", 1, MAX_VOLTAGE_V, "Voltage that makes A to kW [V]; that of the unity window without it"),
+]
+DrivesOption = Annotated[
+    Path | None, typer.Option("--drives", help="With --vehicle: its drives, of which a minute is shown.")
+]
+DrivesLayoutOption = Annotated[Path | None, typer.Option("--layout", help="Layout (TOML) of these drives.")]
+
 
 def report(
     context: typer.Context,
-    result: Annotated[Path, typer.Argument(help="Folder that 'calibrator calibrate' wrote.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", help="HTML file to write; report.html, or VEHICLE.html, without it.")
-    ] = None,
-    vehicle: Annotated[
-        str | None, typer.Option("--vehicle", help="A page of this vehicle alone, to be printed.")
-    ] = None,
-    beside: Annotated[
-        Path | None, typer.Option("--beside", help="Result of the same fleet by another method, laid beside.")
-    ] = None,
-    earlier: Annotated[
-        Path | None, typer.Option("--earlier", help="Earlier result of the same fleet, to see how sensors age.")
-    ] = None,
-    battery: Annotated[
-        str | None, typer.Option("--battery", help="Branch whose protection margin is told; without it 'battery'.")
-    ] = None,
-    limit: Annotated[
-        float | None,
-        number_option("--limit", 0.1, MAX_LIMIT_A, "Current limit of the battery [A]; full scale without it"),
-    ] = None,
-    voltage: Annotated[
-        float | None,
-        number_option(
-            "--voltage", 1, MAX_VOLTAGE_V, "Voltage that makes A to kW [V]; that of the unity window without it"
-        ),
-    ] = None,
-    drives: Annotated[
-        Path | None, typer.Option("--drives", help="With --vehicle: its drives, of which a minute is shown.")
-    ] = None,
-    layout: Annotated[Path | None, typer.Option("--layout", help="Layout (TOML) of these drives.")] = None,
+    result: ResultArgument,
+    out: PageOption = None,
+    vehicle: VehicleOption = None,
+    beside: BesideOption = None,
+    earlier: EarlierOption = None,
+    battery: BatteryOption = None,
+    limit: LimitOption = None,
+    voltage: VoltageOption = None,
+    drives: DrivesOption = None,
+    layout: DrivesLayoutOption = None,
     json: JsonOption = False,
 ) -> None:
     """Show a result: one HTML page of the fleet, or of one vehicle, that needs nothing else and fetches nothing."""

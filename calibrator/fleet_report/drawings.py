@@ -12,11 +12,12 @@ from matplotlib.figure import Figure
 
 from calibrator.drive import Array
 from calibrator.evidence.vehicle_evidence import VehicleEvidence
+from calibrator.fleet_report.figures import AFTER, BEFORE
 from calibrator.fleet_report.traces import Traces
 
 __all__ = ["draw_evidence", "draw_traces"]
 
-BEFORE, AFTER, IDEAL = "#D55E00", "#0072B2", "#1b1f24"
+IDEAL = "#1b1f24"
 STYLE: Any = {
     "axes.axisbelow": True,
     "axes.edgecolor": "#57606a",

@@ -199,9 +199,8 @@ def _about_zero(values: Array) -> list[float]:
 
 def _largest(table: FleetTable, k: int, chosen: Mask) -> Sequence[int]:
     """Faulty sensors of a branch by falling full-scale error, as many as are drawn."""
-    error_a = np.abs(table.drift[:, k]) * table.run.full_scale_a + np.abs(table.offset_a[:, k])
     rows = np.flatnonzero(chosen & table.faulty[:, k])
-    kept: list[int] = rows[np.argsort(-error_a[rows], kind="stable")][:MOST_POINTS].tolist()
+    kept: list[int] = rows[np.argsort(-table.error_a[rows, k], kind="stable")][:MOST_POINTS].tolist()
     return kept
 
 

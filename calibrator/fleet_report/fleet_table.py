@@ -110,6 +110,11 @@ class FleetTable:
         return np.asarray((self.drift != 0.0) | (self.offset_a != 0.0))
 
     @property
+    def error_a(self) -> Array:
+        """What each sensor is off by at full scale, |d| I + |o|, shape (N, K). [A]"""
+        return np.asarray(np.abs(self.drift) * self.run.full_scale_a + np.abs(self.offset_a))
+
+    @property
     def corrected(self) -> Mask:
         """Vehicles of which the node corrects some branch, shape (N,); faults of all-zero size correct nothing."""
         return np.asarray((self.applied & self.faulty).any(axis=1))

@@ -210,7 +210,7 @@ def comparison_rows(table: FleetTable, other: FleetTable) -> list[tuple[str, str
 
 def _sensors(table: FleetTable, chosen: Mask) -> list[SensorRow]:
     """Some sensors by falling error at full scale."""
-    error_a = np.abs(table.drift) * table.run.full_scale_a + np.abs(table.offset_a)
+    error_a = table.error_a
     rows, branches = np.nonzero(chosen)
     order: NDArray[np.int64] = np.argsort(-error_a[rows, branches], kind="stable")[: max(MOST_RANKED, MOST_WORKSHOP)]
     return [_sensor(table, int(rows[n]), int(branches[n]), float(error_a[rows[n], branches[n]])) for n in order]

@@ -155,7 +155,9 @@ def vehicle_report(
     if not traces:
         missing.append("No currents are drawn: the result has no unity window; give --drives and --layout.")
     if written.evidence is None:
-        missing.append(f"No evidence is drawn: method {run.method} keeps none, or the result is of an older version.")
+        missing.append(
+            f"No evidence is drawn: method {run.method} keeps none, or its parameters are of an earlier run."
+        )
     page = vehicle_page(
         parameters, evidence=written.evidence, names=names, ratios=ratio_count(names), traces=traces, missing=missing
     )
