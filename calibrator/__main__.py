@@ -8,6 +8,7 @@ import signal
 from calibrator.interrupts import INTERRUPTED, MESSAGE, ending_at_sigterm, importing
 from ecu_node.errors import UserError
 from ecu_node.failures import say_error
+from ecu_node.python_can import load_python_can
 from ecu_node.standard_output import drop_output, flush_output
 
 __all__ = ["main"]
@@ -36,6 +37,7 @@ def main() -> None:
 def _run() -> int:
     try:
         with importing():
+            load_python_can()
             from calibrator.cli import main as run  # noqa: PLC0415
     except ModuleNotFoundError as error:
         say_error(f"calibrator: {error.name} is not installed; pip install 'hv-current-correction[calibrator]'")

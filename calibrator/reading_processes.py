@@ -21,6 +21,8 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext
 from typing import Any, Generic, TypeVar
 
+from ecu_node.python_can import load_python_can
+
 __all__ = ["TIME_LIMIT_S", "Unread", "read_in_processes"]
 
 TIME_LIMIT_S = 600.0
@@ -31,7 +33,7 @@ LOOK_UP_S = 1.0
 """Time after which a Ctrl-C is heeded that a library has swallowed as it was interrupted. [s]"""
 AHEAD_PER_WORKER = 4
 """Files read before it is the turn of their results: others go on while one takes long, and few wait in memory."""
-PRELOADED = ["can", "cantools", "numba", "numpy", "pyarrow.parquet", "threadpoolctl"]
+PRELOADED = ["numba", "numpy", "pyarrow.parquet", "threadpoolctl"]
 """Slow to import, so imported once, for all workers. Not this package: the fork server may find another copy of it."""
 
 _REMEDY = "remove the file if it is damaged, cut it if it is long"
@@ -175,7 +177,7 @@ class _Worker:
         """Start a process. Ctrl-C waits until it is there, and never reaches it."""
         context = _context()
         ours, theirs = context.Pipe()
-        process = context.Process(target=_work, args=(theirs, read, folder), daemon=True)
+        process = context.Process(target=_work, args=(theirs, pickle.dumps(read), folder), daemon=True)
         with _interrupts_held():
             process.start()
         theirs.close()
@@ -256,12 +258,14 @@ def _context() -> ForkServerContext:
     return context
 
 
-def _work(pipe: Connection, read: Callable[[Any], Any], folder: str) -> None:
+def _work(pipe: Connection, pickled_read: bytes, folder: str) -> None:
     """What a worker does until the parent closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.setsid()  # a group of its own, so that it can be killed with what it starts
     tempfile.tempdir = folder
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    load_python_can()  # before the reader's modules are imported, with which they would take seconds
+    read = pickle.loads(pickled_read)  # noqa: S301 (of the parent)
     with suppress(EOFError, ConnectionError):  # the parent is gone, or wants no more
         while True:
             source = pipe.recv()

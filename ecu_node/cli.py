@@ -19,6 +19,7 @@ from ecu_node import __version__
 from ecu_node.command_parser import CommandParser
 from ecu_node.failures import DEBUG, DEBUG_HELP, DEBUG_HINT, end_of, say_error, split_debug
 from ecu_node.interrupts import ending_at_interrupt, ignoring_hangups
+from ecu_node.python_can import load_python_can
 from ecu_node.standard_output import drop_output, flush_output, write_output, write_text
 from ecu_node.template import add_template_command
 from ecu_node.trust.commands import add_trust_commands
@@ -67,7 +68,7 @@ def _main(arguments: Sequence[str]) -> int:
     options = _parser().parse_args(arguments)
     with ignoring_hangups() if options.command is _run else nullcontext():
         logging.getLogger("can").addHandler(logging.NullHandler())
-        _load_python_can()
+        load_python_can()
         return int(options.command(options))
 
 
@@ -213,19 +214,8 @@ def _add_vehicle(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _load_python_can() -> None:
-    """Import python-can without asammdf: where that is installed, it would bring numpy and pandas into the node."""
-    if "can" in sys.modules or "asammdf" in sys.modules:
-        return
-    sys.modules["asammdf"] = None  # type: ignore[assignment]  # documented: makes its import fail
-    try:
-        import can  # noqa: F401, PLC0415
-    finally:
-        del sys.modules["asammdf"]
-
-
 def _run(options: argparse.Namespace) -> int:
-    from ecu_node.run import RunOptions, run_node  # noqa: PLC0415  # after _load_python_can
+    from ecu_node.run import RunOptions, run_node  # noqa: PLC0415  # after load_python_can
 
     if options.gateway == options.channel:
         say_error(f"ecu-node: --gateway {options.gateway} is the bus of the sensors itself; two buses are expected")
@@ -255,7 +245,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _monitor(options: argparse.Namespace) -> int:
-    from ecu_node.monitor import MonitorOptions, run_monitor  # noqa: PLC0415  # after _load_python_can
+    from ecu_node.monitor import MonitorOptions, run_monitor  # noqa: PLC0415  # after load_python_can
 
     if options.json and options.once is None:
         options.error("--json needs --once SECONDS")
@@ -272,7 +262,7 @@ def _monitor(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from ecu_node.check import check_report, report_text  # noqa: PLC0415  # after _load_python_can
+    from ecu_node.check import check_report, report_text  # noqa: PLC0415  # after load_python_can
     from ecu_node.guard import Mode  # noqa: PLC0415
 
     mode = Mode.GATEWAY if options.gateway else Mode.OVERLAY
@@ -285,7 +275,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _schema(options: argparse.Namespace) -> int:  # noqa: ARG001
-    from ecu_node.parameters import parameter_schema  # noqa: PLC0415  # after _load_python_can
+    from ecu_node.parameters import parameter_schema  # noqa: PLC0415  # after load_python_can
 
     write_output(json.dumps(parameter_schema(), indent=2))
     return 0

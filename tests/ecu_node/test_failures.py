@@ -54,7 +54,7 @@ def test_a_fault_of_the_node_names_its_place_and_ends_with_70(
     def broken(*_: object) -> None:
         raise ZeroDivisionError("nobody thought of that")
 
-    monkeypatch.setattr(cli, "_load_python_can", broken)
+    monkeypatch.setattr(cli, "load_python_can", broken)
     assert main(["schema"]) == INTERNAL_ERROR
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("ecu-node: internal error: ZeroDivisionError: nobody thought of that (cli.py, line ")
