@@ -25,7 +25,8 @@ demo: setup              ## a fleet, its calibration, and the Kirchhoff sum befo
 
 test: setup              ## all tests; those of SocketCAN on a kernel that has it
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
-	tools/with_vcan --or-skip $(BIN)/python -m pytest tests/vcan
+	$(BIN)/python -m tests.vcan.calibrated_fleet build/vcan_fleet
+	HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan --or-skip $(BIN)/python -m pytest tests/vcan
 
 bench: setup             ## how long each step takes, beside its peers; also build/bench.json (long)
 	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all

@@ -1,7 +1,6 @@
 """A real SocketCAN kernel with can-utils as the other party: run with ``tools/with_vcan``; nothing here ever skips."""
 
 import os
-import re
 import shutil
 import socket
 from collections.abc import Iterator
@@ -14,12 +13,9 @@ import pytest
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_parameters
+from tests.vcan.patient_layout import write_patient_layout
 from tests.vcan.processes import CHANNEL, OTHER_CHANNEL, NodeProcess, Recording, running_node, running_recording
 from tests.vcan.small_drive import true_parameters
-
-LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
-TIMEOUT_S = 5.0
-"""Branches are stale after this. [s]"""
 
 
 class StartNode(Protocol):
@@ -55,12 +51,8 @@ def long_queues(socketcan: None) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def database(tmp_path_factory: pytest.TempPathFactory) -> VehicleDatabase:
-    """The project's own layout and DBC, but with timeouts that a slow kernel keeps."""
-    folder = tmp_path_factory.mktemp("vehicle")
-    shutil.copy(LAYOUT.with_suffix(".dbc"), folder)
-    patient, _ = re.subn(r"(?m)^timeout_s = [0-9.]+$", f"timeout_s = {TIMEOUT_S}", LAYOUT.read_text())
-    (folder / LAYOUT.name).write_text(patient)
-    return read_database(read_layout(folder / LAYOUT.name))
+    """The vehicle of the tests."""
+    return read_database(read_layout(write_patient_layout(tmp_path_factory.mktemp("vehicle"))))
 
 
 @pytest.fixture

@@ -51,7 +51,7 @@ def wait_until(done: Callable[[], bool], what: str) -> None:
     give_up = time.monotonic() + LONGEST_WAIT_S
     while not done():
         assert time.monotonic() < give_up, f"waited in vain for {what}"
-        time.sleep(0.02)
+        time.sleep(0.05)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,6 +110,16 @@ class Recording:
     def data_of(self, identifier: int) -> list[bytes]:
         """Data of the frames of one identifier (11 bits) so far."""
         return [bytes.fromhex(frame.data) for frame in self.frames if frame.identifier == f"{identifier:03X}"]
+
+    def wait_for_frames(self, count: int) -> list[LoggedFrame]:
+        """Wait until so many frames of any identifier are recorded; returns all of them."""
+        wait_until(lambda: len(self.frames) >= count, f"{count} frames")
+        return self.frames
+
+    def wait_for_marker(self, identifier: int) -> None:
+        """Send a frame on vcan0 that nobody else sends, and wait until it is recorded: what was before it is, too."""
+        send(f"{identifier:03X}#")
+        self.wait_for(identifier, 1)
 
     def wait_for(self, identifier: int, count: int) -> list[bytes]:
         """Wait until so many frames of an identifier are recorded; returns all of them."""

@@ -3,6 +3,7 @@
 import gzip
 import json
 import math
+import os
 import subprocess
 import sys
 from fractions import Fraction
@@ -14,7 +15,9 @@ import pytest
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters, read_parameters
 from ecu_node.status import Quality
-from tests.vcan.conftest import LAYOUT, StartNode
+from tests.vcan.calibrated_fleet import make_calibrated_fleet
+from tests.vcan.conftest import StartNode
+from tests.vcan.patient_layout import LAYOUT
 from tests.vcan.processes import Recording, play
 
 SECONDS = 8.0
@@ -23,23 +26,14 @@ STEP_A = Fraction(1, 50)
 LARGEST_CODE = 32500
 
 
-def run(*command: object) -> None:
-    subprocess.run([sys.executable, "-m", *map(str, command)], check=True, timeout=300)
-
-
 @pytest.fixture(scope="module")
-def fleet(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four vehicles on a common trip, calibrated with the perfect classifier."""
-    fleet, layout = tmp_path_factory.mktemp("calibrated") / "fleet", database.layout.path
-    run(
-        *("calibrator", "simulate", "--vehicles", 4, "--sparsity", 60, "--common-drive", "--symmetric", "--balanced"),
-        *("--minutes", 3, "--unseen-minutes", 1, "--seed", 5, "--layout", layout, "--out", fleet, "--workers", 1),
-    )
-    run(
-        *("calibrator", "calibrate", fleet, "--layout", layout, "--out", fleet.parent / "result", "--workers", 1),
-        *("--method", "published", "--classifier", "perfect", "--truth", fleet / "truth.json"),
-    )
-    return fleet
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fleet beside its result, made here unless it was before."""
+    made = os.environ.get("HV_CALIBRATED_FLEET")
+    folder = Path(made) if made else tmp_path_factory.mktemp("calibrated")
+    if not made:
+        make_calibrated_fleet(folder)
+    return folder / "fleet"
 
 
 def faulty_vehicle(fleet: Path) -> tuple[str, VehicleParameters]:

@@ -29,7 +29,7 @@ from tests.vcan.small_drive import BRANCHES, passed_on, protected, true_paramete
 
 INSTANTS = 45
 """A multiple of the counter's period, so that a drive may follow itself."""
-STATUS, BATTERY, BATTERY_CORRECTED = 0x5F0, 0x110, 0x510
+STATUS, BATTERY, AUXILIARY, BATTERY_CORRECTED, MARKER = 0x5F0, 0x110, 0x130, 0x510, 0x7F0
 GATEWAY = ("--gateway", OTHER_CHANNEL)
 
 
@@ -135,7 +135,7 @@ def test_error_frames_are_counted_and_not_passed_on(
         send("20000004#0008000000000000")
         send("20000040#0000000000000000")
         send_branches(database, 0)
-        other_recording.wait_for(BATTERY, 1)
+        other_recording.wait_for(AUXILIARY, 1)
         assert node.stop() == 0
     assert "frames in 3, rewritten 3, forwarded 3, bus errors 2, bus off 1" in node.messages
     assert {item.identifier for item in other_recording.frames} == {"110", "120", "130", "5F0"}
@@ -220,6 +220,7 @@ def test_a_node_that_was_killed_goes_on_after_a_restart(
         with start_node(params) as node:
             recording.wait_for(BATTERY_CORRECTED, 5)
             assert node.stop(signal.SIGKILL) == -signal.SIGKILL
+        recording.wait_for_marker(MARKER)
         first = len(recording.data_of(BATTERY_CORRECTED))
         with start_node(params) as node:
             recording.wait_for(BATTERY_CORRECTED, first + 20)

@@ -5,7 +5,17 @@ from pathlib import Path
 
 from ecu_node.database import VehicleDatabase
 from tests.vcan.conftest import StartNode
-from tests.vcan.processes import CHANNEL, OTHER_CHANNEL, LoggedFrame, Recording, generate, play, playing, wait_until
+from tests.vcan.processes import (
+    CHANNEL,
+    OTHER_CHANNEL,
+    LoggedFrame,
+    Recording,
+    frames_of,
+    generate,
+    play,
+    playing,
+    wait_until,
+)
 from tests.vcan.small_drive import VEHICLE, passed_on, write_drive
 
 INSTANTS = 150
@@ -53,7 +63,7 @@ def test_a_gateway_changes_currents_and_crcs_and_nothing_else(
             generate(CHANNEL, 150, "-I", NOISE, "-m")
             generate(CHANNEL, 50, "-e")
             assert player.wait() == 0
-        sent = recording.frames
+        sent = recording.wait_for_frames(len(frames_of(drive)) + 200)
         expected = rewritten(database, drive_of(sent))
         wait_until(
             lambda: (
@@ -105,7 +115,8 @@ def test_in_shadow_mode_a_gateway_changes_nothing(
     with start_node(params, "--gateway", OTHER_CHANNEL, "--shadow") as node:
         other_recording.wait_for(int(STATUS, 16), 1)
         play(drive)
-        intact = [item for item in recording.frames if rewritten(database, [item])]
+        sent = recording.wait_for_frames(len(frames_of(drive)))
+        intact = [item for item in sent if rewritten(database, [item])]
         wait_until(lambda: len(drive_of(other_recording.frames)) >= len(intact), "all frames on the other bus")
         assert node.stop() == 0
     assert drive_of(other_recording.frames) == intact

@@ -15,7 +15,7 @@ from tests.vcan.processes import Recording, frames_of, play, send
 from tests.vcan.small_drive import BRANCHES, VEHICLE, protected, write_drive
 
 INSTANTS = 250
-STATUS = 0x5F0
+STATUS, MARKER = 0x5F0, 0x7F0
 CORRECTED = {"battery": 0x510, "motor": 0x520, "auxiliary": 0x530}
 
 
@@ -68,6 +68,8 @@ def test_a_drive_is_corrected_bit_by_bit_and_everything_else_left_alone(
             expected_frame(database, name, k, code, Quality.CORRECTED) for k, code in enumerate(corrected[name])
         ]
     own = {f"{identifier:03X}" for identifier in (*CORRECTED.values(), STATUS)}
+    recording.wait_for_marker(MARKER)
+    own.add(f"{MARKER:03X}")
     assert [frame for frame in recording.frames if frame.identifier not in own] == frames_of(drive)
     assert state_and_reason(database, status[-1]) == (State.CORRECTING, Reason.NONE)
     assert [data[1] & 15 for data in status] == [k % 15 for k in range(len(status))]

@@ -1,8 +1,6 @@
 """The node as its service runs it, without any privilege, and the monitor beside it on a real SocketCAN bus."""
 
 import json
-import re
-import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +11,7 @@ import pytest
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_parameters
-from tests.vcan.conftest import LAYOUT
+from tests.vcan.patient_layout import LAYOUT, write_patient_layout
 from tests.vcan.processes import (
     CHANNEL,
     ECU_NODE,
@@ -57,10 +55,7 @@ def playing(log: Path) -> Iterator[None]:
 @pytest.fixture
 def patient(tmp_path: Path) -> VehicleDatabase:
     """The layout with timeouts that a slow machine keeps."""
-    shutil.copy(LAYOUT.with_suffix(".dbc"), tmp_path)
-    path = tmp_path / LAYOUT.name
-    path.write_text(re.sub(r"^timeout_s = .*$", "timeout_s = 30.0", LAYOUT.read_text(), flags=re.MULTILINE))
-    return read_database(read_layout(path))
+    return read_database(read_layout(write_patient_layout(tmp_path, timeout_s=30.0)))
 
 
 def test_the_monitor_shows_branches_sums_and_node(patient: VehicleDatabase, tmp_path: Path) -> None:
