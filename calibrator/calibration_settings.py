@@ -9,7 +9,7 @@ from calibrator.artificial.truth import FleetTruth
 from calibrator.errors import FleetError
 from calibrator.options import Classifier, Method
 from calibrator.reading_processes import TIME_LIMIT_S
-from calibrator.report.text import counted, few_reasons
+from calibrator.terminal.text import counted, few_reasons
 from ecu_node.layout import file_digest
 from ecu_node.parameters import VehicleParameters
 

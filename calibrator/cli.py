@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from calibrator.command_options import (
+from calibrator.doctor.command import doctor
+from calibrator.errors import LogError
+from calibrator.export.command import export
+from calibrator.fleet_report.command import report
+from calibrator.folders import require_new_folder, require_possible_file, require_possible_folder
+from calibrator.interrupts import importing
+from calibrator.kirchhoff.command import kirchhoff
+from calibrator.options import Classifier, ExperimentName, Method
+from calibrator.proposal.command import layout as layout_commands
+from calibrator.reading_processes import TIME_LIMIT_S
+from calibrator.signing.command import keys, revoke, sign
+from calibrator.terminal.command_line import command_app, run_app
+from calibrator.terminal.options import (
     BalancedOption,
     BankOption,
     BranchesOption,
@@ -56,20 +68,8 @@ from calibrator.command_options import (
     require_own_options,
     require_truth_where_used,
 )
-from calibrator.commands import command_app, run_app
-from calibrator.doctor.command import doctor
-from calibrator.errors import LogError
-from calibrator.export.command import export
-from calibrator.fleet_report.command import report
-from calibrator.folders import require_new_folder, require_possible_file, require_possible_folder
-from calibrator.interrupts import importing
-from calibrator.options import Classifier, ExperimentName, Method
-from calibrator.proposal.command import layout as layout_commands
-from calibrator.reading_processes import TIME_LIMIT_S
-from calibrator.report.kirchhoff_command import kirchhoff
-from calibrator.report.progress import progress_bar
-from calibrator.report.text import dumps, print_report
-from calibrator.signing.command import keys, revoke, sign
+from calibrator.terminal.progress import progress_bar
+from calibrator.terminal.text import dumps, print_report
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
@@ -87,7 +87,7 @@ app = command_app(
 
 
 def main() -> int:
-    """Run the command line and return its exit code, see :data:`calibrator.commands.EXIT_CODES`."""
+    """Run the command line and return its exit code, see :data:`calibrator.terminal.command_line.EXIT_CODES`."""
     return run_app(app, "calibrator", sys.argv[1:])
 
 
@@ -288,9 +288,9 @@ def calibrate(
     reference: its classifier 'tree' is trained on an artificial fleet of this --sparsity, --magnitude and --seed.
     """
     with importing():
+        from calibrator.calibration.calibrate_fleet import calibrate_fleet
+        from calibrator.calibration.in_order import Workers
         from calibrator.calibration_settings import CalibrationSettings
-        from calibrator.fleet import calibrate_fleet
-        from calibrator.run.in_order import Workers
 
     require_truth_where_used(classifier, truth, method)
     require_own_options(context, method)

@@ -11,9 +11,9 @@ from calibrator.drive import Array, Mask
 from calibrator.drives.fleet_id import require_same_fleet
 from calibrator.errors import FleetError
 from calibrator.faults import Faults
-from calibrator.report.text import dumps, table
 from calibrator.results import RunRecord, read_results, read_run
 from calibrator.score import f2_score, harmed, recovered
+from calibrator.terminal.text import dumps, table
 
 __all__ = ["FleetScore", "score_result"]
 

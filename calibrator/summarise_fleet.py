@@ -8,10 +8,10 @@ from calibrator.drives.copies import without_copies
 from calibrator.drives.fleet_source import find_fleet, probe_equipment
 from calibrator.identification.filter_bank import FilterBank
 from calibrator.reading_processes import TIME_LIMIT_S
-from calibrator.report.text import counted, dumps, left_out_text
 from calibrator.storage import open_storage
 from calibrator.summaries.summarise import add_drives, open_store, require_store_or_nothing
 from calibrator.summaries.unity import keep_unity_window
+from calibrator.terminal.text import counted, dumps, left_out_text
 from ecu_node.database import VehicleDatabase
 
 __all__ = ["SummariseReport", "summarise_fleet"]

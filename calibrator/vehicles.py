@@ -11,7 +11,7 @@ from calibrator.drive import DriveFile
 from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
 from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
-from calibrator.report.progress import progress_bar
+from calibrator.terminal.progress import progress_bar
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 

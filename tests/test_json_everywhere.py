@@ -11,7 +11,7 @@ import pytest
 import typer
 
 from calibrator.cli import app
-from calibrator.commands import run_app
+from calibrator.terminal.command_line import run_app
 from ecu_node import cli as node_cli
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout

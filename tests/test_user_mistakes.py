@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from calibrator.cli import app
-from calibrator.commands import run_app
+from calibrator.terminal.command_line import run_app
 from ecu_node import cli as node_cli
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout

@@ -21,9 +21,9 @@ import can
 import typer
 
 from calibrator.artificial.truth import FleetTruth, read_truth
-from calibrator.commands import command_app, run_tool
 from calibrator.errors import FleetError
-from calibrator.report.progress import progress_bar
+from calibrator.terminal.command_line import command_app, run_tool
+from calibrator.terminal.progress import progress_bar
 from ecu_node.buses import SteadyBus
 from ecu_node.database import read_database
 from ecu_node.errors import UserError

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import typer
 
-from calibrator.commands import command_app, run_tool
 from calibrator.drives.store import has_drive, require_plain_name, write_drive
 from calibrator.errors import LogError
 from calibrator.folders import require_possible_folder
@@ -17,8 +16,9 @@ from calibrator.recordings.bmw_i3 import BRANCHES, INPUTS, ImportedTrip, trip_fr
 from calibrator.recordings.csv_table import read_csv_table
 from calibrator.recordings.drive_log import write_drive_log
 from calibrator.recordings.signal_range import signal_ranges
-from calibrator.report.progress import shown
-from calibrator.report.text import told_once
+from calibrator.terminal.command_line import command_app, run_tool
+from calibrator.terminal.progress import shown
+from calibrator.terminal.text import told_once
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.failures import say_error

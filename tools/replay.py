@@ -20,7 +20,7 @@ import can
 from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import CLASSIC_BYTES, EXTENDED_BIT, Frames
 from calibrator.recordings.frames import LOG_SUFFIXES, read_frames
-from calibrator.report.progress import progress_bar
+from calibrator.terminal.progress import progress_bar
 from ecu_node.buses import connect
 from ecu_node.command_parser import CommandParser
 from ecu_node.errors import BusError

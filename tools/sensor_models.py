@@ -6,12 +6,12 @@ from typing import Annotated
 
 import typer
 
-from calibrator.command_options import MAX_CURRENTS, MAX_VEHICLES, SeedOption, number_option, whole_option
-from calibrator.commands import command_app, run_tool
 from calibrator.experiments.recorded_fleet import builtin_fleet, read_fleet
 from calibrator.experiments.sensor_fleet import SensorCase, calibrate_sensors, draw_sensors
 from calibrator.experiments.sensor_score import score_sensors
-from calibrator.report.text import print_report
+from calibrator.terminal.command_line import command_app, run_tool
+from calibrator.terminal.options import MAX_CURRENTS, MAX_VEHICLES, SeedOption, number_option, whole_option
+from calibrator.terminal.text import print_report
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 

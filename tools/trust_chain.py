@@ -14,7 +14,8 @@ import typer
 
 from calibrator.artificial.simulate import FleetPlan
 from calibrator.artificial.trips import choose_trips
-from calibrator.command_options import (
+from calibrator.terminal.command_line import command_app, run_tool
+from calibrator.terminal.options import (
     MAX_MINUTES,
     MAX_VEHICLES,
     CurrentsOption,
@@ -25,8 +26,7 @@ from calibrator.command_options import (
     number_option,
     whole_option,
 )
-from calibrator.commands import command_app, run_tool
-from calibrator.report.text import print_report
+from calibrator.terminal.text import print_report
 from chain.fleet import draw_fleet
 from chain.whole import drive_chain
 from ecu_node.database import read_database

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from calibrator.command_options import DbcOption, JsonOption, LayoutOption
 from calibrator.interrupts import importing
 from calibrator.layout_files import chosen_layout
+from calibrator.terminal.options import DbcOption, JsonOption, LayoutOption
 from ecu_node.standard_output import write_output
 
 __all__ = ["doctor"]

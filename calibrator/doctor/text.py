@@ -8,7 +8,7 @@ from typing import Any
 from calibrator.doctor.channel_facts import ChannelFacts
 from calibrator.doctor.examine import Examination
 from calibrator.doctor.findings import Finding
-from calibrator.report.text import counted, dumps, table
+from calibrator.terminal.text import counted, dumps, table
 
 __all__ = ["examination_json", "examination_text"]
 

@@ -16,7 +16,7 @@ from calibrator.errors import FleetError
 from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
 from calibrator.recordings.readers import read_drive
 from calibrator.recordings.sources import find_logs
-from calibrator.report.text import few_reasons
+from calibrator.terminal.text import few_reasons
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout

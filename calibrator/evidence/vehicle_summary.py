@@ -13,7 +13,7 @@ from calibrator.errors import DriveError
 from calibrator.evidence.summary import DriveSummary, summarise
 from calibrator.evidence.zero_current import ZeroCurrent, zero_current_offsets
 from calibrator.identification.filter_bank import FilterBank
-from calibrator.report.text import counted
+from calibrator.terminal.text import counted
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 

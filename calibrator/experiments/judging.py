@@ -11,7 +11,7 @@ from calibrator.experiments.outcome import Outcome, confidence_bins, figures_of,
 from calibrator.experiments.result import Figure, Row
 from calibrator.experiments.trial import Trial
 from calibrator.interrupts import in_processes
-from calibrator.report.progress import shown
+from calibrator.terminal.progress import shown
 
 __all__ = ["Effort", "PaperFigures", "Setting", "run_settings"]
 

@@ -14,7 +14,7 @@ from calibrator.drives.align import base_inputs, choose_inputs
 from calibrator.drives.derived import evaluate_formula
 from calibrator.errors import FleetError
 from calibrator.random_streams import Purpose, random_stream
-from calibrator.report.progress import shown
+from calibrator.terminal.progress import shown
 from ecu_node.database import VehicleDatabase
 from ecu_node.formula import parse_formula
 from ecu_node.layout import Layout

@@ -26,7 +26,7 @@ from calibrator.experiments.records import read_results, write_result
 from calibrator.experiments.result import ExperimentResult
 from calibrator.experiments.table import result_table
 from calibrator.experiments.trial import FleetLaw
-from calibrator.report.progress import one_pass
+from calibrator.terminal.progress import one_pass
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 

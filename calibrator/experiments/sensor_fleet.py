@@ -25,9 +25,9 @@ from calibrator.options import Method
 from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.fleet import learn_fleet
 from calibrator.random_streams import Purpose, random_stream
-from calibrator.report.progress import progress_bar, shown
 from calibrator.sensor_models.families import GainBySign, SensorModel, TemperatureDrift
 from calibrator.sensor_models.fleet import SensorFindings, findings_of, summaries_about_zeros
+from calibrator.terminal.progress import progress_bar, shown
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
 

@@ -7,10 +7,10 @@ import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.experiments.sensor_fleet import SensorFleet
-from calibrator.report.text import dumps, table
 from calibrator.sensor_models.choice import LINEAR
 from calibrator.sensor_models.families import GainBySign, GainBySignFamily, TemperatureDrift, TemperatureFamily
 from calibrator.sensor_models.fleet import SensorFindings
+from calibrator.terminal.text import dumps, table
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
 from ecu_node.wiring import InForce, sensor_fault

@@ -7,7 +7,6 @@ from typing import Annotated
 import msgspec
 import typer
 
-from calibrator.command_options import JsonOption, LayoutOption
 from calibrator.errors import ContradictionError, ExportError
 from calibrator.export.c99 import c99_files
 from calibrator.export.cdfx import cdfx_document
@@ -16,8 +15,9 @@ from calibrator.export.csv_table import csv_text
 from calibrator.export.dcm import dcm_text
 from calibrator.folders import require_possible_file, require_possible_folder
 from calibrator.options import ExportFormat
-from calibrator.report.progress import shown
-from calibrator.report.text import dumps
+from calibrator.terminal.options import JsonOption, LayoutOption
+from calibrator.terminal.progress import shown
+from calibrator.terminal.text import dumps
 from calibrator.whole_files import made_folder, remove_abandoned, require_own_file, write_files
 from ecu_node.database import read_database
 from ecu_node.errors import printable

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibrator.command_options import JsonOption, given_options, number_option
 from calibrator.folders import require_possible_file
 from calibrator.interrupts import importing
-from calibrator.report.text import dumps
+from calibrator.terminal.options import JsonOption, given_options, number_option
+from calibrator.terminal.text import dumps
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_atomically

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.fleet_report.fleet_table import FleetTable
-from calibrator.report.progress import shown
 from calibrator.results import PARTS
+from calibrator.terminal.progress import shown
 from ecu_node.parameters import Explanation
 
 __all__ = ["Evidence", "explanation_text", "ratio_count", "read_evidence"]

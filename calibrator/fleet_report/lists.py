@@ -12,7 +12,7 @@ from calibrator.fleet_report.fleet_table import FleetTable
 from calibrator.fleet_report.overview import Overview
 from calibrator.fleet_report.protection import Margins
 from calibrator.fleet_report.words import amperes, with_sd
-from calibrator.report.text import few
+from calibrator.terminal.text import few
 
 __all__ = [
     "HardwareRow",

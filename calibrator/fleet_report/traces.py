@@ -19,8 +19,8 @@ from calibrator.drives.fleet_source import find_fleet, load_drive
 from calibrator.errors import FleetError
 from calibrator.evidence.vehicle_evidence import VehicleEvidence
 from calibrator.fleet_report.window import IdealWindow
-from calibrator.report.text import few
 from calibrator.summaries.unity import WINDOW_S, UnityWindow, liveliest_window
+from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 from ecu_node.parameters import VehicleParameters

@@ -10,7 +10,7 @@ from calibrator.fleet_report.evidence_columns import explanation_text
 from calibrator.fleet_report.templates import asset, template
 from calibrator.fleet_report.traces import Traces
 from calibrator.posterior.verdict import SUSPECTED
-from calibrator.report.text import few
+from calibrator.terminal.text import few
 from ecu_node.parameters import VehicleParameters
 
 __all__ = ["vehicle_page"]

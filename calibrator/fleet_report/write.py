@@ -15,9 +15,9 @@ from calibrator.fleet_report.protection import Margins, margins
 from calibrator.fleet_report.traces import recorded_traces, unity_traces
 from calibrator.fleet_report.vehicle_page import vehicle_page
 from calibrator.fleet_report.window import ideal_window, read_out_of, read_unity
-from calibrator.report.text import few
 from calibrator.results import read_run, written_of
 from calibrator.summaries.unity import UnityWindow
+from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters, decode_parameters
 

@@ -18,7 +18,7 @@ from calibrator.identification.pooled_bank import pooled_bank
 from calibrator.identification.read_out import far_below_fleet, fit_read_outs
 from calibrator.identification.state_space import StateSpaceModel
 from calibrator.identification.vehicle_model import identify_vehicle
-from calibrator.report.text import dumps, left_out_text, table
+from calibrator.terminal.text import dumps, left_out_text, table
 from calibrator.vehicles import read_each, read_vehicles
 from ecu_node.database import VehicleDatabase
 

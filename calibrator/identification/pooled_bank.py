@@ -21,7 +21,7 @@ from calibrator.identification.filter_bank import FilterBank, Poles, low_passes
 from calibrator.identification.identify import observability, standardised_moments, subspace_modes
 from calibrator.identification.read_out import fit_read_outs
 from calibrator.identification.state_space import Complex
-from calibrator.report.progress import shown
+from calibrator.terminal.progress import shown
 
 __all__ = ["pooled_bank"]
 

@@ -17,7 +17,7 @@ from calibrator.drives.fleet_source import Equipment, load_drive
 from calibrator.errors import DriveError
 from calibrator.identification.identify import identify
 from calibrator.identification.state_space import StateSpaceModel, simulation_snr_db
-from calibrator.report.text import counted
+from calibrator.terminal.text import counted
 from ecu_node.database import VehicleDatabase
 
 __all__ = ["LEAD_IN_S", "VehicleModel", "identify_vehicle", "read_vehicle_model"]

@@ -6,11 +6,11 @@ from typing import Annotated
 
 import typer
 
-from calibrator.command_options import JsonOption
 from calibrator.errors import ProposalError
 from calibrator.folders import require_possible_file
 from calibrator.interrupts import importing
-from calibrator.report.text import dumps
+from calibrator.terminal.options import JsonOption
+from calibrator.terminal.text import dumps
 from ecu_node.errors import printable
 from ecu_node.failures import say_error
 from ecu_node.parameters import write_atomically

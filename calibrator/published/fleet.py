@@ -17,8 +17,8 @@ from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_m
 from calibrator.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.published.calibration import ExpectedFaults, calibrate_published
 from calibrator.published.recovery import Recovery
-from calibrator.report.progress import progress_bar
-from calibrator.report.text import few
+from calibrator.terminal.progress import progress_bar
+from calibrator.terminal.text import few
 from calibrator.vehicles import read_vehicles
 from ecu_node.parameters import BranchParameters, HardwareFault, VehicleParameters, Verdict
 

@@ -12,9 +12,9 @@ from calibrator.drives.store import has_drive, write_drive
 from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
 from calibrator.recordings.readers import read_recording
 from calibrator.recordings.sources import find_logs
-from calibrator.report.notices import Notice, merged_notices
-from calibrator.report.progress import progress_bar
-from calibrator.report.text import dumps, left_out_text, table
+from calibrator.terminal.notices import Notice, merged_notices
+from calibrator.terminal.progress import progress_bar
+from calibrator.terminal.text import dumps, left_out_text, table
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 

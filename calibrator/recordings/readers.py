@@ -19,7 +19,7 @@ from calibrator.recordings.e2e_profile import message_is_sound
 from calibrator.recordings.frame_arrays import EXTENDED_BIT, Frames, frame_key
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.log_time import CLOCK_GAP_S, repaired_time
-from calibrator.report.notices import Notice
+from calibrator.terminal.notices import Notice
 from ecu_node.database import AMPERE, VOLT, WATT, VehicleDatabase, unit_factor
 from ecu_node.layout import Branch
 

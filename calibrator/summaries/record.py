@@ -18,7 +18,7 @@ from calibrator.errors import DriveError
 from calibrator.evidence.readings import weighted_mean
 from calibrator.evidence.vehicle_summary import LEAST_DURATION_S, VehicleSummary
 from calibrator.evidence.zero_current import ZeroCurrent
-from calibrator.report.text import counted
+from calibrator.terminal.text import counted
 
 __all__ = [
     "IMPOSSIBLE",

@@ -19,12 +19,12 @@ from calibrator.errors import FleetError
 from calibrator.evidence.vehicle_summary import read_vehicle_summary
 from calibrator.identification.filter_bank import FilterBank
 from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
-from calibrator.report.progress import progress_bar
-from calibrator.report.text import few
 from calibrator.storage import Storage
 from calibrator.summaries.identity import StoreIdentity, read_identity, store_identity, write_identity
 from calibrator.summaries.record import Record, source_version
 from calibrator.summaries.store import SummaryStore
+from calibrator.terminal.progress import progress_bar
+from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 

@@ -12,13 +12,13 @@ import pytest
 from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.artificial.ground_truth import GroundTruth, with_branches
 from calibrator.artificial.random_fleet import draw_faults
+from calibrator.calibration.calibrate_fleet import calibrate_fleet
+from calibrator.calibration.in_order import Workers
 from calibrator.calibration_settings import HARM_LIMIT, CalibrationSettings
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.store import write_drive
 from calibrator.faults import measured_currents, true_currents
-from calibrator.fleet import calibrate_fleet
 from calibrator.results import read_run
-from calibrator.run.in_order import Workers
 from calibrator.sensor_models.families import FAMILIES
 from calibrator.sensor_models.families import GainBySign as GainBySignSensor
 from ecu_node.database import read_database

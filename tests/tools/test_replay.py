@@ -183,7 +183,7 @@ def test_ctrl_c_ends_the_line_of_progress_first_and_the_replay_with_130(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(VirtualBus, "send", send)
-    monkeypatch.setattr("calibrator.report.progress.LINE_EVERY_S", 0.0)
+    monkeypatch.setattr("calibrator.terminal.progress.LINE_EVERY_S", 0.0)
     assert main([str(log), "--interface", "virtual", "--channel", "c"]) == 130
     *_, progress, last = capsys.readouterr().err.splitlines()
     assert progress.startswith(f"replay: 3 of {len(FRAMES)} frames, ")

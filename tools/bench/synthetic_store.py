@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from calibrator.artificial.random_fleet import draw_faults
+from calibrator.calibration.in_order import Workers
 from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
 from calibrator.drives.fleet_source import Equipment
@@ -21,12 +22,11 @@ from calibrator.evidence.zero_current import ZeroCurrent
 from calibrator.experiments.recorded_fleet import builtin_fleet
 from calibrator.experiments.recorded_trial import RecordedCase, record_vehicles
 from calibrator.faults import Faults
-from calibrator.report.progress import progress_bar
-from calibrator.run.in_order import Workers
 from calibrator.storage import open_storage
 from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
+from calibrator.terminal.progress import progress_bar
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 

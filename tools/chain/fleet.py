@@ -13,7 +13,7 @@ from calibrator.artificial.vehicle import Vehicle, vehicle_drive
 from calibrator.drives.store import write_drive
 from calibrator.interrupts import in_processes
 from calibrator.random_streams import Purpose, random_stream
-from calibrator.report.progress import shown
+from calibrator.terminal.progress import shown
 from ecu_node.database import VehicleDatabase
 
 __all__ = ["ChainFleet", "draw_fleet"]

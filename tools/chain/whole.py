@@ -9,8 +9,8 @@ from pathlib import Path
 from joblib import delayed
 
 from calibrator.interrupts import in_processes
-from calibrator.report.progress import shown
-from calibrator.report.text import dumps, table
+from calibrator.terminal.progress import shown
+from calibrator.terminal.text import dumps, table
 from chain.fleet import ChainFleet
 from chain.one_vehicle import SignedFile, VehicleOutcome, drive_vehicle
 from ecu_node.errors import UserError

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from calibrator.command_options import DbcOption, JsonOption, LayoutOption, number_option
 from calibrator.interrupts import importing
 from calibrator.layout_files import vehicle_database
+from calibrator.terminal.options import DbcOption, JsonOption, LayoutOption, number_option
 from ecu_node.standard_output import write_output
 
 __all__ = ["kirchhoff"]
@@ -28,11 +28,11 @@ def kirchhoff(
     if (log is None) == (interface is None):
         raise typer.BadParameter("give either a LOG, or --interface and --channel of a live bus")
     with importing():
+        from calibrator.kirchhoff.sums import compare_kirchhoff
+        from calibrator.kirchhoff.view import kirchhoff_json, kirchhoff_text, plot_kirchhoff
         from calibrator.recordings.frames import read_frames
         from calibrator.recordings.live import listen
         from calibrator.recordings.readers import drive_from_frames
-        from calibrator.report.kirchhoff import compare_kirchhoff
-        from calibrator.report.kirchhoff_view import kirchhoff_json, kirchhoff_text, plot_kirchhoff
 
     database = vehicle_database(layout, dbc)
     where = str(log) if log is not None else f"{interface}:{channel}"

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from calibrator.calibration.previous import PreviousResult, moved_sensors
 from calibrator.errors import DriveError
 from calibrator.evidence.vehicle_evidence import VehicleEvidence
 from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.posterior.fleet_task import FleetTask
 from calibrator.results import ChunkResult, Written, encode_chunk
-from calibrator.run.previous import PreviousResult, moved_sensors
 from calibrator.summaries.record import Record, drives_digest, joined_records
 from calibrator.summaries.store import SummaryStore
 from ecu_node.errors import UserError

@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 
 from calibrator.drive import Array
 from calibrator.posterior.verdict import CONFIDENT
-from calibrator.report.text import dumps, left_out_text, reasons_text, table
 from calibrator.results import RunRecord
+from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
 
 __all__ = ["MOST_NAMED", "CalibrationReport", "report_of"]
 

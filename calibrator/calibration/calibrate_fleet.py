@@ -16,6 +16,11 @@ from typing import Any
 
 import msgspec
 
+from calibrator.calibration.in_order import Workers
+from calibrator.calibration.posterior_run import calibrate_store
+from calibrator.calibration.previous import PreviousResult, require_previous
+from calibrator.calibration.report import MOST_NAMED, CalibrationReport, report_of
+from calibrator.calibration.unfinished import Unfinished, unfinished_run
 from calibrator.calibration_settings import CalibrationSettings
 from calibrator.drives.copies import without_copies
 from calibrator.drives.fleet_source import (
@@ -33,9 +38,6 @@ from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.bench import read_bench
 from calibrator.posterior.fleet import FindModels
 from calibrator.published.fleet import calibrate_fleet_published
-from calibrator.report.calibration import MOST_NAMED, CalibrationReport, report_of
-from calibrator.report.progress import numbered_passes, progress_bar
-from calibrator.report.text import few, few_reasons
 from calibrator.results import (
     RunRecord,
     encode_chunk,
@@ -45,16 +47,14 @@ from calibrator.results import (
     write_parameter_files,
     write_run,
 )
-from calibrator.run.in_order import Workers
-from calibrator.run.posterior_run import calibrate_store
-from calibrator.run.previous import PreviousResult, require_previous
-from calibrator.run.unfinished import Unfinished, unfinished_run
 from calibrator.sensor_models.fleet import SensorFindings, find_sensor_models
 from calibrator.storage import Storage, open_storage
 from calibrator.summaries.identity import read_identity
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.summarise import add_drives, open_store
 from calibrator.summaries.unity import UNITY_FILE, keep_unity_window
+from calibrator.terminal.progress import numbered_passes, progress_bar
+from calibrator.terminal.text import few, few_reasons
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import file_digest

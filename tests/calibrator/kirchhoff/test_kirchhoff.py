@@ -8,9 +8,9 @@ from rich.console import Console
 
 from calibrator.drive import Array, Channel, Drive
 from calibrator.errors import DriveError
+from calibrator.kirchhoff.sums import Comparison, compare_kirchhoff, figures_of
+from calibrator.kirchhoff.view import kirchhoff_table, plot_kirchhoff
 from calibrator.recordings.readers import Recording, RecordingReport
-from calibrator.report.kirchhoff import Comparison, compare_kirchhoff, figures_of
-from calibrator.report.kirchhoff_view import kirchhoff_table, plot_kirchhoff
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 

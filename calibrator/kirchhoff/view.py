@@ -14,7 +14,7 @@ from rich.table import Table
 
 from calibrator.drive import Array
 from calibrator.errors import DriveError
-from calibrator.report.kirchhoff import SUM, Comparison, Figures, figures_of
+from calibrator.kirchhoff.sums import SUM, Comparison, Figures, figures_of
 
 __all__ = ["kirchhoff_json", "kirchhoff_table", "kirchhoff_text", "plot_kirchhoff"]
 

@@ -5,20 +5,20 @@ from functools import partial
 
 from threadpoolctl import threadpool_limits
 
+from calibrator.calibration.first_pass import Census, named_outlines, read_sample, take_census
+from calibrator.calibration.in_order import Workers
+from calibrator.calibration.previous import PreviousResult
+from calibrator.calibration.second_pass import calibrate_bucket
+from calibrator.calibration.unfinished import Chunks
 from calibrator.calibration_settings import CalibrationSettings
 from calibrator.errors import FleetError
 from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.bench import read_bench
 from calibrator.posterior.bench_table import vehicles_named
 from calibrator.posterior.fleet import FindModels, Learnt, learn_fleet
-from calibrator.report.progress import progress_bar
-from calibrator.report.text import few, few_reasons
-from calibrator.run.first_pass import Census, named_outlines, read_sample, take_census
-from calibrator.run.in_order import Workers
-from calibrator.run.previous import PreviousResult
-from calibrator.run.second_pass import calibrate_bucket
-from calibrator.run.unfinished import Chunks
 from calibrator.summaries.store import SummaryStore
+from calibrator.terminal.progress import progress_bar
+from calibrator.terminal.text import few, few_reasons
 
 __all__ = ["PosteriorRun", "calibrate_store"]
 

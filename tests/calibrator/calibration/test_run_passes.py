@@ -11,6 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from calibrator.calibration.first_pass import read_sample, take_census
+from calibrator.calibration.in_order import Workers
+from calibrator.calibration.previous import PreviousResult
+from calibrator.calibration.second_pass import calibrate_bucket
 from calibrator.calibration_settings import CalibrationSettings
 from calibrator.errors import FleetError
 from calibrator.evidence.vehicle_summary import VehicleSummary
@@ -20,10 +24,6 @@ from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.fleet import learn_fleet
 from calibrator.posterior.fleet_task import FleetTask
 from calibrator.results import ChunkResult, encode_chunk
-from calibrator.run.first_pass import read_sample, take_census
-from calibrator.run.in_order import Workers
-from calibrator.run.previous import PreviousResult
-from calibrator.run.second_pass import calibrate_bucket
 from calibrator.storage import open_storage
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
@@ -185,7 +185,7 @@ def test_the_sample_is_the_whole_of_a_small_fleet_less_those_held_out(store: Sum
 def test_the_sample_of_a_large_fleet_is_of_fixed_size_and_holds_those_that_were_checked(
     store: SummaryStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("calibrator.run.first_pass.MOST_LEARNT", 10)
+    monkeypatch.setattr("calibrator.calibration.first_pass.MOST_LEARNT", 10)
     census = take_census(store, ONE)
     last = list(store.read(max(census.usable)))[-1]
     settings = CalibrationSettings(trusted=frozenset({last}))

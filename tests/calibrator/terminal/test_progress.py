@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from calibrator.report.progress import bar_line, numbered_passes, progress_bar, rate_text, shown
+from calibrator.terminal.progress import bar_line, numbered_passes, progress_bar, rate_text, shown
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_a_log_gets_lines_with_rate_and_time_left(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock = iter([0.0, 5.0, 11.0, 12.0, 40.0, 41.0])
-    monkeypatch.setattr("calibrator.report.progress.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("calibrator.terminal.progress.time.monotonic", lambda: next(clock))
     with progress_bar("read drives", 8, "vehicles") as done:
         for number in (1, 2, 3, 8, 8):
             done(number)
@@ -73,7 +73,7 @@ def test_a_log_gets_lines_with_rate_and_time_left(
 def test_passes_are_numbered_and_a_later_command_is_not(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("calibrator.report.progress.WORTH_A_LINE_S", 0.0)
+    monkeypatch.setattr("calibrator.terminal.progress.WORTH_A_LINE_S", 0.0)
     with numbered_passes(2):
         with progress_bar("learn the fleet", None):
             pass
@@ -88,7 +88,7 @@ def test_what_was_done_before_is_no_part_of_the_rate(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock = iter([0.0, 10.0])
-    monkeypatch.setattr("calibrator.report.progress.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("calibrator.terminal.progress.time.monotonic", lambda: next(clock))
     with progress_bar("calibrate", 1000, "vehicles", begun=900) as done:
         done(950)
     assert capsys.readouterr().err == "calibrate: 950 of 1000 vehicles, 5.0/s, 10 s, 10 s left\n"
@@ -96,7 +96,7 @@ def test_what_was_done_before_is_no_part_of_the_rate(
 
 IN_TERMINAL = """
 from calibrator.report import progress
-from calibrator.report.progress import progress_bar
+from calibrator.terminal.progress import progress_bar
 progress.WORTH_A_LINE_S = 0.0
 with progress_bar("read drives", 4, "vehicles") as done:
     done(2)

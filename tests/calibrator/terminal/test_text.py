@@ -1,4 +1,4 @@
-from calibrator.report.text import counted, few, few_reasons
+from calibrator.terminal.text import counted, few, few_reasons
 
 
 def test_of_many_names_the_first_are_told() -> None:

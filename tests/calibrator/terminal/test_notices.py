@@ -1,7 +1,7 @@
 """Equal notices of many drives are told once."""
 
-from calibrator.report.notices import Notice, merged_notices
-from calibrator.report.text import left_out_text, reasons_text, told_once
+from calibrator.terminal.notices import Notice, merged_notices
+from calibrator.terminal.text import left_out_text, reasons_text, told_once
 
 
 def spoilt(bad: int, of: int) -> Notice:

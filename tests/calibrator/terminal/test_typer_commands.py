@@ -8,10 +8,10 @@ import pytest
 import typer
 from joblib import delayed
 
-from calibrator.commands import command_app, run_app, run_tool
 from calibrator.errors import ContradictionError, FleetError
 from calibrator.interrupts import in_processes
 from calibrator.reading_processes import read_in_processes
+from calibrator.terminal.command_line import command_app, run_app, run_tool
 from ecu_node.standard_output import write_output
 
 app = command_app(no_args_is_help=True)

@@ -11,9 +11,9 @@ import pytest
 from can.interfaces.virtual import channels
 
 from calibrator.drive import Channel, Drive
+from calibrator.kirchhoff.command import kirchhoff
 from calibrator.recordings.canlog import encode_message, write_candump
 from calibrator.recordings.drive_log import drive_series
-from calibrator.report.kirchhoff_command import kirchhoff
 from ecu_node.database import VehicleDatabase
 
 ROOT = Path(__file__).parents[3]
