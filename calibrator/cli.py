@@ -11,13 +11,13 @@ from rich.console import Console
 from calibrator.doctor.command import doctor
 from calibrator.errors import LogError
 from calibrator.export.command import export
-from calibrator.fleet_report.command import report
-from calibrator.folders import require_new_folder, require_possible_file, require_possible_folder
+from calibrator.files.folders import require_new_folder, require_possible_file, require_possible_folder
 from calibrator.interrupts import importing
 from calibrator.kirchhoff.command import kirchhoff
 from calibrator.options import Classifier, ExperimentName, Method
 from calibrator.proposal.command import layout as layout_commands
 from calibrator.reading_processes import TIME_LIMIT_S
+from calibrator.report.command import report
 from calibrator.signing.command import keys, revoke, sign
 from calibrator.terminal.command_line import command_app, run_app
 from calibrator.terminal.options import (
@@ -126,7 +126,7 @@ def import_(
 ) -> None:
     """Turn CAN logs of one or many vehicles into drives."""
     with importing():
-        from calibrator.recordings.import_logs import import_logs
+        from calibrator.sources.import_logs import import_logs
 
     require_possible_folder(out)
     report = import_logs(logs, _database(layout), out, workers=workers, limit_s=time_limit)
@@ -204,8 +204,8 @@ def summarise(
 ) -> None:
     """Reduce drives to what the calibration needs of them: second moments, a few kilobytes per vehicle."""
     with importing():
-        from calibrator.identification.filter_bank import read_bank
-        from calibrator.summarise_fleet import summarise_fleet
+        from calibrator.summaries.filter_bank import read_bank
+        from calibrator.summaries.summarise_fleet import summarise_fleet
 
     report = summarise_fleet(
         fleet,
@@ -236,8 +236,8 @@ def identify(
     held out. A vehicle whose own dynamics differ too much gets a model of its own, and is named.
     """
     with importing():
-        from calibrator.identification.filter_bank import read_bank
         from calibrator.identification.fleet_identification import identify_fleet
+        from calibrator.summaries.filter_bank import read_bank
 
     require_one_bank(bank, poles)
     if out is not None:
@@ -349,7 +349,7 @@ def score(
 ) -> None:
     """Compare a result with the truth of its artificial fleet."""
     with importing():
-        from calibrator.result_score import score_result
+        from calibrator.artificial.result_score import score_result
 
     figures = score_result(result, truth)
     print_report(figures, json=json)
@@ -392,7 +392,7 @@ def _truth_of(fleet: Path, path: Path) -> "FleetTruth":
     """The truth, if it is that of the fleet's vehicles."""
     from calibrator.artificial.truth import faults_of, read_truth
     from calibrator.drives.fleet_id import require_same_fleet
-    from calibrator.drives.fleet_source import find_fleet
+    from calibrator.sources.fleet_source import find_fleet
 
     truth = read_truth(path)
     source = find_fleet(fleet)

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Array", "Channel", "Drive", "DriveFile", "Mask"]
+__all__ = ["Array", "Channel", "Complex", "Drive", "DriveFile", "Mask"]
 
 Array = NDArray[np.floating[Any]]
 """Real numbers; always double precision in practice."""
 Mask = NDArray[np.bool_]
+Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ import typer
 
 from calibrator.drives.store import has_drive, require_plain_name, write_drive
 from calibrator.errors import LogError
-from calibrator.folders import require_possible_folder
+from calibrator.files.folders import require_possible_folder
 from calibrator.recordings.bmw_i3 import BRANCHES, INPUTS, ImportedTrip, trip_from_table
 from calibrator.recordings.csv_table import read_csv_table
 from calibrator.recordings.drive_log import write_drive_log

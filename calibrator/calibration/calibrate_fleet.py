@@ -22,19 +22,11 @@ from calibrator.calibration.previous import PreviousResult, require_previous
 from calibrator.calibration.report import MOST_NAMED, CalibrationReport, report_of
 from calibrator.calibration.unfinished import Unfinished, unfinished_run
 from calibrator.calibration_settings import CalibrationSettings
-from calibrator.drives.copies import without_copies
-from calibrator.drives.fleet_source import (
-    LOGS_FOLDER,
-    STORE_FOLDER,
-    Equipment,
-    FleetSource,
-    find_fleet,
-    probe_equipment,
-)
 from calibrator.errors import ContradictionError, FleetError
-from calibrator.folders import require_new_folder
+from calibrator.files.folders import require_new_folder
+from calibrator.files.parameter_files import RunIdentity
+from calibrator.files.storage import Storage, open_storage
 from calibrator.options import Method
-from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.bench import read_bench
 from calibrator.posterior.fleet import FindModels
 from calibrator.published.fleet import calibrate_fleet_published
@@ -48,7 +40,15 @@ from calibrator.results import (
     write_run,
 )
 from calibrator.sensor_models.fleet import SensorFindings, find_sensor_models
-from calibrator.storage import Storage, open_storage
+from calibrator.sources.copies import without_copies
+from calibrator.sources.fleet_source import (
+    LOGS_FOLDER,
+    STORE_FOLDER,
+    Equipment,
+    FleetSource,
+    find_fleet,
+    probe_equipment,
+)
 from calibrator.summaries.identity import read_identity
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.summarise import add_drives, open_store
@@ -82,8 +82,8 @@ def calibrate_fleet(
     Parameters
     ----------
     place : str or Path
-        The fleet: its drives, see :func:`calibrator.drives.fleet_source.find_fleet`, or path or URL of a store of their
-        summaries.
+        The fleet: its drives, see :func:`calibrator.sources.fleet_source.find_fleet`, or path or URL of a store of
+        their summaries.
     database : VehicleDatabase
         DBC and layout.
     out : Path

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from calibrator.calibration.in_order import Workers
 from calibrator.calibration_settings import CalibrationSettings, require_learning
 from calibrator.errors import DriveError, FleetError
-from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.summaries.record import Outline, joined_records
 from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.terminal.progress import progress_bar
 
 __all__ = ["MOST_LEARNT", "Census", "named_outlines", "read_sample", "take_census"]

@@ -12,7 +12,7 @@ from calibrator.calibration.second_pass import calibrate_bucket
 from calibrator.calibration.unfinished import Chunks
 from calibrator.calibration_settings import CalibrationSettings
 from calibrator.errors import FleetError
-from calibrator.parameter_files import RunIdentity
+from calibrator.files.parameter_files import RunIdentity
 from calibrator.posterior.bench import read_bench
 from calibrator.posterior.bench_table import vehicles_named
 from calibrator.posterior.fleet import FindModels, Learnt, learn_fleet

@@ -15,11 +15,11 @@ import numpy as np
 from calibrator.calibration.previous import PreviousResult, moved_sensors
 from calibrator.errors import DriveError
 from calibrator.evidence.vehicle_evidence import VehicleEvidence
-from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.posterior.fleet_task import FleetTask
 from calibrator.results import ChunkResult, Written, encode_chunk
 from calibrator.summaries.record import Record, drives_digest, joined_records
 from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.errors import UserError
 from ecu_node.parameters import VehicleParameters, decode_parameters
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibrator.errors import FleetError
+from calibrator.files.storage import DISK_FULL
 from calibrator.results import ChunkResult
-from calibrator.storage import DISK_FULL
 from ecu_node.layout import file_digest
 from ecu_node.parameters import write_atomically
 

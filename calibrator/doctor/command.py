@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from calibrator.files.layout_files import chosen_layout
 from calibrator.interrupts import importing
-from calibrator.layout_files import chosen_layout
 from calibrator.terminal.options import DbcOption, JsonOption, LayoutOption
 from ecu_node.standard_output import write_output
 

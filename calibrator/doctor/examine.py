@@ -22,9 +22,9 @@ from calibrator.doctor.steps import NextSteps, explained_shares, next_steps
 from calibrator.doctor.stuck import stuck_parts
 from calibrator.doctor.usable import usable_part
 from calibrator.doctor.voltage import voltage_slip, without_slip
+from calibrator.doctor.words import is_battery
 from calibrator.drive import Drive
 from calibrator.drives.align import base_inputs
-from calibrator.proposal.words import is_battery
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Input, Layout
 

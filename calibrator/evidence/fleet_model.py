@@ -17,8 +17,8 @@ import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.evidence.block_regression import VehicleRegressions, products, regress_vehicles
+from calibrator.evidence.cluster import densest_clusters
 from calibrator.evidence.fleet_moments import FleetMoments
-from calibrator.posterior.cluster import densest_clusters
 
 __all__ = ["FleetModel", "fit_fleet_model", "regress_on_fleet"]
 

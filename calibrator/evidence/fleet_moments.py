@@ -8,7 +8,7 @@ import numpy as np
 
 from calibrator.drive import Array
 from calibrator.evidence.block_regression import Blocks
-from calibrator.evidence.summary import DriveSummary, common_bank
+from calibrator.summaries.moments import DriveSummary, common_bank
 
 __all__ = ["FleetMoments", "stack_summaries"]
 
@@ -20,7 +20,7 @@ class FleetMoments:
     Attributes
     ----------
     moments : ndarray of shape (B, M + K + 1, M + K + 1)
-        As in a :class:`~calibrator.evidence.summary.DriveSummary`, the vehicles one after the other.
+        As in a :class:`~calibrator.summaries.moments.DriveSummary`, the vehicles one after the other.
     noise_a2 : ndarray of shape (B, K)
         The same. [A^2]
     blocks : Blocks

@@ -11,6 +11,7 @@ import numpy as np
 from calibrator.drive import Array, Mask
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
 from calibrator.faults import Index
+from calibrator.summaries.zero_current import weighted_mean
 
 __all__ = [
     "TRUSTED_DRIFT_SD",
@@ -18,7 +19,6 @@ __all__ = [
     "Readings",
     "no_readings",
     "trusted_readings",
-    "weighted_mean",
     "with_readings",
 ]
 
@@ -58,17 +58,6 @@ class Readings:
     def take_branches(self, order: list[int]) -> "Readings":
         """Return the same readings with the branches in another order."""
         return Readings(**{name: values[:, order] for name, values in vars(self).items()})
-
-
-def weighted_mean(*readings: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Mean by precision of values with standard deviations, NaN where neither tells, and its standard deviation."""
-    told = [np.isfinite(value) & np.isfinite(sd) for value, sd in readings]
-    precision = [np.where(there, 1.0 / np.square(sd), 0.0) for there, (_, sd) in zip(told, readings, strict=True)]
-    total = np.sum(precision, axis=0)
-    parts = zip(told, precision, readings, strict=True)
-    moment = np.sum([np.where(there, weight * value, 0.0) for there, weight, (value, _) in parts], axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(total > 0.0, moment / total, np.nan), np.where(total > 0.0, 1.0 / np.sqrt(total), np.nan)
 
 
 def no_readings(vehicles: int, branches: int) -> Readings:

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrator.drive import Array
+from calibrator.evidence.cluster import densest_clusters
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
 from calibrator.faults import Faults, slopes_and_intercepts
-from calibrator.posterior.cluster import densest_clusters
 from calibrator.published.evidence import FleetEvidence
 
 __all__ = ["MeasuredMoments", "common_rows", "measured_moments"]

@@ -14,7 +14,6 @@ from calibrator.artificial.ground_truth import GroundTruth
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
-from calibrator.evidence.summary import summarise
 from calibrator.experiments.known_law import balanced_law
 from calibrator.experiments.recorded_fleet import RecordedFleet
 from calibrator.experiments.trial import Trial, UnseenDrive, unseen_drive
@@ -25,6 +24,7 @@ from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.random_streams import Purpose, random_stream
+from calibrator.summaries.moments import summarise
 
 __all__ = [
     "NOISE",

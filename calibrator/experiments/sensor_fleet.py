@@ -14,19 +14,19 @@ from calibrator.calibration_settings import CalibrationSettings
 from calibrator.drive import Array, Mask
 from calibrator.drives.align import Samples
 from calibrator.drives.delays import BranchDelays
-from calibrator.evidence.summary import summarise
-from calibrator.evidence.vehicle_summary import VehicleSummary
-from calibrator.evidence.zero_current import ZeroCurrent
 from calibrator.experiments.joined_trial import joined_trips
 from calibrator.experiments.recorded_fleet import RecordedFleet
 from calibrator.experiments.recorded_trial import NOISE
 from calibrator.faults import Faults, measured_currents, true_currents
+from calibrator.files.parameter_files import RunIdentity
 from calibrator.options import Method
-from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.fleet import learn_fleet
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.sensor_models.families import GainBySign, SensorModel, TemperatureDrift
 from calibrator.sensor_models.fleet import SensorFindings, findings_of, summaries_about_zeros
+from calibrator.summaries.moments import summarise
+from calibrator.summaries.vehicle_summary import VehicleSummary
+from calibrator.summaries.zero_current import ZeroCurrent
 from calibrator.terminal.progress import progress_bar, shown
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters

@@ -13,12 +13,12 @@ from calibrator.export.cdfx import cdfx_document
 from calibrator.export.checked import Checked, read_checked
 from calibrator.export.csv_table import csv_text
 from calibrator.export.dcm import dcm_text
-from calibrator.folders import require_possible_file, require_possible_folder
+from calibrator.files.folders import require_possible_file, require_possible_folder
+from calibrator.files.whole_files import made_folder, remove_abandoned, require_own_file, write_files
 from calibrator.options import ExportFormat
 from calibrator.terminal.options import JsonOption, LayoutOption
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps
-from calibrator.whole_files import made_folder, remove_abandoned, require_own_file, write_files
 from ecu_node.database import read_database
 from ecu_node.errors import printable
 from ecu_node.failures import say_error

@@ -9,17 +9,17 @@ import numpy as np
 
 from calibrator.drive import Array, DriveFile
 from calibrator.drives.align import Samples
-from calibrator.drives.copies import without_copies
-from calibrator.drives.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment
 from calibrator.errors import DriveError
-from calibrator.evidence.vehicle_summary import read_samples, read_vehicle_summary
-from calibrator.identification.filter_bank import FilterBank, low_pass_bank
 from calibrator.identification.pooled_bank import pooled_bank
 from calibrator.identification.read_out import far_below_fleet, fit_read_outs
 from calibrator.identification.state_space import StateSpaceModel
 from calibrator.identification.vehicle_model import identify_vehicle
+from calibrator.sources.copies import without_copies
+from calibrator.sources.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment
+from calibrator.sources.vehicles import read_each, read_vehicles
+from calibrator.summaries.filter_bank import FilterBank, low_pass_bank
+from calibrator.summaries.vehicle_summary import read_samples, read_vehicle_summary
 from calibrator.terminal.text import dumps, left_out_text, table
-from calibrator.vehicles import read_each, read_vehicles
 from ecu_node.database import VehicleDatabase
 
 __all__ = ["IdentificationReport", "OwnModel", "identify_fleet", "own_model", "require_fitting_bank"]
@@ -131,7 +131,7 @@ def identify_fleet(
     Parameters
     ----------
     path : Path
-        The fleet, see :func:`calibrator.drives.fleet_source.find_fleet`.
+        The fleet, see :func:`calibrator.sources.fleet_source.find_fleet`.
     database : VehicleDatabase
         DBC and layout.
     bank : FilterBank or None

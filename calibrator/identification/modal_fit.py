@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from calibrator.drive import Array, Mask
-from calibrator.identification.state_space import Complex, StateSpaceModel, snr_from_power
+from calibrator.drive import Array, Complex, Mask
+from calibrator.identification.state_space import StateSpaceModel, snr_from_power
 
 __all__ = ["Modes", "fit_read_out", "stable_modes"]
 

@@ -13,14 +13,13 @@ from operator import add
 
 import numpy as np
 
-from calibrator.drive import Array
+from calibrator.drive import Array, Complex
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
-from calibrator.evidence.summary import DriveSummary, Summariser
-from calibrator.identification.filter_bank import FilterBank, Poles, low_passes
 from calibrator.identification.identify import observability, standardised_moments, subspace_modes
 from calibrator.identification.read_out import fit_read_outs
-from calibrator.identification.state_space import Complex
+from calibrator.summaries.filter_bank import FilterBank, Poles, low_passes
+from calibrator.summaries.moments import DriveSummary, Summariser
 from calibrator.terminal.progress import shown
 
 __all__ = ["pooled_bank"]

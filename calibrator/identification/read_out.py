@@ -13,9 +13,9 @@ import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import DriveError
-from calibrator.evidence.summary import DriveSummary, common_bank
-from calibrator.identification.filter_bank import FilterBank
 from calibrator.identification.state_space import StateSpaceModel, snr_from_power
+from calibrator.summaries.filter_bank import FilterBank
+from calibrator.summaries.moments import DriveSummary, common_bank
 
 __all__ = ["ReadOuts", "far_below_fleet", "fit_read_outs", "state_space_model"]
 

@@ -11,13 +11,12 @@ Symbols: u inputs (T samples, M inputs), y currents (K branches, positive into t
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import DriveError
 
-__all__ = ["Complex", "StateSpaceModel", "simulation_snr_db", "snr_from_power", "valid_or_all"]
+__all__ = ["StateSpaceModel", "simulation_snr_db", "snr_from_power", "valid_or_all"]
 
 WORST_EIGENVECTORS = 1e8
 """Condition number of the eigenvectors of A from which on modes are not separated any more: 8 digits remain. [1]"""
@@ -128,9 +127,6 @@ def _states_step_by_step(A: Array, forcing: Array, x0: Array) -> Array:
     for t in range(len(forcing) - 1):
         x[t + 1] = A @ x[t] + forcing[t]
     return x
-
-
-Complex = NDArray[np.complex128]
 
 
 def valid_or_all(valid: Mask | None, samples: int) -> Mask:

@@ -13,10 +13,10 @@ import numpy as np
 
 from calibrator.drive import Array, DriveFile, Mask
 from calibrator.drives.align import Samples, align
-from calibrator.drives.fleet_source import Equipment, load_drive
 from calibrator.errors import DriveError
 from calibrator.identification.identify import identify
 from calibrator.identification.state_space import StateSpaceModel, simulation_snr_db
+from calibrator.sources.fleet_source import Equipment, load_drive
 from calibrator.terminal.text import counted
 from ecu_node.database import VehicleDatabase
 

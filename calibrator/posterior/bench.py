@@ -9,11 +9,11 @@ from calibrator.calibration_settings import CalibrationSettings
 from calibrator.drive import Mask
 from calibrator.errors import FleetError
 from calibrator.evidence.readings import TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD, Readings, no_readings
-from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.posterior.bench_table import BenchReadings, read_bench_readings, readings_of
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.health import ReferenceHealth
 from calibrator.posterior.model_spread import FEWEST_TRUSTED
+from calibrator.summaries.vehicle_summary import VehicleSummary
 
 __all__ = [
     "contradicted_readings",

@@ -17,7 +17,6 @@ from calibrator.evidence.fleet_model import FleetModel, fit_fleet_model
 from calibrator.evidence.fleet_moments import FleetMoments, stack_summaries
 from calibrator.evidence.readings import Readings, no_readings, trusted_readings, with_readings
 from calibrator.evidence.rows import FleetRows, with_load_spread
-from calibrator.evidence.summary import DriveSummary
 from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetLaw, FleetPosterior, Moments, estimate_vehicles, learn_law
 from calibrator.posterior.fault_prior import FaultPrior
@@ -25,6 +24,7 @@ from calibrator.posterior.health import ReferenceHealth, examine_reference
 from calibrator.posterior.model_spread import FEWEST_TRUSTED
 from calibrator.posterior.trust import broken_trust
 from calibrator.posterior.verdict import SUSPECTED
+from calibrator.summaries.moments import DriveSummary
 from ecu_node.layout import UnmeasuredLoad
 
 __all__ = ["FleetReference", "calibrate_posterior", "estimate_summaries", "learn_reference"]

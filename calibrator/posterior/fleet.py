@@ -13,10 +13,8 @@ import numpy as np
 from calibrator.calibration_settings import CalibrationSettings, require_learning
 from calibrator.drive import Array, Mask
 from calibrator.evidence.readings import Readings
-from calibrator.evidence.summary import DriveSummary
 from calibrator.evidence.vehicle_evidence import evidence_names
-from calibrator.evidence.vehicle_summary import VehicleSummary
-from calibrator.parameter_files import RunIdentity, by_branch
+from calibrator.files.parameter_files import RunIdentity, by_branch
 from calibrator.posterior.bench import contradicted_readings, merge_readings, trust_notices, window_notices
 from calibrator.posterior.bench_table import BenchReadings
 from calibrator.posterior.calibration import FleetReference, estimate_summaries, learn_reference
@@ -25,6 +23,8 @@ from calibrator.posterior.model_parameters import finding_notices
 from calibrator.sensor_models.choice import SensorModelChoice
 from calibrator.sensor_models.fleet import SensorFindings, all_linear
 from calibrator.sensor_models.modelled import ModelledVehicle
+from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.vehicle_summary import VehicleSummary
 
 __all__ = ["FindModels", "Learnt", "learn_fleet"]
 

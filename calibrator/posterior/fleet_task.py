@@ -6,10 +6,8 @@ from functools import partial
 
 import numpy as np
 
-from calibrator.evidence.summary import DriveSummary
 from calibrator.evidence.vehicle_evidence import VehicleEvidence
-from calibrator.evidence.vehicle_summary import VehicleSummary
-from calibrator.parameter_files import RunIdentity
+from calibrator.files.parameter_files import RunIdentity
 from calibrator.posterior.bench import merge_readings
 from calibrator.posterior.bench_table import BenchReadings
 from calibrator.posterior.calibration import FleetReference, estimate_summaries
@@ -23,6 +21,8 @@ from calibrator.posterior.verdict import Deployment, decide
 from calibrator.sensor_models.choice import SensorModelChoice
 from calibrator.sensor_models.fleet import SensorFindings, all_linear
 from calibrator.sensor_models.modelled import ModelledVehicle
+from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.parameters import VehicleParameters
 
 __all__ = ["Calibrated", "FleetTask"]

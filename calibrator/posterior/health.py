@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
+from calibrator.evidence.cluster import Cluster, densest_clusters
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
-from calibrator.posterior.cluster import Cluster, densest_clusters
 from calibrator.posterior.model_spread import FEWEST_TRUSTED, MOST_UNMEASURED, unmeasured_load
 from calibrator.posterior.slab import FAULTS_RANGE
 from ecu_node.layout import UnmeasuredLoad

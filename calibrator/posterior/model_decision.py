@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrator.drive import Array
-from calibrator.evidence.summary import DriveSummary
 from calibrator.posterior.decision import NORMAL_STEPS
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.fault_prior import FaultPrior
@@ -19,6 +18,7 @@ from calibrator.posterior.model_harm import EXCESS_NODES, NODE_OF_STEP, model_ha
 from calibrator.posterior.states import States
 from calibrator.sensor_models.modelled import ModelledSensor, ModelledVehicle
 from calibrator.sensor_models.sections import Sections
+from calibrator.summaries.moments import DriveSummary
 
 __all__ = ["JudgedSensor", "judge_sensor", "with_free_drift"]
 

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from scipy.special import expit, logit
 
-from calibrator.parameter_files import junction_residual
+from calibrator.files.parameter_files import junction_residual
 from calibrator.posterior.model_decision import JudgedSensor
 from calibrator.sensor_models.choice import LINEAR, PRIOR_SHARE, SensorModelChoice
 from calibrator.sensor_models.fleet import SensorFindings

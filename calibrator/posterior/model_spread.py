@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from calibrator.drive import Array, Mask
+from calibrator.evidence.cluster import Cluster, densest_clusters
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, constant_design, relative_design
-from calibrator.posterior.cluster import Cluster, densest_clusters
 from calibrator.posterior.fault_prior import OUTLIER_VARIANCE, FaultPrior, ModelSpread
 from calibrator.posterior.slab import FAULTS_RANGE
 from calibrator.posterior.states import States

@@ -5,12 +5,12 @@ from typing import cast
 
 import numpy as np
 
-from calibrator.evidence.vehicle_summary import VehicleSummary
-from calibrator.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
+from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.posterior.advice import advise
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.explain import explanations
 from calibrator.posterior.verdict import Deployment
+from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.parameters import (
     BranchParameters,
     Explanation,

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from calibrator.errors import ProposalError
-from calibrator.folders import require_possible_file
+from calibrator.files.folders import require_possible_file
 from calibrator.interrupts import importing
 from calibrator.terminal.options import JsonOption
 from calibrator.terminal.text import dumps

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from calibrator.doctor.words import PLACES, word_set
 from calibrator.proposal.signals import Candidate
-from calibrator.proposal.words import PLACES, word_set
 from ecu_node.units import AMPERE, VOLT, WATT
 
 __all__ = ["FITS", "POSITIONS", "Role", "branch_points", "position_of", "role_points", "seen_points"]
@@ -63,7 +63,7 @@ class Role:
 
 
 def branch_points(candidate: Candidate, place: str) -> float:
-    """Points of a signal as the branch at some place of :data:`calibrator.proposal.words.PLACES`."""
+    """Points of a signal as the branch at some place of :data:`calibrator.doctor.words.PLACES`."""
     names = PLACES[place]
     own, around = set(candidate.own), set(candidate.words)
     elsewhere = _ELSEWHERE.get(place, ELSEWHERE)

@@ -1,7 +1,7 @@
 """Inputs that drive a vehicle's currents, and how DBC files call them."""
 
+from calibrator.doctor.words import word_set
 from calibrator.proposal.rating import Role
-from calibrator.proposal.words import word_set
 
 __all__ = ["ROLES"]
 

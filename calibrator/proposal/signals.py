@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from cantools.database.can import Message, Signal
 
+from calibrator.doctor.words import words_of
 from calibrator.drive import Channel
-from calibrator.proposal.words import words_of
 from calibrator.recordings.decode import decode_signal
 from calibrator.recordings.frame_arrays import Frames, frame_key
 from calibrator.recordings.log_time import repaired_time

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from calibrator.doctor.bands import branch_bands
 from calibrator.doctor.junction import orientation_of, peaks
 from calibrator.doctor.multipliers import Known, explanations
+from calibrator.doctor.words import words_of
 from calibrator.drive import Drive
 from calibrator.proposal.branches import ProposedBranch
-from calibrator.proposal.words import words_of
 
 __all__ = ["ProposedSign", "propose_signs", "usual_signs"]
 

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from calibrator.doctor.words import words_of
 from calibrator.proposal.branches import ProposedBranch
 from calibrator.proposal.signals import Candidate
-from calibrator.proposal.words import words_of
 
 __all__ = ["ProposedTarget", "checked_messages", "propose_targets"]
 

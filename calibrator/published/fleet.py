@@ -11,15 +11,15 @@ import numpy as np
 from calibrator.artificial.truth import faults_of
 from calibrator.calibration_settings import CalibrationSettings, FleetOutcome, require_learning
 from calibrator.drive import Array
-from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
+from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_model
-from calibrator.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.published.calibration import ExpectedFaults, calibrate_published
 from calibrator.published.recovery import Recovery
+from calibrator.sources.fleet_source import Equipment, FleetSource
+from calibrator.sources.vehicles import read_vehicles
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import few
-from calibrator.vehicles import read_vehicles
 from ecu_node.parameters import BranchParameters, HardwareFault, VehicleParameters, Verdict
 
 __all__ = ["calibrate_fleet_published", "few_vehicles_notice"]

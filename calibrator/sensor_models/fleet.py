@@ -18,14 +18,14 @@ import numpy as np
 from calibrator.drive import Array, DriveFile, Mask
 from calibrator.drives.align import Samples, align
 from calibrator.drives.delays import without_delays
-from calibrator.drives.fleet_source import Equipment, FleetSource, load_drive
-from calibrator.evidence.summary import DriveSummary
-from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.sensor_models.choice import LEAST_VEHICLES, LINEAR, SensorModelChoice, choose_sensor_models
 from calibrator.sensor_models.modelled import ModelledVehicle, modelled_vehicle, usual_sections
 from calibrator.sensor_models.summary import SensorSummary, summarise_sensors
-from calibrator.vehicles import read_each
+from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive
+from calibrator.sources.vehicles import read_each
+from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.database import VehicleDatabase
 
 __all__ = ["SensorFindings", "all_linear", "find_sensor_models", "findings_of", "summaries_about_zeros"]

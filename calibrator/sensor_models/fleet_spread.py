@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrator.drive import Array, Mask
-from calibrator.posterior.cluster import densest_clusters
+from calibrator.evidence.cluster import densest_clusters
 
 __all__ = ["FleetSpread", "first_spread", "next_spread"]
 

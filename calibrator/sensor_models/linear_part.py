@@ -9,10 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from calibrator.drive import Array
-from calibrator.evidence.summary import DriveSummary
 from calibrator.sensor_models.choice import LINEAR, SensorModelChoice
 from calibrator.sensor_models.families import FAMILIES, Family, GainBySign, SensorModel, TemperatureDrift
 from calibrator.sensor_models.summary import SensorSummary
+from calibrator.summaries.moments import DriveSummary
 from ecu_node.sensor_models import GainBySign as GainBySignParameters
 from ecu_node.sensor_models import SensorModel as SensorModelParameters
 from ecu_node.sensor_models import TemperatureDrift as TemperatureDriftParameters

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibrator.drive import Array
-from calibrator.evidence.summary import DriveSummary
 from calibrator.sensor_models.choice import LINEAR, SensorModelChoice
 from calibrator.sensor_models.families import Family
 from calibrator.sensor_models.linear_part import excess_column, family_of, linear_columns, linear_summary
 from calibrator.sensor_models.sections import ColumnMoments, Sections, usual_moments
 from calibrator.sensor_models.summary import SensorSummary
+from calibrator.summaries.moments import DriveSummary
 
 __all__ = ["ModelledSensor", "ModelledVehicle", "UsualSections", "modelled_vehicle", "usual_sections"]
 

@@ -8,8 +8,8 @@ import numpy as np
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
-from calibrator.evidence.summary import DriveSummary, summarise
 from calibrator.sensor_models.families import FAMILIES, Family
+from calibrator.summaries.moments import DriveSummary, summarise
 
 __all__ = ["SensorSummary", "summarise_sensors"]
 

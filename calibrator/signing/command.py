@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 
 from calibrator.errors import ContradictionError, SigningError
-from calibrator.folders import require_possible_folder
+from calibrator.files.folders import require_possible_folder
+from calibrator.files.whole_files import made_folder, remove_abandoned, require_own_file, write_files
 from calibrator.signing.key_files import PASSPHRASE_VARIABLE, new_key, read_public_key, read_signer
 from calibrator.signing.numbers import require_near_number, signing_time, time_text
 from calibrator.signing.orders import Order
@@ -18,7 +19,6 @@ from calibrator.signing.statements import signed_statement
 from calibrator.terminal.options import JsonOption, whole_option
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps
-from calibrator.whole_files import made_folder, remove_abandoned, require_own_file, write_files
 from ecu_node.errors import printable
 from ecu_node.failures import say_error
 from ecu_node.standard_output import write_output

@@ -2,11 +2,11 @@
 
 import msgspec
 
-from calibrator.drives.fleet_source import Equipment
 from calibrator.errors import DriveError, FleetError
-from calibrator.evidence.summary import BLOCK_S
-from calibrator.identification.filter_bank import FilterBank
-from calibrator.storage import Storage
+from calibrator.files.storage import Storage
+from calibrator.sources.fleet_source import Equipment
+from calibrator.summaries.filter_bank import FilterBank
+from calibrator.summaries.moments import BLOCK_S
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
@@ -30,7 +30,7 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     layout, layout_sha256, dbc_sha256 : str
         Names and digests of what the signals mean.
     branches, inputs, fleet_inputs : tuple of str
-        Branches and model inputs of the fleet, see :class:`~calibrator.drives.fleet_source.Equipment`.
+        Branches and model inputs of the fleet, see :class:`~calibrator.sources.fleet_source.Equipment`.
     notices : tuple of str
         What the layout has and the fleet lacks.
     bank : FilterBank

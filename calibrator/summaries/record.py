@@ -15,9 +15,8 @@ from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
 from calibrator.drives.store import require_plain_name
 from calibrator.errors import DriveError
-from calibrator.evidence.readings import weighted_mean
-from calibrator.evidence.vehicle_summary import LEAST_DURATION_S, VehicleSummary
-from calibrator.evidence.zero_current import ZeroCurrent
+from calibrator.summaries.vehicle_summary import LEAST_DURATION_S, VehicleSummary
+from calibrator.summaries.zero_current import ZeroCurrent, weighted_mean
 from calibrator.terminal.text import counted
 
 __all__ = [

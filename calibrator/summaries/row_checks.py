@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calibrator.evidence.summary import DriveSummary
+from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import IMPOSSIBLE, MOST_MOMENT, MOST_VARIANCE_A2
 
 __all__ = ["row_problem"]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from calibrator.drives.store import is_plain_name
 from calibrator.errors import FleetError
-from calibrator.storage import Storage
+from calibrator.files.storage import Storage
 from calibrator.summaries.buckets import bucket_of
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.record import Outline, Record

@@ -14,15 +14,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calibrator.drive import DriveFile
-from calibrator.drives.fleet_source import Equipment, FleetSource
 from calibrator.errors import FleetError
-from calibrator.evidence.vehicle_summary import read_vehicle_summary
-from calibrator.identification.filter_bank import FilterBank
+from calibrator.files.storage import Storage
 from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
-from calibrator.storage import Storage
+from calibrator.sources.fleet_source import Equipment, FleetSource
+from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity, read_identity, store_identity, write_identity
 from calibrator.summaries.record import Record, source_version
 from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.vehicle_summary import read_vehicle_summary
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase

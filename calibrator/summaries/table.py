@@ -18,12 +18,12 @@ import pyarrow.parquet as pq
 from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
 from calibrator.errors import FleetError
-from calibrator.evidence.summary import DriveSummary
-from calibrator.evidence.vehicle_summary import VehicleSummary
-from calibrator.evidence.zero_current import ZeroCurrent
 from calibrator.summaries.identity import StoreIdentity
+from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import Outline, Record, name_problem, outline_of, stored_problem
 from calibrator.summaries.row_checks import row_problem
+from calibrator.summaries.vehicle_summary import VehicleSummary
+from calibrator.summaries.zero_current import ZeroCurrent
 
 __all__ = ["MOST_BLOCKS", "SCHEMA", "decode_outlines", "decode_records", "encode_records"]
 

@@ -17,10 +17,10 @@ import pyarrow.parquet as pq
 
 from calibrator.drive import Array, Drive, DriveFile, Mask
 from calibrator.drives.align import align
-from calibrator.drives.fleet_source import FleetSource, load_drive
 from calibrator.errors import FleetError
-from calibrator.identification.filter_bank import FilterBank
 from calibrator.reading_processes import Unread, read_in_processes
+from calibrator.sources.fleet_source import FleetSource, load_drive
+from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase

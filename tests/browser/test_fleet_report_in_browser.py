@@ -13,10 +13,10 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 from selenium.webdriver.support.wait import WebDriverWait
 
-from calibrator.fleet_report.write import ReportOptions, fleet_report, vehicle_report
+from calibrator.report.write import ReportOptions, fleet_report, vehicle_report
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
-from tests.calibrator.fleet_report.results_at_hand import six_vehicle_result
+from tests.calibrator.report.results_at_hand import six_vehicle_result
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 PATIENCE_S = 60.0

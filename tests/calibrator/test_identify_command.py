@@ -12,7 +12,7 @@ from calibrator.cli import app
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError, FleetError
-from calibrator.identification.filter_bank import low_pass_bank, read_bank
+from calibrator.summaries.filter_bank import low_pass_bank, read_bank
 from ecu_node.layout import read_layout
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"

@@ -14,7 +14,7 @@ import pytest
 from calibrator.doctor.examine import examine
 from calibrator.doctor.findings import Severity
 from calibrator.drives.store import iterate_drives
-from calibrator.layout_files import vehicle_database
+from calibrator.files.layout_files import vehicle_database
 from calibrator.recordings.drive_log import write_drive_log
 from ecu_node.layout import read_layout
 from tests.real.delay_trips import import_trips

@@ -20,10 +20,10 @@ from bench.row import Row
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
 from calibrator.drive import Channel
-from calibrator.drives.fleet_source import find_fleet, probe_equipment
 from calibrator.drives.store import write_drive
-from calibrator.evidence.vehicle_summary import read_vehicle_summary
 from calibrator.recordings.readers import read_recording
+from calibrator.sources.fleet_source import find_fleet, probe_equipment
+from calibrator.summaries.vehicle_summary import read_vehicle_summary
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout, split_signal
 

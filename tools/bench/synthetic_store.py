@@ -15,17 +15,17 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.calibration.in_order import Workers
 from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
-from calibrator.drives.fleet_source import Equipment
-from calibrator.evidence.summary import DriveSummary, summarise
-from calibrator.evidence.vehicle_summary import VehicleSummary
-from calibrator.evidence.zero_current import ZeroCurrent
 from calibrator.experiments.recorded_fleet import builtin_fleet
 from calibrator.experiments.recorded_trial import RecordedCase, record_vehicles
 from calibrator.faults import Faults
-from calibrator.storage import open_storage
+from calibrator.files.storage import open_storage
+from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.identity import store_identity, write_identity
+from calibrator.summaries.moments import DriveSummary, summarise
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.vehicle_summary import VehicleSummary
+from calibrator.summaries.zero_current import ZeroCurrent
 from calibrator.terminal.progress import progress_bar
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout

@@ -10,10 +10,10 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from tests.calibrator.calibration.test_run_commands import ENVIRONMENT, LAYOUT, calibrate, command, contents
 
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
+from tests.calibrator.calibration.test_run_commands import ENVIRONMENT, LAYOUT, calibrate, command, contents
 from tests.calibrator.summaries.small_stores import random_faults, small_store
 
 pytest.importorskip("distributed")

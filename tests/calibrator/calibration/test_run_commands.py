@@ -12,13 +12,13 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from tests.calibrator.calibration.test_run_passes import faults_of_vehicle
 
 from calibrator.calibration.unfinished import unfinished_run
 from calibrator.errors import FleetError
 from calibrator.results import read_results, read_run
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
+from tests.calibrator.calibration.test_run_passes import faults_of_vehicle
 from tests.calibrator.evidence.simulated_drives import Conditions, summaries_of
 from tests.calibrator.summaries.small_stores import random_faults, record_of, small_store
 

@@ -17,16 +17,16 @@ from calibrator.calibration.previous import PreviousResult
 from calibrator.calibration.second_pass import calibrate_bucket
 from calibrator.calibration_settings import CalibrationSettings
 from calibrator.errors import FleetError
-from calibrator.evidence.vehicle_summary import VehicleSummary
 from calibrator.faults import Faults
+from calibrator.files.parameter_files import RunIdentity
+from calibrator.files.storage import open_storage
 from calibrator.options import Method
-from calibrator.parameter_files import RunIdentity
 from calibrator.posterior.fleet import learn_fleet
 from calibrator.posterior.fleet_task import FleetTask
 from calibrator.results import ChunkResult, encode_chunk
-from calibrator.storage import open_storage
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import decode_parameters
 from ecu_node.sensor_models import GainBySign

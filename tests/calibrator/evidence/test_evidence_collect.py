@@ -10,8 +10,8 @@ from calibrator.evidence.collect import collect_rows
 from calibrator.evidence.fleet_model import FleetModel, fit_fleet_model
 from calibrator.evidence.fleet_moments import stack_summaries
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, constant_design, relative_design
-from calibrator.evidence.summary import DriveSummary
 from calibrator.faults import Faults
+from calibrator.summaries.moments import DriveSummary
 from tests.calibrator.evidence.simulated_drives import Conditions, no_faults, read_out_of, summaries_of
 
 K, FULL_SCALE_A = 3, 400.0

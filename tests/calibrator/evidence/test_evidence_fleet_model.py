@@ -8,8 +8,8 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.evidence.fleet_model import FleetModel, fit_fleet_model, regress_on_fleet
 from calibrator.evidence.fleet_moments import stack_summaries
-from calibrator.evidence.summary import DriveSummary
 from calibrator.faults import Faults, slopes_and_intercepts
+from calibrator.summaries.moments import DriveSummary
 from tests.calibrator.evidence.simulated_drives import Conditions, no_faults, read_out_of, summaries_of
 
 K = 3

@@ -2,10 +2,10 @@ import pytest
 
 from calibrator.artificial.dynamic_vehicles import PERIOD_S, dynamic_vehicle, recorded
 from calibrator.drives.align import Samples
-from calibrator.evidence.summary import summarise
 from calibrator.identification.fleet_identification import OWN_GAIN_DB, own_model
 from calibrator.identification.pooled_bank import pooled_bank
 from calibrator.identification.read_out import ReadOuts, far_below_fleet, fit_read_outs
+from calibrator.summaries.moments import summarise
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,6 @@ from calibrator.artificial.dynamic_vehicles import (
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
-from calibrator.evidence.summary import BLOCK_S, DriveSummary, summarise
-from calibrator.identification.filter_bank import FilterBank, low_pass_bank, plain_bank
 from calibrator.identification.pooled_bank import pooled_bank
 from calibrator.identification.read_out import (
     FIRST_HELD_OUT,
@@ -24,6 +22,8 @@ from calibrator.identification.read_out import (
     state_space_model,
 )
 from calibrator.identification.state_space import StateSpaceModel, simulation_snr_db
+from calibrator.summaries.filter_bank import FilterBank, low_pass_bank, plain_bank
+from calibrator.summaries.moments import BLOCK_S, DriveSummary, summarise
 
 BLOCK = round(BLOCK_S / PERIOD_S)
 LEAD_IN = 600

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array, Channel, Drive, DriveFile
-from calibrator.drives.fleet_source import Equipment
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError
 from calibrator.faults import corrected_currents
+from calibrator.files.parameter_files import current_moments, junction_residual
 from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_model
-from calibrator.parameter_files import current_moments, junction_residual
+from calibrator.sources.fleet_source import Equipment
 from ecu_node.database import VehicleDatabase
 
 INPUTS = ("driving_current", "heater_current")

@@ -8,9 +8,9 @@ import pytest
 from calibrator.calibration_settings import CalibrationSettings
 from calibrator.drives.delays import BranchDelays
 from calibrator.errors import FleetError
-from calibrator.evidence.vehicle_summary import VehicleSummary
-from calibrator.evidence.zero_current import ZeroCurrent
 from calibrator.posterior.bench import merge_readings, read_bench
+from calibrator.summaries.vehicle_summary import VehicleSummary
+from calibrator.summaries.zero_current import ZeroCurrent
 from tests.calibrator.evidence.simulated_drives import no_faults, summaries_of
 
 BRANCHES = ("battery", "motor")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.evidence.summary import DriveSummary
 from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.model_decision import JudgedSensor
@@ -18,6 +17,7 @@ from calibrator.posterior.second_pass import ModelJudge, with_sensor_models
 from calibrator.posterior.verdict import Deployment
 from calibrator.sensor_models.choice import SensorModelChoice
 from calibrator.sensor_models.fleet import SensorFindings
+from calibrator.summaries.moments import DriveSummary
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import (
     BranchParameters,

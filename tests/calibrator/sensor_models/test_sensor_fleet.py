@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array, Channel, Drive
-from calibrator.drives.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment
 from calibrator.drives.store import write_drive
-from calibrator.evidence.vehicle_summary import VehicleSummary, read_vehicle_summary
 from calibrator.sensor_models.choice import LINEAR
 from calibrator.sensor_models.families import GainBySign
 from calibrator.sensor_models.fleet import SensorFindings, find_sensor_models, findings_of, summaries_about_zeros
-from calibrator.vehicles import read_vehicles
+from calibrator.sources.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment
+from calibrator.sources.vehicles import read_vehicles
+from calibrator.summaries.vehicle_summary import VehicleSummary, read_vehicle_summary
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.sensor_models.sensor_fleets import PERIOD_S, TEMPERATURE, SensorFleet, make_fleet
 from tests.calibrator.summaries.small_stores import record_of

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.parameter_files import junction_residual
+from calibrator.files.parameter_files import junction_residual
 from calibrator.sensor_models.choice import SensorModelChoice
 from calibrator.sensor_models.families import GainBySign, SensorModel, TemperatureDrift
 from calibrator.sensor_models.linear_part import chosen_sensor, linear_summary, sensor_parameters

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from calibrator.errors import DriveError
-from calibrator.evidence.summary import summarise
 from calibrator.sensor_models.choice import SensorModelChoice
 from calibrator.sensor_models.families import FAMILIES
 from calibrator.sensor_models.linear_part import linear_summary
 from calibrator.sensor_models.summary import summarise_sensors
+from calibrator.summaries.moments import summarise
 from tests.calibrator.sensor_models.sensor_fleets import PERIOD_S, TEMPERATURE, make_fleet
 
 DRIVE = make_fleet(vehicles=1, branches=3, minutes=3.0, seed=5).samples[0]

@@ -8,16 +8,16 @@ import numpy as np
 
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drives.delays import BranchDelays
-from calibrator.drives.fleet_source import Equipment
-from calibrator.evidence.summary import BLOCK_S, DriveSummary
-from calibrator.evidence.vehicle_summary import VehicleSummary
-from calibrator.evidence.zero_current import ZeroCurrent
 from calibrator.faults import Faults
-from calibrator.identification.filter_bank import FilterBank
-from calibrator.storage import Storage, open_storage
+from calibrator.files.storage import Storage, open_storage
+from calibrator.sources.fleet_source import Equipment
+from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity, store_identity, write_identity
+from calibrator.summaries.moments import BLOCK_S, DriveSummary
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.vehicle_summary import VehicleSummary
+from calibrator.summaries.zero_current import ZeroCurrent
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.evidence.simulated_drives import PERIOD_S, Conditions, summaries_of
 

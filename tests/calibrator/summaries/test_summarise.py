@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Channel, Drive
-from calibrator.drives.fleet_source import Equipment, find_fleet
 from calibrator.drives.store import write_drive
 from calibrator.errors import FleetError
-from calibrator.storage import open_storage
+from calibrator.files.storage import open_storage
+from calibrator.sources.fleet_source import Equipment, find_fleet
 from calibrator.summaries.record import joined_records
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.summarise import Added, add_drives, open_store

@@ -15,10 +15,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from calibrator.errors import DriveError, FleetError
-from calibrator.evidence.summary import DriveSummary
-from calibrator.storage import Storage, StorageError, open_storage
+from calibrator.files.storage import Storage, StorageError, open_storage
 from calibrator.summaries.buckets import bucket_of
 from calibrator.summaries.identity import SCHEMA_VERSION, read_identity, write_identity
+from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import Record, joined_records
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.table import MOST_BLOCKS, SCHEMA
@@ -256,7 +256,7 @@ def test_a_full_disk_is_told_with_what_to_do(tmp_path: Path, monkeypatch: pytest
     def full(path: Path, content: bytes) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("calibrator.storage.write_atomically", full)
+    monkeypatch.setattr("calibrator.files.storage.write_atomically", full)
     expected = rf"^{tmp_path}/x: cannot write it: No space left on device; make room, and run the same command again"
     with pytest.raises(StorageError, match=expected):
         open_storage(tmp_path).write("x", b"")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibrator.errors import FleetError
-from calibrator.identification.filter_bank import plain_bank
+from calibrator.summaries.filter_bank import plain_bank
 from calibrator.summaries.unity import UnityWindow, decode_window, liveliest_window
 from tests.calibrator.test_results import run_command
 

@@ -1,0 +1,1 @@
+"""The drives of a fleet, wherever they are: which log belongs to which vehicle, what was recorded twice."""

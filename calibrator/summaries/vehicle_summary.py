@@ -1,0 +1,169 @@
+"""From the drives of one vehicle to its summary: delays between branches, zero-current windows, second moments."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrator.drive import Array, Drive, DriveFile
+from calibrator.drives.align import Samples, align
+from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
+from calibrator.errors import DriveError
+from calibrator.sources.fleet_source import Equipment, load_drive
+from calibrator.summaries.filter_bank import FilterBank
+from calibrator.summaries.moments import DriveSummary, summarise
+from calibrator.summaries.zero_current import ZeroCurrent, zero_current_offsets
+from calibrator.terminal.text import counted
+from ecu_node.database import VehicleDatabase
+from ecu_node.layout import Layout
+
+__all__ = ["VehicleSummary", "read_samples", "read_vehicle_summary"]
+
+LEAST_DURATION_S = 120.0
+"""Valid data below which a vehicle is left out: fewer than four blocks do not tell how sure anything is. [s]"""
+
+MOST_OVER_FULL_SCALE = 10.0
+"""Largest current that is taken for one, over full scale. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleSummary:
+    """One vehicle as the posterior sees it.
+
+    Attributes
+    ----------
+    vehicle : str
+        Name.
+    drives : tuple of str
+        Names of the drives used.
+    summary : DriveSummary
+        Of all of them, delays taken out.
+    delays : BranchDelays
+        Of its branches; the reference is the branch that moves most.
+    zero_current : ZeroCurrent
+        What the sensors showed while the contactors were open.
+    recorded : frozenset of str
+        Recorded inputs of which every drive has good samples.
+    """
+
+    vehicle: str
+    drives: tuple[str, ...]
+    summary: DriveSummary
+    delays: BranchDelays
+    zero_current: ZeroCurrent
+    recorded: frozenset[str]
+
+
+def read_samples(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> list[Samples]:
+    """Read the drives of one vehicle as aligned samples, delays taken out.
+
+    Parameters
+    ----------
+    entries, equipment, database
+        As for :func:`read_vehicle_summary`.
+
+    Returns
+    -------
+    list of Samples
+        One per drive, with the inputs of the fleet model.
+
+    Raises
+    ------
+    UserError
+        If a drive cannot be read, or there is too little valid data; the message says which and how much.
+    """
+    return _aligned(entries, equipment, database).samples
+
+
+def read_vehicle_summary(
+    entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase, *, bank: FilterBank | None = None
+) -> VehicleSummary:
+    """Read the drives of one vehicle and summarise them.
+
+    Parameters
+    ----------
+    entries : sequence of DriveFile
+        Drives of one vehicle.
+    equipment : Equipment
+        Branches and model inputs of the fleet.
+    database : VehicleDatabase
+        DBC and layout.
+    bank : FilterBank or None
+        Filters of the fleet model's inputs; None: the plain inputs.
+
+    Returns
+    -------
+    VehicleSummary
+        The vehicle.
+
+    Raises
+    ------
+    UserError
+        If a drive cannot be read, or there is too little valid data; the message says which and how much.
+    """
+    vehicle = _aligned(entries, equipment, database)
+    return VehicleSummary(
+        vehicle=entries[0].vehicle,
+        drives=tuple(entry.name for entry in entries),
+        summary=summarise(vehicle.samples, period_s=database.layout.period_s, bank=bank),
+        delays=vehicle.delays,
+        zero_current=zero_current_offsets(vehicle.drives, equipment.branches, database),
+        recorded=frozenset.intersection(*(_recorded(drive) for drive in vehicle.drives)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _AlignedDrives:
+    """Drives of one vehicle as they are, the delays of its branches, and the drives on one time base without them."""
+
+    drives: list[Drive]
+    delays: BranchDelays
+    samples: list[Samples]
+
+
+def _aligned(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> _AlignedDrives:
+    layout = database.layout
+    drives = [load_drive(entry, database) for entry in entries]
+    for drive in drives:
+        _require_possible(drive, layout)
+    delays = estimate_delays(drives, _most_moving_first(drives, equipment.branches))
+    samples = [
+        align(without_delays(drive, delays.by_branch()), layout, equipment.branches, inputs=equipment.fleet_inputs)
+        for drive in drives
+    ]
+    duration_s = layout.period_s * sum(int(part.valid.sum()) for part in samples)
+    if duration_s < LEAST_DURATION_S:
+        raise DriveError(
+            f"{duration_s:.1f} s of usable data in {counted(len(entries), 'drive')}; at least "
+            f"{LEAST_DURATION_S:.0f} s are needed"
+        )
+    return _AlignedDrives(drives=drives, delays=delays, samples=samples)
+
+
+def _require_possible(drive: Drive, layout: Layout) -> None:
+    """Refuse currents that no sensor of this junction shows, and numbers that are none."""
+    for name, channel in drive.branches.items():
+        largest = float(np.abs(channel.value[channel.good]).max(initial=0.0))
+        if not largest <= MOST_OVER_FULL_SCALE * layout.full_scale_a:
+            raise DriveError(
+                f"drive {drive.name}: branch {name} shows {largest:.3g} A, full scale of the junction being "
+                f"{layout.full_scale_a:g} A; check its signal in the DBC, or full_scale_a in {layout.path.name}"
+            )
+    for name, channel in drive.inputs.items():
+        if not np.isfinite(channel.value[channel.good]).all():
+            raise DriveError(f"drive {drive.name}: input {name} has values that are no numbers; import it again")
+
+
+def _recorded(drive: Drive) -> frozenset[str]:
+    return frozenset(name for name, channel in drive.inputs.items() if channel.good.any())
+
+
+def _most_moving_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple[str, ...]:
+    """Branches by falling variance; the order asked for where a drive lacks one, as is noticed later."""
+
+    def variance_a2(name: str) -> float:
+        channels = [drive.branches[name] for drive in drives if name in drive.branches]
+        values: list[Array] = [channel.value[channel.good] for channel in channels]
+        return float(np.var(np.concatenate(values))) if sum(map(len, values)) else 0.0
+
+    return tuple(sorted(branches, key=variance_a2, reverse=True))

@@ -1,0 +1,110 @@
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from calibrator.errors import FleetError
+from calibrator.files.folders import require_new_folder, require_possible_folder, whole_folder
+
+
+def test_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "out"
+    with whole_folder(out) as partial:
+        (partial / "x").write_text("1")
+        assert not out.exists()
+    assert [path.name for path in out.iterdir()] == ["x"]
+    assert [path.name for path in out.parent.iterdir()] == ["out"]
+
+
+def test_failure_leaves_nothing(tmp_path: Path) -> None:
+    def fill() -> None:
+        with whole_folder(tmp_path / "out") as partial:
+            (partial / "x").write_text("1")
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fill()
+    assert not list(tmp_path.iterdir())
+
+
+def test_folder_in_use_is_refused_untouched(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").write_text("1")
+    with pytest.raises(FleetError, match="exists and is not empty"), whole_folder(tmp_path / "out"):
+        pass
+    assert (tmp_path / "out" / "mine").read_text() == "1"
+
+
+def test_what_a_killed_process_left_is_removed_and_that_of_a_running_one_stays(tmp_path: Path) -> None:
+    gone = subprocess.Popen([sys.executable, "-c", "pass"])
+    gone.wait()
+    (tmp_path / f".out.partial-{gone.pid}").mkdir()
+    (tmp_path / ".out.partial-1").mkdir()
+    with whole_folder(tmp_path / "out"):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".out.partial-1", "out"]
+
+
+def test_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("1")
+    with (
+        pytest.raises(FleetError, match=r"file/out: cannot be made: .*file is a file; choose another folder"),
+        whole_folder(tmp_path / "file" / "out"),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
+@pytest.mark.parametrize("name", ["x", "x/y/z"])
+def test_folder_in_which_the_system_makes_nothing_is_refused(require: Callable[[Path], None], name: str) -> None:
+    # No right forbids it to root; only trying tells.
+    with pytest.raises(FleetError, match=rf"^/proc/{name}: nothing can be made in /proc: .*; choose another folder$"):
+        require(Path("/proc") / name)
+
+
+@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
+def test_trial_leaves_nothing_behind(require: Callable[[Path], None], tmp_path: Path) -> None:
+    for out in (tmp_path, tmp_path / "a", tmp_path / "a" / "b" / "c"):
+        require(out)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
+def test_name_that_is_too_long_is_refused_at_the_start(require: Callable[[Path], None], tmp_path: Path) -> None:
+    with pytest.raises(FleetError, match=r"nothing can be made in .*: File name too long"):
+        require(tmp_path / "good" / ("x" * 300))
+    assert not list(tmp_path.iterdir())
+
+
+def test_link_is_not_replaced_wherever_it_leads(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "out").symlink_to(tmp_path / "there")
+    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
+    for name in ("out", "dangling"):
+        with pytest.raises(FleetError, match=f"{name}: is a link"):
+            require_new_folder(tmp_path / name)
+    require_possible_folder(tmp_path / "out")
+    with pytest.raises(FleetError, match="choose another"):
+        require_possible_folder(tmp_path / "dangling")
+
+
+def fill_while_the_place_is_taken(out: Path) -> None:
+    with whole_folder(out) as folder:
+        (folder / "result").write_text("hours of work")
+        out.mkdir()
+        (out / "in the way").write_text("")
+
+
+def test_what_was_made_stays_if_it_cannot_be_put_in_its_place(tmp_path: Path) -> None:
+    with pytest.raises(FleetError, match=r"out: cannot be replaced: .*; what was made stands in") as caught:
+        fill_while_the_place_is_taken(tmp_path / "out")
+    kept = Path(str(caught.value).rpartition("stands in ")[2])
+    assert (kept / "result").read_text() == "hours of work"
+
+
+def test_new_folder_is_not_made_over_a_mounted_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "is_mount", lambda _: True)
+    with pytest.raises(FleetError, match="a disk is mounted there"):
+        require_new_folder(tmp_path)

@@ -1,0 +1,211 @@
+"""Results whose every number is known, without a calibration."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from msgspec.structs import replace
+
+from calibrator.evidence.vehicle_evidence import VehicleEvidence, evidence_names
+from calibrator.results import RunRecord, encode_chunk, join_rows, write_parameter_files, write_run
+from calibrator.summaries.filter_bank import plain_bank
+from calibrator.summaries.unity import UNITY_FILE, UnityWindow
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import (
+    BranchParameters,
+    Explanation,
+    HardwareFault,
+    JunctionResidual,
+    VehicleParameters,
+)
+from tests.ecu_node.vehicles import parameters_for
+
+BRANCHES = ("battery", "motor")
+FULL_SCALE_A = 400.0
+READ_OUT_A = {"battery": [50.0, 10.0, 1.0], "motor": [-50.0, -10.0, -1.0]}
+EVIL = "<script>document.title='run'</script>"
+WINDOW = UnityWindow(
+    vehicle="V1",
+    drive="d1",
+    time_s=0.1 * np.arange(600),
+    columns=np.column_stack([np.sin(0.02 * np.arange(600)), np.cos(0.05 * np.arange(600))]),
+    voltage_v=350.0,
+    bank=plain_bank(("driving_current", "heater_current"), period_s=0.1),
+)
+
+
+def sensor(
+    drift: float = 0.0, offset_a: float = 0.0, *, apply: bool = False, held_back: str | None = None, sd: float = 0.001
+) -> BranchParameters:
+    """A sensor with a fault, known to sd of the gain, and to 100 A times as much."""
+    faulty = drift != 0.0 or offset_a != 0.0
+    return BranchParameters(
+        drift=drift,
+        offset_a=offset_a,
+        drift_sd=sd,
+        offset_sd_a=100.0 * sd,
+        apply=apply,
+        held_back=held_back,  # type: ignore[arg-type]
+        delay_s=0.02,
+        delay_sd_s=0.001,
+        fault_probability=0.995 if faulty else 0.004,
+        harm_probability=0.0002 if faulty else 0.0,
+    )
+
+
+def vehicle(
+    database: VehicleDatabase,
+    name: str,
+    battery: BranchParameters,
+    motor: BranchParameters,
+    *,
+    verdict: str = "corrected",
+    sums_a: tuple[float, float] = (10.0, 1.0),
+    hardware: HardwareFault | None = None,
+    explanations: Sequence[Explanation] = (),
+    decides: str = "",
+) -> VehicleParameters:
+    """Parameters of a vehicle with two branches."""
+    plain = parameters_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0))
+    return replace(
+        plain,
+        vehicle=name,
+        verdict=verdict,
+        confidence=0.97,
+        branches={"battery": battery, "motor": motor},
+        hardware_fault=hardware or HardwareFault(suspected=False, probability=0.01),
+        junction_residual=JunctionResidual(measured_a=sums_a[0], corrected_a=sums_a[1]),
+        explanations=list(explanations),
+        deciding_evidence=decides,
+        provenance=replace(plain.provenance, method="posterior", fleet_size=6, drives=["d1", "d2"], duration_s=1800.0),
+    )
+
+
+def six_vehicles(database: VehicleDatabase) -> list[VehicleParameters]:
+    """One of each kind."""
+    offset_or_drift = (
+        Explanation(probability=0.6, offset_a={"battery": 8.0}),
+        Explanation(probability=0.4, drift={"motor": -0.03}, hardware_drift=0.01),
+    )
+    moved_hardware = HardwareFault(
+        suspected=True, drift=-0.06, offset_a={"battery": 2.0, "motor": -2.0}, probability=0.97
+    )
+    return [
+        vehicle(database, "V1", sensor(0.1, 4.0, apply=True), sensor(), sums_a=(24.0, 0.5)),
+        vehicle(database, "V2", sensor(), sensor(), verdict="no sensor fault", sums_a=(0.4, 0.4)),
+        vehicle(
+            database, "V3", sensor(), sensor(), verdict="no sensor fault", sums_a=(0.6, 0.6), hardware=moved_hardware
+        ),
+        vehicle(
+            database,
+            "V4",
+            sensor(0.0, 8.0, held_back="harm limit", sd=0.02),
+            sensor(),
+            verdict="cannot tell",
+            sums_a=(8.0, 8.0),
+            explanations=offset_or_drift,
+            decides="a zero-current window (contactors open) would decide",
+        ),
+        vehicle(
+            database,
+            "V5",
+            sensor(),
+            sensor(0.45, 0.0, held_back="beyond the limits"),
+            verdict="cannot tell",
+            sums_a=(60.0, 60.0),
+        ),
+        vehicle(database, "V10", sensor(-0.05, 0.0, apply=True), sensor(0.0, -6.0, apply=True), sums_a=(13.0, 0.7)),
+    ]
+
+
+def evidence_of(item: VehicleParameters) -> VehicleEvidence:
+    """What a noise-free vehicle with these faults shows."""
+    battery, motor = (item.branches[name] for name in BRANCHES)
+    hardware = 1.0 + item.hardware_fault.drift
+    ratio = (1.0 + battery.drift) / (1.0 + motor.drift)
+    constant_a = (1.0 + battery.drift) * (battery.offset_a / (1.0 + battery.drift) + motor.offset_a / (1 + motor.drift))
+    told = [
+        (1.0 + battery.drift) * hardware,
+        (1.0 + motor.drift) * hardware,
+        ratio,
+        *(1.0 + battery.drift, 1.0 + motor.drift),
+        battery.offset_a + (1.0 + battery.drift) * item.hardware_fault.offset_a.get("battery", 0.0),
+        motor.offset_a + (1.0 + motor.drift) * item.hardware_fault.offset_a.get("motor", 0.0),
+        constant_a,
+        *(battery.offset_a, motor.offset_a),
+    ]
+    unknown = (3, 4, 8, 9)
+    return VehicleEvidence(
+        value=[None if r in unknown else value for r, value in enumerate(told)],
+        sd=[None if r in unknown else 0.002 if r < 5 else 0.2 for r in range(10)],
+        explained=told,
+    )
+
+
+def write_result(
+    folder: Path,
+    vehicles: Sequence[VehicleParameters],
+    *,
+    left_out: Mapping[str, str] | None = None,
+    moved: Mapping[tuple[str, str], str] | None = None,
+    method: str = "posterior",
+    window: UnityWindow | None = WINDOW,
+    evidence: bool = True,
+    created: str = "2026-01-01T00:00:00+00:00",
+) -> Path:
+    """A result folder as ``calibrator calibrate`` writes it."""
+    folder.mkdir()
+    told = {item.vehicle: evidence_of(item) for item in vehicles} if evidence else {}
+    chunk = encode_chunk(vehicles, left_out or {}, moved=moved, evidence=told)
+    rows, parameters = folder / "rows", folder / "part"
+    rows.write_bytes(chunk.rows)
+    parameters.write_bytes(chunk.parameters)
+    join_rows(folder, [rows], {})
+    write_parameter_files(folder, {0: parameters}, vehicles=len(vehicles))
+    rows.unlink()
+    parameters.unlink()
+    if window is not None:
+        (folder / UNITY_FILE).write_bytes(window.encoded())
+    run = run_of(len(vehicles), left_out or {}, method=method, evidence=evidence)
+    write_run(folder, replace(run, created=created))
+    return folder
+
+
+def run_of(vehicles: int, left_out: Mapping[str, str], *, method: str, evidence: bool) -> RunRecord:
+    """How a result at hand was made."""
+    reference = {
+        "agreeing_share": {"battery": 0.8, "motor": 0.75},
+        "mean_distance": {"battery": 0.012, "motor": -0.004},
+        "unmeasured_a": 0.3,
+        "doubtful": [],
+        "read_out": READ_OUT_A,
+    }
+    spread = {"model_spread": {"battery": 0.004, "motor": 0.005}}
+    own = {"reference": reference, "hyperparameters": spread, "evidence": evidence_names(BRANCHES)}
+    return RunRecord(
+        tool="calibrator test",
+        method=method,
+        fleet="at hand",
+        layout="hv_powertrain",
+        branches=list(BRANCHES),
+        model_inputs=[],
+        settings={},
+        created="2026-01-01T00:00:00+00:00",
+        details=own if evidence else {},
+        vehicles=vehicles,
+        buckets=0,
+        full_scale_a=FULL_SCALE_A,
+        left_out=dict(left_out),
+        left_out_count=len(left_out),
+        notices=[f"a notice with {EVIL}"],
+    )
+
+
+def six_vehicle_result(folder: Path, database: VehicleDatabase) -> Path:
+    """The six vehicles, with one left out whose name and reason are code, and one sensor that moved."""
+    return write_result(
+        folder,
+        six_vehicles(database),
+        left_out={f"log of {EVIL}": f"cannot be read: {EVIL}"},
+        moved={("V10", "motor"): "offset +0.00 A -> -6.00 A"},
+    )

@@ -1,0 +1,53 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrator.drive import Channel, Drive
+from calibrator.drives.store import write_drive
+from calibrator.errors import FleetError
+from calibrator.sources.fleet_source import find_fleet, probe_equipment
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import LayoutError
+
+INPUTS = ("voltage", "torque", "speed")
+
+
+def channel() -> Channel:
+    return Channel(time_s=np.arange(100) * 0.1, value=np.ones(100), good=np.full(100, True))
+
+
+@pytest.fixture
+def store(database: VehicleDatabase, tmp_path: Path) -> Path:
+    """One vehicle with battery, motor and auxiliary."""
+    branches = {name: channel() for name in ("battery", "motor", "auxiliary")}
+    drive = Drive(vehicle="V", name="d", branches=branches, inputs={name: channel() for name in INPUTS})
+    write_drive(tmp_path, drive, database.layout)
+    return tmp_path
+
+
+def notices(store: Path, database: VehicleDatabase, branches: list[str] | None) -> list[str]:
+    return [n for n in probe_equipment(find_fleet(store), database, branches).notices if n.startswith("branches")]
+
+
+def test_branches_that_were_not_recorded_are_named(store: Path, database: VehicleDatabase) -> None:
+    assert notices(store, database, None) == ["branches not recorded, taken as not fitted: dcdc, motor_rear"]
+
+
+def test_recorded_branches_that_were_not_asked_for_are_not_called_unrecorded(
+    store: Path, database: VehicleDatabase
+) -> None:
+    assert notices(store, database, ["battery", "motor"]) == [
+        "branches not recorded, taken as not fitted: dcdc, motor_rear",
+        "branches recorded but not asked for, missing from the junction sum: auxiliary",
+    ]
+
+
+def test_a_branch_asked_for_twice_is_refused(store: Path, database: VehicleDatabase) -> None:
+    with pytest.raises(FleetError, match="branch battery is asked for twice; name each branch once"):
+        probe_equipment(find_fleet(store), database, ["battery", "battery"])
+
+
+def test_an_unknown_branch_is_refused_with_the_known_ones(store: Path, database: VehicleDatabase) -> None:
+    with pytest.raises(LayoutError, match="no branch 'pack'; known are battery, motor"):
+        probe_equipment(find_fleet(store), database, ["pack", "battery"])

@@ -1,0 +1,122 @@
+import gzip
+import json
+import multiprocessing
+import os
+import re
+import signal
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from calibrator.artificial.simulate import FleetPlan, simulate_fleet
+from calibrator.artificial.trips import BuiltinTrips
+from calibrator.drives.fleet_id import read_fleet_ids
+from calibrator.sources.import_logs import ImportReport, import_logs
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.layout import read_layout
+
+LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("import") / "fleet"
+    plan = FleetPlan(vehicles=2, currents=2, sparsity=80.0, magnitude=(0.05, 0.25))
+    trips = BuiltinTrips(seed=0, duration_s=20.0, unseen_s=20.0)
+    simulate_fleet(plan, trips, read_database(read_layout(LAYOUT)), out, workers=1)
+    return out
+
+
+def imported(logs: list[Path], store: Path, database: VehicleDatabase) -> ImportReport:
+    return import_logs(logs, database, store, workers=1)
+
+
+def test_what_is_there_is_named_and_what_is_new_is_added(
+    fleet: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
+    first = imported([fleet / "logs" / "V001"], tmp_path, database)
+    both = imported([fleet / "logs"], tmp_path, database)
+    assert (len(first.drives), first.already_there) == (1, ())
+    assert ([drive.vehicle for drive in both.drives], both.already_there) == (["V002"], ("V001/drive",))
+    assert f"1 drives written to {tmp_path}, 1 already there, 0 left out" in both.as_text()
+
+
+def test_equal_notices_are_told_once_and_json_keeps_those_of_every_drive(
+    fleet: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
+    report = imported([fleet / "logs"], tmp_path, database)
+    told = [line for line in report.as_text().splitlines() if "junction_box_temperature" in line]
+    kept = [notice for drive in json.loads(report.as_json())["drives"] for notice in drive["notices"]]
+    kept = [notice for notice in kept if "junction_box_temperature" in notice]
+    frames = [int(re.findall(r"(\d+) of", notice)[0]) for notice in kept]
+    assert len(frames) == 2
+    assert told == [
+        f"  in 2 vehicles: junction_box_temperature: {sum(frames)} of {sum(frames)} frames not usable",
+    ]
+
+
+def test_a_damaged_drive_in_the_store_is_not_taken_for_imported(
+    fleet: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
+    imported([fleet / "logs" / "V001"], tmp_path, database)
+    (tmp_path / "drives" / "V001" / "drive.parquet").write_bytes(b"cut")
+    report = imported([fleet / "logs" / "V001"], tmp_path, database)
+    assert report.already_there == ()
+    assert "not a drive" in report.left_out["V001/drive"]
+    assert "remove it and import it again" in report.left_out["V001/drive"]
+
+
+def test_a_drive_of_another_layout_is_not_taken_for_imported(
+    fleet: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
+    imported([fleet / "logs" / "V001"], tmp_path / "store", database)
+    text = LAYOUT.read_text().replace('"hv_powertrain.dbc"', f'"{LAYOUT.parent / "hv_powertrain.dbc"}"')
+    (tmp_path / "other.toml").write_text(text + "\n# changed\n")
+    other = read_database(read_layout(tmp_path / "other.toml"))
+    report = imported([fleet / "logs" / "V001"], tmp_path / "store", other)
+    assert "made with layout hv_powertrain" in report.left_out["V001/drive"]
+
+
+def test_the_store_knows_which_artificial_fleet_its_drives_are_of(
+    fleet: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
+    imported([fleet / "logs" / "V001" / "drive.log.gz"], tmp_path, database)
+    assert read_fleet_ids(tmp_path) == read_fleet_ids(fleet / "logs") != frozenset()
+
+
+def write_endless_log(path: Path) -> None:
+    """A log of blank lines, small as a file, that takes minutes to read."""
+    path.parent.mkdir(parents=True)
+    path.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)
+
+
+def kill_first_reader(others: set[int | None]) -> None:
+    """Kill the first worker that was not there before."""
+    while not (new := {child.pid for child in multiprocessing.active_children()} - others):
+        time.sleep(0.01)
+    os.kill(new.pop() or 0, signal.SIGKILL)
+
+
+def test_a_log_that_takes_too_long_costs_itself_only(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+    endless = tmp_path / "logs" / "V000" / "endless.log.gz"
+    write_endless_log(endless)
+    logs = [endless, fleet / "logs"]
+    report = import_logs(logs, database, tmp_path / "store", workers=1, limit_s=5.0)
+    assert [drive.vehicle for drive in report.drives] == ["V001", "V002"]
+    assert list(report.left_out) == ["V000/endless"]
+    assert report.left_out["V000/endless"].startswith(f"{endless}: reading took more than 5 s and was ended; ")
+
+
+def test_a_log_whose_reader_is_killed_costs_itself_only(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
+    endless = tmp_path / "logs" / "V000" / "endless.log.gz"
+    write_endless_log(endless)
+    others = {child.pid for child in multiprocessing.active_children()}
+    killer = threading.Thread(target=kill_first_reader, args=[others])
+    killer.start()
+    report = imported([endless, fleet / "logs"], tmp_path / "store", database)
+    killer.join()
+    assert [drive.vehicle for drive in report.drives] == ["V001", "V002"]
+    reason = f"{endless}: the process that read it was killed by SIGKILL; "
+    assert report.left_out["V000/endless"].startswith(reason)

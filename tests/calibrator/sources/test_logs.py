@@ -1,0 +1,58 @@
+from pathlib import Path
+
+from calibrator.sources.logs import find_logs
+
+
+def make(*paths: Path) -> None:
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def test_the_folder_names_the_vehicle_and_the_file_the_drive(tmp_path: Path) -> None:
+    make(tmp_path / "logs" / "V1" / "monday.log.gz", tmp_path / "logs" / "V2" / "a.b.blf", tmp_path / "truth.json")
+    found = find_logs([tmp_path])
+    assert [(log.vehicle, log.name) for log in found.logs] == [("V1", "monday"), ("V2", "a.b")]
+    assert not found.problems
+
+
+def test_a_file_named_twice_is_read_once(tmp_path: Path) -> None:
+    make(tmp_path / "V1" / "a.log")
+    found = find_logs([tmp_path / "V1", tmp_path / "V1" / "a.log", tmp_path])
+    assert len(found.logs) == 1
+    assert not found.problems
+
+
+def test_two_vehicles_with_one_name_are_left_out_and_the_rest_goes_on(tmp_path: Path) -> None:
+    make(tmp_path / "x" / "V1" / "a.log", tmp_path / "y" / "V1" / "b.log", tmp_path / "y" / "V2" / "a.log")
+    found = find_logs([tmp_path])
+    assert [log.vehicle for log in found.logs] == ["V2"]
+    (problem,) = found.problems
+    assert str(problem).startswith(f"two vehicles with one name: V1 is in {tmp_path / 'x' / 'V1'} and in")
+
+
+def test_two_files_of_one_drive_are_left_out_and_named(tmp_path: Path) -> None:
+    make(tmp_path / "V1" / "a.log", tmp_path / "V1" / "a.blf", tmp_path / "V1" / "b.log")
+    found = find_logs([tmp_path])
+    assert [log.name for log in found.logs] == ["b"]
+    (problem,) = found.problems
+    assert "vehicle V1: drive a is in" in str(problem)
+    assert "a.blf and" in str(problem)
+
+
+def test_an_argument_that_does_not_exist_or_has_no_logs_is_a_problem(tmp_path: Path) -> None:
+    make(tmp_path / "V1" / "a.log")
+    (tmp_path / "empty").mkdir()
+    found = find_logs([tmp_path / "nothing", tmp_path / "empty", tmp_path / "V1"])
+    assert len(found.logs) == 1
+    assert ["no such file or folder" in str(p) or "no logs in this folder" in str(p) for p in found.problems] == [
+        True,
+        True,
+    ]
+
+
+def test_a_folder_name_that_cannot_name_a_vehicle_is_a_problem(tmp_path: Path) -> None:
+    make(tmp_path / "V*1" / "a.log")
+    found = find_logs([tmp_path])
+    assert not found.logs
+    assert "'V*1' cannot be used" in str(found.problems[0])
