@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calibrator.files.folders import require_possible_file
+from calibrator.files.layout_files import vehicle_database
 from calibrator.interrupts import importing
 from calibrator.terminal.options import JsonOption, given_options, number_option
 from calibrator.terminal.text import dumps
-from ecu_node.database import read_database
-from ecu_node.layout import read_layout
 from ecu_node.parameters import write_atomically
 from ecu_node.standard_output import write_output
 
@@ -69,7 +68,7 @@ def report(
 ) -> None:
     """Show a result: one HTML page of the fleet, or of one vehicle, that needs nothing else and fetches nothing."""
     with importing():
-        from calibrator.report.write import ReportOptions, fleet_report, vehicle_report  # noqa: PLC0415
+        from calibrator.report.write import ReportOptions, fleet_report, vehicle_report
 
     _require_own_options(context, vehicle)
     target = out if out is not None else Path(f"{vehicle or 'report'}.html")
@@ -80,7 +79,7 @@ def report(
     if vehicle is None:
         text, found = fleet_report(result, options)
     else:
-        database = None if layout is None else read_database(read_layout(layout))
+        database = None if layout is None else vehicle_database(layout)
         text, found = vehicle_report(result, vehicle, drives=drives, database=database)
     target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(target, text.encode())

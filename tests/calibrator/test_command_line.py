@@ -15,9 +15,9 @@ import pytest
 from typer.testing import CliRunner
 
 from calibrator.cli import app, main
+from calibrator.experiments.command import RECORDED_EXPERIMENTS
 from calibrator.experiments.runner import EXPERIMENTS, Recorded
 from calibrator.interrupts import INTERRUPTED, MESSAGE, TERMINATED, TERMINATED_MESSAGE
-from calibrator.terminal.options import RECORDED_EXPERIMENTS
 
 ROOT = Path(__file__).parents[2]
 LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"

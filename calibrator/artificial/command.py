@@ -1,0 +1,111 @@
+"""``calibrator simulate`` and ``calibrator score``: an artificial fleet, and a result beside its truth."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calibrator.artificial.options import (
+    BalancedOption,
+    CommonDriveOption,
+    CurrentsOption,
+    DelayOption,
+    DrivesOption,
+    MagnitudeOption,
+    MinutesOption,
+    NoiseOption,
+    SparsityOption,
+    SymmetricOption,
+    UnmeasuredOption,
+    UnseenMinutesOption,
+    VehiclesOption,
+)
+from calibrator.files.folders import require_new_folder
+from calibrator.files.layout_files import vehicle_database
+from calibrator.interrupts import importing
+from calibrator.terminal.options import JsonOption, LayoutOption, SeedOption, WorkersOption
+from calibrator.terminal.progress import progress_bar
+from calibrator.terminal.text import dumps, print_report
+from ecu_node.standard_output import write_output, write_text
+
+if TYPE_CHECKING:
+    from calibrator.artificial.truth import FleetTruth
+
+__all__ = ["score", "simulate"]
+
+
+def simulate(
+    layout: LayoutOption,
+    out: Annotated[Path, typer.Option("--out", help="Folder of the fleet, new or empty.")],
+    vehicles: VehiclesOption,
+    drives: DrivesOption = "builtin",
+    currents: CurrentsOption = 2,
+    sparsity: SparsityOption = 80.0,
+    magnitude: MagnitudeOption = (0.05, 0.25),
+    common_drive: CommonDriveOption = False,
+    symmetric: SymmetricOption = False,
+    balanced: BalancedOption = False,
+    noise: NoiseOption = 0.001,
+    delay: DelayOption = 0.0,
+    unmeasured: UnmeasuredOption = (0.0, 0.0),
+    minutes: MinutesOption = 10.0,
+    unseen_minutes: UnseenMinutesOption = 3.0,
+    seed: SeedOption = 0,
+    workers: WorkersOption = 2,
+    json: JsonOption = False,
+) -> None:
+    """Write an artificial fleet: CAN logs of vehicles with known faults, and truth.json."""
+    with importing():
+        from calibrator.artificial.simulate import FleetPlan, simulate_fleet
+        from calibrator.artificial.trips import choose_trips
+
+    require_new_folder(out)
+    database = vehicle_database(layout)
+    plan = FleetPlan(
+        vehicles=vehicles,
+        currents=currents,
+        sparsity=sparsity,
+        magnitude=magnitude,
+        balanced=balanced,
+        symmetric=symmetric,
+        common_drive=common_drive,
+        noise=noise,
+        delay_max_s=delay / 1e3,
+        unmeasured_a=unmeasured,
+        seed=seed,
+    )
+    trips = choose_trips(
+        drives,
+        database.layout,
+        vehicles=vehicles,
+        seed=seed,
+        duration_s=60.0 * minutes,
+        unseen_s=60.0 * unseen_minutes,
+        common=common_drive,
+    )
+    with progress_bar("simulate", vehicles, "vehicles") as progress:
+        truth = simulate_fleet(plan, trips, database, out, workers=workers, progress=progress)
+    _print_fleet(truth, out, trips.notices, json=json)
+
+
+def score(
+    result: Annotated[Path, typer.Argument(help="Folder that 'calibrator calibrate' wrote.")],
+    truth: Annotated[Path, typer.Option("--truth", help="truth.json that 'calibrator simulate' wrote.")],
+    json: JsonOption = False,
+) -> None:
+    """Compare a result with the truth of its artificial fleet."""
+    with importing():
+        from calibrator.artificial.result_score import score_result
+
+    figures = score_result(result, truth)
+    print_report(figures, json=json)
+
+
+def _print_fleet(truth: "FleetTruth", out: Path, notices: Sequence[str], *, json: bool) -> None:
+    figures = {"vehicles": len(truth.vehicles), "branches": truth.branches, "out": str(out), "notices": notices}
+    lines = [f"{out}: {len(truth.vehicles)} vehicles with branches {', '.join(truth.branches)}"]
+    if json:
+        write_output(dumps(figures))
+    else:
+        write_text("\n".join([*lines, *(f"notice: {notice}" for notice in notices)]))
