@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from calibrator.artificial.truth import FleetTruth
 from calibrator.errors import FleetError
+from calibrator.fleet_truth import FleetTruth
 from calibrator.options import Classifier, Method
 from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.terminal.text import counted, few_reasons

@@ -20,8 +20,8 @@ from typing import Annotated
 import can
 import typer
 
-from calibrator.artificial.truth import FleetTruth, read_truth
 from calibrator.errors import FleetError
+from calibrator.fleet_truth import FleetTruth, read_truth
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import progress_bar
 from ecu_node.buses import SteadyBus

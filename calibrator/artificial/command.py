@@ -30,7 +30,7 @@ from calibrator.terminal.text import dumps, print_report
 from ecu_node.standard_output import write_output, write_text
 
 if TYPE_CHECKING:
-    from calibrator.artificial.truth import FleetTruth
+    from calibrator.fleet_truth import FleetTruth
 
 __all__ = ["score", "simulate"]
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from calibrator.artificial.truth import FleetTruth, faults_of, read_truth
 from calibrator.drive import Array, Mask
 from calibrator.drives.fleet_id import require_same_fleet
 from calibrator.errors import FleetError
 from calibrator.faults import Faults
+from calibrator.fleet_truth import FleetTruth, faults_of, read_truth
 from calibrator.results import RunRecord, read_results, read_run
 from calibrator.score import f2_score, harmed, recovered
 from calibrator.terminal.text import dumps, table

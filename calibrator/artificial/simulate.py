@@ -9,10 +9,10 @@ from joblib import delayed
 from calibrator.artificial.ground_truth import GroundTruth, choose_branches, with_branches
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.artificial.trips import TripPurpose, TripSource
-from calibrator.artificial.truth import TRUTH_FILE, FleetTruth, VehicleTruth, with_fleet_id, write_truth
 from calibrator.artificial.vehicle import Vehicle, draw_disturbances, write_vehicle
 from calibrator.drives.fleet_id import write_fleet_ids
 from calibrator.files.folders import whole_folder
+from calibrator.fleet_truth import TRUTH_FILE, FleetTruth, VehicleTruth, with_fleet_id, write_truth
 from calibrator.interrupts import in_processes
 from calibrator.random_streams import Purpose, random_stream
 from ecu_node.database import VehicleDatabase

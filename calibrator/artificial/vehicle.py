@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from calibrator.artificial.ground_truth import GroundTruth
-from calibrator.artificial.truth import VehicleTruth
 from calibrator.drive import Array, Channel, Drive
 from calibrator.errors import FleetError
 from calibrator.faults import Faults, measured_currents, true_currents
+from calibrator.fleet_truth import VehicleTruth
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.recordings.canlog import FrameSeries, encode_message, sent_values, write_candump
 from ecu_node.database import AMPERE, VehicleDatabase, unit_factor

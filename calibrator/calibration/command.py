@@ -40,7 +40,7 @@ from ecu_node.parameters import write_atomically
 from ecu_node.standard_output import write_output
 
 if TYPE_CHECKING:
-    from calibrator.artificial.truth import FleetTruth
+    from calibrator.fleet_truth import FleetTruth
 
 __all__ = ["calibrate", "params"]
 
@@ -127,8 +127,8 @@ def params(
 
 def _truth_of(fleet: Path, path: Path) -> "FleetTruth":
     """The truth, if it is that of the fleet's vehicles."""
-    from calibrator.artificial.truth import faults_of, read_truth
     from calibrator.drives.fleet_id import require_same_fleet
+    from calibrator.fleet_truth import faults_of, read_truth
     from calibrator.sources.fleet_source import find_fleet
 
     truth = read_truth(path)

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibrator.artificial.truth import faults_of
 from calibrator.calibration_settings import CalibrationSettings, FleetOutcome, require_learning
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
+from calibrator.fleet_truth import faults_of
 from calibrator.identification.vehicle_model import VehicleModel, read_vehicle_model
 from calibrator.published.calibration import ExpectedFaults, calibrate_published
 from calibrator.published.recovery import Recovery

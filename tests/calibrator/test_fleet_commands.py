@@ -11,7 +11,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from calibrator.artificial.truth import read_truth
+from calibrator.fleet_truth import read_truth
 from calibrator.results import read_results
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from calibrator.artificial.truth import read_truth
+from calibrator.fleet_truth import read_truth
 from calibrator.results import read_results, read_run
 from ecu_node.database import read_database
 from ecu_node.layout import file_digest, read_layout

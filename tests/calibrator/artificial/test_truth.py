@@ -3,8 +3,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from calibrator.artificial.truth import FleetTruth, VehicleTruth, read_truth, with_fleet_id, write_truth
 from calibrator.errors import FleetError
+from calibrator.fleet_truth import FleetTruth, VehicleTruth, read_truth, with_fleet_id, write_truth
 
 
 def truth(drift: float = 0.1, seed: int = 0) -> FleetTruth:
