@@ -24,7 +24,8 @@ from calibrator.errors import FleetError
 from calibrator.evidence.vehicle_evidence import VehicleEvidence
 from calibrator.summaries.buckets import bucket_of
 from ecu_node.errors import ParameterError
-from ecu_node.parameters import VehicleParameters, encode_parameters, write_atomically
+from ecu_node.parameters import VehicleParameters, encode_parameters
+from ecu_node.user_files import write_atomically
 
 __all__ = [
     "LEFT_OUT",

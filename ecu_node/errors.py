@@ -14,7 +14,11 @@ __all__ = [
     "UnfitError",
     "UserError",
     "printable",
+    "shown_name",
 ]
+
+_LONGEST_NAME = 64
+"""Characters of a name that are shown."""
 
 
 class UserError(Exception):
@@ -56,3 +60,8 @@ class BusError(UserError):
 def printable(text: str) -> str:
     """A text of a stranger's file without characters that would break the line or move the cursor."""
     return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)
+
+
+def shown_name(name: str) -> str:
+    """A name that a stranger's file gives to something, such that it stays within a line."""
+    return printable(name if len(name) <= _LONGEST_NAME else f"{name[:_LONGEST_NAME]}...")

@@ -4,22 +4,18 @@ JSON, UTF-8, one file per vehicle. The structures below are the schema: ``ecu-no
 made from them, which stands in ``ecu_node/parameters.schema.json``. Currents are positive into the junction.
 """
 
-import json
 import math
-import os
-import tempfile
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
 
-from ecu_node.database import VehicleDatabase
-from ecu_node.errors import ParameterError, UnfitError, printable
+from ecu_node.errors import ParameterError, UnfitError, printable, shown_name
 from ecu_node.field_errors import field_error, json_error, quoted_place
-from ecu_node.layout import Layout
-from ecu_node.sensor_models import GainBySign, SensorModel
+from ecu_node.repeated_keys import repeated_key
+from ecu_node.sensor_models import SensorModel
 from ecu_node.status import Reason
-from ecu_node.user_files import UnsuitableFileError, read_user_file
+from ecu_node.user_files import UnsuitableFileError, read_user_file, write_atomically
 
 __all__ = [
     "BranchParameters",
@@ -31,18 +27,14 @@ __all__ = [
     "Provenance",
     "VehicleParameters",
     "Verdict",
-    "check_fit",
     "decode_parameters",
     "encode_parameters",
     "parameter_bytes",
     "parameter_schema",
     "read_parameters",
-    "write_atomically",
     "write_parameters",
 ]
 
-MAX_DELAY_S = 5.0
-"""Branches of one vehicle do not lag each other by more. [s]"""
 MAX_FILE_BYTES = 1_000_000
 """A parameter file has some kilobytes; a larger one is not one."""
 
@@ -50,12 +42,9 @@ _LARGEST_NUMBER = (1 << 53) - 1
 """Beyond it readers of JSON differ."""
 _SIGNED = "this file is signed"
 _SIGNED_ADVICE = "use 'ecu-node activate' and --state, or name the file that was signed"
-_LONGEST_NAME = 64
-"""Characters of a name that are shown."""
 
 Verdict = Literal["no sensor fault", "corrected", "cannot tell", "not enough data"]
-_UNDECIDED: tuple[Verdict, ...] = ("cannot tell", "not enough data")
-"""Verdicts with which nothing was found that could be applied."""
+"""What was found of the sensors of one vehicle."""
 
 HeldBack = Literal[
     "beyond the limits", "not linear", "no temperature", "reference in doubt", "moved too little", "harm limit"
@@ -203,7 +192,7 @@ def read_parameters(path: Path) -> VehicleParameters:
     Returns
     -------
     VehicleParameters
-        The parameters; nothing is applied yet, see :func:`check_fit`.
+        The parameters; nothing is applied yet, see :func:`~ecu_node.parameter_fit.check_fit`.
 
     Raises
     ------
@@ -227,27 +216,20 @@ def parameter_bytes(path: Path) -> bytes:
 
 
 def decode_parameters(content: bytes, where: str) -> VehicleParameters:
-    """Parameters from the text of a parameter file; `where` it is from, for messages. Raises as its reading does."""
+    """Read the text of a parameter file; `where` it is from, for messages.
+
+    Raises
+    ------
+    UnfitError
+        With reason MALFORMED_PARAMETERS if it is no JSON, outside the schema, signed, or has a key twice.
+    """
     try:
         found = msgspec.json.decode(content, type=VehicleParameters)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise _malformed(where, _why_not(error, content)) from None
-    try:
-        json.loads(content, object_pairs_hook=_once_each, parse_float=str, parse_int=str)
-    except _TwiceError as error:
-        raise _malformed(where, str(error)) from None
+    if (twice := repeated_key(content)) is not None:
+        raise _malformed(where, f"'{shown_name(twice)}' stands there twice in one place")
     return found
-
-
-class _TwiceError(Exception):
-    """A key stands twice in one object: readers differ in which of the values they take."""
-
-
-def _once_each(pairs: list[tuple[str, Any]]) -> None:
-    keys = [key for key, _ in pairs]
-    if len(set(keys)) < len(keys):
-        twice = next(key for place, key in enumerate(keys) if key in keys[:place])
-        raise _TwiceError(f"'{_shown(twice)}' stands there twice in one place")
 
 
 def _malformed(where: str, why: str) -> UnfitError:
@@ -265,102 +247,6 @@ def _why_not(error: Exception, content: bytes) -> str:
     if isinstance(document, dict) and {"payload", "payloadType", "signatures"} <= document.keys():
         return _SIGNED
     return field_error(error, document, VehicleParameters, quoted_place)
-
-
-def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:
-    """Check that parameters were made for this vehicle, layout and DBC, decided on, and within the layout's limits.
-
-    A file whose verdict is "cannot tell" or "not enough data" fits only if it applies no branch. Limits are those of
-    what is applied.
-
-    Parameters
-    ----------
-    parameters : VehicleParameters
-        From :func:`read_parameters`.
-    database : VehicleDatabase
-        Layout and DBC in use.
-    vehicle : str or None
-        Identity of the vehicle that the node rides in; None: not checked.
-
-    Raises
-    ------
-    UnfitError
-        With the reason that the node then publishes; the message gives both values.
-    """
-    _check_belongs(parameters, database, vehicle)
-    layout = database.layout
-    if not abs(parameters.junction_residual.expected_a) <= layout.offset_limit_a:
-        raise UnfitError(
-            Reason.IMPLAUSIBLE_PARAMETERS,
-            f"an expected Kirchhoff sum of {parameters.junction_residual.expected_a:+.4g} A is beyond the layout's "
-            f"limit of offsets, {layout.offset_limit_a:g} A",
-        )
-    applied = [name for name, branch in parameters.branches.items() if branch.apply]
-    if parameters.verdict in _UNDECIDED and applied:
-        raise UnfitError(
-            Reason.IMPLAUSIBLE_PARAMETERS,
-            f"verdict {parameters.verdict!r}, yet branch {', '.join(map(_shown, applied))} has 'apply': true; "
-            f"nothing was found to apply, calibrate with more drives",
-        )
-    for name, branch in parameters.branches.items():
-        _check_branch(name, branch, layout)
-
-
-def _check_belongs(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:
-    """Check that parameters were made for this vehicle, layout and DBC."""
-    layout = database.layout
-    if vehicle is not None and parameters.vehicle != vehicle:
-        raise UnfitError(
-            Reason.WRONG_VEHICLE, f"parameters are for vehicle {parameters.vehicle!r}, this is {vehicle!r}"
-        )
-    if parameters.layout.sha256 != layout.digest:
-        raise UnfitError(
-            Reason.WRONG_LAYOUT,
-            f"parameters were made with layout {_shown(parameters.layout.name)} ({parameters.layout.sha256[:12]}), "
-            f"this is {layout.path} ({layout.digest[:12]}); calibrate with this layout",
-        )
-    if parameters.dbc.sha256 != database.digest:
-        raise UnfitError(
-            Reason.WRONG_DBC,
-            f"parameters were made with DBC {_shown(parameters.dbc.name)} ({parameters.dbc.sha256[:12]}), "
-            f"this is {layout.dbc_path} ({database.digest[:12]}); calibrate with this DBC",
-        )
-
-
-def _check_branch(name: str, branch: BranchParameters, layout: Layout) -> None:
-    """Check that the layout has a branch, and that what is applied to it is within the limits."""
-    if name not in layout.branch_names:
-        raise UnfitError(
-            Reason.WRONG_LAYOUT, f"parameters for branch {_shown(name)!r}, which {layout.path} does not have"
-        )
-    if abs(branch.delay_s or 0.0) > MAX_DELAY_S:
-        raise UnfitError(
-            Reason.IMPLAUSIBLE_PARAMETERS, f"branch {name}: delay {branch.delay_s:g} s is beyond {MAX_DELAY_S:g} s"
-        )
-    if not branch.apply:
-        return
-    for drift in _drifts(branch):
-        if not abs(drift) <= layout.limits.drift:
-            raise UnfitError(
-                Reason.IMPLAUSIBLE_PARAMETERS,
-                f"branch {name}: drift {drift:+.4g} is beyond the layout's limit of {layout.limits.drift:g}",
-            )
-    if not abs(branch.offset_a) <= layout.offset_limit_a:
-        raise UnfitError(
-            Reason.IMPLAUSIBLE_PARAMETERS,
-            f"branch {name}: offset {branch.offset_a:+.4g} A is beyond the layout's limit of "
-            f"{layout.offset_limit_a:g} A",
-        )
-
-
-def _shown(name: str) -> str:
-    """A name that the file gives to something, such that it stays within a line."""
-    return printable(name if len(name) <= _LONGEST_NAME else f"{name[:_LONGEST_NAME]}...")
-
-
-def _drifts(branch: BranchParameters) -> tuple[float, ...]:
-    model = branch.sensor_model
-    return (model.drift_positive, model.drift_negative) if isinstance(model, GainBySign) else (branch.drift,)
 
 
 def encode_parameters(parameters: VehicleParameters, where: str) -> bytes:
@@ -414,21 +300,6 @@ def write_parameters(parameters: VehicleParameters, path: Path) -> None:
         As :func:`encode_parameters`; nothing is written.
     """
     write_atomically(path, encode_parameters(parameters, str(path)))
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file by new content; after a power cut either the old or the new one stands there."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def parameter_schema() -> dict[str, Any]:

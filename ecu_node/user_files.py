@@ -1,4 +1,4 @@
-"""Files that a user names: regular ones of a bearable size, and nothing else is opened.
+"""Files that a user names: regular ones of a bearable size are read, and nothing else is opened; written whole.
 
 A pipe would keep the reader waiting, a device would never end.
 """
@@ -6,11 +6,12 @@ A pipe would keep the reader waiting, a device would never end.
 import hashlib
 import os
 import stat
+import tempfile
 from pathlib import Path
 
 from ecu_node.errors import UserError
 
-__all__ = ["UnsuitableFileError", "read_user_file", "require_user_file", "text_digest"]
+__all__ = ["UnsuitableFileError", "read_user_file", "require_user_file", "text_digest", "write_atomically"]
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -75,3 +76,18 @@ def text_digest(content: bytes) -> str:
 
 def _too_large(largest_bytes: int) -> UnsuitableFileError:
     return UnsuitableFileError(f"it is larger than {largest_bytes} bytes, which no such file is")
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file by new content; after a power cut either the old or the new one stands there."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise

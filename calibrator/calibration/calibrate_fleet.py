@@ -58,7 +58,7 @@ from calibrator.terminal.text import few, few_reasons
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import file_digest
-from ecu_node.parameters import write_atomically
+from ecu_node.user_files import write_atomically
 
 __all__ = ["calibrate_fleet"]
 

@@ -36,8 +36,8 @@ from calibrator.terminal.options import (
     WorkersOption,
 )
 from calibrator.terminal.text import dumps, print_report
-from ecu_node.parameters import write_atomically
 from ecu_node.standard_output import write_output
+from ecu_node.user_files import write_atomically
 
 if TYPE_CHECKING:
     from calibrator.fleet_truth import FleetTruth

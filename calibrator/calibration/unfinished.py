@@ -17,7 +17,7 @@ from calibrator.errors import FleetError
 from calibrator.files.storage import DISK_FULL
 from calibrator.results import ChunkResult
 from ecu_node.layout import file_digest
-from ecu_node.parameters import write_atomically
+from ecu_node.user_files import write_atomically
 
 __all__ = ["Chunks", "Unfinished", "unfinished_run"]
 

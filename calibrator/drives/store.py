@@ -22,7 +22,7 @@ from calibrator.drive import Channel, Drive, DriveFile
 from calibrator.errors import DriveError
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout, file_digest
-from ecu_node.parameters import write_atomically
+from ecu_node.user_files import write_atomically
 
 __all__ = [
     "drive_digest",

@@ -6,7 +6,7 @@ from pathlib import Path
 from calibrator.experiments.picture import write_picture
 from calibrator.experiments.result import ExperimentResult, decode_result
 from calibrator.experiments.table import caption, headline, markdown_table, result_markdown
-from ecu_node.parameters import write_atomically
+from ecu_node.user_files import write_atomically
 
 __all__ = ["index_path", "read_results", "write_result"]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ecu_node.errors import UserError
-from ecu_node.parameters import write_atomically
+from ecu_node.user_files import write_atomically
 
 __all__ = ["DISK_FULL", "Storage", "StorageError", "open_storage"]
 

@@ -11,7 +11,7 @@ from calibrator.files.layout_files import vehicle_database
 from calibrator.interrupts import importing
 from calibrator.terminal.options import BankOption, FleetArgument, JsonOption, LayoutOption, WorkersOption
 from calibrator.terminal.text import print_report
-from ecu_node.parameters import write_atomically
+from ecu_node.user_files import write_atomically
 
 __all__ = ["identify"]
 

@@ -13,8 +13,8 @@ from calibrator.terminal.options import JsonOption
 from calibrator.terminal.text import dumps
 from ecu_node.errors import printable
 from ecu_node.failures import say_error
-from ecu_node.parameters import write_atomically
 from ecu_node.standard_output import write_output
+from ecu_node.user_files import write_atomically
 
 __all__ = ["layout"]
 

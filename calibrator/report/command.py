@@ -10,8 +10,8 @@ from calibrator.files.layout_files import vehicle_database
 from calibrator.interrupts import importing
 from calibrator.terminal.options import JsonOption, given_options, number_option
 from calibrator.terminal.text import dumps
-from ecu_node.parameters import write_atomically
 from ecu_node.standard_output import write_output
+from ecu_node.user_files import write_atomically
 
 if TYPE_CHECKING:
     from calibrator.report.write import FleetReport, VehicleReport

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UnfitError
-from ecu_node.parameters import check_fit
+from ecu_node.parameter_fit import check_fit
 from ecu_node.status import Reason
 from ecu_node.trust.key_set import KeySet
 from ecu_node.trust.largest_step import require_small_step

@@ -11,7 +11,7 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UnfitError, UserError
 from ecu_node.guard import Mode
 from ecu_node.parameter_file import FileSignature, signature
-from ecu_node.parameters import check_fit
+from ecu_node.parameter_fit import check_fit
 from ecu_node.status import Reason
 from ecu_node.trust.activation import conclude
 from ecu_node.trust.state import Slot, SlotName, TrustState, read_state, signed_parameters, slot_path, state_path

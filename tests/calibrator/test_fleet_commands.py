@@ -15,7 +15,8 @@ from calibrator.fleet_truth import read_truth
 from calibrator.results import read_results
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
-from ecu_node.parameters import check_fit, read_parameters
+from ecu_node.parameter_fit import check_fit
+from ecu_node.parameters import read_parameters
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 

@@ -11,7 +11,8 @@ from calibrator.fleet_truth import read_truth
 from calibrator.results import read_results, read_run
 from ecu_node.database import read_database
 from ecu_node.layout import file_digest, read_layout
-from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
+from ecu_node.parameter_fit import check_fit
+from ecu_node.parameters import VehicleParameters, read_parameters
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 DELAY_TOLERANCE_S = 0.005

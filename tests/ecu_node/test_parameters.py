@@ -18,13 +18,13 @@ from msgspec.structs import replace
 import ecu_node
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError, UnfitError
+from ecu_node.parameter_fit import check_fit
 from ecu_node.parameters import (
     MAX_FILE_BYTES,
     BranchParameters,
     HardwareFault,
     JunctionResidual,
     Verdict,
-    check_fit,
     parameter_schema,
     read_parameters,
     write_parameters,

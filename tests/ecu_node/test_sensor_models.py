@@ -13,13 +13,8 @@ from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, UnfitError
 from ecu_node.layout import read_layout
-from ecu_node.parameters import (
-    VehicleParameters,
-    check_fit,
-    parameter_schema,
-    read_parameters,
-    write_parameters,
-)
+from ecu_node.parameter_fit import check_fit
+from ecu_node.parameters import VehicleParameters, parameter_schema, read_parameters, write_parameters
 from ecu_node.sensor_models import GainBySign, SensorModel, TemperatureDrift
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, as_document, parameters_for
 

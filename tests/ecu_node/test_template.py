@@ -11,7 +11,8 @@ import pytest
 
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import check_fit, decode_parameters
+from ecu_node.parameter_fit import check_fit
+from ecu_node.parameters import decode_parameters
 from ecu_node.template import template_text
 from ecu_node.trust.trial import begin_trial
 from tests.ecu_node.vehicles import LAYOUT

@@ -16,7 +16,8 @@ from ecu_node.correction import SignPlan, TemperaturePlans
 from ecu_node.database import VehicleDatabase
 from ecu_node.guard import Mode
 from ecu_node.layout import Layout
-from ecu_node.parameters import VehicleParameters, check_fit, read_parameters, write_parameters
+from ecu_node.parameter_fit import check_fit
+from ecu_node.parameters import VehicleParameters, read_parameters, write_parameters
 from ecu_node.sensor_models import GainBySign, SensorModel, TemperatureDrift
 from ecu_node.wiring import InForce, branch_plan, sensor_fault, wire
 from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet
