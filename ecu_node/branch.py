@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator
 
 from ecu_node.bits import PlacedSignal
 from ecu_node.codes import Codes
-from ecu_node.correction import NO_FAULT, CorrectionPlan, IntegerPlan, SensorFault, SignPlan, TemperaturePlans
+from ecu_node.correction import AS_IT_IS, CorrectionPlan, IntegerPlan, SignPlan, TemperaturePlans
 from ecu_node.counters import Counters
+from ecu_node.sensor_fault import NO_FAULT, SensorFault
 from ecu_node.status import Quality
 
-__all__ = ["AS_IT_IS", "Auxiliary", "LiveBranch"]
+__all__ = ["Auxiliary", "LiveBranch"]
 
 LEAST_VOLTAGE_V = 10.0
 """Below this the HV net is switched off, and power / voltage says nothing of the current. [V]"""
@@ -21,11 +22,6 @@ _TEMPERATURES = 256
 
 _Fix = Callable[[int], int | None]
 """From a measured code to the one to write; None where the code is no value."""
-
-_EVERYTHING = 1 << 64
-AS_IT_IS = IntegerPlan(gain=2, bias=0, shift=1, lowest=-_EVERYTHING, highest=_EVERYTHING)
-"""Writes every value as it was measured."""
-
 
 Frames = deque[tuple[float, bytearray]]
 """Times [s] and payloads of the last intact frames of a message."""

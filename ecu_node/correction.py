@@ -29,15 +29,15 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from ecu_node.codes import Codes, as_written, writable_range
-from ecu_node.sensor_models import GainBySign, SensorModel, TemperatureDrift
+from ecu_node.sensor_fault import SensorFault
+from ecu_node.sensor_models import GainBySign, TemperatureDrift
 
 __all__ = [
+    "AS_IT_IS",
     "LARGEST_ERROR",
-    "NO_FAULT",
     "CorrectionPlan",
     "IntegerPlan",
     "Line",
-    "SensorFault",
     "SignPlan",
     "Signals",
     "TemperaturePlans",
@@ -52,76 +52,6 @@ LARGEST_ERROR = Fraction(1, 1 << _ERROR_BITS)
 _WORD_BITS = 59
 """Products and sums stay below 2^59 where the wanted error allows it: C with int64_t gives the same bits, and Python's
 integers have two digits."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SensorFault:
-    """What is corrected on one branch.
-
-    Attributes
-    ----------
-    drift : float
-        d; where a model is given, what it says takes its place or adds to it. [1]
-    offset_a : float
-        o, positive into the junction. [A]
-    model : GainBySign, TemperatureDrift or None
-        None: the sensor is linear.
-    largest_drift : float
-        Limit of the layout; where the drift at a temperature is beyond it, nothing is corrected. [1]
-    """
-
-    drift: float = 0.0
-    offset_a: float = 0.0
-    model: SensorModel | None = None
-    largest_drift: float = 0.99
-
-    @property
-    def applied(self) -> bool:
-        """Whether there is anything to correct."""
-        return bool(self.drift or self.offset_a) or self.model is not None
-
-    def drift_at(self, current_a: float, temperature_c: float | None) -> float | None:
-        """Drift at a current, of which only the sign matters, and a temperature; None if that must be known and is not.
-
-        Parameters
-        ----------
-        current_a : float
-            Positive into the junction. [A]
-        temperature_c : float or None
-            Of the sensor. [degC]
-        """
-        match self.model:
-            case None:
-                return self.drift
-            case GainBySign():
-                return self.model.drift_positive if current_a >= 0.0 else self.model.drift_negative
-            case TemperatureDrift():
-                if temperature_c is None:
-                    return None
-                drift = self.drift + self.model.drift_per_k * (temperature_c - self.model.reference_c)
-                return drift if abs(drift) <= self.largest_drift else None
-
-    def true_current(self, i_m: float, temperature_c: float | None = None) -> float | None:
-        """Invert the sensor model for one current, (25) in [1]_.
-
-        Parameters
-        ----------
-        i_m : float
-            Measured current, positive into the junction. [A]
-        temperature_c : float or None
-            Of the sensor. [degC]
-
-        Returns
-        -------
-        float or None
-            Corrected current [A]; None if the temperature must be known and is not, or if the drift
-            is beyond its limit.
-        """
-        drift = self.drift_at(i_m - self.offset_a, temperature_c)
-        return None if drift is None else (i_m - self.offset_a) / (1.0 + drift)
-
-
-NO_FAULT = SensorFault()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +76,7 @@ class Signals:
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
-    """Exact correction: code_out = slope * code + voltage_slope * voltage_code + constant."""
+    """Exact correction: code_out = slope * code + voltage_slope * voltage_code + constant. [code]"""
 
     slope: Fraction
     voltage_slope: Fraction
@@ -186,6 +116,11 @@ class IntegerPlan:
 
     def _unbounded(self, code: int, voltage_code: int) -> int:
         return (code * self.gain + voltage_code * self.voltage_gain + self.bias + (1 << (self.shift - 1))) >> self.shift
+
+
+_EVERYTHING = 1 << 64
+AS_IT_IS = IntegerPlan(gain=2, bias=0, shift=1, lowest=-_EVERYTHING, highest=_EVERYTHING)
+"""Writes every value as it was measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,7 +166,7 @@ def correction_plan(signals: Signals, fault: SensorFault, *, temperature: Codes 
     signals : Signals
         What is read and written.
     fault : SensorFault
-        What is corrected; :data:`NO_FAULT` to pass through.
+        What is corrected; :data:`~ecu_node.sensor_fault.NO_FAULT` to pass through.
     temperature : Codes or None
         Of the temperature signal, which a fault with temperature needs. [degC]
 

@@ -10,17 +10,9 @@ from dataclasses import dataclass, field, replace
 from cantools.database.can import Message, Signal
 
 from ecu_node.bits import BitPlace, PlacedSignal, bit_place, multiplexers
-from ecu_node.branch import AS_IT_IS, Auxiliary, LiveBranch
+from ecu_node.branch import Auxiliary, LiveBranch
 from ecu_node.codes import Codes, as_written, not_available_code, read_codes, require_reach, writable_range
-from ecu_node.correction import (
-    NO_FAULT,
-    CorrectionPlan,
-    IntegerPlan,
-    SensorFault,
-    Signals,
-    TemperaturePlans,
-    correction_plan,
-)
+from ecu_node.correction import AS_IT_IS, CorrectionPlan, IntegerPlan, Signals, TemperaturePlans, correction_plan
 from ecu_node.corrector import Corrector, StatusFields
 from ecu_node.counters import Counters
 from ecu_node.database import AMPERE, CELSIUS, VOLT, WATT, VehicleDatabase
@@ -31,6 +23,7 @@ from ecu_node.guard import PARAMETER_SETS, Mode, check_output, is_fd, key_of, re
 from ecu_node.junction_watch import JunctionWatch
 from ecu_node.layout import Branch, SignalName, split_signal
 from ecu_node.parameters import VehicleParameters
+from ecu_node.sensor_fault import NO_FAULT, SensorFault
 from ecu_node.sensor_models import TemperatureDrift
 from ecu_node.status import Reason
 

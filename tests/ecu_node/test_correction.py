@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ecu_node.codes import Codes, not_available_code, read_codes, require_reach, writable_range
-from ecu_node.correction import LARGEST_ERROR, IntegerPlan, SensorFault, Signals, correction_plan
+from ecu_node.correction import LARGEST_ERROR, IntegerPlan, Signals, correction_plan
 from ecu_node.database import AMPERE
 from ecu_node.errors import DatabaseError
+from ecu_node.sensor_fault import SensorFault
 
 HALF = Fraction(1, 2)
 

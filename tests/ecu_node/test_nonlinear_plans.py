@@ -7,16 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ecu_node.codes import Codes
-from ecu_node.correction import (
-    LARGEST_ERROR,
-    NO_FAULT,
-    IntegerPlan,
-    SensorFault,
-    Signals,
-    SignPlan,
-    TemperaturePlans,
-    correction_plan,
-)
+from ecu_node.correction import LARGEST_ERROR, IntegerPlan, Signals, SignPlan, TemperaturePlans, correction_plan
+from ecu_node.sensor_fault import NO_FAULT, SensorFault
 from ecu_node.sensor_models import GainBySign, TemperatureDrift
 from tests.ecu_node.test_correction import current, whole_range
 

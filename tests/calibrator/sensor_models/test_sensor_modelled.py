@@ -13,7 +13,7 @@ from calibrator.sensor_models.linear_part import chosen_sensor, linear_summary, 
 from calibrator.sensor_models.modelled import ModelledVehicle, modelled_vehicle, usual_sections
 from calibrator.sensor_models.sections import ColumnMoments, usual_moments
 from calibrator.sensor_models.summary import SensorSummary
-from ecu_node.correction import SensorFault
+from ecu_node.sensor_fault import SensorFault
 from tests.calibrator.sensor_models.sensor_fleets import SensorFleet, make_fleet
 
 LINEAR = SensorModelChoice(log_bayes_factor=-3.0)
