@@ -14,7 +14,7 @@ from cantools.database.can import Message, Signal
 
 from ecu_node.bits import bit_place
 from ecu_node.database import VehicleDatabase
-from ecu_node.e2e import protection_of
+from ecu_node.e2e_profiles import protection_of
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.frames import FrameKey
 from ecu_node.status import Quality, Reason, State

@@ -1,4 +1,4 @@
-"""Entries of a layout that say how messages are protected end to end; what they do is in :mod:`ecu_node.e2e`."""
+"""Entries of a layout on how messages are protected end to end; what they do is in :mod:`ecu_node.e2e_profiles`."""
 
 from typing import Annotated, Literal
 

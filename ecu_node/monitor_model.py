@@ -16,7 +16,8 @@ from ecu_node.bits import PlacedSignal, bit_place, multiplexers
 from ecu_node.branch import Auxiliary, Frames, LiveBranch, Past
 from ecu_node.codes import Codes, read_codes
 from ecu_node.database import AMPERE, VehicleDatabase
-from ecu_node.e2e import Check, Receiver, protection_of
+from ecu_node.e2e import Check, Receiver
+from ecu_node.e2e_profiles import protection_of
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode, key_of, received, transmitted
 from ecu_node.layout import Branch, SignalName, StatusMessage

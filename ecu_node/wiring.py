@@ -16,7 +16,7 @@ from ecu_node.correction import AS_IT_IS, CorrectionPlan, IntegerPlan, Signals, 
 from ecu_node.corrector import Corrector, StatusFields
 from ecu_node.counters import Counters
 from ecu_node.database import AMPERE, CELSIUS, VOLT, WATT, VehicleDatabase
-from ecu_node.e2e import protection_of
+from ecu_node.e2e_profiles import protection_of
 from ecu_node.errors import LayoutError
 from ecu_node.frames import FrameKey, Reader, Source, Target, TargetField
 from ecu_node.guard import PARAMETER_SETS, Mode, check_output, is_fd, key_of, received

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array
 from ecu_node.database import VehicleDatabase
-from ecu_node.e2e import Protection, protection_of
+from ecu_node.e2e import Protection
+from ecu_node.e2e_profiles import protection_of
 from ecu_node.user_files import write_atomically
 
 __all__ = ["FrameSeries", "encode_message", "sent_values", "write_candump"]

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Mask
 from ecu_node.database import VehicleDatabase
-from ecu_node.e2e import Protection, protection_of
+from ecu_node.e2e import Protection
+from ecu_node.e2e_profiles import protection_of
 from ecu_node.layout_e2e import ProfileP01
 
 __all__ = ["is_sound", "message_is_sound", "p01_is_sound"]

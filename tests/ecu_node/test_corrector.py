@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
-from ecu_node.e2e import protection_of
+from ecu_node.e2e_profiles import protection_of
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode

@@ -8,7 +8,8 @@ from e2e.p02 import e2e_p02_check
 from e2e.p05 import e2e_p05_check
 
 from ecu_node.database import VehicleDatabase
-from ecu_node.e2e import Check, Protection, Receiver, protection_of
+from ecu_node.e2e import Check, Protection, Receiver
+from ecu_node.e2e_profiles import protection_of
 from ecu_node.errors import DatabaseError, LayoutError
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT
 

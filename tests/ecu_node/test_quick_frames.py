@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.e2e import protection_of
+from ecu_node.e2e_profiles import protection_of
 from ecu_node.frames import Source
 from ecu_node.guard import Mode
 from ecu_node.layout import read_layout

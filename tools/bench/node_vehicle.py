@@ -11,7 +11,7 @@ from pathlib import Path
 from bench.true_parameters import true_parameters
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.e2e import protection_of
+from ecu_node.e2e_profiles import protection_of
 from ecu_node.guard import Mode
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters, VehicleParameters
