@@ -3,109 +3,24 @@
 Currents are positive into the junction. Times are those of one steady clock, passed in. [s]
 """
 
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
+from ecu_node.auxiliary import Auxiliary
 from ecu_node.bits import PlacedSignal
 from ecu_node.codes import Codes
 from ecu_node.correction import AS_IT_IS, CorrectionPlan, IntegerPlan, SignPlan, TemperaturePlans
 from ecu_node.counters import Counters
+from ecu_node.past import Frames, Past
+from ecu_node.plan_function import plan_function
 from ecu_node.sensor_fault import NO_FAULT, SensorFault
 from ecu_node.status import Quality
 
-__all__ = ["Auxiliary", "LiveBranch"]
+__all__ = ["LiveBranch"]
 
-LEAST_VOLTAGE_V = 10.0
+_LEAST_VOLTAGE_V = 10.0
 """Below this the HV net is switched off, and power / voltage says nothing of the current. [V]"""
 _TEMPERATURES = 256
 """Plans that are kept, one per code of the temperature."""
-
-_Fix = Callable[[int], int | None]
-"""From a measured code to the one to write; None where the code is no value."""
-
-Frames = deque[tuple[float, bytearray]]
-"""Times [s] and payloads of the last intact frames of a message."""
-
-
-class Past:
-    """A signal in the last frames of its message; read only when it is asked for.
-
-    Parameters
-    ----------
-    signal : PlacedSignal, optional
-        Where it stands.
-    frames : deque
-        Frames that the message's source goes on to add to.
-    """
-
-    def __init__(self, signal: PlacedSignal | None = None, frames: Frames | None = None) -> None:
-        self._signal = signal
-        self._frames: Frames = deque() if frames is None else frames
-
-    def newest_first(self) -> Iterator[tuple[float, int]]:
-        """Times and codes, back from the last frame that has the signal. [s]"""
-        for time_s, payload in reversed(self._frames):
-            code = self._signal.code(payload) if self._signal is not None else None
-            if code is not None:
-                yield time_s, code
-
-
-class Auxiliary:
-    """A signal that corrections need beside the current: a voltage or a temperature.
-
-    Parameters
-    ----------
-    codes : Codes
-        Of the signal. [V or degC]
-    timeout_s : float
-        Without a frame for this long its value is not used any more. [s]
-    """
-
-    def __init__(self, codes: Codes, timeout_s: float) -> None:
-        self.code: int | None = None
-        """Last code that is a value."""
-        self.when_changed: list[Callable[[int | None], None]] = []
-        self.is_needed = True
-        """Whether a plan that is in force, or the watch, depends on it."""
-        self._codes = codes
-        self._timeout_s = timeout_s
-        self._time_s = 0.0
-        self._past = Past()
-
-    def follow(self, signal: PlacedSignal, frames: Frames) -> None:
-        """Look for the signal in these frames, when its past is asked for."""
-        self._past = Past(signal, frames)
-
-    def take(self, code: int, now_s: float) -> None:
-        """Take the code of a new frame."""
-        self._time_s = now_s
-        self._set(code if self._codes.is_value(code) else None)
-
-    def expire(self, now_s: float) -> None:
-        """Forget a value that is too old."""
-        if self.code is not None and now_s - self._time_s > self._timeout_s:
-            self._set(None)
-
-    def value(self) -> float | None:
-        """Last value; None if there is none, or it is too old."""
-        return None if self.code is None else self._value_of(self.code)
-
-    def value_at(self, time_s: float) -> float | None:
-        """Value in the last frame up to a time; None if there is none, it is no value, or too old."""
-        for seen_s, code in self._past.newest_first():
-            if seen_s <= time_s:
-                is_known = time_s - seen_s <= self._timeout_s and self._codes.is_value(code)
-                return self._value_of(code) if is_known else None
-        return None
-
-    def _value_of(self, code: int) -> float:
-        return float(self._codes.scale) * code + float(self._codes.offset)
-
-    def _set(self, code: int | None) -> None:
-        if code != self.code:
-            self.code = code
-            for react in self.when_changed:
-                react(code)
 
 
 class LiveBranch:
@@ -155,7 +70,7 @@ class LiveBranch:
         self._scale, self._offset = float(sign * codes.scale), float(sign * codes.offset)
         self._passing: CorrectionPlan = AS_IT_IS
         self._correcting: CorrectionPlan | None = None
-        self._fix = _fixer(codes, AS_IT_IS, voltage, Counters())
+        self._fix = plan_function(codes, AS_IT_IS, voltage, Counters())
         self.plan: CorrectionPlan = AS_IT_IS
         """What is done now."""
         self._active = False
@@ -211,7 +126,7 @@ class LiveBranch:
         corrects = active and self.fault.applied and self._correcting is not None
         self.plan = self._correcting if corrects and self._correcting is not None else self._passing
         self.quality = Quality.CORRECTED if corrects else Quality.PASSED_THROUGH
-        self._fix = _fixer(self.codes, self.plan, self.voltage, self.counters)
+        self._fix = plan_function(self.codes, self.plan, self.voltage, self.counters)
         latest = None if self._spoilt else self.latest()
         if latest is not None:  # what is published of the last code is to be of the quality that is told of it
             self.out = self._fix(latest[1])
@@ -317,7 +232,7 @@ class LiveBranch:
         measured = self._scale * code + self._offset
         if self.voltage is not None:
             volts = self.voltage.value_at(time_s)
-            if volts is None or volts < LEAST_VOLTAGE_V:
+            if volts is None or volts < _LEAST_VOLTAGE_V:
                 return None
             measured /= volts
         temperature = self.temperature.value() if self.temperature is not None else None
@@ -348,61 +263,3 @@ class LiveBranch:
             self._per_temperature[code] = self._plans.at(code)
         self._correcting = None if code is None else self._per_temperature[code]
         self.activate(active=self._active)
-
-
-def _fixer(codes: Codes, plan: CorrectionPlan, voltage: Auxiliary | None, counters: Counters) -> _Fix:
-    """Make a function of a plan; what it looks up in every frame is bound to it.
-
-    Parameters
-    ----------
-    codes : Codes
-        Of the measured signal.
-    plan : IntegerPlan or SignPlan
-        Correction in integers; that of one temperature where it depends on it.
-    voltage : Auxiliary or None
-        Of a branch that is a power.
-    counters : Counters
-        Where results beyond the ends are counted.
-
-    Returns
-    -------
-    callable
-        Corrects a code as the plan does.
-    """
-    assert not isinstance(plan, TemperaturePlans), "the temperature chooses one of its plans"
-    if isinstance(plan, SignPlan):
-        return _sign_fixer(codes, plan, voltage, counters)
-    if voltage is not None and plan.voltage_gain:
-        return _voltage_fixer(codes, plan, voltage, counters)
-
-    def fix(code: int) -> int | None:
-        if not codes.is_value(code):
-            return None
-        counters.saturated += plan.saturates(code)
-        return plan.apply(code)
-
-    return fix
-
-
-def _voltage_fixer(codes: Codes, plan: IntegerPlan, voltage: Auxiliary, counters: Counters) -> _Fix:
-    def fix(code: int) -> int | None:
-        if voltage.code is None or not codes.is_value(code):
-            return None
-        counters.saturated += plan.saturates(code, voltage.code)
-        return plan.apply(code, voltage.code)
-
-    return fix
-
-
-def _sign_fixer(codes: Codes, plan: SignPlan, voltage: Auxiliary | None, counters: Counters) -> _Fix:
-    needs_voltage = bool(plan.weights[1])
-
-    def fix(code: int) -> int | None:
-        voltage_code = voltage.code if voltage is not None and needs_voltage else 0
-        if voltage_code is None or not codes.is_value(code):
-            return None
-        chosen = plan.plan(code, voltage_code)
-        counters.saturated += chosen.saturates(code, voltage_code)
-        return chosen.apply(code, voltage_code)
-
-    return fix

@@ -9,8 +9,9 @@ given a valid CRC. Times are those of one steady clock. [s]
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from ecu_node.auxiliary import Auxiliary
 from ecu_node.bits import BitPlace
-from ecu_node.branch import Auxiliary, LiveBranch
+from ecu_node.branch import LiveBranch
 from ecu_node.codes import Codes, as_written
 from ecu_node.counters import Counters
 from ecu_node.e2e import Protection

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 from cantools.database.can import Message, Signal
 
+from ecu_node.auxiliary import Auxiliary
 from ecu_node.bits import PlacedSignal, bit_place, multiplexers
-from ecu_node.branch import Auxiliary, Frames, LiveBranch, Past
+from ecu_node.branch import LiveBranch
 from ecu_node.codes import Codes, read_codes
 from ecu_node.database import AMPERE, VehicleDatabase
 from ecu_node.e2e import Check, Receiver
@@ -21,6 +22,7 @@ from ecu_node.e2e_profiles import protection_of
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode, key_of, received, transmitted
 from ecu_node.layout import Branch, SignalName, StatusMessage
+from ecu_node.past import Frames, Past
 from ecu_node.status import Quality
 from ecu_node.wiring import branch_signals
 

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field, replace
 
 from cantools.database.can import Message, Signal
 
+from ecu_node.auxiliary import Auxiliary
 from ecu_node.bits import BitPlace, PlacedSignal, bit_place, multiplexers
-from ecu_node.branch import Auxiliary, LiveBranch
+from ecu_node.branch import LiveBranch
 from ecu_node.codes import Codes, as_written, not_available_code, read_codes, require_reach, writable_range
 from ecu_node.correction import AS_IT_IS, CorrectionPlan, IntegerPlan, Signals, TemperaturePlans, correction_plan
 from ecu_node.corrector import Corrector, StatusFields

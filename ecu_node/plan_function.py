@@ -1,0 +1,71 @@
+"""A plan as a function of measured codes: its kind is asked for once, when it is put in force, and not per frame."""
+
+from collections.abc import Callable
+
+from ecu_node.auxiliary import Auxiliary
+from ecu_node.codes import Codes
+from ecu_node.correction import CorrectionPlan, IntegerPlan, SignPlan, TemperaturePlans
+from ecu_node.counters import Counters
+
+__all__ = ["PlanFunction", "plan_function"]
+
+PlanFunction = Callable[[int], int | None]
+"""From a measured code to the one to write; None where there is none."""
+
+
+def plan_function(codes: Codes, plan: CorrectionPlan, voltage: Auxiliary | None, counters: Counters) -> PlanFunction:
+    """Make the function; what it looks up in every frame is bound to it.
+
+    Parameters
+    ----------
+    codes : Codes
+        Of the measured signal.
+    plan : IntegerPlan or SignPlan
+        Correction in integers; that of one temperature where it depends on it.
+    voltage : Auxiliary or None
+        Of a branch that is a power.
+    counters : Counters
+        Where results beyond the ends are counted.
+
+    Returns
+    -------
+    callable
+        Takes a measured code, and returns the one to write; None where the code, or a voltage, is no value.
+    """
+    assert not isinstance(plan, TemperaturePlans), "the temperature chooses one of its plans"
+    if isinstance(plan, SignPlan):
+        return _of_sign_plan(codes, plan, voltage, counters)
+    if voltage is not None and plan.voltage_gain:
+        return _with_voltage(codes, plan, voltage, counters)
+
+    def fix(code: int) -> int | None:
+        if not codes.is_value(code):
+            return None
+        counters.saturated += plan.saturates(code)
+        return plan.apply(code)
+
+    return fix
+
+
+def _with_voltage(codes: Codes, plan: IntegerPlan, voltage: Auxiliary, counters: Counters) -> PlanFunction:
+    def fix(code: int) -> int | None:
+        if voltage.code is None or not codes.is_value(code):
+            return None
+        counters.saturated += plan.saturates(code, voltage.code)
+        return plan.apply(code, voltage.code)
+
+    return fix
+
+
+def _of_sign_plan(codes: Codes, plan: SignPlan, voltage: Auxiliary | None, counters: Counters) -> PlanFunction:
+    needs_voltage = bool(plan.weights[1])
+
+    def fix(code: int) -> int | None:
+        voltage_code = voltage.code if voltage is not None and needs_voltage else 0
+        if voltage_code is None or not codes.is_value(code):
+            return None
+        chosen = plan.plan(code, voltage_code)
+        counters.saturated += chosen.saturates(code, voltage_code)
+        return chosen.apply(code, voltage_code)
+
+    return fix
