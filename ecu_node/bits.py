@@ -12,7 +12,7 @@ from cantools.database.can import Message, Signal
 
 from ecu_node.errors import DatabaseError
 
-__all__ = ["BitPlace", "Multiplexer", "Order", "PlacedSignal", "WordField", "bit_place", "multiplexers"]
+__all__ = ["BitPlace", "Multiplexer", "Order", "PlacedSignal", "WordField", "bit_place", "placed_signal"]
 
 _BITS_PER_BYTE = 8
 _LONGEST = 64
@@ -143,7 +143,7 @@ def bit_place(signal: Signal) -> BitPlace:
     Parameters
     ----------
     signal : Signal
-        An integer signal; where it is multiplexed, see :func:`multiplexers`.
+        An integer signal; where it is multiplexed, see :func:`placed_signal`.
 
     Returns
     -------
@@ -211,8 +211,8 @@ class PlacedSignal:
         return None
 
 
-def multiplexers(message: Message, signal: Signal) -> tuple[Multiplexer, ...]:
-    """Multiplexers that decide whether a signal is in a frame, the nearest one first.
+def placed_signal(message: Message, signal: Signal) -> PlacedSignal:
+    """Find out where a signal of the DBC stands, and in which frames.
 
     Parameters
     ----------
@@ -223,12 +223,18 @@ def multiplexers(message: Message, signal: Signal) -> tuple[Multiplexer, ...]:
 
     Returns
     -------
-    tuple of Multiplexer
-        All of them must have one of their codes; empty for a signal of every frame.
+    PlacedSignal
+        All multiplexers of it must have one of their codes, the nearest one first; none for a signal of every frame.
+
+    Raises
+    ------
+    DatabaseError
+        As :func:`bit_place`, for the signal or one of its multiplexers.
     """
     found = []
-    while signal.multiplexer_ids is not None and signal.multiplexer_signal is not None:
-        above = message.get_signal_by_name(signal.multiplexer_signal)
-        found.append(Multiplexer(place=bit_place(above), codes=frozenset(signal.multiplexer_ids)))
-        signal = above
-    return tuple(found)
+    inner = signal
+    while inner.multiplexer_ids is not None and inner.multiplexer_signal is not None:
+        above = message.get_signal_by_name(inner.multiplexer_signal)
+        found.append(Multiplexer(place=bit_place(above), codes=frozenset(inner.multiplexer_ids)))
+        inner = above
+    return PlacedSignal(place=bit_place(signal), above=tuple(found))

@@ -6,13 +6,15 @@ The node is built as ``ecu-node run`` builds it, so that what is accepted here i
 from pathlib import Path
 from typing import Any
 
+from ecu_node.branch_plans import branch_plan
 from ecu_node.correction import CorrectionPlan, IntegerPlan, SignPlan
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import printable
 from ecu_node.guard import Mode, needs_fd
+from ecu_node.in_force import InForce, no_temperature, not_published, sensor_fault
 from ecu_node.layout import Branch, read_layout
 from ecu_node.parameter_file import choose_parameters
-from ecu_node.wiring import InForce, branch_plan, no_temperature, not_published, sensor_fault, wire
+from ecu_node.wiring import wire
 
 __all__ = ["check_report", "report_text", "warnings_of"]
 

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from cantools.database.can import Message, Signal
 
 from ecu_node.auxiliary import Auxiliary
-from ecu_node.bits import PlacedSignal, bit_place, multiplexers
+from ecu_node.bits import PlacedSignal, bit_place, placed_signal
 from ecu_node.branch import LiveBranch
+from ecu_node.branch_plans import branch_signals
 from ecu_node.codes import Codes, read_codes
 from ecu_node.database import AMPERE, VehicleDatabase
 from ecu_node.e2e import Check, Receiver
@@ -24,7 +25,6 @@ from ecu_node.guard import Mode, key_of, received, transmitted
 from ecu_node.layout import Branch, SignalName, StatusMessage
 from ecu_node.past import Frames, Past
 from ecu_node.status import Quality
-from ecu_node.wiring import branch_signals
 
 __all__ = ["BranchView", "BusMonitor", "FrameFaults", "NodeView", "Sums", "View"]
 
@@ -391,7 +391,7 @@ def _heard_of(database: VehicleDatabase, name: SignalName, heard: _NotedFrames) 
 
 def _followed(database: VehicleDatabase, name: SignalName, heard: _NotedFrames) -> tuple[PlacedSignal, Frames]:
     message, signal = database.signal(name)
-    return PlacedSignal(place=bit_place(signal), above=multiplexers(message, signal)), heard[key_of(message)].frames
+    return placed_signal(message, signal), heard[key_of(message)].frames
 
 
 def _newest(branch: LiveBranch) -> float | None:

@@ -8,9 +8,9 @@ from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UnfitError, UserError
 from ecu_node.guard import Mode
+from ecu_node.in_force import InForce, put_in_force
 from ecu_node.parameter_fit import check_fit
 from ecu_node.parameters import read_parameters
-from ecu_node.wiring import InForce, put_in_force
 
 __all__ = ["FileSignature", "ParameterFile", "ParameterSource", "choose_parameters", "signature"]
 

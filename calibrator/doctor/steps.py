@@ -12,8 +12,9 @@ from calibrator.errors import DriveError
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.guard import Mode
+from ecu_node.in_force import InForce
 from ecu_node.layout import Layout
-from ecu_node.wiring import InForce, wire
+from ecu_node.wiring import wire
 
 __all__ = ["NextSteps", "explained_shares", "next_steps"]
 

@@ -12,8 +12,8 @@ from calibrator.sensor_models.families import GainBySign, GainBySignFamily, Temp
 from calibrator.sensor_models.fleet import SensorFindings
 from calibrator.terminal.text import dumps, table
 from ecu_node.database import VehicleDatabase
+from ecu_node.in_force import InForce, sensor_fault
 from ecu_node.parameters import VehicleParameters
-from ecu_node.wiring import InForce, sensor_fault
 
 __all__ = ["SensorScore", "score_sensors", "unseen_errors_a"]
 

@@ -12,13 +12,14 @@ from cantools.database.can import Message
 
 from calibrator.errors import ExportError
 from calibrator.export.checked import Checked
-from ecu_node.bits import PlacedSignal, bit_place, multiplexers
+from ecu_node.bits import PlacedSignal, placed_signal
+from ecu_node.branch_plans import branch_plan, branch_signals
 from ecu_node.codes import Codes, read_codes
 from ecu_node.correction import IntegerPlan, SignPlan, TemperaturePlans
 from ecu_node.database import CELSIUS, VOLT
 from ecu_node.guard import Mode, rewritten
 from ecu_node.layout import Branch, SignalName, split_signal
-from ecu_node.wiring import branch_plan, branch_signals, wire
+from ecu_node.wiring import wire
 
 __all__ = ["CBranch", "CInput", "CMessage", "CProgram", "SignRule", "c_program"]
 
@@ -167,7 +168,7 @@ def _branch(checked: Checked, branch: Branch) -> CBranch:
         name=branch.name,
         signal=branch.source,
         codes=signals.source,
-        placed=_placed(checked, branch.source),
+        placed=placed_signal(*database.signal(branch.source)),
         voltage=voltage,
     )
     if not fault.applied:
@@ -213,14 +214,9 @@ def _input(checked: Checked, name: SignalName, units: Mapping[str, float]) -> CI
     return CInput(
         name="_".join(split_signal(name)),
         message=message,
-        placed=_placed(checked, name),
+        placed=placed_signal(message, signal),
         codes=read_codes(signal, units, name),
     )
-
-
-def _placed(checked: Checked, name: SignalName) -> PlacedSignal:
-    message, signal = checked.database.signal(name)
-    return PlacedSignal(place=bit_place(signal), above=multiplexers(message, signal))
 
 
 def _require_own_names(inputs: Sequence[CInput]) -> None:

@@ -10,6 +10,7 @@ from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UnfitError, UserError
 from ecu_node.guard import Mode
+from ecu_node.in_force import InForce, put_in_force
 from ecu_node.parameter_file import FileSignature, signature
 from ecu_node.parameter_fit import check_fit
 from ecu_node.status import Reason
@@ -18,7 +19,6 @@ from ecu_node.trust.state import Slot, SlotName, TrustState, read_state, signed_
 from ecu_node.trust.statements import SignedParameters
 from ecu_node.trust.trial import Trial, TrialResult, begin_trial
 from ecu_node.trust.validity import require_time
-from ecu_node.wiring import InForce, put_in_force
 
 __all__ = ["ParameterStore"]
 

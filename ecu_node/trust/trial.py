@@ -19,10 +19,10 @@ from dataclasses import dataclass
 
 from ecu_node.branch import LiveBranch
 from ecu_node.database import VehicleDatabase
+from ecu_node.in_force import InForce, sensor_fault
 from ecu_node.junction_watch import aligned_currents
 from ecu_node.parameters import JunctionResidual, VehicleParameters
 from ecu_node.sensor_fault import SensorFault
-from ecu_node.wiring import InForce, sensor_fault
 
 __all__ = ["Trial", "TrialResult", "TrialRules", "begin_trial"]
 

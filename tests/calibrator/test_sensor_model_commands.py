@@ -22,11 +22,12 @@ from calibrator.results import read_run
 from calibrator.sensor_models.families import FAMILIES
 from calibrator.sensor_models.families import GainBySign as GainBySignSensor
 from ecu_node.database import read_database
+from ecu_node.in_force import InForce
 from ecu_node.layout import read_layout
 from ecu_node.parameter_fit import check_fit
 from ecu_node.parameters import VehicleParameters, read_parameters
 from ecu_node.sensor_models import GainBySign
-from ecu_node.wiring import InForce, wire
+from ecu_node.wiring import wire
 
 pytest.importorskip("fastsim")
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"

@@ -14,10 +14,11 @@ from ecu_node.e2e_profiles import protection_of
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode
+from ecu_node.in_force import InForce, put_in_force
 from ecu_node.parameters import JunctionResidual
 from ecu_node.sensor_models import TemperatureDrift
 from ecu_node.status import Quality, Reason, State
-from ecu_node.wiring import InForce, put_in_force, wire
+from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, Frame, answers, decoded, parameters_for, protected
 
 MakeDatabase = Callable[..., VehicleDatabase]

@@ -12,9 +12,10 @@ from ecu_node.counters import Counters
 from ecu_node.database import VehicleDatabase
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode
+from ecu_node.in_force import InForce
 from ecu_node.sensor_models import TemperatureDrift
 from ecu_node.status import Quality, Reason, State
-from ecu_node.wiring import InForce, wire
+from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import Frame, answers, decoded, parameters_for, passed_on, protected
 
 TABLE = Path(__file__).parents[2] / "docs" / "fault_table.md"

@@ -11,9 +11,10 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode, transmitted
+from ecu_node.in_force import InForce
 from ecu_node.sensor_models import TemperatureDrift
 from ecu_node.status import Reason, State
-from ecu_node.wiring import InForce, wire
+from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, Frame, decoded, parameters_for, passed_on, protected
 
 MakeDatabase = Callable[..., VehicleDatabase]

@@ -21,10 +21,11 @@ from ecu_node.counters import Counters
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
 from ecu_node.guard import Mode
+from ecu_node.in_force import InForce
 from ecu_node.node import GatewayNode, open_bus
 from ecu_node.socketcan import SocketCanLink
 from ecu_node.status import Reason, State
-from ecu_node.wiring import InForce, wire
+from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import decoded, parameters_for, protected
 
 LONGEST_WAIT_S = 20.0

@@ -13,8 +13,9 @@ from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.e2e_profiles import protection_of
 from ecu_node.frames import Source
 from ecu_node.guard import Mode
+from ecu_node.in_force import InForce
 from ecu_node.layout import read_layout
-from ecu_node.wiring import InForce, wire
+from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, parameters_for
 
 HEADER = ' SG_ Crc : 0|8@1+ (1,0) [0|255] "" Node\n SG_ Alive : 8|4@1+ (1,0) [0|14] "" Node\n'

@@ -23,9 +23,10 @@ from ecu_node.buses import SteadyBus
 from ecu_node.counters import Counters
 from ecu_node.database import VehicleDatabase
 from ecu_node.guard import Mode
+from ecu_node.in_force import InForce
 from ecu_node.node import GatewayNode, OverlayNode
 from ecu_node.parameters import VehicleParameters
-from ecu_node.wiring import InForce, wire
+from ecu_node.wiring import wire
 
 __all__ = ["WrongFrameError", "fuzz"]
 

@@ -13,6 +13,7 @@ from chain.node_drive import BranchTrace, NodeDrive, drive_through
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.guard import Mode
+from ecu_node.in_force import InForce, sensor_fault
 from ecu_node.parameters import BranchParameters, VehicleParameters
 from ecu_node.status import State
 from ecu_node.trust.activation import accept
@@ -20,7 +21,7 @@ from ecu_node.trust.key_set import KeySet
 from ecu_node.trust.parameter_store import ParameterStore
 from ecu_node.trust.provision import provision
 from ecu_node.trust.trial import Trial, TrialResult, begin_trial
-from ecu_node.wiring import InForce, sensor_fault, wire
+from ecu_node.wiring import wire
 
 __all__ = ["SignedFile", "VehicleOutcome", "WrongSet", "drive_vehicle"]
 

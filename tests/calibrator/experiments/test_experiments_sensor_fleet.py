@@ -11,15 +11,17 @@ from calibrator.experiments.sensor_fleet import SensorCase, SensorFleet, calibra
 from calibrator.experiments.sensor_score import score_sensors, unseen_errors_a
 from calibrator.sensor_models.choice import LINEAR
 from calibrator.sensor_models.fleet import SensorFindings
+from ecu_node.branch_plans import branch_plan
 from ecu_node.check import check_report, report_text
 from ecu_node.correction import SignPlan, TemperaturePlans
 from ecu_node.database import VehicleDatabase
 from ecu_node.guard import Mode
+from ecu_node.in_force import InForce, sensor_fault
 from ecu_node.layout import Layout
 from ecu_node.parameter_fit import check_fit
 from ecu_node.parameters import VehicleParameters, read_parameters, write_parameters
 from ecu_node.sensor_models import GainBySign, SensorModel, TemperatureDrift
-from ecu_node.wiring import InForce, branch_plan, sensor_fault, wire
+from ecu_node.wiring import wire
 from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet
 
 CASE = SensorCase(vehicles=40, sparsity=90.0, difference=(0.1, 0.2), drift_per_k=(0.003, 0.006), duration_s=1200.0)

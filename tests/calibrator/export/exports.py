@@ -12,10 +12,11 @@ from calibrator.export.checked import Checked, read_checked
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.guard import Mode, key_of
+from ecu_node.in_force import InForce
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters, VehicleParameters, write_parameters
 from ecu_node.sensor_models import SensorModel
-from ecu_node.wiring import InForce, wire
+from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
 
 needs_compiler = pytest.mark.skipif(shutil.which(COMPILER) is None, reason=f"no {COMPILER} to compile the export with")
