@@ -2,11 +2,12 @@
 
 from ecu_node.codes import as_written, require_reach
 from ecu_node.correction import AS_IT_IS, CorrectionPlan, IntegerPlan, Signals, correction_plan
-from ecu_node.database import AMPERE, VOLT, WATT, VehicleDatabase
+from ecu_node.database import VehicleDatabase
 from ecu_node.guard import Mode
 from ecu_node.layout import Branch
 from ecu_node.layout_signals import signal_codes, temperature_codes
 from ecu_node.sensor_fault import NO_FAULT, SensorFault
+from ecu_node.units import AMPERE, VOLT, WATT
 
 __all__ = ["branch_plan", "branch_signals", "passing_plan", "require_branch_reach"]
 

@@ -83,7 +83,7 @@ def read_codes(signal: Signal, units: Mapping[str, float], where: str) -> Codes:
     signal : Signal
         An integer signal of the DBC.
     units : mapping of str to float
-        One of the tables of :mod:`ecu_node.database`; values come out in its base unit.
+        One of the tables of :mod:`ecu_node.units`; values come out in its base unit.
     where : str
         What the signal is for, for messages of errors.
 

@@ -8,20 +8,10 @@ from cantools.database.can import Database, Message, Signal
 from ecu_node.codes import impossible_values
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import Layout, split_signal
-from ecu_node.units import AMPERE, CELSIUS, VOLT, WATT, unit_factor
+from ecu_node.units import AMPERE, VOLT, WATT, unit_factor
 from ecu_node.user_files import UnsuitableFileError, read_user_file, text_digest
 
-__all__ = [
-    "AMPERE",
-    "CELSIUS",
-    "MAX_DBC_BYTES",
-    "VOLT",
-    "WATT",
-    "VehicleDatabase",
-    "look_everything_up",
-    "read_database",
-    "unit_factor",
-]
+__all__ = ["MAX_DBC_BYTES", "VehicleDatabase", "look_everything_up", "read_database"]
 
 MAX_DBC_BYTES = 16_000_000
 """The largest DBCs have some megabytes; to read one takes a hundred times its size in memory."""

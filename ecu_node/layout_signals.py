@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ecu_node.codes import Codes, read_codes
-from ecu_node.database import CELSIUS, VehicleDatabase
+from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
 from ecu_node.layout import SignalName
+from ecu_node.units import CELSIUS
 
 __all__ = ["input_signal", "signal_codes", "temperature_codes"]
 

@@ -17,7 +17,7 @@ from ecu_node.bits import PlacedSignal, bit_place, placed_signal
 from ecu_node.branch import LiveBranch
 from ecu_node.branch_plans import branch_signals
 from ecu_node.codes import Codes, read_codes
-from ecu_node.database import AMPERE, VehicleDatabase
+from ecu_node.database import VehicleDatabase
 from ecu_node.e2e import Check, Receiver
 from ecu_node.e2e_profiles import protection_of
 from ecu_node.frames import FrameKey
@@ -25,6 +25,7 @@ from ecu_node.guard import Mode, key_of, received, transmitted
 from ecu_node.layout import Branch, SignalName, StatusMessage
 from ecu_node.past import Frames, Past
 from ecu_node.status import Quality
+from ecu_node.units import AMPERE
 
 __all__ = ["BranchView", "BusMonitor", "FrameFaults", "NodeView", "Sums", "View"]
 

@@ -22,7 +22,7 @@ def unit_factor(signal: Signal, known: Mapping[str, float], where: str) -> float
     signal : Signal
         A signal of the DBC. A signal without unit counts as being in the base unit.
     known : mapping of str to float
-        One of :data:`AMPERE`, :data:`VOLT`, :data:`WATT`.
+        One of :data:`AMPERE`, :data:`VOLT`, :data:`WATT`, :data:`CELSIUS`.
     where : str
         What the signal is for, for the message of the error.
 

@@ -14,7 +14,7 @@ from ecu_node.branch_plans import branch_signals, require_branch_reach
 from ecu_node.codes import Codes, as_written, not_available_code, read_codes, require_reach, writable_range
 from ecu_node.corrector import Corrector, StatusFields
 from ecu_node.counters import Counters
-from ecu_node.database import AMPERE, VOLT, VehicleDatabase
+from ecu_node.database import VehicleDatabase
 from ecu_node.e2e_profiles import protection_of
 from ecu_node.frames import FrameKey, Reader, Source, Target, TargetField
 from ecu_node.guard import Mode, check_output, is_fd, key_of, received
@@ -22,6 +22,7 @@ from ecu_node.in_force import InForce, put_in_force
 from ecu_node.junction_watch import JunctionWatch
 from ecu_node.layout import SignalName, split_signal
 from ecu_node.layout_signals import input_signal, signal_codes, temperature_codes
+from ecu_node.units import AMPERE, VOLT
 
 __all__ = ["wire"]
 

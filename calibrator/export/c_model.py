@@ -16,9 +16,9 @@ from ecu_node.bits import PlacedSignal, placed_signal
 from ecu_node.branch_plans import branch_plan, branch_signals
 from ecu_node.codes import Codes, read_codes
 from ecu_node.correction import IntegerPlan, SignPlan, TemperaturePlans
-from ecu_node.database import CELSIUS, VOLT
 from ecu_node.guard import Mode, rewritten
 from ecu_node.layout import Branch, SignalName, split_signal
+from ecu_node.units import CELSIUS, VOLT
 from ecu_node.wiring import wire
 
 __all__ = ["CBranch", "CInput", "CMessage", "CProgram", "SignRule", "c_program"]

@@ -18,9 +18,10 @@ from calibrator.proposal.signs import ProposedSign, propose_signs, usual_signs
 from calibrator.proposal.targets import ProposedTarget, propose_targets
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.readers import drive_from_frames
-from ecu_node.database import AMPERE, VehicleDatabase, read_database
+from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import DatabaseError
 from ecu_node.layout import Branch, Input, Layout
+from ecu_node.units import AMPERE
 
 __all__ = ["Proposal", "propose_layout"]
 

@@ -6,8 +6,9 @@ import numpy as np
 
 from calibrator.drive import Array, Channel, Drive
 from calibrator.recordings.canlog import FrameSeries, encode_message, write_candump
-from ecu_node.database import AMPERE, VehicleDatabase, unit_factor
+from ecu_node.database import VehicleDatabase
 from ecu_node.layout import split_signal
+from ecu_node.units import AMPERE, unit_factor
 
 __all__ = ["drive_series", "write_drive_log"]
 

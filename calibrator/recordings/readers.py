@@ -20,8 +20,9 @@ from calibrator.recordings.frame_arrays import EXTENDED_BIT, Frames, frame_key
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.log_time import CLOCK_GAP_S, repaired_time
 from calibrator.terminal.notices import Notice
-from ecu_node.database import AMPERE, VOLT, WATT, VehicleDatabase, unit_factor
+from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Branch
+from ecu_node.units import AMPERE, VOLT, WATT, unit_factor
 
 __all__ = ["ChannelReport", "Recording", "RecordingReport", "drive_from_frames", "read_drive", "read_recording"]
 

@@ -7,7 +7,8 @@ import numpy as np
 from cantools.database.can import Signal
 
 from calibrator.drive import Array, Mask
-from ecu_node.database import AMPERE, VehicleDatabase, unit_factor
+from ecu_node.database import VehicleDatabase
+from ecu_node.units import AMPERE, unit_factor
 
 __all__ = ["SignalRange", "signal_range", "signal_ranges"]
 

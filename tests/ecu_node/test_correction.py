@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from ecu_node.codes import Codes, not_available_code, read_codes, require_reach, writable_range
 from ecu_node.correction import LARGEST_ERROR, IntegerPlan, Signals, correction_plan
-from ecu_node.database import AMPERE
 from ecu_node.errors import DatabaseError
 from ecu_node.sensor_fault import SensorFault
+from ecu_node.units import AMPERE
 
 HALF = Fraction(1, 2)
 
