@@ -14,14 +14,12 @@ from ecu_node.bits import BitPlace, PlacedSignal
 from ecu_node.branch import LiveBranch
 from ecu_node.counters import Counters
 from ecu_node.e2e import Check, Protection, Receiver
-from ecu_node.past import Frames
+from ecu_node.past import REMEMBERED_FRAMES, Frames
 from ecu_node.quick_frames import Answer, Forward, Message, quick_answer, quick_forward, quick_signals
 from ecu_node.status import Quality
 
 __all__ = ["FrameKey", "Reader", "Source", "Target", "TargetField"]
 
-_REMEMBERED = 1024
-"""Frames of a message that are remembered: longer than branches lag each other."""
 _LEAST_SILENCE_S = 1.0
 """After a silence of this long, or of a branch's timeout, a message's counter begins anew. [s]"""
 _USABLE = frozenset((Check.OK, Check.LOST))
@@ -143,7 +141,7 @@ class Source:
         self._auxiliaries = [(part, signal) for part, signal in readers if isinstance(part, Auxiliary)]
         self._branches = [(part, signal) for part, signal in readers if isinstance(part, LiveBranch)]
         self._counters, self._pass_on_invalid = counters, pass_on_invalid
-        self._history: Frames = deque(maxlen=_REMEMBERED)
+        self._history: Frames = deque(maxlen=REMEMBERED_FRAMES)
         self._silence_s = max([_LEAST_SILENCE_S, *(branch.timeout_s for branch, _ in self._branches)])
         self._message = Message(length, protection, self._receiver, counters, self._history.append)
         self.timeout_s = max((branch.timeout_s for branch, _ in self._branches), default=float("inf"))

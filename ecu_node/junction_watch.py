@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from ecu_node.branch import LiveBranch
 
-__all__ = ["JunctionSums", "JunctionWatch", "aligned_currents"]
+__all__ = ["JunctionSums", "JunctionWatch", "aligned_currents", "simultaneous_currents"]
 
 _MOST_MARGINS = 10.0
 """More than so many margins nobody may expect the corrected sum to be worse."""
@@ -56,17 +56,23 @@ def aligned_currents(
         Measured, and as the parameters that are in force make it; positive into the junction. [A]
         None, instead of both, while a fitted branch is stale or has no value.
     """
-    fitted = [branch for branch in branches if branch.is_fitted]
-    latest = [found for branch in fitted if not branch.is_stale(now_s) and (found := branch.latest()) is not None]
-    if not fitted or len(latest) < len(fitted):
+    return simultaneous_currents([branch for branch in branches if branch.is_fitted], delays_s, now_s)
+
+
+def simultaneous_currents(
+    branches: Sequence[LiveBranch], delays_s: Mapping[str, float], now_s: float
+) -> tuple[float, dict[str, tuple[float, float]]] | None:
+    """Take the currents of just these branches, fitted or not; otherwise as :func:`aligned_currents`."""
+    latest = [found for branch in branches if not branch.is_stale(now_s) and (found := branch.latest()) is not None]
+    if not branches or len(latest) < len(branches):
         return None
-    delays = [delays_s.get(branch.name, 0.0) for branch in fitted]
+    delays = [delays_s.get(branch.name, 0.0) for branch in branches]
     instant_s = min(seen_s - delay_s for delay_s, (seen_s, _) in zip(delays, latest, strict=True))
     currents = {
-        branch.name: branch.currents_at(instant_s + delay_s) for branch, delay_s in zip(fitted, delays, strict=True)
+        branch.name: branch.currents_at(instant_s + delay_s) for branch, delay_s in zip(branches, delays, strict=True)
     }
     known = {name: pair for name, pair in currents.items() if pair is not None}
-    return (instant_s, known) if len(known) == len(fitted) else None
+    return (instant_s, known) if len(known) == len(branches) else None
 
 
 class JunctionWatch:

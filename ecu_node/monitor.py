@@ -19,9 +19,10 @@ from ecu_node.errors import UserError
 from ecu_node.failures import say_error
 from ecu_node.guard import Mode
 from ecu_node.layout import read_layout
-from ecu_node.monitor_model import BusMonitor, View
+from ecu_node.monitor_model import BusMonitor
 from ecu_node.monitor_table import picture
 from ecu_node.monitor_text import as_json, plain_block
+from ecu_node.monitor_view import View
 from ecu_node.node import open_bus
 from ecu_node.service import Log, Requests
 from ecu_node.standard_output import write_output, write_text

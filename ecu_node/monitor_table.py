@@ -7,8 +7,8 @@ import textwrap
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ecu_node.monitor_model import View
 from ecu_node.monitor_text import COLUMNS, LEFT, Row, node_line, notes, rows
+from ecu_node.monitor_view import View
 
 __all__ = ["Line", "picture"]
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
-from ecu_node.monitor_model import BranchView, FrameFaults, NodeView, Sums, View
+from ecu_node.monitor_view import BranchView, FrameFaults, NodeView, Sums, View
 from ecu_node.status import Reason, State
 
 __all__ = ["COLUMNS", "LEFT", "REASONS", "STATES", "Row", "as_json", "node_line", "notes", "plain_block", "rows"]
@@ -137,7 +137,7 @@ def plain_block(view: View, where: str, more: Sequence[str] = ()) -> str:
 
 
 def as_json(view: View) -> dict[str, Any]:
-    """The view as a document: fields as in :class:`~ecu_node.monitor_model.View`, codes of the node by name."""
+    """The view as a document: fields as in :class:`~ecu_node.monitor_view.View`, codes of the node by name."""
     document = asdict(view)
     for branch, seen in zip(document["branches"], view.branches, strict=True):
         branch["quality"] = seen.quality.name if seen.quality is not None else None

@@ -5,7 +5,10 @@ from collections.abc import Iterator
 
 from ecu_node.bits import PlacedSignal
 
-__all__ = ["Frames", "Past"]
+__all__ = ["REMEMBERED_FRAMES", "Frames", "Past"]
+
+REMEMBERED_FRAMES = 1024
+"""Frames of a message that are remembered: longer than branches lag each other."""
 
 Frames = deque[tuple[float, bytearray]]
 """Times [s] and payloads of the last intact frames of a message."""

@@ -7,7 +7,8 @@ import pytest
 
 from ecu_node.database import VehicleDatabase
 from ecu_node.guard import key_of
-from ecu_node.monitor_model import BranchView, BusMonitor, FrameFaults, Sums, View
+from ecu_node.monitor_model import BusMonitor
+from ecu_node.monitor_view import BranchView, FrameFaults, Sums, View
 from ecu_node.status import Quality, Reason, State
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, protected
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from ecu_node.monitor_model import FrameFaults, View
 from ecu_node.monitor_table import picture
+from ecu_node.monitor_view import FrameFaults, View
 from ecu_node.status import Quality, Reason, State
 from tests.ecu_node.test_monitor_text import BRANCH, MISSING, NODE, a_view
 

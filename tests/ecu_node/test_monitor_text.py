@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from ecu_node.monitor_model import BranchView, FrameFaults, NodeView, Sums, View
 from ecu_node.monitor_text import COLUMNS, REASONS, STATES, as_json, node_line, notes, plain_block, rows
+from ecu_node.monitor_view import BranchView, FrameFaults, NodeView, Sums, View
 from ecu_node.status import Quality, Reason, State
 
 NODE = NodeView(
