@@ -1,12 +1,13 @@
 """How frames get from a bus of python-can to the node and back: one by one, as every interface can."""
 
+import socket
 import time
 from collections.abc import Sequence
 from typing import Protocol
 
 import can
 
-__all__ = ["Link", "OneByOne", "is_of"]
+__all__ = ["Link", "OneByOne", "data_frame", "socketcan_socket"]
 
 _SYSTEM_CLOCK = ("socketcan", "udp_multicast", "virtual")
 """Interfaces whose time stamps are of this computer's time of day; an adapter's own clock tells nothing here."""
@@ -63,9 +64,15 @@ class Link(Protocol):
         """
 
 
-def is_of(bus: can.BusABC, interface: str) -> bool:
+def _is_of(bus: can.BusABC, interface: str) -> bool:
     """Whether a bus is one of python-can's interface of this name."""
     return any(kind.__module__.split(".")[:3] == ["can", "interfaces", interface] for kind in type(bus).__mro__)
+
+
+def socketcan_socket(bus: can.BusABC) -> socket.socket | None:
+    """Socket of a bus of SocketCAN; None for other interfaces."""
+    found = getattr(bus, "socket", None) if _is_of(bus, "socketcan") else None
+    return found if isinstance(found, socket.socket) else None
 
 
 class OneByOne:
@@ -82,7 +89,7 @@ class OneByOne:
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
         self.asked_s = self.read_s = time.monotonic()
-        self._has_stamps = any(is_of(bus, name) for name in _SYSTEM_CLOCK)
+        self._has_stamps = any(_is_of(bus, name) for name in _SYSTEM_CLOCK)
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """Wait for a frame; see :meth:`Link.receive`."""
@@ -102,3 +109,28 @@ class OneByOne:
         """Send one frame; see :meth:`Link.send`."""
         self._bus.send(messages[first])
         return 1
+
+
+def data_frame(
+    key: tuple[int, bool], data: bytes | bytearray, *, fd: bool, bitrate_switch: bool = False
+) -> can.Message:
+    """Make a frame to be sent.
+
+    Parameters
+    ----------
+    key : tuple of int and bool
+        Its identifier, and whether that has 29 bits.
+    data : bytes or bytearray
+        Its payload.
+    fd, bitrate_switch : bool
+        Whether it is one of CAN FD, and if so one with the fast bit rate.
+    """
+    identifier, extended = key
+    return can.Message(
+        arbitration_id=identifier,
+        is_extended_id=extended,
+        is_fd=fd,
+        bitrate_switch=bitrate_switch,
+        data=data,
+        is_rx=False,
+    )

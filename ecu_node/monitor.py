@@ -11,7 +11,7 @@ from pathlib import Path
 
 import can
 
-from ecu_node.buses import SteadyBus
+from ecu_node.buses import open_bus
 from ecu_node.clocks import steady_time_s
 from ecu_node.counters import Counters
 from ecu_node.database import read_database
@@ -23,9 +23,9 @@ from ecu_node.monitor_model import BusMonitor
 from ecu_node.monitor_table import picture
 from ecu_node.monitor_text import as_json, plain_block
 from ecu_node.monitor_view import View
-from ecu_node.node import open_bus
 from ecu_node.service import Log, Requests
 from ecu_node.standard_output import write_output, write_text
+from ecu_node.steady_bus import SteadyBus
 
 __all__ = ["MonitorOptions", "listen", "run_monitor"]
 

@@ -9,17 +9,19 @@ from pathlib import Path
 
 import can
 
-from ecu_node.buses import SteadyBus, carries_fd
+from ecu_node.buses import carries_fd, open_bus
 from ecu_node.check import warnings_of
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.gateway_node import GatewayNode
 from ecu_node.guard import Mode
 from ecu_node.in_force import not_published
 from ecu_node.layout import read_layout
-from ecu_node.node import GatewayNode, OverlayNode, open_bus
+from ecu_node.overlay_node import OverlayNode
 from ecu_node.parameter_file import ParameterFile, ParameterSource
 from ecu_node.service import Log, Requests, ServiceManager
 from ecu_node.status import Reason, State
+from ecu_node.steady_bus import SteadyBus
 from ecu_node.wiring import wire
 
 __all__ = ["RunOptions", "run_node"]

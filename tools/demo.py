@@ -24,14 +24,15 @@ from calibrator.errors import FleetError
 from calibrator.fleet_truth import FleetTruth, read_truth
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import progress_bar
-from ecu_node.buses import SteadyBus
+from ecu_node.buses import open_bus
 from ecu_node.database import read_database
 from ecu_node.errors import UserError
 from ecu_node.guard import Mode
 from ecu_node.layout import read_layout
-from ecu_node.node import OverlayNode, open_bus
+from ecu_node.overlay_node import OverlayNode
 from ecu_node.parameter_file import choose_parameters
 from ecu_node.parameters import read_parameters
+from ecu_node.steady_bus import SteadyBus
 from ecu_node.wiring import wire
 from replay import read_log, replay
 

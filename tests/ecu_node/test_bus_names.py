@@ -2,9 +2,10 @@
 
 import pytest
 
-from ecu_node.buses import SteadyBus, connect
+from ecu_node.buses import connect
 from ecu_node.counters import Counters
 from ecu_node.errors import BusError
+from ecu_node.steady_bus import SteadyBus
 
 
 @pytest.mark.parametrize(

@@ -15,16 +15,17 @@ import pytest
 from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
-from ecu_node.buses import SteadyBus
+from ecu_node.buses import open_bus
 from ecu_node.corrector import Corrector
 from ecu_node.counters import Counters
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
+from ecu_node.gateway_node import GatewayNode
 from ecu_node.guard import Mode
 from ecu_node.in_force import InForce
-from ecu_node.node import GatewayNode, open_bus
 from ecu_node.socketcan import SocketCanLink
 from ecu_node.status import Reason, State
+from ecu_node.steady_bus import SteadyBus
 from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import decoded, parameters_for, protected
 
@@ -236,7 +237,7 @@ class BlockingBus(VirtualBus):
 def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
     database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
-    monkeypatch.setattr("ecu_node.node._LONGEST_TURN_S", 0.2)
+    monkeypatch.setattr("ecu_node.gateway_node._LONGEST_TURN_S", 0.2)
     name = request.node.name
     corrector = wire(database, InForce(parameters=None), time.monotonic(), mode=Mode.GATEWAY)
     near, stop, fed = BlockingBus(f"{name} a"), threading.Event(), queue.SimpleQueue[float]()

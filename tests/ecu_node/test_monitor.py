@@ -15,12 +15,12 @@ from pathlib import Path
 import can
 import pytest
 
-from ecu_node.buses import SteadyBus
 from ecu_node.cli import main
 from ecu_node.counters import Counters
 from ecu_node.database import VehicleDatabase
 from ecu_node.monitor import listen
 from ecu_node.monitor_model import BusMonitor
+from ecu_node.steady_bus import SteadyBus
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, protected
 
 CHANNEL = "monitor"

@@ -13,15 +13,17 @@ import pytest
 from can.interfaces.virtual import VirtualBus
 from e2e.p01 import e2e_p01_check
 
-from ecu_node.buses import SteadyBus
+from ecu_node.buses import open_bus, receive_filters
 from ecu_node.corrector import Corrector
 from ecu_node.counters import Counters
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
+from ecu_node.gateway_node import GatewayNode
 from ecu_node.guard import Mode
 from ecu_node.in_force import InForce
-from ecu_node.node import GatewayNode, OverlayNode, open_bus, receive_filters
+from ecu_node.overlay_node import OverlayNode
 from ecu_node.status import Reason, State
+from ecu_node.steady_bus import SteadyBus
 from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import SMALL_DBC, decoded, parameters_for, protected
 

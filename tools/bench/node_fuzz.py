@@ -19,13 +19,14 @@ import can
 
 from bench.node_fuzz_oracle import FuzzFrame, Oracle
 from bench.node_fuzz_vehicles import FuzzMessage, FuzzVehicle, draw_vehicle
-from ecu_node.buses import SteadyBus
 from ecu_node.counters import Counters
 from ecu_node.database import VehicleDatabase
+from ecu_node.gateway_node import GatewayNode
 from ecu_node.guard import Mode
 from ecu_node.in_force import InForce
-from ecu_node.node import GatewayNode, OverlayNode
+from ecu_node.overlay_node import OverlayNode
 from ecu_node.parameters import VehicleParameters
+from ecu_node.steady_bus import SteadyBus
 from ecu_node.wiring import wire
 
 __all__ = ["WrongFrameError", "fuzz"]
