@@ -11,7 +11,8 @@ from calibrator.drives.fleet_id import require_same_fleet
 from calibrator.errors import FleetError
 from calibrator.faults import Faults
 from calibrator.fleet_truth import FleetTruth, faults_of, read_truth
-from calibrator.results import RunRecord, read_results, read_run
+from calibrator.results.rows import read_results
+from calibrator.results.run_record import RunRecord, read_run
 from calibrator.score import f2_score, harmed, recovered
 from calibrator.terminal.text import dumps, table
 

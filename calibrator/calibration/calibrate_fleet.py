@@ -30,15 +30,11 @@ from calibrator.options import Method
 from calibrator.posterior.bench import read_bench
 from calibrator.posterior.fleet import FindModels
 from calibrator.published.fleet import calibrate_fleet_published
-from calibrator.results import (
-    RunRecord,
-    encode_chunk,
-    join_rows,
-    left_out_of,
-    read_run,
-    write_parameter_files,
-    write_run,
-)
+from calibrator.results.chunk import encode_chunk
+from calibrator.results.left_out import left_out_of
+from calibrator.results.parameter_parts import write_parameter_files
+from calibrator.results.rows import join_rows
+from calibrator.results.run_record import RunRecord, read_run, write_run
 from calibrator.sensor_models.fleet import SensorFindings, find_sensor_models
 from calibrator.sources.copies import without_copies
 from calibrator.sources.fleet_source import (

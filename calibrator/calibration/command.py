@@ -113,7 +113,7 @@ def params(
 ) -> None:
     """Write the parameter files of some vehicles, of a fleet too large for a file each in one folder."""
     with importing():
-        from calibrator.results import parameters_of
+        from calibrator.results.vehicle import parameters_of
 
     texts = {vehicle: parameters_of(result, vehicle) for vehicle in vehicles}
     require_possible_folder(out)

@@ -10,7 +10,8 @@ from calibrator.errors import FleetError
 from calibrator.evidence.readings import TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD
 from calibrator.options import Method
 from calibrator.posterior.estimate import FleetPosterior
-from calibrator.results import PARTS, Written, read_part, read_run
+from calibrator.results.parameter_parts import PARTS, Written, read_part
+from calibrator.results.run_record import read_run
 from calibrator.summaries.identity import StoreIdentity
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters, VehicleParameters

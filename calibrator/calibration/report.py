@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from calibrator.drive import Array
 from calibrator.posterior.verdict import CONFIDENT
-from calibrator.results import RunRecord
+from calibrator.results.run_record import RunRecord
 from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
 
 __all__ = ["MOST_NAMED", "CalibrationReport", "report_of"]

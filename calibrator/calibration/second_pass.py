@@ -16,7 +16,8 @@ from calibrator.calibration.previous import PreviousResult, moved_sensors
 from calibrator.errors import DriveError
 from calibrator.evidence.vehicle_evidence import VehicleEvidence
 from calibrator.posterior.fleet_task import FleetTask
-from calibrator.results import ChunkResult, Written, encode_chunk
+from calibrator.results.chunk import ChunkResult, encode_chunk
+from calibrator.results.parameter_parts import Written
 from calibrator.summaries.record import Record, drives_digest, joined_records
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary

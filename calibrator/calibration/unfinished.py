@@ -15,7 +15,7 @@ from pathlib import Path
 
 from calibrator.errors import FleetError
 from calibrator.files.storage import DISK_FULL
-from calibrator.results import ChunkResult
+from calibrator.results.chunk import ChunkResult
 from ecu_node.layout import file_digest
 from ecu_node.user_files import write_atomically
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.report.fleet_table import FleetTable
-from calibrator.results import PARTS
+from calibrator.results.parameter_parts import PARTS
 from calibrator.terminal.progress import shown
 from ecu_node.parameters import Explanation
 

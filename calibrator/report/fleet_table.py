@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
-from calibrator.results import SCHEMA, RunRecord, read_run
+from calibrator.results.rows import SCHEMA
+from calibrator.results.run_record import RunRecord, read_run
 
 __all__ = ["FleetTable", "read_fleet_table"]
 

@@ -15,7 +15,8 @@ from calibrator.report.protection import Margins, margins
 from calibrator.report.traces import recorded_traces, unity_traces
 from calibrator.report.vehicle_page import vehicle_page
 from calibrator.report.window import ideal_window, read_out_of, read_unity
-from calibrator.results import read_run, written_of
+from calibrator.results.run_record import read_run
+from calibrator.results.vehicle import written_of
 from calibrator.summaries.unity import UnityWindow
 from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 
+from calibrator.cli import main
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 
@@ -11,3 +12,9 @@ LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 @pytest.fixture(scope="session")
 def database() -> VehicleDatabase:
     return read_database(read_layout(LAYOUT))
+
+
+def run_command(arguments: list[str]) -> int:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["calibrator", *arguments])
+        return main()

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from calibrator.fleet_truth import read_truth
-from calibrator.results import read_results
+from calibrator.results.rows import read_results
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameter_fit import check_fit

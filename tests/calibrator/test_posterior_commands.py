@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from calibrator.fleet_truth import read_truth
-from calibrator.results import read_results, read_run
+from calibrator.results.rows import read_results
+from calibrator.results.run_record import read_run
 from ecu_node.database import read_database
 from ecu_node.layout import file_digest, read_layout
 from ecu_node.parameter_fit import check_fit

@@ -18,7 +18,7 @@ from calibrator.calibration_settings import HARM_LIMIT, CalibrationSettings
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.store import write_drive
 from calibrator.faults import measured_currents, true_currents
-from calibrator.results import read_run
+from calibrator.results.run_record import read_run
 from calibrator.sensor_models.families import FAMILIES
 from calibrator.sensor_models.families import GainBySign as GainBySignSensor
 from ecu_node.database import read_database

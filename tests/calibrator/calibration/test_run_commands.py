@@ -15,7 +15,8 @@ import pytest
 
 from calibrator.calibration.unfinished import unfinished_run
 from calibrator.errors import FleetError
-from calibrator.results import read_results, read_run
+from calibrator.results.rows import read_results
+from calibrator.results.run_record import read_run
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.calibration.test_run_passes import faults_of_vehicle

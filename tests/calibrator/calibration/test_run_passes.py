@@ -23,7 +23,7 @@ from calibrator.files.storage import open_storage
 from calibrator.options import Method
 from calibrator.posterior.fleet import learn_fleet
 from calibrator.posterior.fleet_task import FleetTask
-from calibrator.results import ChunkResult, encode_chunk
+from calibrator.results.chunk import ChunkResult, encode_chunk
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary

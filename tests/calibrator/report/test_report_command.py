@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.calibrator.conftest import LAYOUT
-from tests.calibrator.test_results import run_command
+from tests.calibrator.conftest import LAYOUT, run_command
 
 
 def test_the_page_of_the_fleet_is_written(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,8 @@ from calibrator.report import page as page_module
 from calibrator.report.traces import unity_traces
 from calibrator.report.window import ideal_window, read_unity
 from calibrator.report.write import ReportOptions, fleet_report, vehicle_report
-from calibrator.results import read_run, written_of
+from calibrator.results.run_record import read_run
+from calibrator.results.vehicle import written_of
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import decode_parameters
 from tests.calibrator.report.results_at_hand import (

@@ -6,7 +6,7 @@ import pytest
 from calibrator.errors import FleetError
 from calibrator.summaries.filter_bank import plain_bank
 from calibrator.summaries.unity import UnityWindow, decode_window, liveliest_window
-from tests.calibrator.test_results import run_command
+from tests.calibrator.conftest import run_command
 
 WINDOW = UnityWindow(
     vehicle="v 1",

@@ -3,23 +3,16 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from calibrator.cli import main
 from calibrator.errors import FleetError
-from calibrator.results import (
-    MOST_FILES,
-    PARTS,
-    RunRecord,
-    encode_chunk,
-    join_rows,
-    parameters_of,
-    read_results,
-    read_run,
-    write_parameter_files,
-    write_run,
-)
+from calibrator.results.chunk import encode_chunk
+from calibrator.results.parameter_parts import MOST_FILES, PARTS, write_parameter_files
+from calibrator.results.rows import join_rows, read_results
+from calibrator.results.run_record import RunRecord, read_run, write_run
+from calibrator.results.vehicle import parameters_of
 from calibrator.summaries.buckets import bucket_of
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import read_parameters
+from tests.calibrator.conftest import run_command
 from tests.ecu_node.vehicles import parameters_for
 
 BUCKETS = 16
@@ -100,9 +93,3 @@ def test_parameter_files_are_written_by_the_command(
     assert run_command(["params", str(result), "v1", "v9", "--out", str(tmp_path / "none")]) == 1
     assert "no vehicle 'v9' in it" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
-
-
-def run_command(arguments: list[str]) -> int:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["calibrator", *arguments])
-        return main()
