@@ -24,7 +24,7 @@ from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.random_streams import Purpose, random_stream
-from calibrator.summaries.moments import summarise
+from calibrator.summaries.summariser import summarise
 
 __all__ = [
     "NOISE",

@@ -24,7 +24,7 @@ from calibrator.posterior.fleet import learn_fleet
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.sensor_models.families import GainBySign, SensorModel, TemperatureDrift
 from calibrator.sensor_models.fleet import SensorFindings, findings_of, summaries_about_zeros
-from calibrator.summaries.moments import summarise
+from calibrator.summaries.summariser import summarise
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.summaries.zero_current import ZeroCurrent
 from calibrator.terminal.progress import progress_bar, shown

@@ -19,7 +19,8 @@ from calibrator.errors import DriveError
 from calibrator.identification.identify import observability, standardised_moments, subspace_modes
 from calibrator.identification.read_out import fit_read_outs
 from calibrator.summaries.filter_bank import FilterBank, Poles, low_passes
-from calibrator.summaries.moments import DriveSummary, Summariser
+from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.summariser import Summariser
 from calibrator.terminal.progress import shown
 
 __all__ = ["pooled_bank"]

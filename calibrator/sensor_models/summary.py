@@ -9,7 +9,8 @@ from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
 from calibrator.sensor_models.families import FAMILIES, Family
-from calibrator.summaries.moments import DriveSummary, summarise
+from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.summariser import summarise
 
 __all__ = ["SensorSummary", "summarise_sensors"]
 

@@ -11,7 +11,8 @@ from calibrator.drives.delays import BranchDelays, estimate_delays, without_dela
 from calibrator.errors import DriveError
 from calibrator.sources.fleet_source import Equipment, load_drive
 from calibrator.summaries.filter_bank import FilterBank
-from calibrator.summaries.moments import DriveSummary, summarise
+from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.summariser import summarise
 from calibrator.summaries.zero_current import ZeroCurrent, zero_current_offsets
 from calibrator.terminal.text import counted
 from ecu_node.database import VehicleDatabase

@@ -26,7 +26,7 @@ from calibrator.identification.pooled_bank import pooled_bank
 from calibrator.identification.read_out import fit_read_outs, state_space_model
 from calibrator.identification.state_space import StateSpaceModel, simulation_snr_db
 from calibrator.summaries.filter_bank import FilterBank
-from calibrator.summaries.moments import summarise
+from calibrator.summaries.summariser import summarise
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # run as a script, the tools are not found otherwise
 from bench.row import Row

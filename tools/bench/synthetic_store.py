@@ -21,9 +21,10 @@ from calibrator.faults import Faults
 from calibrator.files.storage import open_storage
 from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.identity import store_identity, write_identity
-from calibrator.summaries.moments import DriveSummary, summarise
+from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.summariser import summarise
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.summaries.zero_current import ZeroCurrent
 from calibrator.terminal.progress import progress_bar

@@ -9,7 +9,8 @@ from scipy.signal import lfilter
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.faults import Faults, measured_currents, true_currents
-from calibrator.summaries.moments import DriveSummary, summarise
+from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.summariser import summarise
 
 PERIOD_S = 1.0
 INPUTS = 3

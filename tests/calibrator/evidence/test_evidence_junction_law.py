@@ -8,7 +8,8 @@ from calibrator.evidence.block_regression import BlockRegression
 from calibrator.evidence.collect import LEAST_GAIN
 from calibrator.evidence.fleet_moments import stack_summaries
 from calibrator.evidence.junction_law import junction_law
-from calibrator.summaries.moments import DriveSummary, summarise
+from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.summariser import summarise
 from tests.calibrator.evidence.simulated_drives import PERIOD_S, coloured, samples_of
 
 

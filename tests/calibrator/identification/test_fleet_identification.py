@@ -5,7 +5,7 @@ from calibrator.drives.align import Samples
 from calibrator.identification.fleet_identification import OWN_GAIN_DB, own_model
 from calibrator.identification.pooled_bank import pooled_bank
 from calibrator.identification.read_out import ReadOuts, far_below_fleet, fit_read_outs
-from calibrator.summaries.moments import summarise
+from calibrator.summaries.summariser import summarise
 
 
 @pytest.fixture(scope="module")

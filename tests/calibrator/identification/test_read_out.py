@@ -23,7 +23,8 @@ from calibrator.identification.read_out import (
 )
 from calibrator.identification.state_space import StateSpaceModel, simulation_snr_db
 from calibrator.summaries.filter_bank import FilterBank, low_pass_bank, plain_bank
-from calibrator.summaries.moments import BLOCK_S, DriveSummary, summarise
+from calibrator.summaries.moments import BLOCK_S, DriveSummary
+from calibrator.summaries.summariser import summarise
 
 BLOCK = round(BLOCK_S / PERIOD_S)
 LEAD_IN = 600

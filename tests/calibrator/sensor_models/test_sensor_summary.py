@@ -10,7 +10,7 @@ from calibrator.sensor_models.choice import SensorModelChoice
 from calibrator.sensor_models.families import FAMILIES
 from calibrator.sensor_models.linear_part import linear_summary
 from calibrator.sensor_models.summary import summarise_sensors
-from calibrator.summaries.moments import summarise
+from calibrator.summaries.summariser import summarise
 from tests.calibrator.sensor_models.sensor_fleets import PERIOD_S, TEMPERATURE, make_fleet
 
 DRIVE = make_fleet(vehicles=1, branches=3, minutes=3.0, seed=5).samples[0]

@@ -10,7 +10,8 @@ from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
 from calibrator.evidence.fleet_moments import stack_summaries
 from calibrator.summaries.filter_bank import FilterBank, low_passes
-from calibrator.summaries.moments import BLOCK_S, DriveSummary, Summariser, summarise
+from calibrator.summaries.moments import BLOCK_S, DriveSummary
+from calibrator.summaries.summariser import Summariser, summarise
 from tests.calibrator.evidence.simulated_drives import PERIOD_S, Conditions, drive_of, no_faults, samples_of
 
 
