@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from calibrator.drives.store import has_drive, require_plain_name, write_drive
+from calibrator.drives.plain_names import require_plain_name
+from calibrator.drives.store import has_drive, write_drive
 from calibrator.errors import LogError
 from calibrator.files.folders import require_possible_folder
 from calibrator.recordings.bmw_i3 import BRANCHES, INPUTS, ImportedTrip, trip_from_table

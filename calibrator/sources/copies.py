@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibrator.drive import DriveFile
-from calibrator.drives.store import drive_digest, drive_outline
+from calibrator.drives.drive_file import drive_digest, drive_outline
 from calibrator.sources.fleet_source import FleetSource
 from ecu_node.errors import UserError
 

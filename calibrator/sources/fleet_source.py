@@ -10,8 +10,9 @@ from pathlib import Path
 
 from calibrator.drive import Drive, DriveFile
 from calibrator.drives.align import choose_inputs
+from calibrator.drives.drive_file import read_drive_file
 from calibrator.drives.fleet_id import read_fleet_ids
-from calibrator.drives.store import list_drives, read_drive_file
+from calibrator.drives.store import list_drives
 from calibrator.errors import FleetError
 from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
 from calibrator.recordings.readers import read_drive

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibrator.drive import DriveFile
-from calibrator.drives.store import require_plain_name
+from calibrator.drives.plain_names import require_plain_name
 from calibrator.errors import LogError
 from calibrator.recordings.frames import LOG_SUFFIXES, is_log
 from ecu_node.errors import UserError

@@ -13,7 +13,7 @@ import numpy as np
 
 from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
-from calibrator.drives.store import require_plain_name
+from calibrator.drives.plain_names import require_plain_name
 from calibrator.errors import DriveError
 from calibrator.summaries.vehicle_summary import LEAST_DURATION_S, VehicleSummary
 from calibrator.summaries.zero_current import ZeroCurrent, weighted_mean

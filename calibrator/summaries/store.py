@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from calibrator.drives.store import is_plain_name
+from calibrator.drives.plain_names import is_plain_name
 from calibrator.errors import FleetError
 from calibrator.files.storage import Storage
 from calibrator.summaries.buckets import bucket_of

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.drives.store import list_drives, read_drive_file
+from calibrator.drives.drive_file import read_drive_file
+from calibrator.drives.store import list_drives
 from calibrator.errors import DriveError, LogError
 from calibrator.recordings.bmw_i3 import COLUMNS, ImportedTrip, trip_from_table
 from calibrator.recordings.csv_table import read_csv_table

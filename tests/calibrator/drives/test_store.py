@@ -8,7 +8,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from calibrator.drive import Channel, Drive
-from calibrator.drives.store import iterate_drives, list_drives, read_drive_file, write_drive
+from calibrator.drives.drive_file import read_drive_file
+from calibrator.drives.store import iterate_drives, list_drives, write_drive
 from calibrator.errors import DriveError
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
