@@ -7,7 +7,7 @@ import numpy as np
 from calibrator.drive import Mask
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.explain import FaultExplanation
-from calibrator.posterior.model_spread import FEWEST_TRUSTED
+from calibrator.posterior.spread_starts import FEWEST_TRUSTED
 from calibrator.posterior.verdict import Deployment
 from ecu_node.layout import Layout
 

@@ -12,7 +12,7 @@ from calibrator.evidence.readings import TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD, Re
 from calibrator.posterior.bench_table import BenchReadings, read_bench_readings, readings_of
 from calibrator.posterior.estimate import FleetPosterior
 from calibrator.posterior.health import ReferenceHealth
-from calibrator.posterior.model_spread import FEWEST_TRUSTED
+from calibrator.posterior.spread_starts import FEWEST_TRUSTED
 from calibrator.summaries.vehicle_summary import VehicleSummary
 
 __all__ = [

@@ -21,7 +21,7 @@ from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetLaw, FleetPosterior, Moments, estimate_vehicles, learn_law
 from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.posterior.health import ReferenceHealth, examine_reference
-from calibrator.posterior.model_spread import FEWEST_TRUSTED
+from calibrator.posterior.spread_starts import FEWEST_TRUSTED
 from calibrator.posterior.trust import broken_trust
 from calibrator.posterior.verdict import SUSPECTED
 from calibrator.summaries.moments import DriveSummary

@@ -16,13 +16,8 @@ from calibrator.posterior.hyperparameters import (
     draw_hyperparameters,
     estimate_hyperparameters,
 )
-from calibrator.posterior.model_spread import (
-    FEWEST_TRUSTED,
-    free_centres,
-    initial_spreads,
-    trusted_spread,
-    uncarried_centres,
-)
+from calibrator.posterior.spread_rows import free_centres
+from calibrator.posterior.spread_starts import FEWEST_TRUSTED, initial_spreads, trusted_spread, uncarried_centres
 from calibrator.posterior.states import States, enumerate_states, mean_states
 
 __all__ = ["FleetLaw", "FleetPosterior", "Moments", "estimate_fleet", "estimate_vehicles", "learn_law"]

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from calibrator.drive import Array, Mask
 from calibrator.evidence.cluster import Cluster, densest_clusters
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows
-from calibrator.posterior.model_spread import FEWEST_TRUSTED, MOST_UNMEASURED, unmeasured_load
 from calibrator.posterior.slab import FAULTS_RANGE
+from calibrator.posterior.spread_starts import FEWEST_TRUSTED
+from calibrator.posterior.unmeasured_load import MOST_UNMEASURED, unmeasured_load
 from ecu_node.layout import UnmeasuredLoad
 
 __all__ = ["ReferenceHealth", "examine_reference"]

@@ -20,15 +20,11 @@ from calibrator.compiled import in_place, inner
 from calibrator.drive import Array
 from calibrator.evidence.rows import FleetRows
 from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
-from calibrator.posterior.model_spread import (
-    USED_STATES,
-    centre_covariance,
-    drawn_spread,
-    free_centres,
-    next_spread,
-)
+from calibrator.posterior.model_spread import USED_STATES, next_spread
 from calibrator.posterior.slab import WIDEST, Slab
 from calibrator.posterior.small_matrices import log_mass
+from calibrator.posterior.spread_doubt import centre_covariance, drawn_spread
+from calibrator.posterior.spread_rows import free_centres
 from calibrator.posterior.states import States, enumerate_states
 from calibrator.random_streams import Purpose, random_stream
 

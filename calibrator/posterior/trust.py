@@ -7,7 +7,7 @@ import numpy as np
 from calibrator.drive import Mask
 from calibrator.evidence.readings import TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD
 from calibrator.evidence.rows import FleetRows
-from calibrator.posterior.model_spread import MOST_UNMEASURED
+from calibrator.posterior.unmeasured_load import MOST_UNMEASURED
 from ecu_node.layout import UnmeasuredLoad
 
 __all__ = ["broken_trust"]

@@ -20,7 +20,7 @@ from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, constant_desig
 from calibrator.posterior.decision import best_estimate, harm_probability
 from calibrator.posterior.estimate import Moments, estimate_fleet
 from calibrator.posterior.hyperparameters import Hyperparameters, estimate_hyperparameters
-from calibrator.posterior.model_spread import initial_spreads
+from calibrator.posterior.spread_starts import initial_spreads
 from calibrator.posterior.states import enumerate_states
 from calibrator.published.basis_pursuit import BasisPursuit
 from calibrator.published.enumeration import l1_optimum

@@ -9,7 +9,8 @@ from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, with_load_spre
 from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
 from calibrator.posterior.hyperparameters import draw_hyperparameters, estimate_hyperparameters
-from calibrator.posterior.model_spread import trusted_spread, unmeasured_load
+from calibrator.posterior.spread_starts import trusted_spread
+from calibrator.posterior.unmeasured_load import unmeasured_load
 from calibrator.score import recovered
 from tests.calibrator.posterior.simulated_rows import (
     FULL_SCALE_A,
