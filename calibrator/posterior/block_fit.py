@@ -5,158 +5,21 @@ With y = X theta + e, e ~ N(0, R), and the slab's density on theta, the integral
     N(y - X theta_hat; 0, R) sqrt(det(2 pi C)) prod_i mass_i,   C = (X^T R^-1 X)^-1,
 
 mass_i being that of N(theta_hat_i, C_ii) under the slab. That is exact where all of the likelihood lies inside the
-slab; at its edges the correlation between parameters is left out. All of it is computed from the rows' *normal form*:
-A = X^T R^-1 X, b = X^T R^-1 y, c = y^T R^-1 y.
-
-Rows can leave directions open: if all relative parameters are there, a common factor can move from d_h to the drifts
-unseen, and if o_h,k and o_k are there, an offset from one to the other, unless some reading tells one of them. Which
-directions are open depends on the rows of the vehicle. One parameter of each, the pivot, is set to the nodes of the
-slab in turn, and the others follow.
+slab; at its edges the correlation between parameters is left out. All of it is computed from the rows' *normal form*,
+with the pivots of open directions set to nodes of the slab.
 """
 
 import math
-from functools import cache
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibrator.compiled import inlined, inner
 from calibrator.drive import Array
-from calibrator.posterior.slab import Slab
-from calibrator.posterior.small_matrices import (
-    LOG_2PI,
-    cholesky,
-    inverse,
-    log_mass,
-    quadratic,
-    solution,
-    variances,
-)
+from calibrator.posterior.normal import TINY, Normal, Places, Scratch
+from calibrator.posterior.slab_nodes import SlabNodes
+from calibrator.posterior.small_matrices import LOG_2PI, cholesky, inverse, log_mass, quadratic, solution, variances
 
-__all__ = ["Normal", "Scratch", "SlabNodes", "fit_node", "open_directions", "scratch_of", "slab_nodes", "weigh_nodes"]
-
-Places = NDArray[np.int64]
-TINY = 1e-9
-"""Information on a parameter that no row tells. [1]"""
-
-
-class SlabNodes(NamedTuple):
-    """A slab, and its nodes for 0 .. D open directions; both logarithms and values where they stand for drifts.
-
-    ``values`` (D + 1, Q, D), of which ``counts[d]`` are used; ``sd`` (D + 1, Q, D) what each stands for; ``spacing``
-    (D + 1,) how far they lie apart if there is one direction more.
-    """
-
-    low: float
-    high: float
-    logarithmic: bool
-    counts: Places
-    values: Array
-    sd: Array
-    spacing: Array
-
-
-class Normal(NamedTuple):
-    """Normal form of rows: A (P, P), b (P,), and (c, logarithm of the density at a misfit of zero) as an array."""
-
-    A: Array
-    b: Array
-    level: Array
-
-
-class Scratch(NamedTuple):
-    """Room for intermediate results."""
-
-    fitted: Places
-    pivots: Places
-    node: Array
-    right: Array
-    z: Array
-    x: Array
-    variance: Array
-    L: Array
-    work: Array
-    C: Array
-    lever: Array
-
-
-def slab_nodes(slab: Slab, directions: int, *, logarithmic: bool) -> SlabNodes:
-    """Nodes of a slab for up to so many open directions.
-
-    Parameters
-    ----------
-    slab : Slab
-        Of drifts or offsets.
-    directions : int
-        Most directions that can be open.
-    logarithmic : bool
-        Whether the rows are linear in the logarithm of 1 + parameter.
-
-    Returns
-    -------
-    SlabNodes
-        For compiled functions.
-    """
-    units = [_unit_nodes(d) for d in range(directions + 1)]
-    most = max(len(unit) for unit in units)
-    values, sd = np.zeros((directions + 1, most, directions)), np.zeros((directions + 1, most, directions))
-    for d, unit in enumerate(units):
-        nodes = slab.at(unit)
-        values[d, : len(unit), :d] = np.log1p(nodes) if logarithmic else nodes
-        sd[d, : len(unit), :d] = slab.cell_sd(d) / (1.0 + nodes if logarithmic else 1.0)
-    return SlabNodes(
-        low=slab.low,
-        high=slab.high,
-        logarithmic=logarithmic,
-        counts=np.array([len(unit) for unit in units]),
-        values=values,
-        sd=sd,
-        spacing=np.array([slab.spacing(d + 1) for d in range(directions + 1)]),
-    )
-
-
-@cache
-def _unit_nodes(directions: int) -> Array:
-    return Slab.unit_nodes(directions)
-
-
-def scratch_of(size: int) -> Scratch:
-    """Room for supports of up to so many parameters, or matrices of so many rows."""
-    places, vectors, matrices = np.zeros((2, size), np.int64), np.zeros((5, size)), np.zeros((4, size, size))
-    return Scratch(*places, *vectors, *matrices)
-
-
-@inner
-def open_directions(A: Array, active: Places, count: int, spacing: Array, room: Scratch) -> int:
-    """Which of the active parameters are pivots, as bits: the first that is open, until none is.
-
-    A direction is open where its parameters' deviations are wider than nodes would lie apart with one pivot more.
-    """
-    pivots, found = 0, 0
-    while found < count:
-        kept = 0
-        for i in range(count):
-            if not (pivots >> i) & 1:
-                room.fitted[kept] = i
-                kept += 1
-        for i in range(kept):
-            for j in range(kept):
-                room.C[i, j] = A[active[room.fitted[i]], active[room.fitted[j]]]
-            room.C[i, i] += TINY
-            room.pivots[i] = i
-        cholesky(room.C, room.pivots, kept, room.L)
-        variances(room.L, kept, room.work, room.variance)
-        first = -1
-        for i in range(kept):
-            if room.variance[i] > spacing[found] ** 2:
-                first = room.fitted[i]
-                break
-        if first < 0:
-            break
-        pivots |= 1 << first
-        found += 1
-    return pivots
+__all__ = ["fit_node", "weigh_nodes"]
 
 
 @inlined

@@ -9,18 +9,18 @@ What cannot come near the best state is not worked out: no integral is larger th
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibrator.compiled import inlined, inner
 from calibrator.drive import Array
-from calibrator.posterior.block_fit import Normal, Scratch, open_directions, weigh_nodes
+from calibrator.posterior.block_fit import weigh_nodes
+from calibrator.posterior.normal import Normal, Places, Scratch
+from calibrator.posterior.open_directions import open_directions
 from calibrator.posterior.relative_states import take_relative
 from calibrator.posterior.small_matrices import LOG_2PI, cholesky, inverse, normal_form, sort_falling
 from calibrator.posterior.workspace import BEAM, Evidence, Law, Room
 
 __all__ = ["bit_count", "bits_of", "grown", "pattern_of", "sharpest", "take_pattern", "take_turn", "weigh_constants"]
 
-Places = NDArray[np.int64]
 DROPPED = 15.0
 """States so far below the best (logarithm) are not worked out. [1]"""
 GROWING = 3.0

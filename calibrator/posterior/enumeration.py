@@ -14,7 +14,7 @@ import numpy as np
 
 from calibrator.compiled import in_place, inlined
 from calibrator.drive import Array
-from calibrator.posterior.block_fit import Normal, fit_node
+from calibrator.posterior.block_fit import fit_node
 from calibrator.posterior.constant_states import (
     bit_count,
     bits_of,
@@ -25,6 +25,7 @@ from calibrator.posterior.constant_states import (
     take_turn,
     weigh_constants,
 )
+from calibrator.posterior.normal import Normal
 from calibrator.posterior.relative_states import take_relative, weigh_relative
 from calibrator.posterior.small_matrices import quadratic, sort_falling
 from calibrator.posterior.workspace import Evidence, Found, Law, Room

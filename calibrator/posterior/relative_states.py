@@ -6,7 +6,8 @@ import numpy as np
 
 from calibrator.compiled import inlined, inner
 from calibrator.evidence.rows import MOST_TURN
-from calibrator.posterior.block_fit import fit_node, open_directions, weigh_nodes
+from calibrator.posterior.block_fit import fit_node, weigh_nodes
+from calibrator.posterior.open_directions import open_directions
 from calibrator.posterior.small_matrices import LOG_2PI, normal_form, sort_falling
 from calibrator.posterior.workspace import Evidence, Law, Room
 

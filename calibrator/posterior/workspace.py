@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array
 from calibrator.evidence.rows import FleetRows, constant_design, relative_design
-from calibrator.posterior.block_fit import Normal, Scratch, SlabNodes, scratch_of, slab_nodes
 from calibrator.posterior.fault_prior import FaultPrior, ModelSpread
+from calibrator.posterior.normal import Normal, Places, Scratch, scratch_of
+from calibrator.posterior.slab_nodes import SlabNodes, slab_nodes
 from calibrator.posterior.supports import EXACT_BRANCHES, MOST_CONSTANT, constant_supports, relative_supports
 
 __all__ = ["Evidence", "Found", "Law", "Room", "evidence_of", "found_of", "law_of", "room_of"]
 
-Places = NDArray[np.int64]
 MOST_STATES = 128
 """States kept per vehicle, the most probable ones. [1]"""
 MOST_RELATIVE = 24

@@ -12,17 +12,11 @@ from scipy.stats import multivariate_normal
 from calibrator.compiled import in_place
 from calibrator.drive import Array
 from calibrator.evidence.rows import UNKNOWN_VARIANCE, constant_design, relative_design
-from calibrator.posterior.block_fit import (
-    Normal,
-    Scratch,
-    SlabNodes,
-    fit_node,
-    open_directions,
-    scratch_of,
-    slab_nodes,
-    weigh_nodes,
-)
+from calibrator.posterior.block_fit import fit_node, weigh_nodes
+from calibrator.posterior.normal import Normal, Scratch, scratch_of
+from calibrator.posterior.open_directions import open_directions
 from calibrator.posterior.slab import Slab
+from calibrator.posterior.slab_nodes import SlabNodes, slab_nodes
 
 K = 2
 SLAB = Slab(0.05, 0.25)
