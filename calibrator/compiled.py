@@ -40,9 +40,10 @@ SOURCES = (
     "drives/charge.py",
     "drives/delay_fit.py",
     "evidence/rows.py",
-    "evidence/summary.py",
-    "identification/filter_bank.py",
     "posterior/*.py",
+    "summaries/bank_state.py",
+    "summaries/summariser.py",
+    "summaries/white_noise.py",
 )
 """Files of this package whose functions or constants are compiled."""
 KEPT = 4

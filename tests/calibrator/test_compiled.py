@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import calibrator
-from calibrator.compiled import compiled
+from calibrator.compiled import SOURCES, compiled
 from calibrator.drive import Array
 
 LINE = "compiling the estimator"
@@ -96,6 +96,15 @@ def test_a_changed_source_is_compiled_anew(folder: Path, cache: Path) -> None:
         source.write("# changed\n")
     assert LINE in said(started(folder, cache))
     assert len(list(cache.glob("compiled-*"))) == 2
+
+
+def test_every_file_with_compiled_functions_is_among_those_whose_change_is_noticed() -> None:
+    package = Path(calibrator.__file__).parent
+    found = {pattern: set(package.glob(pattern)) for pattern in SOURCES}
+    assert [pattern for pattern, paths in found.items() if not paths] == []
+    users = {path for path in package.rglob("*.py") if "from calibrator.compiled import" in path.read_text("utf-8")}
+    assert len(users) > 10
+    assert users - set().union(*found.values()) == set()
 
 
 @pytest.mark.parametrize(("variable", "other"), [("NUMBA_CPU_NAME", "generic"), ("NUMBA_CPU_FEATURES", "+sse2")])
