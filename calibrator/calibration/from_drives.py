@@ -17,9 +17,10 @@ from calibrator.posterior.bench import read_bench
 from calibrator.results.run_record import read_run
 from calibrator.sensor_models.fleet import SensorFindings, find_sensor_models
 from calibrator.sources.fleet_source import FleetSource, probe_equipment
+from calibrator.summaries.add_drives import add_drives
 from calibrator.summaries.identity import read_identity
+from calibrator.summaries.open_store import open_store
 from calibrator.summaries.store import SummaryStore
-from calibrator.summaries.summarise import add_drives, open_store
 from calibrator.summaries.unity import keep_unity_window
 from ecu_node.database import VehicleDatabase
 

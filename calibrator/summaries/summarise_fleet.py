@@ -8,8 +8,9 @@ from calibrator.files.storage import open_storage
 from calibrator.reading_processes import TIME_LIMIT_S
 from calibrator.sources.copies import without_copies
 from calibrator.sources.fleet_source import find_fleet, probe_equipment
+from calibrator.summaries.add_drives import add_drives
 from calibrator.summaries.filter_bank import FilterBank
-from calibrator.summaries.summarise import add_drives, open_store, require_store_or_nothing
+from calibrator.summaries.open_store import open_store, require_store_or_nothing
 from calibrator.summaries.unity import keep_unity_window
 from calibrator.terminal.text import counted, dumps, left_out_text
 from ecu_node.database import VehicleDatabase

@@ -11,9 +11,10 @@ from calibrator.drives.store import write_drive
 from calibrator.errors import FleetError
 from calibrator.files.storage import open_storage
 from calibrator.sources.fleet_source import Equipment, find_fleet
+from calibrator.summaries.add_drives import Added, add_drives
+from calibrator.summaries.open_store import open_store
 from calibrator.summaries.record import joined_records
 from calibrator.summaries.store import SummaryStore
-from calibrator.summaries.summarise import Added, add_drives, open_store
 from ecu_node.database import VehicleDatabase
 
 EQUIPMENT = Equipment(branches=("battery", "motor"), inputs=("speed",), fleet_inputs=("speed",), notices=())
