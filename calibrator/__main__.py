@@ -5,9 +5,10 @@ All that takes time is imported inside a function, so that Ctrl-C and a closed p
 
 import signal
 
-from calibrator.interrupts import INTERRUPTED, MESSAGE, ending_at_sigterm, importing
+from calibrator.processes.interrupts import MESSAGE, ending_at_sigterm, importing
 from ecu_node.errors import UserError
 from ecu_node.failures import say_error
+from ecu_node.interrupts import INTERRUPTED
 from ecu_node.python_can import load_python_can
 from ecu_node.standard_output import drop_output, flush_output
 

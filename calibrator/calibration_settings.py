@@ -8,7 +8,7 @@ from typing import Any
 from calibrator.errors import FleetError
 from calibrator.fleet_truth import FleetTruth
 from calibrator.options import Classifier, Method
-from calibrator.reading_processes import TIME_LIMIT_S
+from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.terminal.text import counted, few_reasons
 from ecu_node.layout import file_digest
 from ecu_node.parameters import VehicleParameters

@@ -23,7 +23,7 @@ from calibrator.artificial.options import (
 )
 from calibrator.files.folders import require_new_folder
 from calibrator.files.layout_files import vehicle_database
-from calibrator.interrupts import importing
+from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import JsonOption, LayoutOption, SeedOption, WorkersOption
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import dumps, print_report

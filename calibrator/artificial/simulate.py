@@ -13,7 +13,7 @@ from calibrator.artificial.vehicle import Vehicle, draw_disturbances, write_vehi
 from calibrator.drives.fleet_id import write_fleet_ids
 from calibrator.files.folders import whole_folder
 from calibrator.fleet_truth import TRUTH_FILE, FleetTruth, VehicleTruth, with_fleet_id, write_truth
-from calibrator.interrupts import in_processes
+from calibrator.processes.computing import in_processes
 from calibrator.random_streams import Purpose, random_stream
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout

@@ -23,9 +23,9 @@ from calibrator.calibration.options import (
 )
 from calibrator.files.folders import require_possible_folder
 from calibrator.files.layout_files import vehicle_database
-from calibrator.interrupts import importing
 from calibrator.options import Classifier, Method
-from calibrator.reading_processes import TIME_LIMIT_S
+from calibrator.processes.interrupts import importing
+from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.terminal.options import (
     BranchesOption,
     FleetOrSummariesArgument,

@@ -16,7 +16,7 @@ from joblib import delayed
 from threadpoolctl import threadpool_limits
 
 from calibrator.errors import FleetError
-from calibrator.interrupts import in_processes
+from calibrator.processes.computing import in_processes
 
 __all__ = ["Workers"]
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from calibrator.files.layout_files import chosen_layout
-from calibrator.interrupts import importing
+from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import DbcOption, JsonOption, LayoutOption
 from ecu_node.standard_output import write_output
 

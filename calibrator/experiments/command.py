@@ -7,8 +7,8 @@ import typer
 from rich.console import Console
 
 from calibrator.files.folders import require_possible_folder
-from calibrator.interrupts import importing
 from calibrator.options import ExperimentName
+from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import JsonOption, SeedOption, WorkersOption, given_options, whole_option
 from ecu_node.standard_output import write_output
 

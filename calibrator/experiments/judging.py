@@ -10,7 +10,7 @@ from calibrator.experiments.methods import Method
 from calibrator.experiments.outcome import Outcome, confidence_bins, figures_of, judge, pooled
 from calibrator.experiments.result import Figure, Row
 from calibrator.experiments.trial import Trial
-from calibrator.interrupts import in_processes
+from calibrator.processes.computing import in_processes
 from calibrator.terminal.progress import shown
 
 __all__ = ["Effort", "PaperFigures", "Setting", "run_settings"]

@@ -8,7 +8,7 @@ import typer
 
 from calibrator.files.folders import require_possible_file
 from calibrator.files.layout_files import vehicle_database
-from calibrator.interrupts import importing
+from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import BankOption, FleetArgument, JsonOption, LayoutOption, WorkersOption
 from calibrator.terminal.text import print_report
 from ecu_node.user_files import write_atomically

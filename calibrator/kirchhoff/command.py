@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from calibrator.files.layout_files import vehicle_database
-from calibrator.interrupts import importing
+from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import DbcOption, JsonOption, LayoutOption, number_option
 from ecu_node.standard_output import write_output
 

@@ -8,7 +8,7 @@ import typer
 
 from calibrator.errors import ProposalError
 from calibrator.files.folders import require_possible_file
-from calibrator.interrupts import importing
+from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import JsonOption
 from calibrator.terminal.text import dumps
 from ecu_node.errors import printable

@@ -7,7 +7,7 @@ import typer
 
 from calibrator.files.folders import require_possible_file
 from calibrator.files.layout_files import vehicle_database
-from calibrator.interrupts import importing
+from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import JsonOption, given_options, number_option
 from calibrator.terminal.text import dumps
 from ecu_node.standard_output import write_output

@@ -18,7 +18,7 @@ import numpy as np
 from calibrator.drive import Array, DriveFile, Mask
 from calibrator.drives.align import Samples, align
 from calibrator.drives.delays import without_delays
-from calibrator.reading_processes import TIME_LIMIT_S
+from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.sensor_models.choice import LEAST_VEHICLES, LINEAR, SensorModelChoice, choose_sensor_models
 from calibrator.sensor_models.modelled import ModelledVehicle, modelled_vehicle, usual_sections
 from calibrator.sensor_models.summary import SensorSummary, summarise_sensors

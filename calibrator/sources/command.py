@@ -8,8 +8,8 @@ import typer
 from calibrator.errors import LogError
 from calibrator.files.folders import require_possible_folder
 from calibrator.files.layout_files import vehicle_database
-from calibrator.interrupts import importing
-from calibrator.reading_processes import TIME_LIMIT_S
+from calibrator.processes.interrupts import importing
+from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.terminal.options import JsonOption, LayoutOption, TimeLimitOption, WorkersOption
 from calibrator.terminal.text import print_report
 

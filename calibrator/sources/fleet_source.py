@@ -14,7 +14,8 @@ from calibrator.drives.drive_file import read_drive_file
 from calibrator.drives.fleet_id import read_fleet_ids
 from calibrator.drives.store import list_drives
 from calibrator.errors import FleetError
-from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
+from calibrator.processes.messages import Unread
+from calibrator.processes.reading import TIME_LIMIT_S, read_in_processes
 from calibrator.recordings.readers import read_drive
 from calibrator.sources.logs import find_logs
 from calibrator.terminal.text import few_reasons

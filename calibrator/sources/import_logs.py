@@ -9,7 +9,8 @@ from pathlib import Path
 from calibrator.drive import DriveFile
 from calibrator.drives.fleet_id import read_fleet_ids, write_fleet_ids
 from calibrator.drives.store import has_drive, write_drive
-from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
+from calibrator.processes.messages import Unread
+from calibrator.processes.reading import TIME_LIMIT_S, read_in_processes
 from calibrator.recordings.readers import read_recording
 from calibrator.sources.logs import find_logs
 from calibrator.terminal.notices import Notice, merged_notices

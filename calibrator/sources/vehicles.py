@@ -9,7 +9,8 @@ from threadpoolctl import threadpool_limits
 
 from calibrator.drive import DriveFile
 from calibrator.errors import FleetError
-from calibrator.reading_processes import TIME_LIMIT_S, Unread, read_in_processes
+from calibrator.processes.messages import Unread
+from calibrator.processes.reading import TIME_LIMIT_S, read_in_processes
 from calibrator.sources.fleet_source import Equipment, FleetSource
 from calibrator.terminal.progress import progress_bar
 from ecu_node.database import VehicleDatabase

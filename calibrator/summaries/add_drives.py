@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from calibrator.drive import DriveFile
-from calibrator.reading_processes import TIME_LIMIT_S, read_in_processes
+from calibrator.processes.reading import TIME_LIMIT_S, read_in_processes
 from calibrator.sources.fleet_source import FleetSource
 from calibrator.summaries.known_drives import NewDrives, new_drives, remove_others, stays
 from calibrator.summaries.read_record import read_record, record_of

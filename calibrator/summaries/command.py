@@ -5,8 +5,8 @@ from typing import Annotated
 import typer
 
 from calibrator.files.layout_files import vehicle_database
-from calibrator.interrupts import importing
-from calibrator.reading_processes import TIME_LIMIT_S
+from calibrator.processes.interrupts import importing
+from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.terminal.options import (
     BankOption,
     BranchesOption,

@@ -6,7 +6,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calibrator.drive import DriveFile
-from calibrator.reading_processes import Unread
+from calibrator.processes.messages import Unread
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.record import Record, source_version
 from calibrator.summaries.vehicle_summary import read_vehicle_summary

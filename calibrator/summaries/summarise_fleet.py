@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibrator.files.storage import open_storage
-from calibrator.reading_processes import TIME_LIMIT_S
+from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.sources.copies import without_copies
 from calibrator.sources.fleet_source import find_fleet, probe_equipment
 from calibrator.summaries.add_drives import add_drives

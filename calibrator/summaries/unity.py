@@ -18,7 +18,8 @@ import pyarrow.parquet as pq
 from calibrator.drive import Array, Drive, DriveFile, Mask
 from calibrator.drives.align import align
 from calibrator.errors import FleetError
-from calibrator.reading_processes import Unread, read_in_processes
+from calibrator.processes.messages import Unread
+from calibrator.processes.reading import read_in_processes
 from calibrator.sources.fleet_source import FleetSource, load_drive
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity

@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 from calibrator.cli import app, main
 from calibrator.experiments.command import RECORDED_EXPERIMENTS
 from calibrator.experiments.runner import EXPERIMENTS, Recorded
-from calibrator.interrupts import INTERRUPTED, MESSAGE, TERMINATED, TERMINATED_MESSAGE
+from calibrator.processes.interrupts import MESSAGE, TERMINATED, TERMINATED_MESSAGE
+from ecu_node.interrupts import INTERRUPTED
 
 ROOT = Path(__file__).parents[2]
 LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"

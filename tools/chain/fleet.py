@@ -11,7 +11,7 @@ from calibrator.artificial.simulate import FleetPlan, draw_vehicles, trip_of
 from calibrator.artificial.trips import TripPurpose, TripSource
 from calibrator.artificial.vehicle import Vehicle, vehicle_drive
 from calibrator.drives.store import write_drive
-from calibrator.interrupts import in_processes
+from calibrator.processes.computing import in_processes
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.terminal.progress import shown
 from ecu_node.database import VehicleDatabase

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from joblib import delayed
 
-from calibrator.interrupts import in_processes
+from calibrator.processes.computing import in_processes
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps, table
 from chain.fleet import ChainFleet

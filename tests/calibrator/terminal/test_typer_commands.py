@@ -9,8 +9,8 @@ import typer
 from joblib import delayed
 
 from calibrator.errors import ContradictionError, FleetError
-from calibrator.interrupts import in_processes
-from calibrator.reading_processes import read_in_processes
+from calibrator.processes.computing import in_processes
+from calibrator.processes.reading import read_in_processes
 from calibrator.terminal.command_line import command_app, run_app, run_tool
 from ecu_node.standard_output import write_output
 

@@ -5,7 +5,8 @@ import numpy as np
 from joblib import delayed
 
 from calibrator.drive import Array
-from calibrator.interrupts import importing, in_processes
+from calibrator.processes.computing import in_processes
+from calibrator.processes.interrupts import importing
 
 
 def seen_by_worker(values: Array) -> tuple[float, bool, bool]:

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from calibrator.reading_processes import AHEAD_PER_WORKER, Unread, read_in_processes
+from calibrator.processes.messages import Unread
+from calibrator.processes.reading import AHEAD_PER_WORKER, read_in_processes
 
 LIMIT_S = 2.0
 TIME_LIMIT = (
@@ -210,8 +211,8 @@ PARENT = """
 import sys
 from functools import partial
 from pathlib import Path
-from calibrator.reading_processes import read_in_processes
-from tests.calibrator.test_reading_processes import started_and_left
+from calibrator.processes.reading import read_in_processes
+from tests.calibrator.processes.test_reading_processes import started_and_left
 
 if __name__ == "__main__":
     list(read_in_processes(partial(started_and_left, note=Path(sys.argv[2])), [Path(sys.argv[1])], workers=1))
@@ -221,7 +222,7 @@ if __name__ == "__main__":
 def test_a_reader_ends_with_a_parent_that_is_killed(endless: Path, tmp_path: Path) -> None:
     script, note = tmp_path / "parent.py", tmp_path / "note"
     script.write_text(PARENT)
-    path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, str(script), str(endless), str(note)]
     with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}) as parent:
         wait_until(note.exists)
