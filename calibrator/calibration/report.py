@@ -1,6 +1,5 @@
 """What a calibration found, in short: counted from the rows of its result."""
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -14,6 +13,7 @@ import pyarrow.parquet as pq
 
 from calibrator.drive import Array
 from calibrator.posterior.verdict import CONFIDENT
+from calibrator.results.counts import Counts, count_rows, deployed_rms_a
 from calibrator.results.run_record import RunRecord
 from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
 
@@ -123,14 +123,14 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
         result=str(shown),
         parameters=parameters,
         run=run,
-        verdicts=dict(tally.verdicts),
+        verdicts=dict(tally.counts.verdicts),
         undecided=tally.undecided,
         corrected=tally.corrected,
         hardware_suspected=tally.hardware,
-        hardware_count=tally.hardware_count,
-        held_back=dict(tally.held_back),
+        hardware_count=tally.counts.hardware_suspected,
+        held_back=dict(tally.counts.held_back),
         moved=tally.moved,
-        moved_count=tally.moved_count,
+        moved_count=tally.counts.moved_vehicles,
         junction_rms_measured_a=float(np.median(np.concatenate(tally.measured_a))),
         junction_rms_deployed_a=float(np.median(np.concatenate(tally.deployed_a))),
     )
@@ -138,16 +138,13 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
 
 @dataclass(kw_only=True)
 class _Tally:
-    """Counts over the rows, a few vehicles at a time; a vehicle's rows stand together, one per branch."""
+    """Counts and names over the rows, a few vehicles at a time; a vehicle's rows stand together, one per branch."""
 
-    verdicts: Counter[str] = field(default_factory=Counter)
-    held_back: Counter[str] = field(default_factory=Counter)
+    counts: Counts = field(default_factory=Counts)
     undecided: dict[str, str] = field(default_factory=dict)
     corrected: dict[str, str] = field(default_factory=dict)
     hardware: dict[str, str] = field(default_factory=dict)
     moved: dict[str, str] = field(default_factory=dict)
-    hardware_count: int = 0
-    moved_count: int = 0
     measured_a: list[Array] = field(default_factory=list)
     deployed_a: list[Array] = field(default_factory=list)
     rest: pa.Table | None = None
@@ -158,20 +155,17 @@ class _Tally:
         whole = rows.num_rows - rows.num_rows % len(branches)
         self.rest, rows = rows.slice(whole), rows.slice(0, whole)
         vehicles = rows.filter(pc.field("branch") == branches[0])
-        applied = rows["applied"].to_numpy().reshape(-1, len(branches)).any(axis=1)
-        measured_a = vehicles["junction_rms_measured_a"].to_numpy()
+        applied = rows["applied"].to_numpy().reshape(-1, len(branches))
+        measured_a, corrected_a = (vehicles[f"junction_rms_{name}_a"].to_numpy() for name in ("measured", "corrected"))
         self.measured_a.append(measured_a)
-        self.deployed_a.append(np.where(applied, vehicles["junction_rms_corrected_a"].to_numpy(), measured_a))
-        self.verdicts.update(_counts(vehicles["verdict"]))
-        self.held_back.update(_counts(rows["held_back"].drop_null()))
+        self.deployed_a.append(deployed_rms_a(applied, measured_a=measured_a, corrected_a=corrected_a))
+        self.counts += count_rows(rows, branches)
         _name(
             self.undecided, vehicles.filter(pc.field("verdict") == "cannot tell"), lambda rows: rows[0]["reason"] or ""
         )
         suspected = vehicles.filter(pc.field("hardware_fault"))
-        self.hardware_count += suspected.num_rows
         _name(self.hardware, suspected, lambda rows: _probability(rows[0]["hardware_probability"]))
         moved = rows.filter(pc.field("moved").is_valid())
-        self.moved_count += len(pc.unique(moved["vehicle"]))
         _name(self.moved, moved, lambda rows: "; ".join(f"{row['branch']} {row['moved']}" for row in rows))
         corrected = rows.filter((pc.field("verdict") == "corrected") & pc.field("applied"))
         _name(self.corrected, corrected, _corrections)
@@ -194,10 +188,6 @@ def _corrections(rows: list[dict[str, Any]]) -> str:
 
 def _probability(value: float | None) -> str:
     return "" if value is None else f"probability {value:.1f}"
-
-
-def _counts(values: pa.ChunkedArray) -> dict[str, int]:
-    return {item["values"]: item["counts"] for item in pc.value_counts(values).to_pylist()}
 
 
 def _doubt(confidence: float | None) -> str:

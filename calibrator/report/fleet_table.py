@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
+from calibrator.results.counts import Counts, count_rows, deployed_rms_a
 from calibrator.results.rows import SCHEMA
 from calibrator.results.run_record import RunRecord, read_run
 
@@ -46,6 +47,8 @@ class FleetTable:
     ----------
     run : RunRecord
         How it was made.
+    counts : Counts
+        Of all its vehicles.
     vehicle, verdict, reason : ndarray of str, shape (N,)
         Names of the vehicles that have parameters, what was found, and what would decide.
     confidence, hardware_probability, hardware_drift : ndarray of shape (N,)
@@ -73,6 +76,7 @@ class FleetTable:
     """
 
     run: RunRecord
+    counts: Counts
     vehicle: Names
     verdict: Names
     reason: Names
@@ -123,7 +127,7 @@ class FleetTable:
     @property
     def deployed_a(self) -> Array:
         """Root mean square of the Kirchhoff sum with what the node applies, shape (N,). [A]"""
-        return np.where(self.applied.any(axis=1), self.corrected_a, self.measured_a)
+        return deployed_rms_a(self.applied, measured_a=self.measured_a, corrected_a=self.corrected_a)
 
     def places(self, vehicles: Sequence[str]) -> NDArray[np.int64]:
         """Where each of some vehicles stands in this table, -1 where it does not."""
@@ -175,6 +179,7 @@ def read_fleet_table(result: Path) -> FleetTable:
     first = rows.take(pa.array(range(0, rows.num_rows, K), pa.int64()))
     return FleetTable(
         run=run,
+        counts=count_rows(rows, branches),
         vehicle=_texts(first, "vehicle"),
         verdict=_texts(first, "verdict"),
         reason=_texts(first, "reason"),

@@ -197,8 +197,8 @@ def comparison_rows(table: FleetTable, other: FleetTable) -> list[tuple[str, str
         return {
             "vehicles calibrated": f"{len(each):,}",
             "corrected": f"{int(each.corrected.sum()):,}",
-            "cannot tell": f"{int((each.verdict == 'cannot tell').sum()):,}",
-            "hardware fault suspected": f"{int(each.suspected.sum()):,}",
+            "cannot tell": f"{each.counts.verdicts['cannot tell']:,}",
+            "hardware fault suspected": f"{each.counts.hardware_suspected:,}",
             "Kirchhoff sum as measured, median RMS": amperes(float(np.median(each.measured_a))),
             "after correction, median": amperes(float(np.median(each.deployed_a))),
             "after correction, 95 % of the vehicles below": amperes(float(np.quantile(each.deployed_a, 0.95))),

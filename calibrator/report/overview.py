@@ -152,12 +152,12 @@ def overview_of(table: FleetTable) -> Overview:
     return Overview(
         vehicles=len(table),
         left_out=len(table.left_out),
-        verdicts=dict(Counter(table.verdict.tolist()).most_common()),
+        verdicts=dict(table.counts.verdicts.most_common()),
         corrected=int(table.corrected.sum()),
-        hardware_suspected=int(table.suspected.sum()),
+        hardware_suspected=table.counts.hardware_suspected,
         faulty_sensors=int(faulty.sum()),
         applied_sensors=int((table.applied & faulty).sum()),
-        held_back=dict(Counter(why for why in table.held_back.ravel() if why is not None).most_common()),
+        held_back=dict(table.counts.held_back.most_common()),
         junction_measured_a=spread_of(table.measured_a),
         junction_deployed_a=spread_of(table.deployed_a),
         unmeasured_a=details.get("reference", {}).get("unmeasured_a"),
@@ -169,7 +169,7 @@ def overview_of(table: FleetTable) -> Overview:
         },
         reference=_reference(table.branches, details),
         left_out_reasons=dict(reasons.most_common(MOST_REASONS)),
-        moved_sensors=sum(text is not None for text in table.moved.ravel()),
+        moved_sensors=table.counts.moved_sensors,
     )
 
 
