@@ -57,3 +57,11 @@ def test_links_are_found() -> None:
     assert len(found) >= FEWEST_LINKS
     assert (ROOT / "docs" / "layout.md", "trust.md", "the-trial") in found
     assert "the-trial" in headings(ROOT / "docs" / "trust.md")
+
+
+def test_modules_that_a_document_names_exist() -> None:
+    named = {(path, name) for path in DOCUMENTS for name in re.findall(r"`([a-z_]+(?:/\w+)+\.py)`", text_of(path))}
+    assert len(named) > 20
+    assert [
+        found for found in sorted(named) if not any((ROOT / top / found[1]).exists() for top in ("", "calibrator"))
+    ] == []
