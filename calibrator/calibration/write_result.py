@@ -16,7 +16,7 @@ from calibrator.results.rows import join_rows
 from calibrator.results.run_record import RunRecord, write_run
 from calibrator.summaries.unity import UNITY_FILE
 from calibrator.terminal.progress import progress_bar
-from ecu_node.parameters import write_atomically
+from ecu_node.user_files import write_atomically
 
 __all__ = ["write_result"]
 

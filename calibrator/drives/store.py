@@ -9,7 +9,7 @@ from calibrator.drives.plain_names import require_plain_name
 from calibrator.errors import DriveError
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout
-from ecu_node.parameters import write_atomically
+from ecu_node.user_files import write_atomically
 
 __all__ = ["has_drive", "iterate_drives", "list_drives", "write_drive"]
 

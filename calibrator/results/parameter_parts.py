@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from calibrator.errors import FleetError
 from calibrator.evidence.vehicle_evidence import VehicleEvidence
-from ecu_node.parameters import write_atomically
+from ecu_node.user_files import write_atomically
 
 __all__ = [
     "MOST_FILES",

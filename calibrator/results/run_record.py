@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 
 from calibrator.errors import FleetError
-from ecu_node.parameters import write_atomically
+from ecu_node.user_files import write_atomically
 
 __all__ = ["REMEDY", "RunRecord", "read_run", "write_run"]
 
