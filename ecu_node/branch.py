@@ -8,7 +8,7 @@ from collections.abc import Callable
 from ecu_node.auxiliary import Auxiliary
 from ecu_node.bits import PlacedSignal
 from ecu_node.codes import Codes
-from ecu_node.correction import AS_IT_IS, CorrectionPlan, IntegerPlan, SignPlan, TemperaturePlans
+from ecu_node.correction import AS_IT_IS, CodePlan, CorrectionPlan, IntegerPlan, TemperaturePlans
 from ecu_node.counters import Counters
 from ecu_node.past import Frames, Past
 from ecu_node.plan_function import plan_function
@@ -68,10 +68,10 @@ class LiveBranch:
         self._is_named = False
         self._time_s = self._awake_s = self._waited_s = float("-inf")
         self._scale, self._offset = float(sign * codes.scale), float(sign * codes.offset)
-        self._passing: CorrectionPlan = AS_IT_IS
-        self._correcting: CorrectionPlan | None = None
+        self._passing: CodePlan = AS_IT_IS
+        self._correcting: CodePlan | None = None
         self._fix = plan_function(codes, AS_IT_IS, voltage, Counters())
-        self.plan: CorrectionPlan = AS_IT_IS
+        self.plan: CodePlan = AS_IT_IS
         """What is done now."""
         self._active = False
         self._plans: TemperaturePlans | None = None
@@ -198,10 +198,7 @@ class LiveBranch:
         """Whether a fault is applied to it, and yet it is not corrected now: something that this needs is missing."""
         if not self.fault.applied:
             return False
-        plan = self.plan
-        of_voltage = plan.weights[1] if isinstance(plan, SignPlan) else 0
-        of_voltage = plan.voltage_gain if isinstance(plan, IntegerPlan) else of_voltage
-        no_voltage = self.voltage is not None and bool(of_voltage) and self.voltage.code is None
+        no_voltage = self.voltage is not None and self.plan.needs_voltage and self.voltage.code is None
         return self.quality is not Quality.CORRECTED or no_voltage or (self.seen and self.latest() is None)
 
     def why_no_value(self) -> Quality:

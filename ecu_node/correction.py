@@ -35,6 +35,7 @@ from ecu_node.sensor_models import GainBySign, TemperatureDrift
 __all__ = [
     "AS_IT_IS",
     "LARGEST_ERROR",
+    "CodePlan",
     "CorrectionPlan",
     "IntegerPlan",
     "Line",
@@ -106,6 +107,11 @@ class IntegerPlan:
     lowest: int
     highest: int
 
+    @property
+    def needs_voltage(self) -> bool:
+        """Whether the result depends on the voltage."""
+        return self.voltage_gain != 0
+
     def apply(self, code: int, voltage_code: int = 0) -> int:
         """Correct one code; the result saturates at the ends and never wraps."""
         return min(max(self._unbounded(code, voltage_code), self.lowest), self.highest)
@@ -139,11 +145,20 @@ class SignPlan:
     negative: IntegerPlan
     weights: tuple[int, int, int]
 
+    @property
+    def needs_voltage(self) -> bool:
+        """Whether it depends on the voltage which plan holds."""
+        return self.weights[1] != 0
+
     def plan(self, code: int, voltage_code: int = 0) -> IntegerPlan:
         """The plan that holds for a code."""
         of_code, of_voltage, constant = self.weights
         into = code * of_code + voltage_code * of_voltage + constant >= 0
         return self.positive if into else self.negative
+
+
+CodePlan = IntegerPlan | SignPlan
+"""What corrects a code without asking for more than a voltage."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +169,7 @@ class TemperaturePlans:
     """Plan for a code; None where the drift is beyond the layout's limit."""
 
 
-CorrectionPlan = IntegerPlan | SignPlan | TemperaturePlans
+CorrectionPlan = CodePlan | TemperaturePlans
 """Any of them."""
 
 

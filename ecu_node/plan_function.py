@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from ecu_node.auxiliary import Auxiliary
 from ecu_node.codes import Codes
-from ecu_node.correction import CorrectionPlan, IntegerPlan, SignPlan, TemperaturePlans
+from ecu_node.correction import CodePlan, IntegerPlan, SignPlan
 from ecu_node.counters import Counters
 
 __all__ = ["PlanFunction", "plan_function"]
@@ -13,7 +13,7 @@ PlanFunction = Callable[[int], int | None]
 """From a measured code to the one to write; None where there is none."""
 
 
-def plan_function(codes: Codes, plan: CorrectionPlan, voltage: Auxiliary | None, counters: Counters) -> PlanFunction:
+def plan_function(codes: Codes, plan: CodePlan, voltage: Auxiliary | None, counters: Counters) -> PlanFunction:
     """Make the function; what it looks up in every frame is bound to it.
 
     Parameters
@@ -32,10 +32,9 @@ def plan_function(codes: Codes, plan: CorrectionPlan, voltage: Auxiliary | None,
     callable
         Takes a measured code, and returns the one to write; None where the code, or a voltage, is no value.
     """
-    assert not isinstance(plan, TemperaturePlans), "the temperature chooses one of its plans"
     if isinstance(plan, SignPlan):
         return _of_sign_plan(codes, plan, voltage, counters)
-    if voltage is not None and plan.voltage_gain:
+    if voltage is not None and plan.needs_voltage:
         return _with_voltage(codes, plan, voltage, counters)
 
     def fix(code: int) -> int | None:
@@ -58,7 +57,7 @@ def _with_voltage(codes: Codes, plan: IntegerPlan, voltage: Auxiliary, counters:
 
 
 def _of_sign_plan(codes: Codes, plan: SignPlan, voltage: Auxiliary | None, counters: Counters) -> PlanFunction:
-    needs_voltage = bool(plan.weights[1])
+    needs_voltage = plan.needs_voltage
 
     def fix(code: int) -> int | None:
         voltage_code = voltage.code if voltage is not None and needs_voltage else 0
