@@ -126,7 +126,7 @@ def iterate_drives(
     Raises
     ------
     DriveError
-        If the folder is no store; also as :func:`read_drive_file` if `on_error` is not given.
+        If the folder is no store; also as :func:`.read_drive_file` if `on_error` is not given.
     """
     for entry in list_drives(store):
         try:
