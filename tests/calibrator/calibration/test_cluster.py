@@ -72,7 +72,7 @@ def test_a_scheduler_that_is_killed_is_told_in_one_line_and_the_run_goes_on(
         f"calibrator: {address}: the scheduler is gone; start it and its workers again; the same command, run again, "
         f"goes on where it stopped"
     )
-    known = ("chunks", "vehicles", "learn the fleet")
+    known = ("chunks", "vehicles", "learn the fleet", "compiling the estimator")
     assert all(any(words in text for words in known) or not text.strip() for text in progress)
     assert list(chunks.glob("*.rows.parquet"))
 
