@@ -6,7 +6,7 @@ DRIVES ?= builtin
 OUT ?= build/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test bench bench-quick lint types docs schema constraints clean
+.PHONY: help setup demo test bench bench-quick release-check lint types docs schema constraints clean
 
 help:                    ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -33,6 +33,9 @@ bench: setup             ## how long each step takes, beside its peers; also bui
 
 bench-quick: setup       ## the same at small sizes, within five minutes
 	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all --quick
+
+release-check: setup     ## measure again all that was promised, on this commit (hours; goes on where it stopped)
+	PYTHONPATH=tools $(BIN)/python tools/release_check.py
 
 lint: setup              ## ruff, formatting included
 	$(BIN)/ruff check .

@@ -27,6 +27,7 @@ def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="small sizes, within five minutes: shows that all works")
+    parser.add_argument("--out", type=Path, default=OUT, help=f"JSON file; {OUT} without it")
     parser.add_argument("--only", choices=list(GROUPS), help="one group")
     arguments = parser.parse_args()
     found: list[Row] = []
@@ -34,7 +35,7 @@ def main() -> None:
         if arguments.only in {None, name}:
             print(f"bench: {name}", file=sys.stderr, flush=True)
             found += rows(quick=arguments.quick)
-            write(found, OUT)
+            write(found, arguments.out)
     Console(width=None if sys.stdout.isatty() else 160).print(table_of(found))
 
 
