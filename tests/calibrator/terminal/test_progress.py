@@ -95,7 +95,7 @@ def test_what_was_done_before_is_no_part_of_the_rate(
 
 
 IN_TERMINAL = """
-from calibrator.report import progress
+from calibrator.terminal import progress
 from calibrator.terminal.progress import progress_bar
 progress.WORTH_A_LINE_S = 0.0
 with progress_bar("read drives", 4, "vehicles") as done:
