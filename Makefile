@@ -4,9 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 DRIVES ?= builtin
 OUT ?= build/demo
+TRIPS ?= ../shared/data/bmw_i3_summer
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test bench bench-quick release-check lint types docs schema constraints clean
+.PHONY: help setup demo test bench bench-quick experiments soak fuzz release-check lint types docs schema constraints clean
 
 help:                    ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -33,6 +34,17 @@ bench: setup             ## how long each step takes, beside its peers; also bui
 
 bench-quick: setup       ## the same at small sizes, within five minutes
 	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all --quick
+
+experiments: setup       ## docs/results anew, ten repetitions; TRIPS=folder of the recorded BMW i3 trips (hours)
+	$(BIN)/python tools/import_bmw_i3.py $(TRIPS) --layout dbc/hv_powertrain.toml --out build/i3
+	$(BIN)/calibrator experiment all --drives build/i3 --layout dbc/hv_powertrain.toml --out docs/results
+
+soak: setup              ## the node at the full load of a CAN FD bus, 10^7 frames (a quarter of an hour)
+	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all --only node --out build/soak.json
+
+fuzz: setup              ## 10^7 random frames through the node, 10^6 changed parameter files (hours)
+	PYTHONPATH=tools $(BIN)/python -m bench.trust_fuzz
+	PYTHONPATH=tools $(BIN)/python -m bench.node_fuzz
 
 release-check: setup     ## measure again all that was promised, on this commit (hours; goes on where it stopped)
 	PYTHONPATH=tools $(BIN)/python tools/release_check.py

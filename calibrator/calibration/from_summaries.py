@@ -9,13 +9,14 @@ from calibrator.calibration.in_order import Workers
 from calibrator.calibration.posterior_run import calibrate_store
 from calibrator.calibration.previous import PreviousResult, require_previous
 from calibrator.calibration.report import CalibrationReport
-from calibrator.calibration.run_facts import FleetFacts, run_identity, time_of_run
+from calibrator.calibration.run_facts import FleetFacts, run_identity
 from calibrator.calibration.unfinished import Unfinished
 from calibrator.calibration.write_result import write_result
 from calibrator.calibration_settings import CalibrationSettings
 from calibrator.posterior.fleet import FindModels
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.unity import UNITY_FILE
+from calibrator.time_of_run import time_of_run
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import file_digest

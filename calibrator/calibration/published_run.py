@@ -4,13 +4,14 @@ from dataclasses import replace
 
 from calibrator.calibration.in_order import Workers
 from calibrator.calibration.report import CalibrationReport
-from calibrator.calibration.run_facts import FleetFacts, run_identity, time_of_run
+from calibrator.calibration.run_facts import FleetFacts, run_identity
 from calibrator.calibration.unfinished import Unfinished
 from calibrator.calibration.write_result import write_result
 from calibrator.calibration_settings import CalibrationSettings
 from calibrator.published.fleet import calibrate_fleet_published
 from calibrator.results.chunk import encode_chunk
 from calibrator.sources.fleet_source import FleetSource, probe_equipment
+from calibrator.time_of_run import time_of_run
 from ecu_node.database import VehicleDatabase
 
 __all__ = ["calibrate_published"]

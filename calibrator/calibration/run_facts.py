@@ -1,18 +1,15 @@
 """What a result says of its run: which fleet, when, how."""
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
 from calibrator.calibration_settings import CalibrationSettings
-from calibrator.errors import FleetError
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.sources.fleet_source import Equipment, FleetSource
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
 
-__all__ = ["FleetFacts", "run_identity", "time_of_run"]
+__all__ = ["FleetFacts", "run_identity"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,15 +44,6 @@ class FleetFacts:
             left_out={},
             notices=identity.notices,
         )
-
-
-def time_of_run() -> str:
-    """The time, ISO 8601; that of SOURCE_DATE_EPOCH, if it is set, makes results alike to the bit."""
-    epoch = os.environ.get("SOURCE_DATE_EPOCH")
-    if epoch is not None and not epoch.isdecimal():
-        raise FleetError(f"SOURCE_DATE_EPOCH is {epoch!r}; expected seconds since 1970, or leave it unset")
-    now = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
-    return now.isoformat(timespec="seconds")
 
 
 def run_identity(

@@ -54,7 +54,7 @@ def _index(folder: Path, results: Sequence[ExperimentResult]) -> str:
             f"## [{result.title}]({folder.name}/{result.name}.md)",
             "",
             f"`calibrator experiment {result.name}`: {settings['repetitions']} repetitions, seed {settings['seed']}, "
-            f"drive {settings['drive']}.",
+            f"drive {settings['drive']}{f'; {result.made}' if result.made else ''}.",
             "",
             *markdown_table(*headline(result)),
             "",

@@ -1,13 +1,17 @@
 """Results of experiments: rows of figures, ours beside the paper's."""
 
+import os
+import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import msgspec
 
 from calibrator.errors import FleetError
+from calibrator.time_of_run import time_of_run
+from ecu_node import __version__
 
-__all__ = ["Bin", "ExperimentResult", "Figure", "Row", "decode_result"]
+__all__ = ["Bin", "ExperimentResult", "Figure", "Row", "decode_result", "made_now"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +90,8 @@ class ExperimentResult:
         Seed, repetitions, fleet law, drive.
     rows : tuple of Row
         Figures.
+    made : str
+        Version, machine and day, as :func:`made_now` says; empty in records of before version 1.0.
     """
 
     name: str
@@ -94,6 +100,7 @@ class ExperimentResult:
     series_label: str = ""
     settings: Mapping[str, float | int | str]
     rows: tuple[Row, ...]
+    made: str = ""
 
     def row(self, *, x: float, method: str, series: str = "") -> Row:
         """Return the row of a method under a setting; KeyError if there is none."""
@@ -110,6 +117,14 @@ class ExperimentResult:
     def to_json(self) -> bytes:
         """Encode as JSON, UTF-8."""
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
+
+
+def made_now() -> str:
+    """Version of the calibrator, machine and day, in words."""
+    return (
+        f"calibrator {__version__}, Python {platform.python_version()} on {platform.machine()} with "
+        f"{os.cpu_count()} cores, {time_of_run()[:10]}"
+    )
 
 
 def decode_result(record: bytes, where: str) -> ExperimentResult:

@@ -23,7 +23,7 @@ from calibrator.experiments.recorded_experiments import data_experiment, phase_e
 from calibrator.experiments.recorded_fleet import RecordedFleet, builtin_fleet, read_fleet
 from calibrator.experiments.recorded_trial import RecordedCase
 from calibrator.experiments.records import read_results, write_result
-from calibrator.experiments.result import ExperimentResult
+from calibrator.experiments.result import ExperimentResult, made_now
 from calibrator.experiments.table import result_table
 from calibrator.experiments.trial import FleetLaw
 from calibrator.terminal.progress import one_pass
@@ -185,7 +185,7 @@ def run_experiments(
         if console is not None:
             console.print(result_table(result))
         if out is not None:
-            write_result(out, result, known)
+            write_result(out, replace(result, made=made_now()), known)
     return done
 
 

@@ -145,7 +145,7 @@ def result_markdown(result: ExperimentResult) -> str:
             *markdown_table(*_details(result)),
             "",
             *_reliability(result),
-            f"Settings: {settings}.",
+            f"Settings: {settings}.{f' Made by {result.made}.' if result.made else ''}",
             "",
         ]
     )

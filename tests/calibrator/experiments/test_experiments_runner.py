@@ -1,4 +1,5 @@
 import json
+import platform
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from calibrator.experiments.runner import EXPERIMENTS, RunOptions, run_experimen
 from calibrator.experiments.table import DETAILS, caption, headline, result_markdown, result_table
 from calibrator.experiments.trial import FleetLaw
 from calibrator.options import ExperimentName
+from ecu_node import __version__
 from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, smooth_drive
 
 LAW = FleetLaw(vehicles=16, training_vehicles=400)
@@ -233,12 +235,16 @@ def test_delay_experiment_shows_the_default_with_and_without_compensation(fleet:
     assert result.row(x=300.0, method=POSTERIOR.name).figures["delay_rmse_ms"].mean < 5.0
 
 
-def test_runner_runs_quick_experiments_of_both_kinds(tmp_path: Path) -> None:
+def test_runner_runs_quick_experiments_of_both_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
     options = RunOptions(quick=True, repetitions=1, layout=LAYOUT, drive=smooth_drive(samples=2000))
     snr, real = run_experiments(["snr", "real"], options, out=tmp_path / "results")
     assert snr.settings["drive"] == "smooth"
     assert real.settings["drive"] == "8 built-in trips, no recordings"
-    assert (tmp_path / "results.md").is_file()
+    made = f"calibrator {__version__}, Python {platform.python_version()}"
+    for page in ("results.md", "results/snr.md", "results/real.md"):
+        assert made in (tmp_path / page).read_text()
+        assert "2023-11-14" in (tmp_path / page).read_text()
 
 
 def test_only_experiments_on_recorded_trips_need_a_layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
