@@ -89,7 +89,7 @@ def require_branch_reach(database: VehicleDatabase, mode: Mode) -> None:
     Raises
     ------
     DatabaseError
-        As :func:`ecu_node.codes.require_reach`.
+        If a value up to full scale has a name in the DBC, and would be read as that name.
     """
     layout = database.layout
     for branch in layout.branch:
