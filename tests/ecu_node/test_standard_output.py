@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from ecu_node import __version__
 from tests.ecu_node.vehicles import LAYOUT
 
 FULL = "import resource, runpy, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
@@ -57,4 +58,4 @@ def test_where_standard_output_is_closed_nothing_is_said(program: str) -> None:
         timeout=60,
         check=False,
     )
-    assert (done.returncode, done.stderr.removeprefix("ecu-node 0.1.0\n")) == (0, "")
+    assert (done.returncode, done.stderr.removeprefix(f"ecu-node {__version__}\n")) == (0, "")
