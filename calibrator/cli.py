@@ -13,6 +13,7 @@ from calibrator.export.command import export
 from calibrator.identification.command import identify
 from calibrator.kirchhoff.command import kirchhoff
 from calibrator.proposal.command import layout as layout_commands
+from calibrator.recordings.command import replay
 from calibrator.report.command import report
 from calibrator.signing.command import keys, revoke, sign
 from calibrator.sources.command import import_
@@ -31,6 +32,7 @@ app.command()(sign)
 app.command()(revoke)
 app.command()(doctor)
 app.command()(kirchhoff)
+app.command()(replay)
 app.command("import")(import_)
 app.command()(simulate)
 app.command()(summarise)

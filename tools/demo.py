@@ -22,6 +22,7 @@ import typer
 
 from calibrator.errors import FleetError
 from calibrator.fleet_truth import FleetTruth, read_truth
+from calibrator.recordings.replay import messages_of, read_log, replay
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import progress_bar
 from ecu_node.buses import open_bus
@@ -34,7 +35,6 @@ from ecu_node.parameter_file import choose_parameters
 from ecu_node.parameters import read_parameters
 from ecu_node.steady_bus import SteadyBus
 from ecu_node.wiring import wire
-from replay import read_log, replay
 
 ROOT = Path(__file__).resolve().parent.parent
 LAYOUT = "dbc/hv_powertrain.toml"
@@ -223,7 +223,7 @@ def node_thread(parameters: Path, vehicle: str, interface: str, channel: str) ->
 
 def play(log: Path, bus: can.BusABC) -> None:
     """Send the first seconds of a log with its timing."""
-    messages = read_log(log)
+    messages = messages_of(read_log(log))
     first = next(messages)
     frames = chain([first], takewhile(lambda message: message.timestamp < first.timestamp + SECONDS, messages))
     with progress_bar("drive", int(SECONDS), "s") as progress:

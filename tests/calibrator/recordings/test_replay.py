@@ -13,10 +13,12 @@ import can
 import pytest
 from can.interfaces.virtual import VirtualBus
 
+from calibrator.cli import app
 from calibrator.errors import LogError
 from calibrator.recordings.frames import LOG_SUFFIXES
+from calibrator.recordings.replay import messages_of, read_log, replay
+from calibrator.terminal.command_line import run_app
 from ecu_node.errors import BusError
-from replay import main, read_log, replay
 
 FRAMES = [
     can.Message(
@@ -64,14 +66,14 @@ def test_every_frame_of_every_format_comes_in_order(
 ) -> None:
     path = written(tmp_path / name)
     with VirtualBus(request.node.name) as bus:
-        assert replay(read_log(path), bus, speed=0.0) == len(FRAMES)
+        assert replay(messages_of(read_log(path)), bus, speed=0.0) == len(FRAMES)
     assert heard(listener) == SENT
 
 
 def test_a_zipped_blf_is_played(tmp_path: Path) -> None:
     path = tmp_path / "x.blf.gz"
     path.write_bytes(gzip.compress(written(tmp_path / "x.blf").read_bytes()))
-    assert len(list(read_log(path))) == len(FRAMES)
+    assert len(list(messages_of(read_log(path)))) == len(FRAMES)
 
 
 @pytest.mark.parametrize("speed", [1.0, 4.0])
@@ -108,7 +110,7 @@ def test_a_bus_that_takes_nothing_ends_the_replay(monkeypatch: pytest.MonkeyPatc
         def send(self, msg: can.Message, timeout: float | None = None) -> None:
             raise can.CanOperationError("Transmit buffer full")
 
-    monkeypatch.setattr("replay._SEND_LIMIT_S", 0.01)
+    monkeypatch.setattr("calibrator.recordings.replay._SEND_LIMIT_S", 0.01)
     with Full("full") as bus, pytest.raises(BusError, match="the bus takes no frame: Transmit buffer full"):
         replay(FRAMES, bus, speed=0.0)
 
@@ -146,7 +148,7 @@ def test_logs_that_cannot_be_played_are_named_with_the_reason(tmp_path: Path) ->
     for name, (make, words) in cases.items():
         make(tmp_path / name)
         with pytest.raises(LogError, match=words) as caught:
-            list(read_log(tmp_path / name))
+            read_log(tmp_path / name)
         assert name in str(caught.value)
         assert "\n" not in str(caught.value)
 
@@ -155,27 +157,35 @@ def written_text(path: Path) -> None:
     path.write_text("(1.0) can0 this is no frame\n")
 
 
+def command(*arguments: object) -> int:
+    """Exit code of the command, in this process."""
+    return run_app(app, "calibrator", ["replay", *map(str, arguments)])
+
+
 def test_the_command_plays_a_log_and_counts(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with VirtualBus("command") as bus:
-        assert main([str(log), "--interface", "virtual", "--channel", "command", "--speed", "0"]) == 0
+        assert command(log, "--interface", "virtual", "--channel", "command", "--speed", "0") == 0
         assert heard(bus) == SENT
     assert capsys.readouterr().out.startswith("60 frames in ")
 
 
 @pytest.mark.parametrize(
     ("name", "interface", "words"),
-    [("missing.log", "virtual", "replay: .*no such file"), ("drive.log", "pigeon", "replay: pigeon c: cannot open")],
+    [
+        ("missing.log", "virtual", "calibrator: .*no such file"),
+        ("drive.log", "pigeon", "calibrator: pigeon c: cannot open"),
+    ],
 )
 def test_a_replay_that_fails_ends_in_1(
     log: Path, capsys: pytest.CaptureFixture[str], name: str, interface: str, words: str
 ) -> None:
-    assert main([str(log.parent / name), "--interface", interface, "--channel", "c"]) == 1
+    assert command(log.parent / name, "--interface", interface, "--channel", "c") == 1
     captured = capsys.readouterr()
     assert captured.out == ""
     assert re.match(words, captured.err)
 
 
-def test_ctrl_c_ends_the_line_of_progress_first_and_the_replay_with_130(
+def test_ctrl_c_ends_the_line_of_progress_first_and_says_how_much_was_sent(
     log: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def send(self: VirtualBus, msg: can.Message, timeout: float | None = None) -> None:
@@ -183,18 +193,18 @@ def test_ctrl_c_ends_the_line_of_progress_first_and_the_replay_with_130(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(VirtualBus, "send", send)
-    monkeypatch.setattr("calibrator.terminal.progress.LINE_EVERY_S", 0.0)
-    assert main([str(log), "--interface", "virtual", "--channel", "c"]) == 130
+    monkeypatch.setattr("calibrator.report.progress.LINE_EVERY_S", 0.0)
+    assert command(log, "--interface", "virtual", "--channel", "c") == 130
     *_, progress, last = capsys.readouterr().err.splitlines()
     assert progress.startswith(f"replay: 3 of {len(FRAMES)} frames, ")
-    assert last == "replay: interrupted after 3 frames"
+    assert last == f"calibrator replay: 3 of {len(FRAMES)} frames were sent"
 
 
 def test_the_account_as_json_is_all_that_stands_on_standard_output(
     log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with VirtualBus("json"):
-        assert main([str(log), "--interface", "virtual", "--channel", "json", "--speed", "0", "--json"]) == 0
+        assert command(log, "--interface", "virtual", "--channel", "json", "--speed", "0", "--json") == 0
     account = json.loads(capsys.readouterr().out)
     assert account.keys() == {"frames", "duration_s"}
     assert account["frames"] == 60
@@ -203,29 +213,24 @@ def test_the_account_as_json_is_all_that_stands_on_standard_output(
 def test_long_payloads_are_played_as_can_fd(tmp_path: Path) -> None:
     path = tmp_path / "fd.log"
     path.write_text("(1.000000) can0 123##1" + "AB" * 12 + "\n(1.100000) can0 123#AB\n")
-    assert [(frame.is_fd, bytes(frame.data)) for frame in read_log(path)] == [(True, b"\xab" * 12), (False, b"\xab")]
+    frames = list(messages_of(read_log(path)))
+    assert [(frame.is_fd, bytes(frame.data)) for frame in frames] == [(True, b"\xab" * 12), (False, b"\xab")]
 
 
-@pytest.mark.parametrize("option", ["-h", "--help"])
-def test_help_names_the_formats_that_are_read(option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main([option])
-    assert caught.value.code == 0
+def test_help_names_the_formats_that_are_read(capsys: pytest.CaptureFixture[str]) -> None:
+    assert command("--help") == 0
     assert " ".join(LOG_SUFFIXES) in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("more", [[], ["--channel"]])
-def test_wrong_use_of_replay_ends_in_2(log: Path, more: list[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main([str(log), *more])
-    assert caught.value.code == 2
+def test_wrong_use_of_replay_ends_in_2(log: Path, more: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert command(log, *more) == 2
+    assert "--channel" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("speed", ["-1", "nan", "inf", "fast"])
 def test_speed_that_is_none_is_named_with_what_is_expected(
     log: Path, speed: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main([str(log), "--channel=c", f"--speed={speed}"])
-    assert caught.value.code == 2
-    assert f"argument --speed: {speed}: a number of at least 0 is expected" in capsys.readouterr().err
+    assert command(log, "--channel=c", f"--speed={speed}") == 2
+    assert f"'--speed': {speed}: expected a number from 0 to 1e+06" in capsys.readouterr().err

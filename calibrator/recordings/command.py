@@ -1,0 +1,63 @@
+"""``calibrator replay``: a CAN log onto a bus."""
+
+import logging
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibrator.processes.interrupts import importing
+from calibrator.terminal.options import JsonOption, number_option
+from calibrator.terminal.progress import progress_bar
+from calibrator.terminal.text import dumps
+from ecu_node.failures import say_error
+from ecu_node.standard_output import write_output
+
+__all__ = ["replay"]
+
+_FASTEST = 1e6
+"""An hour in 4 ms: beyond what any bus takes. [1]"""
+
+
+def replay(
+    *,
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log: .log .asc .blf .trc .mf4, also .gz.")],
+    channel: Annotated[str, typer.Option(help="Channel of the bus, such as vcan0.")],
+    interface: Annotated[str, typer.Option(help="Interface of python-can.")] = "socketcan",
+    speed: Annotated[
+        float,
+        number_option("--speed", 0.0, _FASTEST, "1: as recorded, 2: twice as fast, 0: as fast as the bus takes it"),
+    ] = 1.0,
+    fd: Annotated[bool, typer.Option("--fd", help="Open the bus for CAN FD.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Play a CAN log onto a bus.
+
+    The log is read whole before the first frame is sent. Error and remote frames are left out.
+    """
+    with importing():
+        from calibrator.recordings import replay as core
+        from ecu_node.buses import connect
+
+    logging.getLogger("can").addHandler(logging.NullHandler())
+    frames, sent = core.read_log(log), 0
+
+    def count(so_far: int, _: float) -> None:
+        nonlocal sent
+        sent = so_far
+        progress(so_far)
+
+    try:
+        with (
+            progress_bar("replay", len(frames.time_ns), "frames") as progress,
+            connect(interface, channel, fd=fd) as bus,
+        ):
+            begin_s = time.monotonic()
+            core.replay(core.messages_of(frames), bus, speed=speed, progress=count)
+            duration_s = time.monotonic() - begin_s
+    except KeyboardInterrupt:
+        say_error(f"calibrator replay: {sent} of {len(frames.time_ns)} frames were sent")
+        raise
+    facts = {"frames": sent, "duration_s": duration_s}
+    write_output(dumps(facts) if json else f"{sent} frames in {duration_s:.1f} s")
