@@ -5,9 +5,11 @@ BIN := $(VENV)/bin
 DRIVES ?= builtin
 OUT ?= build/demo
 TRIPS ?= ../shared/data/bmw_i3_summer
+PYTHONS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test bench bench-quick experiments soak fuzz release-check lint types docs schema constraints clean
+.PHONY: help setup demo test bench bench-quick experiments soak fuzz release-check lint types docs dist package sbom \
+	licences schema constraints clean
 
 help:                    ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -60,6 +62,21 @@ docs: setup              ## the documentation, in build/docs; its examples are r
 	rm -rf build/docs docs/reference/api
 	PYTHONPATH=tools $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --fresh-env --conf-dir docs \
 		--doctree-dir build/doctrees . build/docs
+
+dist: setup              ## wheel and source distribution, in dist/, checked
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation
+	$(BIN)/python -m twine check --strict dist/*
+
+sbom: dist               ## and bills of materials of what they bring (CycloneDX JSON)
+	PYTHONPATH=tools $(BIN)/python -m release.sbom dist
+
+package: sbom            ## and all of it, with every extra, in clean environments (long; PYTHONS='other interpreters')
+	PYTHONPATH=tools $(BIN)/python -m release.measure_install dist
+	HV_PYTHONS="$(PYTHONS)" $(BIN)/python -m pytest tests/package
+
+licences: setup          ## write docs/licences.md anew; fails on licences that do not go with Apache-2.0
+	PYTHONPATH=tools $(BIN)/python -m release.licences
 
 schema: setup            ## write the JSON Schema of the parameter file anew
 	$(BIN)/ecu-node schema > ecu_node/parameters.schema.json

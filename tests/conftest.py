@@ -12,7 +12,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
-VCAN_TESTS = ROOT / "tests" / "vcan"
+WHEN_ASKED = [ROOT / "tests" / name for name in ("package", "vcan")]
+"""Folders whose tests run only where they are named: they need a built wheel, or a kernel with SocketCAN."""
 NOTHING_MAY_BE_SKIPPED = os.environ.get("HV_REQUIRE_ALL") == "1"
 
 _open_buses: WeakSet[can.BusABC] = WeakSet()
@@ -58,11 +59,11 @@ def pytest_configure() -> None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave the tests of SocketCAN out unless asked for: they need a kernel that has it, and never skip."""
-    if collection_path != VCAN_TESTS:
+    """Leave tests out that run only when asked for: they never skip."""
+    if collection_path not in WHEN_ASKED:
         return None
     asked = [(config.invocation_params.dir / argument.partition("::")[0]).resolve() for argument in config.args]
-    return None if any(path.is_relative_to(VCAN_TESTS) for path in asked) else True
+    return None if any(path.is_relative_to(collection_path) for path in asked) else True
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -1,0 +1,72 @@
+"""What is in the wheel and in the source distribution, and what is not."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from release.clean_venv import ROOT
+
+PACKAGES = ("calibrator", "ecu_node")
+LEFT_OUT = {"__pycache__", ".venv", "build", "dist", "api"}
+"""Folders that are made, and not kept."""
+
+
+@pytest.fixture(scope="module")
+def in_wheel(wheel: Path) -> set[str]:
+    with zipfile.ZipFile(wheel) as archive:
+        return set(archive.namelist())
+
+
+def files(folder: Path) -> set[str]:
+    """Files below a folder that are kept, relative to the root of the checkout."""
+    kept = (path for path in folder.rglob("*") if path.is_file() and not LEFT_OUT & set(path.relative_to(ROOT).parts))
+    return {str(path.relative_to(ROOT)) for path in kept}
+
+
+def test_the_wheel_has_every_file_of_the_packages_and_no_other(in_wheel: set[str]) -> None:
+    own = {name for name in in_wheel if ".dist-info/" not in name}
+    assert own == {name for package in PACKAGES for name in files(ROOT / package)}
+
+
+def test_the_wheel_has_types_assets_and_the_schema(in_wheel: set[str]) -> None:
+    assets = {
+        f"calibrator/fleet_report/assets/{name}" for name in ("fleet.html", "fleet.js", "page.css", "vehicle.html")
+    }
+    needed = {"calibrator/py.typed", "ecu_node/py.typed", "ecu_node/parameters.schema.json", *assets}
+    assert needed <= in_wheel
+
+
+def test_the_wheel_names_its_licence_and_its_programs(wheel: Path, in_wheel: set[str]) -> None:
+    (licence,) = (name for name in in_wheel if name.endswith(".dist-info/licenses/LICENSE"))
+    with zipfile.ZipFile(wheel) as archive:
+        assert archive.read(licence) == (ROOT / "LICENSE").read_bytes()
+        (programs,) = (archive.read(name).decode() for name in in_wheel if name.endswith("entry_points.txt"))
+    assert "calibrator = calibrator.__main__:main" in programs
+    assert "ecu-node = ecu_node.cli:main" in programs
+
+
+def test_the_source_has_every_file_that_is_kept(unpacked: Path) -> None:
+    folders = ("calibrator", "dbc", "deploy", "docs", "ecu_node", "examples", "tests", "tools", ".ci")
+    kept = set().union(*(files(ROOT / folder) for folder in folders))
+    kept |= {"CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "Makefile", "README.md", "constraints.txt", "pyproject.toml"}
+    assert {name for name in kept if not (unpacked / name).is_file()} == set()
+
+
+def test_the_tests_of_the_source_are_all_found_and_can_be_run(unpacked: Path) -> None:
+    def pytest_in(folder: Path, *options: str) -> str:
+        command = [sys.executable, "-m", "pytest", "--quiet", "-p", "no:cacheprovider", *options]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=600)
+        assert done.returncode == 0, done.stdout
+        return done.stdout.replace(str(folder), "")
+
+    in_source, here = (
+        {line for line in pytest_in(folder, "--collect-only").splitlines() if "::" in line}
+        for folder in (unpacked, ROOT)
+    )
+    assert len(here) > 1000
+    assert in_source == here
+    some = ("tests/ecu_node/test_correction.py", "tests/deploy", "tests/docs/test_links.py")
+    assert " passed" in pytest_in(unpacked, *some)

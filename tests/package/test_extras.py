@@ -1,0 +1,150 @@
+"""Every extra, installed alone, makes its commands work."""
+
+import json
+import os
+import socket
+import urllib.request
+from pathlib import Path
+
+import can
+import pytest
+
+from release.clean_venv import CleanVenv
+from tests.package.conftest import VEHICLE, Installed
+from tests.package.processes import on_terminal, started, until
+
+EXTRAS = ("bench", "calibrator", "cluster", "demo", "docs", "metrics", "mf4", "monitor")
+LAYOUT = ("--layout", "my_car.toml")
+
+
+def calibrator(venv: CleanVenv, folder: Path, *arguments: object) -> str:
+    """What a command prints that must succeed."""
+    done = venv.run("calibrator", *arguments, folder=folder)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_no_extra_is_left_out(wheel: Path, installed: Installed) -> None:
+    code = (
+        "from importlib.metadata import metadata; print(*metadata('hv-current-correction').get_all('Provides-Extra'))"
+    )
+    told = installed().run("python", "-c", code, folder=wheel.parent).stdout.split()
+    assert set(told) == {*EXTRAS, "dev"}
+
+
+@pytest.mark.parametrize("extra", EXTRAS)
+def test_an_extra_alone_is_whole(installed: Installed, extra: str, car: Path) -> None:
+    venv = installed(extra)
+    done = venv.run("python", "-m", "pip", "check", folder=car)
+    assert done.returncode == 0, done.stdout
+    assert venv.run("ecu-node", "schema", folder=car).returncode == 0
+
+
+def test_calibrator_takes_a_fleet_from_logs_to_reports_and_exports(
+    installed: Installed, car: Path, fleet: Path, drive: Path, tmp_path: Path
+) -> None:
+    venv, result = installed("calibrator"), tmp_path / "result"
+    layout = ("--layout", car / "my_car.toml")
+    calibrator(venv, tmp_path, "import", fleet / "logs", *layout, "--out", "store")
+    calibrator(venv, tmp_path, "calibrate", "store", *layout, "--out", result)
+    calibrator(venv, tmp_path, "score", result, "--truth", fleet / "truth.json")
+    calibrator(venv, tmp_path, "report", result)
+    assert "<script>" in (result / "report.html").read_text()
+    calibrator(venv, tmp_path, "report", result, "--vehicle", VEHICLE, "--out", "vehicle.html")
+    parameters = result / "params" / f"{VEHICLE}.json"
+    for kind in ("dcm", "cdfx", "csv", "c99"):
+        calibrator(venv, tmp_path, "export", parameters, *layout, "--format", kind, "--out", f"out-{kind}")
+    calibrator(venv, tmp_path, "layout", "init", car / "hv_powertrain.dbc", "--log", drive, "--out", "guessed.toml")
+    assert json.loads(calibrator(venv, tmp_path, "kirchhoff", drive, *layout, "--plot", "x.png", "--json"))["instants"]
+    played = calibrator(venv, tmp_path, "replay", drive, "--interface", "virtual", "--channel", "x", "--speed", 0)
+    assert " frames in " in played
+
+
+def test_calibrator_makes_keys_and_signs(installed: Installed, car: Path, tmp_path: Path) -> None:
+    venv = installed("calibrator")
+    calibrator(venv, tmp_path, "keys", "new", "anna", "--no-passphrase", "--out", ".")
+    calibrator(venv, tmp_path, "keys", "set", "anna.pub", "--threshold", 1, "--out", "keys-1.json")
+    calibrator(venv, tmp_path, "sign", car / "V001.json", "--key", "anna.key", "--out", "signed")
+    done = venv.run("ecu-node", "inspect", "signed/V001.json", "--keys", "keys-1.json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_demo_has_vehicles_of_its_own(fleet: Path) -> None:
+    assert len(list((fleet / "logs").glob("V*/drive.log.gz"))) == 6
+
+
+def test_cluster_calibrates_on_workers(installed: Installed, car: Path, fleet: Path, tmp_path: Path) -> None:
+    venv, file = installed("cluster"), tmp_path / "scheduler.json"
+    common = ("--no-dashboard", "--scheduler-file", file)
+    scheduler = ("--host", "127.0.0.1", "--port", "0", "--no-jupyter")
+    with (
+        started(venv, "dask", "scheduler", *scheduler, *common, folder=tmp_path),
+        started(venv, "dask", "worker", "--nthreads", "1", "--no-nanny", *common, folder=tmp_path),
+    ):
+        address = until(lambda: json.loads(file.read_text())["address"] if file.exists() else None, "scheduler")
+        layout = ("--layout", car / "my_car.toml")
+        calibrator(venv, tmp_path, "calibrate", fleet, *layout, "--scheduler", address, "--out", "result")
+    assert (tmp_path / "result" / "results.parquet").is_file()
+
+
+def test_metrics_are_answered(installed: Installed, car: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    options = ("--unsigned", "--params", "V001.json", *LAYOUT, "--interface", "virtual", "--channel", "metrics")
+
+    def answer() -> str | None:
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics") as page:
+                return str(page.read().decode())
+        except OSError:
+            return None
+
+    with started(installed("metrics"), "ecu-node", "run", *options, "--metrics-port", port, folder=car) as process:
+        assert "ecu_node_" in until(answer, "metrics")
+        process.terminate()
+        assert process.wait(timeout=60) == 0
+
+
+def test_mf4_logs_are_read(installed: Installed, car: Path, drive: Path, tmp_path: Path) -> None:
+    with can.Logger(tmp_path / "drive.mf4") as log:
+        for frame in can.LogReader(drive):
+            log(frame)
+    told = calibrator(installed("mf4"), tmp_path, "kirchhoff", "drive.mf4", "--layout", car / "my_car.toml", "--json")
+    assert json.loads(told)["branches"] == ["battery", "motor"]
+
+
+def test_monitor_draws_a_table(installed: Installed, car: Path) -> None:
+    options = (*LAYOUT, "--interface", "virtual", "--channel", "monitor")
+    code, shown = on_terminal(installed("monitor"), "ecu-node", "monitor", *options, folder=car, wanted=b"motor_rear")
+    assert code is None, shown
+    assert b"\x1b[?1049h" in shown  # a screen of its own
+
+
+def test_bench_compares_with_its_peers(installed: Installed, unpacked: Path) -> None:
+    command = ("-m", "bench.all", "--quick", "--only", "identification")
+    done = installed("bench").run("python", *command, folder=unpacked / "tools")
+    assert done.returncode == 0, done.stderr
+    assert "sippy" in done.stdout
+
+
+def test_docs_are_built_from_the_source(installed: Installed, unpacked: Path) -> None:
+    venv = installed("docs")
+    tools = {
+        **venv.environment,
+        "PYTHONPATH": str(unpacked / "tools"),
+        "PATH": os.pathsep.join([str(venv.folder / "bin"), venv.environment["PATH"]]),
+    }
+    options = (
+        "--quiet",
+        "--fail-on-warning",
+        "--conf-dir",
+        "docs",
+        "--doctree-dir",
+        "build/doctrees",
+        ".",
+        "build/docs",
+    )
+    done = CleanVenv(folder=venv.folder, environment=tools).run("sphinx-build", *options, folder=unpacked)
+    assert done.returncode == 0, done.stderr
+    assert (unpacked / "build" / "docs" / "docs" / "index.html").is_file()

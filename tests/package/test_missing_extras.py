@@ -1,0 +1,88 @@
+"""What a command says whose extra is missing is one line, and doing what it says helps."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+import pytest
+
+from release.clean_venv import CleanVenv, new_venv
+from tests.package.processes import on_terminal
+
+LAYOUT = ("--layout", "my_car.toml")
+BUS = ("--interface", "virtual", "--channel", "c")
+PARAMETERS = ("--unsigned", "--params", "V001.json")
+
+
+def piped(program: str, *arguments: object) -> Callable[[CleanVenv, Path], tuple[int | None, str]]:
+    """A command whose output nobody looks at."""
+
+    def run(venv: CleanVenv, folder: Path) -> tuple[int | None, str]:
+        done = venv.run(program, *arguments, folder=folder)
+        return done.returncode, done.stderr
+
+    return run
+
+
+def shown(venv: CleanVenv, folder: Path) -> tuple[int | None, str]:
+    """The monitor on a terminal, which breaks lines."""
+    code, text = on_terminal(venv, "ecu-node", "monitor", *LAYOUT, *BUS, folder=folder, wanted=b"motor_rear")
+    return code, " ".join(text.decode().split()) + "\n"
+
+
+STEPS = {
+    "monitor": (shown, "ecu-node: a live table needs rich; install it with "),
+    "metrics": (
+        piped(
+            "ecu-node", "run", *PARAMETERS, *LAYOUT, "--interface", "pigeon", "--channel", "c", "--metrics-port", 9464
+        ),
+        "ecu-node: --metrics-port needs prometheus-client; install it with ",
+    ),
+    "calibrator": (piped("calibrator", "--version"), "calibrator: typer is not installed; "),
+    "demo": (
+        piped("calibrator", "simulate", *LAYOUT, "--vehicles", 2, "--minutes", 1, "--out", "two"),
+        "calibrator: builtin drives need fastsim; install the extra: ",
+    ),
+    "mf4": (
+        piped("calibrator", "kirchhoff", "drive.mf4", *LAYOUT),
+        "calibrator: drive.mf4: reading MF4 needs asammdf; ",
+    ),
+    "cluster": (
+        piped("calibrator", "calibrate", "fleet", *LAYOUT, "--scheduler", "tcp://127.0.0.1:9", "--out", "never"),
+        "calibrator: --scheduler needs Dask: ",
+    ),
+}
+"""By extra, from the lightest on: what needs it, and what that says without it."""
+
+
+@pytest.fixture
+def mf4(car: Path, drive: Path) -> None:
+    with can.Logger(car / "drive.mf4") as log:
+        for frame in can.LogReader(drive):
+            log(frame)
+
+
+@pytest.mark.usefixtures("mf4")
+def test_doing_what_a_command_without_its_extra_says_makes_it_work(wheel: Path, car: Path, tmp_path: Path) -> None:
+    venv = new_venv(tmp_path / "growing", wheel)
+    for extra, (command, words) in STEPS.items():
+        code, said = command(venv, car)
+        assert code == 1, (extra, said)
+        assert said.startswith(words)
+        assert said.count("\n") == 1
+        (remedy,) = re.findall(r"pip install '(\S+)'", said)
+        assert remedy == f"hv-current-correction[{extra}]"
+        venv.install(remedy)
+        code, said = command(venv, car)
+        assert "pip install" not in said
+        assert code != 70
+        assert "Traceback" not in said
+
+
+def test_every_command_of_the_calibrator_says_the_same_without_it(wheel: Path, tmp_path: Path) -> None:
+    venv = new_venv(tmp_path / "node", wheel)
+    for arguments in (["report", "result"], ["calibrate", "fleet"], ["--help"], []):
+        done = venv.run("calibrator", *arguments, folder=tmp_path)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert done.stderr == "calibrator: typer is not installed; pip install 'hv-current-correction[calibrator]'\n"

@@ -1,0 +1,103 @@
+"""The wheel without extras: every command of the node works, and no other package is there."""
+
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from calibrator.cli import app
+from calibrator.terminal.command_line import run_app
+from ecu_node import __version__
+from release.clean_venv import ROOT, CleanVenv
+from tests.package.conftest import VEHICLE, Installed
+
+PLAYER = Path(__file__).with_name("virtual_drive.py")
+LAYOUT = ("--layout", "my_car.toml")
+
+
+@pytest.fixture(scope="module")
+def node(installed: Installed) -> CleanVenv:
+    return installed()
+
+
+def test_only_what_the_node_needs_is_installed(node: CleanVenv) -> None:
+    listed = json.loads(node.run("python", "-m", "pip", "list", "--format", "json", folder=node.folder).stdout)
+    names = {canonicalize_name(package["name"]) for package in listed}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert {canonicalize_name(Requirement(text).name) for text in project["dependencies"]} < names
+    pinned = set(re.findall(r"(?m)^([a-z0-9-]+)==", (ROOT / "deploy" / "requirements.txt").read_text()))
+    assert names == pinned | {"hv-current-correction", "pip"}
+    assert node.run("python", "-m", "pip", "check", folder=node.folder).returncode == 0
+
+
+def test_the_version_is_told(node: CleanVenv, car: Path) -> None:
+    assert node.run("ecu-node", "--version", folder=car).stdout == f"ecu-node {__version__}\n"
+
+
+def test_parameters_are_checked(node: CleanVenv, car: Path) -> None:
+    arguments = ("--params", "V001.json", *LAYOUT, "--vehicle", VEHICLE, "--json")
+    done = node.run("ecu-node", "check", *arguments, folder=car)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["branches"]["battery"]["applied"] is True
+
+
+def test_schema_and_template_are_printed(node: CleanVenv, car: Path) -> None:
+    schema = node.run("ecu-node", "schema", folder=car)
+    assert schema.stdout == (ROOT / "ecu_node" / "parameters.schema.json").read_text()
+    template = node.run("ecu-node", "template", *LAYOUT, "--vehicle", VEHICLE, folder=car)
+    assert json.loads(template.stdout)["vehicle"] == VEHICLE
+
+
+def test_currents_are_corrected_on_a_virtual_bus(node: CleanVenv, car: Path, drive: Path) -> None:
+    bus = ("--interface", "virtual", "--channel", "drive")
+    options = ("--unsigned", "--params", "V001.json", *LAYOUT, "--vehicle", VEHICLE, *bus)
+    done = node.run("python", PLAYER, drive, *options, folder=car, timeout_s=120.0)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) >= 50
+    assert "Traceback" not in done.stderr
+
+
+def test_a_bus_is_watched(node: CleanVenv, car: Path) -> None:
+    bus = ("--interface", "virtual", "--channel", "nobody")
+    done = node.run("ecu-node", "monitor", *LAYOUT, *bus, "--once", "0.2", "--json", folder=car)
+    assert done.returncode == 1
+    assert "no branch of my_car.toml was seen" in done.stderr
+    assert json.loads(done.stdout)["node"] is None
+
+
+def test_signed_parameters_are_taken_and_taken_back(
+    node: CleanVenv, car: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def calibrator(*arguments: str) -> None:
+        assert run_app(app, "calibrator", arguments) == 0
+
+    def trust(*arguments: str) -> str:
+        done = node.run("ecu-node", *arguments, folder=car)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    monkeypatch.chdir(car)
+    calibrator("keys", "new", "anna", "--no-passphrase", "--out", "keys")
+    calibrator("keys", "set", "keys/anna.pub", "--threshold", "1", "--out", "keys-1.json")
+    calibrator("sign", "V001.json", "--key", "keys/anna.key", "--out", "signed", "--sequence", "1000")
+    state = ("--state", "state")
+    trust("provision", "--vehicle", VEHICLE, "--keys", "keys-1.json", *state)
+    trust("verify", "signed/V001.json", *state, *LAYOUT)
+    trust("activate", "signed/V001.json", *state, *LAYOUT)
+    slots = json.loads(trust("inspect", "state", "--json"))["slots"]
+    assert [slot["place"] for slot in slots.values()] == ["on trial"]
+    taken_back = ("--vehicle", VEHICLE, "--number", "1000", "--sequence", "1001", "--why", "a test")
+    calibrator("revoke", *taken_back, "--key", "keys/anna.key", "--out", "revoked.json")
+    trust("revoke", "revoked.json", *state, *LAYOUT)
+    assert json.loads(trust("inspect", "state", "--json"))["revoked"] == [1000]
+
+
+def test_the_start_is_quick_enough_for_a_service(node: CleanVenv) -> None:
+    modules = node.run(
+        "python", "-c", "import ecu_node.cli, sys; print(*sys.modules)", folder=node.folder
+    ).stdout.split()
+    assert not {"can", "cantools", "cryptography", "numpy", "calibrator"} & set(modules)

@@ -1,0 +1,125 @@
+"""Clean environments: the built wheel, its pinned dependencies, and nothing else."""
+
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["ROOT", "CleanVenv", "new_venv", "pins", "the_wheel"]
+
+ROOT = Path(__file__).parents[2]
+_PIN = re.compile(r"(?m)^(\S+==\S+(?: ; [^\\\n]+)?)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CleanVenv:
+    """A virtual environment in which no file of the checkout is seen.
+
+    Attributes
+    ----------
+    folder : Path
+        Where it is.
+    environment : dict of str
+        Variables of the processes that run in it.
+    """
+
+    folder: Path
+    environment: dict[str, str]
+
+    def program(self, name: str) -> str:
+        """Path of a program in it."""
+        return str(self.folder / "bin" / name)
+
+    def run(
+        self, name: str, *arguments: object, folder: Path, timeout_s: float = 900.0
+    ) -> "subprocess.CompletedProcess[str]":
+        """Run a program in it to its end.
+
+        Parameters
+        ----------
+        name : str
+            Of the program.
+        *arguments
+            Its arguments.
+        folder : Path
+            Its working folder.
+        timeout_s : float
+            It is killed after this. [s]
+
+        Returns
+        -------
+        CompletedProcess
+            With what it printed.
+        """
+        return subprocess.run(
+            [self.program(name), *map(str, arguments)],
+            cwd=folder,
+            env=self.environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=timeout_s,
+        )
+
+    def install(self, *what: str) -> None:
+        """Install distributions, pinned by constraints.txt, or end the program with what pip says."""
+        known = self.folder / "pins.txt"
+        known.write_text(pins((ROOT / "constraints.txt").read_text()))
+        _pip(self, "install", "--no-compile", "--constraint", str(known), *what)
+
+
+def new_venv(folder: Path, wheel: Path, *extras: str, interpreter: str = sys.executable) -> CleanVenv:
+    """Make a clean environment.
+
+    Parameters
+    ----------
+    folder : Path
+        To be made.
+    wheel : Path
+        The built wheel.
+    *extras : str
+        What to install with it.
+    interpreter : str
+        The Python it is made of.
+
+    Returns
+    -------
+    CleanVenv
+        With pip, but without setuptools where nothing says that it needs it.
+
+    Raises
+    ------
+    SystemExit
+        If the interpreter or pip fails.
+    """
+    made = subprocess.run([interpreter, "-m", "venv", str(folder)], capture_output=True, text=True, check=False)
+    if made.returncode:
+        raise SystemExit(f"{interpreter}: cannot make an environment: {made.stderr.strip() or made.stdout.strip()}")
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
+    venv = CleanVenv(folder=folder, environment={**environment, "CALIBRATOR_CACHE": str(folder.parent / "cache")})
+    _pip(venv, "uninstall", "--yes", "setuptools")
+    venv.install(f"{wheel}[{','.join(extras)}]" if extras else str(wheel))
+    return venv
+
+
+def pins(constraints: str) -> str:
+    """Pins of a constraints file without their hashes: the wheel itself has none in it."""
+    return "\n".join(pin.strip() for pin in _PIN.findall(constraints)) + "\n"
+
+
+def the_wheel(dist: Path) -> Path:
+    """The one wheel in a folder; ends the program if there is none, or more."""
+    found = sorted(dist.glob("*.whl"))
+    if len(found) != 1:
+        raise SystemExit(f"{dist}: one wheel is expected, found {len(found)}; run 'make package'")
+    return found[0].resolve()
+
+
+def _pip(venv: CleanVenv, *arguments: str) -> None:
+    options = ("--quiet", "--disable-pip-version-check", "--no-input")
+    done = venv.run("python", "-m", "pip", *arguments, *options, folder=venv.folder)
+    if done.returncode:
+        raise SystemExit(f"pip {' '.join(arguments)}: {done.stderr.strip()}")
