@@ -193,7 +193,7 @@ def test_ctrl_c_ends_the_line_of_progress_first_and_says_how_much_was_sent(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(VirtualBus, "send", send)
-    monkeypatch.setattr("calibrator.report.progress.LINE_EVERY_S", 0.0)
+    monkeypatch.setattr("calibrator.terminal.progress.LINE_EVERY_S", 0.0)
     assert command(log, "--interface", "virtual", "--channel", "c") == 130
     *_, progress, last = capsys.readouterr().err.splitlines()
     assert progress.startswith(f"replay: 3 of {len(FRAMES)} frames, ")
