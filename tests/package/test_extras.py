@@ -49,7 +49,7 @@ def test_calibrator_takes_a_fleet_from_logs_to_reports_and_exports(
     calibrator(venv, tmp_path, "calibrate", "store", *layout, "--out", result)
     calibrator(venv, tmp_path, "score", result, "--truth", fleet / "truth.json")
     calibrator(venv, tmp_path, "report", result)
-    assert "<script>" in (result / "report.html").read_text()
+    assert "<script>" in (tmp_path / "report.html").read_text()
     calibrator(venv, tmp_path, "report", result, "--vehicle", VEHICLE, "--out", "vehicle.html")
     parameters = result / "params" / f"{VEHICLE}.json"
     for kind in ("dcm", "cdfx", "csv", "c99"):
@@ -125,7 +125,8 @@ def test_bench_compares_with_its_peers(installed: Installed, unpacked: Path) -> 
     command = ("-m", "bench.all", "--quick", "--only", "identification")
     done = installed("bench").run("python", *command, folder=unpacked / "tools")
     assert done.returncode == 0, done.stderr
-    assert "sippy" in done.stdout
+    found = json.loads((unpacked / "tools" / "build" / "bench.json").read_text())
+    assert len({row["peer"] for row in found if row["peer"] is not None}) >= 2
 
 
 def test_docs_are_built_from_the_source(installed: Installed, unpacked: Path) -> None:
