@@ -3,7 +3,13 @@
 from collections.abc import Callable
 
 import pytest
-from e2e.p01 import E2E_P01_DATAID_ALT, E2E_P01_DATAID_LOW, E2E_P01_DATAID_NIBBLE, e2e_p01_check
+from e2e.p01 import (
+    E2E_P01_DATAID_ALT,
+    E2E_P01_DATAID_BOTH,
+    E2E_P01_DATAID_LOW,
+    E2E_P01_DATAID_NIBBLE,
+    e2e_p01_check,
+)
 from e2e.p02 import e2e_p02_check
 from e2e.p05 import e2e_p05_check
 
@@ -20,6 +26,7 @@ ENTRIES = {
     "P01": 'profile = "P01"\nmessages = ["Room"]\ndata_id = { Room = 0x1234 }',
     "P01 alternating": 'profile = "P01"\nmessages = ["Room"]\ndata_id_mode = "alternating"',
     "P01 low": 'profile = "P01"\nmessages = ["Room"]\ndata_id_mode = "low"',
+    "P01 further on": 'profile = "P01"\nmessages = ["Room"]\noffset = 1',
     "P01 nibble": 'profile = "P01"\nmessages = ["Room"]\ndata_id_mode = "nibble"\noffset = 3',
     "P02": f'profile = "P02"\nmessages = ["Room"]\ndata_id_list = {{ Room = {LIST} }}',
     "P05": 'profile = "P05"\nmessages = ["Room"]\noffset = 2',
@@ -28,6 +35,18 @@ ENTRIES = {
     'algorithm = "autosar"\ndata_id_bytes = 1\ndata_id_at = "after"',
 }
 MODULUS = {"P02": 16, "P05": 256, "OEM": 16}
+HEADERS = {
+    "P01": "ff0f",
+    "P01 alternating": "ff0f",
+    "P01 low": "ff0f",
+    "P01 further on": "00ff0f",
+    "P01 nibble": "000000ffff",
+    "P02": "ff0f",
+    "P05": "0000ffffff",
+    "OEM": "00000000f00000ff",
+    "OEM after": "00000000f00000ff",
+}
+"""The bits that belong to CRC and counter, in the payload."""
 
 
 @pytest.fixture(params=list(ENTRIES))
@@ -79,6 +98,10 @@ def test_only_the_header_is_written(kind: str, protect: Callable[[str], Protecti
         assert changed & ~protection.header_mask == 0
 
 
+def test_the_header_is_crc_and_counter_and_no_bit_more(kind: str, protect: Callable[[str], Protection]) -> None:
+    assert protect(ENTRIES[kind]).header_mask == int.from_bytes(bytes.fromhex(HEADERS[kind]), "little")
+
+
 def test_sealing_keeps_the_counter(kind: str, protect: Callable[[str], Protection]) -> None:
     protection = protect(ENTRIES[kind])
     for frame in stream(protection, 20):
@@ -106,6 +129,7 @@ def test_the_libraries_find_the_frames_sound(protect: Callable[[str], Protection
     for kind, mode, offset in (
         ("P01 alternating", E2E_P01_DATAID_ALT, 0),
         ("P01 low", E2E_P01_DATAID_LOW, 0),
+        ("P01 further on", E2E_P01_DATAID_BOTH, 1),
         ("P01 nibble", E2E_P01_DATAID_NIBBLE, 3),
     ):
         assert all(e2e_p01_check(frame, 700, data_id_mode=mode, offset=offset) for frame in frames(kind))
@@ -141,6 +165,23 @@ def test_a_frame_without_room_for_the_header_is_corrupt(kind: str, protect: Call
     assert {Receiver(protection).check(bytearray(size)) for size in range(protection.least_bytes)} == {Check.CORRUPT}
 
 
+def test_a_frame_that_is_all_header_is_read(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind])
+    (frame,) = stream(protection, 1, size=len(bytes.fromhex(HEADERS[kind])))
+    assert Receiver(protection).check(frame) is Check.OK
+
+
+def test_a_code_beyond_those_of_the_counter_is_corrupt_though_its_crc_is_right(
+    protect: Callable[[str], Protection],
+) -> None:
+    protection = protect(ENTRIES["OEM after"])
+    (frame,) = stream(protection, 1)
+    frame[protection.counter_byte] |= 15 << protection.counter_shift
+    protection.seal(frame)
+    assert protection.is_sound(frame)
+    assert Receiver(protection).check(frame) is Check.CORRUPT
+
+
 def test_counter_15_is_impossible_with_any_crc(protect: Callable[[str], Protection]) -> None:
     protection = protect(ENTRIES["P01"])
     assert {Receiver(protection).check(bytearray([crc, 15, 0, 0])) for crc in range(256)} == {Check.CORRUPT}
@@ -153,6 +194,25 @@ def test_repeated_frames_gaps_and_jumps(kind: str, protect: Callable[[str], Prot
     found = [check(frames[k]) for k in (5, 5, 6, 9, 10, 14, 15, 16)]
     ok, jump = Check.OK, Check.JUMPED
     assert found == [ok, Check.REPEATED, ok, Check.LOST, ok, jump, ok, ok]
+
+
+@pytest.mark.parametrize("last", [-1, 0])
+def test_gaps_and_jumps_count_on_past_the_last_code(kind: str, protect: Callable[[str], Protection], last: int) -> None:
+    protection = protect(ENTRIES[kind] + "\nmax_delta_counter = 3")
+    last += protection.modulus
+    frames = stream(protection, last + 9)
+    for step, found in ((0, Check.REPEATED), (1, Check.OK), (3, Check.LOST), (4, Check.JUMPED), (8, Check.JUMPED)):
+        check = Receiver(protection).check
+        assert [check(frames[last]), check(frames[last + step])] == [Check.OK, found]
+
+
+def test_a_receiver_says_which_counter_it_expects(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind])
+    receiver = Receiver(protection)
+    assert receiver.expected == -1
+    for frame in stream(protection, protection.modulus):
+        receiver.check(frame)
+        assert receiver.expected == (counter(protection, frame) + 1) % protection.modulus
 
 
 def test_a_corrupt_frame_leaves_the_counter_as_it_was(kind: str, protect: Callable[[str], Protection]) -> None:
@@ -199,6 +259,20 @@ def test_protection_that_cannot_be_is_one_line(make_database: MakeDatabase, entr
         for name in ("Room", "Net"):
             protection_of(database, database.message(name))
     assert "\n" not in str(caught.value)
+
+
+def test_a_message_that_can_fd_pads_cannot_be_protected(make_database: MakeDatabase) -> None:
+    dbc = SMALL_DBC.replace("VAL_", ROOM.replace("Room: 16", "Room: 10") + "VAL_", 1)
+    database = make_database(f"{SMALL_LAYOUT}\n[e2e]\n{ENTRIES['P01']}\n", dbc)
+    words = "message Room has 10 bytes in the DBC; CAN FD pads it, .* expected 12, 16, 20, 24, 32, 48, 64$"
+    with pytest.raises(LayoutError, match=words):
+        protection_of(database, database.message("Room"))
+
+
+def test_a_whole_classic_frame_can_be_protected(make_database: MakeDatabase) -> None:
+    dbc = SMALL_DBC.replace("VAL_", ROOM.replace("Room: 16", "Room: 8") + "VAL_", 1)
+    database = make_database(f"{SMALL_LAYOUT}\n[e2e]\n{ENTRIES['P01']}\n", dbc)
+    assert protection_of(database, database.message("Room")) is not None
 
 
 def test_a_message_has_one_protection(make_database: MakeDatabase) -> None:
