@@ -83,10 +83,6 @@ class Line:
     voltage_slope: Fraction
     constant: Fraction
 
-    def at(self, code: int, voltage_code: int = 0) -> Fraction:
-        """Exact corrected code, not rounded."""
-        return self.slope * code + self.voltage_slope * voltage_code + self.constant
-
 
 @dataclass(frozen=True, kw_only=True)
 class IntegerPlan:

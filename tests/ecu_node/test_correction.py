@@ -1,6 +1,7 @@
 """Integer plan against exact fractions."""
 
 import math
+from collections.abc import Iterable
 from fractions import Fraction
 
 import pytest
@@ -10,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ecu_node.codes import Codes, not_available_code, read_codes, require_reach, writable_range
-from ecu_node.correction import LARGEST_ERROR, IntegerPlan, Signals, correction_plan
+from ecu_node.correction import LARGEST_ERROR, IntegerPlan, Line, Signals, correction_plan
+from ecu_node.correction import integer_plan as plan_of_line
 from ecu_node.errors import DatabaseError
 from ecu_node.sensor_fault import SensorFault
 from ecu_node.units import AMPERE
@@ -110,6 +112,7 @@ def test_the_error_over_all_codes_of_16_bits_is_at_most_half_a_code_and_a_little
             assert abs(got * common - gain * code - bias) <= bound
 
 
+@settings(deadline=None)
 @given(
     length=st.integers(2, 64),
     signed=st.booleans(),
@@ -129,11 +132,77 @@ def test_signals_of_any_width_keep_the_error_bound(
     assert abs(got - clamped) <= HALF + LARGEST_ERROR
 
 
+def excess(plan: IntegerPlan, line: Line, codes: Iterable[int], volts: Iterable[int]) -> list[Fraction]:
+    """How far the integers lie above a line, before anything is rounded; largest and least at the ends of the codes."""
+    return [
+        Fraction(code * plan.gain + volt * plan.voltage_gain + plan.bias, 1 << plan.shift)
+        - (line.slope * code + line.voltage_slope * volt + line.constant)
+        for code in codes
+        for volt in volts
+    ]
+
+
+@settings(deadline=None)
+@given(
+    length=st.integers(2, 64),
+    volts=st.integers(2, 64),
+    signed=st.booleans(),
+    slope=st.fractions(-3, 3),
+    voltage_slope=st.fractions(-3, 3),
+    constant=st.fractions(-70000, 70000),
+)
+def test_the_integers_are_never_below_the_line_and_above_it_by_less_than_the_largest_error(
+    length: int, volts: int, signed: bool, slope: Fraction, voltage_slope: Fraction, constant: Fraction
+) -> None:
+    source, voltage = current(length=length, signed=signed), current(length=volts, signed=not signed)
+    line = Line(slope=slope, voltage_slope=voltage_slope, constant=constant)
+    plan = plan_of_line(Signals(source=source, target=source, sign=1, voltage=voltage), line)
+    ends = (source.lowest, source.highest), (voltage.lowest, voltage.highest)
+    assert all(0 <= error < LARGEST_ERROR for error in excess(plan, line, *ends))
+
+
+def test_the_error_is_below_the_largest_where_a_gain_lies_amid_two_integers() -> None:
+    source = current(length=60, signed=False)
+    line = Line(slope=1 + Fraction(1, 2**70), voltage_slope=Fraction(0), constant=Fraction(1, 2**80))
+    plan = plan_of_line(Signals(source=source, target=source, sign=1), line)
+    assert all(0 <= error < LARGEST_ERROR for error in excess(plan, line, (source.lowest, source.highest), (0,)))
+
+
+def test_what_integers_hold_exactly_they_hold_exactly() -> None:
+    line = Line(slope=Fraction(3, 4), voltage_slope=Fraction(-5, 8), constant=Fraction(7, 16))
+    plan = plan_of_line(Signals(source=current(), target=current(), sign=1, voltage=current()), line)
+    assert set(excess(plan, line, (-32768, 32767), (-32768, 32767))) == {Fraction(0)}
+
+
+@pytest.mark.parametrize(("constant", "shift"), [(32766, 43), (32767, 42), (-32766, 43), (-32767, 42)])
+def test_the_shift_is_the_largest_with_which_sums_stay_below_2_to_the_59(constant: int, shift: int) -> None:
+    line = Line(slope=Fraction(1), voltage_slope=Fraction(0), constant=Fraction(constant))
+    plan = plan_of_line(Signals(source=current(), target=current(), sign=1), line)
+    largest = 32768 * plan.gain + abs(plan.bias) + (1 << (plan.shift - 1))
+    assert (plan.shift, largest < 2**59) == (shift, True)
+
+
+def test_a_voltage_that_does_not_matter_changes_no_plan() -> None:
+    wide = current(length=60)
+    line = Line(slope=Fraction(1, 3), voltage_slope=Fraction(0), constant=Fraction(1, 7))
+    alone, beside = (
+        plan_of_line(Signals(source=wide, target=wide, sign=1, voltage=voltage), line)
+        for voltage in (None, current(length=62))
+    )
+    assert alone == beside
+    assert not alone.needs_voltage
+
+
+def test_a_corrected_signal_without_a_code_for_zero_is_named() -> None:
+    with pytest.raises(DatabaseError, match=r"^corrected signal I: the code of 0 of signal I is named 'Off'"):
+        integer_plan(current(), current(names={0: "Off"}), sign=1, drift=0.0, offset_a=0.0)
+
+
 def test_16_bit_plans_fit_64_bit_words() -> None:
     source = current()
     plan = integer_plan(source, source, sign=1, drift=-0.4, offset_a=150.0)
     for code in (source.lowest, source.highest):
-        assert abs(code * plan.gain) + abs(plan.bias) + (1 << (plan.shift - 1)) < 2**63
+        assert abs(code * plan.gain) + abs(plan.bias) + (1 << (plan.shift - 1)) < 2**59
 
 
 def test_passing_through_changes_no_code() -> None:
@@ -180,6 +249,13 @@ def test_results_saturate_at_the_range_of_the_dbc() -> None:
 def test_the_plan_is_the_written_formula() -> None:
     plan = IntegerPlan(gain=3, bias=1, shift=2, lowest=-100, highest=100)
     assert [plan.apply(code) for code in (-1, 0, 1, 1000)] == [0, 0, 1, 100]
+
+
+def test_the_plan_of_a_power_takes_the_voltage_into_account() -> None:
+    plan = IntegerPlan(gain=3, voltage_gain=-8, bias=1, shift=2, lowest=-100, highest=100)
+    assert [plan.apply(1, volts) for volts in (-60, 0, 1, 60)] == [100, 1, -1, -100]
+    assert [plan.saturates(1, volts) for volts in (-50, -49, 50, 51)] == [True, False, False, True]
+    assert (plan.apply(1), plan.saturates(133), plan.saturates(134)) == (plan.apply(1, 0), False, True)
 
 
 def test_named_codes_and_codes_out_of_range_are_no_values() -> None:

@@ -3,7 +3,7 @@
 from fractions import Fraction
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ecu_node.codes import Codes
@@ -61,6 +61,26 @@ def test_gain_by_sign_over_all_codes(sign: int, scale: float) -> None:
     assert worst <= HALF + LARGEST_ERROR
 
 
+def test_the_plan_by_sign_is_chosen_by_the_written_rule() -> None:
+    into, out = (IntegerPlan(gain=gain, bias=0, shift=1, lowest=-9, highest=9) for gain in (2, 3))
+    plan = SignPlan(positive=into, negative=out, weights=(2, 5, -6))
+    assert [plan.plan(code) is into for code in (0, 2, 3)] == [False, False, True]
+    assert [plan.plan(0, volts) is into for volts in (1, 2)] == [False, True]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("target", [current(0.05), current(-0.05), current(0.02, -500.0), current(-0.1, 70.0)])
+def test_which_plan_holds_does_not_depend_on_how_the_target_counts(sign: int, target: Codes) -> None:
+    fault = SensorFault(offset_a=-3.3, model=GainBySign(drift_positive=0.13, drift_negative=-0.07))
+    signals = Signals(source=current(), target=target, sign=sign)
+    plan = correction_plan(signals, fault)
+    assert isinstance(plan, SignPlan)
+    codes = range(-170, -160) if sign == 1 else range(160, 170)
+    assert [plan.plan(code) is plan.positive for code in codes] == [2 * sign * code >= -330 for code in codes]
+    assert not plan.needs_voltage
+
+
+@settings(deadline=None)
 @given(
     code=st.integers(-30000, 30000),
     volts=st.integers(0, 50000),
@@ -113,6 +133,7 @@ def test_a_temperature_at_which_the_drift_is_beyond_the_limit_has_no_plan() -> N
         (SensorFault(drift=0.25, offset_a=5.0), 80.0, None, 105.0),
         (SensorFault(offset_a=1.0, model=GainBySign(drift_positive=0.1, drift_negative=-0.1)), 50.0, None, 56.0),
         (SensorFault(offset_a=1.0, model=GainBySign(drift_positive=0.1, drift_negative=-0.1)), -50.0, None, -44.0),
+        (SensorFault(offset_a=5.0, model=GainBySign(drift_positive=0.1, drift_negative=-0.1)), -2.0, None, 3.2),
         (SensorFault(drift=0.1, model=TemperatureDrift(drift_per_k=0.01, reference_c=20.0)), 10.0, 30.0, 12.0),
     ],
 )
@@ -120,6 +141,19 @@ def test_true_currents_undo_the_sensor_model(
     fault: SensorFault, current_a: float, temperature_c: float | None, measured: float
 ) -> None:
     assert fault.true_current(measured, temperature_c) == pytest.approx(current_a)
+
+
+def test_a_current_of_nothing_counts_as_into_the_junction() -> None:
+    fault = SensorFault(offset_a=1.0, model=GainBySign(drift_positive=0.1, drift_negative=-0.1))
+    assert [fault.drift_at(current_a, None) for current_a in (-1e-9, 0.0, 0.5)] == [-0.1, 0.1, 0.1]
+
+
+@pytest.mark.parametrize(("drift", "per_k"), [(0.25, 0.03125), (-0.25, -0.03125)])
+def test_where_the_drift_is_beyond_the_limit_no_true_current_is_known(drift: float, per_k: float) -> None:
+    model = TemperatureDrift(drift_per_k=per_k, reference_c=20.0)
+    fault = SensorFault(drift=drift, model=model, largest_drift=0.5)
+    assert fault.true_current(30.0, 28.0) == 30.0 / (1.0 + 2.0 * drift)
+    assert fault.true_current(30.0, 28.5) is None
 
 
 def test_without_its_temperature_nothing_is_known() -> None:
