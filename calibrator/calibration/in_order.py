@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -41,10 +42,19 @@ class Workers:
         Number of processes on this machine.
     scheduler : str or None
         Address of a Dask scheduler, ``tcp://host:port``, whose workers are used instead.
+
+    Raises
+    ------
+    FleetError
+        If there is a scheduler, but Dask is not installed.
     """
 
     processes: int
     scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.scheduler is not None and find_spec("distributed") is None:
+            raise FleetError("--scheduler needs Dask: pip install 'hv-current-correction[cluster]'")
 
     def map(self, function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
         """Apply a function to each item.
@@ -85,11 +95,9 @@ def _one_thread() -> threadpool_limits:
 
 
 def _on_cluster(scheduler: str, function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
-    try:
-        from distributed import CancelledError, Client, KilledWorker  # noqa: PLC0415 (an extra)
-        from distributed.comm.core import CommClosedError  # noqa: PLC0415
-    except ImportError:
-        raise FleetError("--scheduler needs Dask: pip install 'hv-current-correction[cluster]'") from None
+    from distributed import CancelledError, Client, KilledWorker  # noqa: PLC0415 (an extra)
+    from distributed.comm.core import CommClosedError  # noqa: PLC0415
+
     with _silenced(TALKATIVE):
         try:
             client = Client(scheduler, timeout=TIMEOUT_S, set_as_default=False)

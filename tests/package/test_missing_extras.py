@@ -1,7 +1,8 @@
 """What a command says whose extra is missing is one line, and doing what it says helps."""
 
 import re
-from collections.abc import Callable
+import socket
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import can
@@ -31,29 +32,39 @@ def shown(venv: CleanVenv, folder: Path) -> tuple[int | None, str]:
     return code, " ".join(text.decode().split()) + "\n"
 
 
-STEPS = {
-    "monitor": (shown, "ecu-node: a live table needs rich; install it with "),
-    "metrics": (
-        piped(
-            "ecu-node", "run", *PARAMETERS, *LAYOUT, "--interface", "pigeon", "--channel", "c", "--metrics-port", 9464
+def steps(taken_port: int) -> dict[str, tuple[Callable[[CleanVenv, Path], tuple[int | None, str]], str]]:
+    """By extra, from the lightest on: what needs it, and what that says without it."""
+    run = ("run", *PARAMETERS, *LAYOUT, *BUS, "--metrics-port", taken_port)  # ends with the extra, too
+    small = ("--vehicles", 2, "--minutes", 1)
+    cluster = (
+        "--scheduler",
+        "tcp://127.0.0.1:9",
+    )  # what is missing is told before the fleet is read, which takes hours
+    return {
+        "monitor": (shown, "ecu-node: a live table needs rich; install it with "),
+        "metrics": (piped("ecu-node", *run), "ecu-node: --metrics-port needs prometheus-client; install it with "),
+        "calibrator": (piped("calibrator", "--version"), "calibrator: typer is not installed; "),
+        "demo": (
+            piped("calibrator", "simulate", *LAYOUT, *small, "--out", "two"),
+            "calibrator: builtin drives need fastsim; install the extra: ",
         ),
-        "ecu-node: --metrics-port needs prometheus-client; install it with ",
-    ),
-    "calibrator": (piped("calibrator", "--version"), "calibrator: typer is not installed; "),
-    "demo": (
-        piped("calibrator", "simulate", *LAYOUT, "--vehicles", 2, "--minutes", 1, "--out", "two"),
-        "calibrator: builtin drives need fastsim; install the extra: ",
-    ),
-    "mf4": (
-        piped("calibrator", "kirchhoff", "drive.mf4", *LAYOUT),
-        "calibrator: drive.mf4: reading MF4 needs asammdf; ",
-    ),
-    "cluster": (
-        piped("calibrator", "calibrate", "fleet", *LAYOUT, "--scheduler", "tcp://127.0.0.1:9", "--out", "never"),
-        "calibrator: --scheduler needs Dask: ",
-    ),
-}
-"""By extra, from the lightest on: what needs it, and what that says without it."""
+        "mf4": (
+            piped("calibrator", "kirchhoff", "drive.mf4", *LAYOUT),
+            "calibrator: drive.mf4: reading MF4 needs asammdf; ",
+        ),
+        "cluster": (
+            piped("calibrator", "calibrate", "none", *LAYOUT, *cluster, "--out", "never"),
+            "calibrator: --scheduler needs Dask: ",
+        ),
+    }
+
+
+@pytest.fixture
+def taken_port() -> Iterator[int]:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        yield int(taken.getsockname()[1])
 
 
 @pytest.fixture
@@ -64,9 +75,11 @@ def mf4(car: Path, drive: Path) -> None:
 
 
 @pytest.mark.usefixtures("mf4")
-def test_doing_what_a_command_without_its_extra_says_makes_it_work(wheel: Path, car: Path, tmp_path: Path) -> None:
+def test_doing_what_a_command_without_its_extra_says_makes_it_work(
+    wheel: Path, car: Path, tmp_path: Path, taken_port: int
+) -> None:
     venv = new_venv(tmp_path / "growing", wheel)
-    for extra, (command, words) in STEPS.items():
+    for extra, (command, words) in steps(taken_port).items():
         code, said = command(venv, car)
         assert code == 1, (extra, said)
         assert said.startswith(words)

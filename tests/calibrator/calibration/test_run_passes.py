@@ -1,5 +1,6 @@
 """The two passes over a store: every vehicle by itself, in any company, and none stops the others."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -308,3 +309,10 @@ def test_a_sensor_that_moved_is_told_and_calibrated_from_the_new_drives(
         sd = battery["drift_sd" if name_of == "drift" else "offset_sd_a"]
         assert abs(battery[name_of] - truth[0, 0]) <= 4.0 * sd
     assert b'"d1"' not in texts(chunk)[name]
+
+
+def test_a_cluster_without_dask_is_refused_before_the_fleet_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)  # makes its import fail
+    with pytest.raises(FleetError, match=r"--scheduler needs Dask: pip install 'hv-current-correction\[cluster\]'"):
+        Workers(processes=1, scheduler="tcp://127.0.0.1:8786")
+    assert Workers(processes=1).scheduler is None
