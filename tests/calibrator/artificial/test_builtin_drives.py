@@ -1,8 +1,11 @@
+import sys
+
 import numpy as np
 import pytest
 
-from calibrator.artificial.builtin_drives import builtin_trip
+from calibrator.artificial.builtin_drives import _fastsim, builtin_trip
 from calibrator.artificial.ground_truth import GroundTruth
+from calibrator.errors import FleetError
 from ecu_node.database import VehicleDatabase
 
 NOT_MODELLED = {"contactor_state", "junction_box_temperature"}
@@ -51,3 +54,9 @@ def test_seed_decides_the_trip() -> None:
     same = [builtin_trip(np.random.default_rng(s), duration_s=60.0, name="t") for s in (1, 1, 2)]
     np.testing.assert_array_equal(same[0].currents_a["battery"], same[1].currents_a["battery"])
     assert len(same[0]) != len(same[2]) or not np.array_equal(same[0].inputs["speed"], same[2].inputs["speed"])
+
+
+def test_without_fastsim_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fastsim", None)  # makes its import fail
+    with pytest.raises(FleetError, match=r"need fastsim; .*: pip install 'hv-current-correction\[demo\]'$"):
+        _fastsim()
