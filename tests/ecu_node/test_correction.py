@@ -163,7 +163,9 @@ def test_the_integers_are_never_below_the_line_and_above_it_by_less_than_the_lar
 
 def test_the_error_is_below_the_largest_where_a_gain_lies_amid_two_integers() -> None:
     source = current(length=60, signed=False)
-    line = Line(slope=1 + Fraction(1, 2**70), voltage_slope=Fraction(0), constant=Fraction(1, 2**80))
+    line = Line(
+        slope=1 + Fraction(1, 2**70), voltage_slope=Fraction(0), constant=Fraction(1, 2**70) + Fraction(1, 2**90)
+    )
     plan = plan_of_line(Signals(source=source, target=source, sign=1), line)
     assert all(0 <= error < LARGEST_ERROR for error in excess(plan, line, (source.lowest, source.highest), (0,)))
 

@@ -34,6 +34,7 @@ ENTRIES = {
     "OEM after": 'profile = "counter CRC8"\nmessages = ["Room"]\ncounter = "Count"\ncrc = "Sum"\ncounter_modulus = 15\n'
     'algorithm = "autosar"\ndata_id_bytes = 1\ndata_id_at = "after"',
 }
+OEM = ENTRIES["OEM"]
 MODULUS = {"P02": 16, "P05": 256, "OEM": 16}
 HEADERS = {
     "P01": "ff0f",
@@ -154,6 +155,12 @@ def test_the_crc_of_a_control_unit_is_what_its_words_say(protect: Callable[[str]
         assert frame[7] == crc8(bytes(frame[:7] + frame[8:]) + bytes([700 & 0xFF]), 0x2F)
 
 
+def test_the_largest_data_identifier_of_a_byte_is_covered(protect: Callable[[str], Protection]) -> None:
+    entry = OEM.replace("data_id_bytes = 2", "data_id_bytes = 1\ndata_id = { Room = 255 }")
+    (frame,) = stream(protect(entry), 1)
+    assert frame[7] == crc8(b"\xff" + frame[:7] + frame[8:], 0x1D)
+
+
 def test_a_frame_of_another_message_is_corrupt(protect: Callable[[str], Protection]) -> None:
     (frame,) = stream(protect(ENTRIES["P01"]), 1)
     other = protect(ENTRIES["P01"].replace("0x1234", "0x1235"))
@@ -226,9 +233,6 @@ def test_a_corrupt_frame_leaves_the_counter_as_it_was(kind: str, protect: Callab
     assert check(frames[1]) is Check.OK
 
 
-OEM = ENTRIES["OEM"]
-
-
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
@@ -239,7 +243,7 @@ OEM = ENTRIES["OEM"]
         (OEM.replace('"Count"', '"Alive"'), r"message Room has no signal 'Alive'; it has Count, Sum"),
         (OEM.replace('crc = "Sum"', 'crc = "Count"'), "signal Count must be one whole byte"),
         (OEM + "\ncounter_modulus = 17", "signal Count cannot count from 0 to 16"),
-        (OEM + '\nalgorithm = "md5"', "algorithm 'md5' is not known; known are autosar, bluetooth,"),
+        (OEM + '\nalgorithm = "md5"', "message Room: algorithm 'md5' is not known; known are autosar, bluetooth,"),
         (ENTRIES["P02"].replace("100, ", ""), "16"),
         (ENTRIES["P01"] + "\nmax_delta_counter = 15", "max_delta_counter is 15, but the counter has 15 codes only"),
         (
@@ -259,6 +263,24 @@ def test_protection_that_cannot_be_is_one_line(make_database: MakeDatabase, entr
         for name in ("Room", "Net"):
             protection_of(database, database.message(name))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("56|8@1+", "57|8@1+", "message Room: signal Sum must be one whole byte to be a CRC-8$"),
+        ("56|8@1+", "56|7@1+", "message Room: signal Sum must be one whole byte to be a CRC-8$"),
+        ("36|4@1+", "38|4@1+", "message Room: signal Count must be within one byte to be a counter$"),
+        ("36|4@1+", "36|4@1-", "message Room: signal Count cannot count from 0 to 7$"),
+    ],
+)
+def test_signals_that_can_be_no_counter_or_crc_are_refused(
+    make_database: MakeDatabase, old: str, new: str, words: str
+) -> None:
+    dbc = SMALL_DBC.replace("VAL_", ROOM.replace(old, new) + "VAL_", 1)
+    database = make_database(f"{SMALL_LAYOUT}\n[e2e]\n{OEM}\n", dbc)
+    with pytest.raises(LayoutError, match=words):
+        protection_of(database, database.message("Room"))
 
 
 def test_a_message_that_can_fd_pads_cannot_be_protected(make_database: MakeDatabase) -> None:
