@@ -1,0 +1,68 @@
+"""A figure holds as long as the files that it was measured with say the same, those that they import included."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from acceptance.inputs import digest, files_that_run
+from acceptance.steps import steps
+
+ROOT = Path(__file__).parents[2]
+FILES = {
+    "constraints.txt": "numpy==2.0\n",
+    "tools/measure.py": "import numpy\n\n\ndef main():\n    from calibrator.fit import solve\n",
+    "calibrator/__init__.py": "",
+    "calibrator/fit.py": "from calibrator import rows, drive\n",
+    "calibrator/rows.py": "from ecu_node.codes import Code\n",
+    "calibrator/drive.py": "",
+    "calibrator/report.py": "",
+    "ecu_node/codes.py": "",
+    "dbc/car.dbc": 'VERSION ""\n',
+}
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    for name, text in FILES.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    subprocess.run(["git", "init", "--quiet"], cwd=tmp_path, check=True)
+    subprocess.run(["git", "add", "--all"], cwd=tmp_path, check=True)
+    return tmp_path
+
+
+def test_what_a_script_imports_counts_within_functions_and_through_modules(checkout: Path) -> None:
+    found = {str(path.relative_to(checkout)) for path in files_that_run(checkout, ["tools/measure.py", "dbc"])}
+    assert found == FILES.keys() - {"constraints.txt", "calibrator/report.py"}
+
+
+@pytest.mark.parametrize(
+    ("changed", "same"),
+    [
+        ("ecu_node/codes.py", False),
+        ("dbc/car.dbc", False),
+        ("constraints.txt", False),
+        ("calibrator/report.py", True),
+        ("calibrator/new.py", True),
+    ],
+)
+def test_figures_hold_until_something_that_they_are_made_with_changes(changed: str, same: bool, checkout: Path) -> None:
+    before = digest(checkout, ["tools/measure.py", "dbc"])
+    (checkout / changed).write_text("# another\n")
+    assert (digest(checkout, ["tools/measure.py", "dbc"]) == before) is same
+
+
+def test_an_entry_that_is_not_there_is_named(checkout: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="nothing: nothing of it is committed"):
+        files_that_run(checkout, ["nothing"])
+
+
+def test_every_step_names_files_of_this_checkout() -> None:
+    wanted = list(steps(Path("build/release"), Path("trips")))
+    assert len({step.name for step in wanted}) == len(wanted)
+    files = {step.name: {path.relative_to(ROOT) for path in files_that_run(ROOT, step.runs)} for step in wanted}
+    assert all(any(path.parts[0] in {"calibrator", "ecu_node"} for path in found) for found in files.values())
+    assert Path("calibrator/posterior/decision.py") in files["experiments"]
+    assert Path("calibrator/report/page.py") not in files["experiments"]
+    assert Path("tests/tools/test_release_inputs.py") in files["tests"]

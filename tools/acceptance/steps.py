@@ -1,0 +1,103 @@
+"""What measures: one command after the other, each with the files that its figures depend on."""
+
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+__all__ = ["PYTHON", "Step", "steps"]
+
+PYTHON = sys.executable
+LAYOUT = "dbc/hv_powertrain.toml"
+CODE = ("calibrator", "ecu_node", "dbc")
+EVERYTHING = (".",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """One command; what it prints is kept.
+
+    Attributes
+    ----------
+    name : str
+        Name of its files in the folder, with ``_`` for blanks.
+    command : tuple of str
+        Program and arguments.
+    runs : tuple of str
+        Files and folders of the checkout that its figures depend on, with what they import.
+    environment : mapping of str to str
+        Variables besides those of the caller.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    runs: tuple[str, ...]
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+
+def steps(out: Path, recorded: Path) -> Iterator[Step]:
+    """What measures, in an order that shows the most first."""
+    tools = {"PYTHONPATH": "tools"}
+    single = {**tools, "OMP_NUM_THREADS": "1"}
+    pytest = (PYTHON, "-m", "pytest", "-q")
+    yield Step(
+        name="tests",
+        command=(*pytest, "--numprocesses", "auto", "--dist", "worksteal", f"--junitxml={out / 'tests.xml'}"),
+        runs=EVERYTHING,
+        environment={"HV_REQUIRE_ALL": "1"},
+    )
+    fleet = str(out / "vcan_fleet")
+    yield Step(
+        name="fleet of vcan", command=(PYTHON, "-m", "tests.vcan.calibrated_fleet", fleet), runs=("tests/vcan", *CODE)
+    )
+    yield Step(
+        name="vcan",
+        command=("tools/with_vcan", *pytest, "tests/vcan", f"--junitxml={out / 'vcan.xml'}"),
+        runs=("tests/vcan", "tests/conftest.py", "tools/with_vcan", "tools", *CODE),
+        environment={"HV_REQUIRE_ALL": "1", "HV_CALIBRATED_FLEET": fleet},
+    )
+    yield Step(
+        name="bench",
+        command=(PYTHON, "-m", "bench.all", "--out", str(out / "bench.json")),
+        runs=("tools/bench", "tools/with_vcan", *CODE),
+        environment=single,
+    )
+    trips, layout = str(out / "i3"), ("--layout", LAYOUT)
+    yield Step(
+        name="trips",
+        command=(PYTHON, "tools/import_bmw_i3.py", str(recorded), *layout, "--out", trips),
+        runs=("tools/import_bmw_i3.py", "dbc"),
+        environment=tools,
+    )
+    options = ("--drives", trips, *layout, "--out", str(out / "experiments"))
+    yield Step(
+        name="experiments",
+        command=(PYTHON, "-m", "calibrator", "experiment", "all", *options),
+        runs=("calibrator/experiments", "tools/import_bmw_i3.py", "dbc"),
+    )
+    chain = ("--vehicles", "500", "--minutes", "5", "--unseen-minutes", "3", "--unmeasured", "2", "0.5", "--json")
+    yield Step(
+        name="chain",
+        command=(PYTHON, "tools/trust_chain.py", *chain),
+        runs=("tools/trust_chain.py", *CODE),
+        environment=tools,
+    )
+    yield Step(
+        name="trust fuzz",
+        command=(PYTHON, "-m", "bench.trust_fuzz", "--seed", "7"),
+        runs=("tools/bench/trust_fuzz.py", "dbc"),
+        environment=tools,
+    )
+    for seed in ("31", "32"):
+        yield Step(
+            name=f"node fuzz {seed}",
+            command=(PYTHON, "-m", "bench.node_fuzz", "--frames", "5000000", "--seed", seed),
+            runs=("tools/bench/node_fuzz.py", "dbc"),
+            environment=tools,
+        )
+    yield Step(
+        name="million",
+        command=(PYTHON, "-m", "bench.fleet_run"),
+        runs=("tools/bench/fleet_run.py", "calibrator/calibration", "dbc"),
+        environment=single,
+    )
