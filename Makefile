@@ -8,7 +8,7 @@ TRIPS ?= ../shared/data/bmw_i3_summer
 PYTHONS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test bench bench-quick experiments soak fuzz release-check lint types docs dist package sbom \
+.PHONY: help setup demo test coverage bench bench-quick experiments soak fuzz release-check lint types docs dist package sbom \
 	licences schema constraints clean
 
 help:                    ## this list
@@ -30,6 +30,14 @@ test: setup              ## all tests; those of SocketCAN on a kernel that has i
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
 	$(BIN)/python -m tests.vcan.calibrated_fleet build/vcan_fleet
 	HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan --or-skip $(BIN)/python -m pytest tests/vcan
+
+coverage: setup          ## the same, and which lines and branches they reach: all of ecu_node, 95 % of calibrator
+	rm -rf build/coverage
+	$(BIN)/python -m pytest --cov --cov-report= --numprocesses auto --dist worksteal
+	$(BIN)/python -m tests.vcan.calibrated_fleet build/vcan_fleet
+	HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan $(BIN)/python -m pytest --cov --cov-append --cov-report= tests/vcan
+	$(BIN)/coverage report --include='ecu_node/*' --fail-under=100
+	$(BIN)/coverage report --include='calibrator/*' --fail-under=95
 
 bench: setup             ## how long each step takes, beside its peers; also build/bench.json (long)
 	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all

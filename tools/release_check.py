@@ -24,7 +24,7 @@ from acceptance.inputs import digest
 from acceptance.row import MissingFigureError, Promise
 from acceptance.speed import million_promises, speed_promises
 from acceptance.steps import Step, steps
-from acceptance.tried import chain_promises, fuzz_promises, promises_of_tests
+from acceptance.tried import chain_promises, coverage_promises, fuzz_promises, promises_of_tests
 from calibrator.terminal.command_line import command_app, run_tool
 from ecu_node.errors import UserError
 from ecu_node.user_files import write_atomically
@@ -67,6 +67,7 @@ def main(
 
 def _judges(out: Path) -> Iterator[Callable[[], Iterator[Promise]]]:
     yield lambda: promises_of_tests(out / "tests.xml", out / "vcan.xml")
+    yield lambda: coverage_promises(out / "coverage.json")
     yield lambda: estimation_promises(out / "experiments")
     yield lambda: speed_promises(out / "bench.json")
     yield lambda: million_promises(_output(out, "million"))

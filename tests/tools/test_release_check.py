@@ -8,7 +8,7 @@ import pytest
 from acceptance.estimation import estimation_promises
 from acceptance.row import MissingFigureError, at_least, at_most
 from acceptance.speed import million_promises
-from acceptance.tried import chain_promises, fuzz_promises, promises_of_tests
+from acceptance.tried import chain_promises, coverage_promises, fuzz_promises, promises_of_tests
 
 RECORDED = Path(__file__).parents[2] / "docs" / "results"
 
@@ -44,6 +44,20 @@ def test_printed_figures_are_judged(tmp_path: Path) -> None:
     million.write_text("killed\n")
     with pytest.raises(MissingFigureError, match="no figure of 1000000 vehicles"):
         list(million_promises(million))
+
+
+def test_coverage_is_judged_by_lines_and_branches_of_each_package(tmp_path: Path) -> None:
+    path = tmp_path / "coverage.json"
+    names = ("covered_lines", "num_statements", "covered_branches", "num_branches")
+    counts = {"ecu_node/a.py": (10, 10, 3, 4), "calibrator/a.py": (40, 40, 0, 0), "calibrator/b.py": (55, 58, 0, 2)}
+    files = {name: {"summary": dict(zip(names, each, strict=True))} for name, each in counts.items()}
+    path.write_text(json.dumps({"files": files}))
+    found = list(coverage_promises(path))
+    assert [promise.figure for promise in found] == ["92.86 %", "95 %"]
+    assert [promise.met for promise in found] == [False, True]
+    path.write_text(json.dumps({"files": {"calibrator/a.py": files["calibrator/a.py"]}}))
+    with pytest.raises(MissingFigureError, match="nothing of ecu_node"):
+        list(coverage_promises(path))
 
 
 def test_the_chain_is_judged_by_vehicles_made_worse_and_sets_in_force(tmp_path: Path) -> None:

@@ -39,12 +39,13 @@ def steps(out: Path, recorded: Path) -> Iterator[Step]:
     """What measures, in an order that shows the most first."""
     tools = {"PYTHONPATH": "tools"}
     single = {**tools, "OMP_NUM_THREADS": "1"}
-    pytest = (PYTHON, "-m", "pytest", "-q")
+    pytest = (PYTHON, "-m", "pytest", "-q", "--cov", "--cov-report=")
+    covered = str(out / "coverage")
     yield Step(
         name="tests",
         command=(*pytest, "--numprocesses", "auto", "--dist", "worksteal", f"--junitxml={out / 'tests.xml'}"),
         runs=EVERYTHING,
-        environment={"HV_REQUIRE_ALL": "1"},
+        environment={"HV_REQUIRE_ALL": "1", "COVERAGE_FILE": covered},
     )
     fleet = str(out / "vcan_fleet")
     yield Step(
@@ -52,9 +53,15 @@ def steps(out: Path, recorded: Path) -> Iterator[Step]:
     )
     yield Step(
         name="vcan",
-        command=("tools/with_vcan", *pytest, "tests/vcan", f"--junitxml={out / 'vcan.xml'}"),
-        runs=("tests/vcan", "tests/conftest.py", "tools/with_vcan", "tools", *CODE),
-        environment={"HV_REQUIRE_ALL": "1", "HV_CALIBRATED_FLEET": fleet},
+        command=("tools/with_vcan", *pytest, "tests/vcan", "--cov-append", f"--junitxml={out / 'vcan.xml'}"),
+        runs=EVERYTHING,
+        environment={"HV_REQUIRE_ALL": "1", "HV_CALIBRATED_FLEET": fleet, "COVERAGE_FILE": covered},
+    )
+    yield Step(
+        name="coverage",
+        command=(PYTHON, "-m", "coverage", "json", "-o", str(out / "coverage.json")),
+        runs=EVERYTHING,
+        environment={"COVERAGE_FILE": covered},
     )
     yield Step(
         name="bench",

@@ -1,4 +1,4 @@
-"""Promises that tests keep, fuzzers, and the chain from drives to the road."""
+"""Promises that tests keep, what they reach, fuzzers, and the chain from drives to the road."""
 
 import json
 import re
@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 
 from acceptance.row import MissingFigureError, Promise, at_least, at_most
 
-__all__ = ["chain_promises", "fuzz_promises", "promises_of_tests"]
+__all__ = ["chain_promises", "coverage_promises", "fuzz_promises", "promises_of_tests"]
 
 TESTED = {
     "SocketCAN kernel: canplayer, node, candump; bit-exact, others untouched, sum falls tenfold": ("vcan",),
@@ -43,6 +43,20 @@ def promises_of_tests(*reports: Path) -> Iterator[Promise]:
             raise MissingFigureError(f"no test of {', '.join(begins)} ran")
         yield Promise(
             what=what, bar="every test passes, none skipped", figure=f"{sum(seen)} of {len(seen)} pass", met=all(seen)
+        )
+
+
+def coverage_promises(path: Path) -> Iterator[Promise]:
+    """Judge what ``coverage json`` wrote: lines and branches that tests reach."""
+    files = json.loads(path.read_text(encoding="utf-8"))["files"]
+    for package, bar in (("ecu_node", 100.0), ("calibrator", 95.0)):
+        counts = [found["summary"] for name, found in files.items() if name.startswith(f"{package}/")]
+        reached = sum(count["covered_lines"] + count["covered_branches"] for count in counts)
+        total = sum(count["num_statements"] + count["num_branches"] for count in counts)
+        if total == 0:
+            raise MissingFigureError(f"{path}: nothing of {package}")
+        yield at_least(
+            f"tests: lines and branches of {package} that they reach", (bar,), (100.0 * reached / total,), unit="%"
         )
 
 
