@@ -158,11 +158,11 @@ def drive_from_frames(frames: Frames, database: VehicleDatabase, *, vehicle: str
     """Decode frames as a drive; as :func:`read_recording`, with `where` to name the source in messages."""
     source = _Source(frames, database, where)
     layout = database.layout
-    branches = {branch.name: source.branch(branch) for branch in layout.branch}
+    branches = {branch.name: source.branch(branch, branch.source) for branch in layout.branch}
     if not any(channel.time_s.size for channel in branches.values()):
         raise LogError(f"{where}: no branch of {layout.path} in this log; {source.found_and_expected()}")
     inputs = {item.name: source.channel(item.signal) for item in layout.input}
-    corrected = {branch.name: source.current(branch.corrected, branch) for branch in layout.branch if branch.corrected}
+    corrected = {branch.name: source.branch(branch, branch.corrected) for branch in layout.branch if branch.corrected}
     signals = {branch.name: branch.source for branch in layout.branch} | {i.name: i.signal for i in layout.input}
     report = RecordingReport(
         channels=tuple(_channel_report(key, signals[key], c) for key, c in (branches | inputs).items()),
@@ -203,16 +203,15 @@ class _Source:
         channel = self.channel(signal_name)
         return Channel(time_s=channel.time_s, value=channel.value * factor, good=channel.good)
 
-    def current(self, signal_name: str, branch: Branch) -> Channel:
-        """One current signal, positive into the junction."""
-        channel = self.scaled(signal_name, AMPERE, branch)
-        return Channel(time_s=channel.time_s, value=branch.sign * channel.value, good=channel.good)
+    def branch(self, branch: Branch, signal_name: str) -> Channel:
+        """One branch, measured or corrected, as a current positive into the junction.
 
-    def branch(self, branch: Branch) -> Channel:
-        """One branch, positive into the junction."""
+        The signal is a current, or a power if the branch is one.
+        """
         if branch.power is None or branch.voltage is None:
-            return self.current(branch.source, branch)
-        power = self.scaled(branch.power, WATT, branch)
+            current = self.scaled(signal_name, AMPERE, branch)
+            return Channel(time_s=current.time_s, value=branch.sign * current.value, good=current.good)
+        power = self.scaled(signal_name, WATT, branch)
         voltage = self.scaled(branch.voltage, VOLT, branch)
         held_v, fresh = _held(voltage, power.time_s, branch.timeout_s)
         good = power.good & fresh & (held_v != 0.0)

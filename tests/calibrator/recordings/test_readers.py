@@ -101,6 +101,17 @@ def test_power_is_divided_by_the_latest_voltage_at_or_before_it(
     np.testing.assert_allclose(motor.value[1:], [-10_000 / 400.0, -10_000 / 200.0])
 
 
+def test_corrected_power_is_divided_by_the_voltage_too(tmp_path: Path, power_database: VehicleDatabase) -> None:
+    dbc = POWER_DBC + 'BO_ 4 Better: 8 B\n SG_ Better : 0|16@1- (0.5,0) [-1000|1000] "kW" A\n'
+    (tmp_path / "power.dbc").write_text(dbc.replace("BU_: A", "BU_: A B"))
+    (tmp_path / "power.toml").write_text(POWER_LAYOUT + 'corrected = "Better.Better"\n')
+    database = read_database(read_layout(tmp_path / "power.toml"))
+    log = log_of(tmp_path / "x.log", [(0.0, "002#A00F"), (0.1, "001#1400"), (0.11, "004#1600")])
+    recording = read_recording(log, database, vehicle="v", name="d")
+    assert recording.drive.branches["motor"].value.tolist() == [-10_000 / 400.0]
+    assert recording.corrected["motor"].value.tolist() == [-11_000 / 400.0]
+
+
 def test_a_voltage_older_than_the_timeout_makes_the_current_not_good(
     tmp_path: Path, power_database: VehicleDatabase
 ) -> None:
