@@ -247,15 +247,21 @@ def _off(gains: Mapping[str, Gain], reference: str) -> dict[str, Gain]:
 
 
 def _mean(facts: JunctionFacts, layout: Layout) -> Iterator[Finding]:
-    total = facts.total
-    if total is None or abs(total.mean_a) < max(LEAST_MEAN_A, LEAST_MEAN * layout.full_scale_a):
+    total, load = facts.total, layout.unmeasured_load
+    if total is None:
         return
+    declared_a = load.mean_a if load is not None else 0.0
+    unexplained_a = abs(total.mean_a - declared_a)
+    spread_a = SURE * load.sd_a if load is not None else 0.0
+    if unexplained_a < max(LEAST_MEAN_A, LEAST_MEAN * layout.full_scale_a, spread_a):
+        return
+    beside = f" ({declared_a:g} A of it is the declared load)" if load is not None else ""
     yield Finding(
-        severity=Severity.WARNING if abs(total.mean_a) > LARGE_MEAN * layout.full_scale_a else Severity.HINT,
+        severity=Severity.WARNING if unexplained_a > LARGE_MEAN * layout.full_scale_a else Severity.HINT,
         kind="mean",
         subject="sum",
-        text=f"it is {total.mean_a:.1f} A in the mean, and varies by {total.sd_a:.1f} A about it",
+        text=f"it is {total.mean_a:.1f} A in the mean{beside}, and varies by {total.sd_a:.1f} A about it",
         remedy="loads that no branch measures, or offsets of sensors: 'calibrate' tells them apart by the fleet; "
-        "if the load is known, say so in [unmeasured_load]",
+        + ("look at the load declared in [unmeasured_load]" if load else "if it is known, say so in [unmeasured_load]"),
         figures={"mean_a": total.mean_a, "sd_a": total.sd_a},
     )

@@ -37,6 +37,17 @@ def test_a_sound_log_has_no_error_and_is_ready_for_all(log: Path, tmp_path: Path
     assert [finding.subject for finding in findings(found, "not in log") if "Rear" in finding.text] == ["motor_rear"]
 
 
+@pytest.mark.parametrize(("declared_a", "told"), [(2.5, False), (1.5, False), (0.5, True)])
+def test_a_declared_load_is_not_told_again(declared_a: float, told: bool, log: Path, tmp_path: Path) -> None:
+    layout = write_layout(tmp_path)
+    with layout.open("a") as file:
+        file.write(f"\n[unmeasured_load]\nmean_a = {declared_a}\nsd_a = 0.5\n")
+    found = findings(examined(layout, log), "mean")
+    assert bool(found) is told
+    assert all("(0.5 A of it is the declared load)" in finding.text for finding in found)
+    assert all("look at the load declared in [unmeasured_load]" in finding.remedy for finding in found)
+
+
 @pytest.mark.parametrize("branch", ["battery", "motor", "auxiliary"])
 def test_an_inverted_sign_is_found_of_the_right_branch(branch: str, log: Path, tmp_path: Path) -> None:
     found = examined(write_layout(tmp_path, inverted=(branch,)), log)
