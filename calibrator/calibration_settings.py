@@ -135,6 +135,7 @@ def require_learning(
         reasons = few_reasons(left_out, count=left_out_count)
         raise FleetError(
             f"{counted(sum(learning), 'usable vehicle')} to learn from, at least {LEAST_VEHICLES} are needed, "
-            f"as every vehicle is compared with its fleet ('calibrator kirchhoff' shows the sum of one){reasons}"
+            f"as every vehicle is compared with its fleet ('calibrator kirchhoff' shows the sum of one, 'ecu-node "
+            f"template' begins a parameter file by hand){reasons}"
         )
     return learning

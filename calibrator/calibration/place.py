@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from calibrator.calibration_settings import CalibrationSettings
+from calibrator.calibration_settings import CalibrationSettings, require_learning
 from calibrator.errors import ContradictionError, FleetError
 from calibrator.files.storage import Storage
 from calibrator.options import Method
@@ -69,4 +69,6 @@ def find_drives(path: Path, settings: CalibrationSettings, *, everyone: bool) ->
             reasons = few_reasons({name: fleet.left_out[name] for name in unknown if name in fleet.left_out})
             there = few(sorted(fleet.vehicles))
             raise FleetError(f"{path}: no vehicle {few(unknown)} to {what}{reasons}; there are {there}")
+    if everyone:
+        require_learning(list(fleet.vehicles), settings, fleet.left_out)
     return fleet

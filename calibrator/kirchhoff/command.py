@@ -20,7 +20,9 @@ def kirchhoff(
     dbc: DbcOption = None,
     interface: Annotated[str | None, typer.Option(help="Listen to a bus of this python-can interface.")] = None,
     channel: Annotated[str | None, typer.Option(help="Channel of the bus, such as vcan0.")] = None,
-    duration: Annotated[float, number_option("--duration", 0.1, 86400.0, "How long to listen [s]")] = 30.0,
+    duration: Annotated[
+        float, number_option("--duration", 0.1, 86400.0, "How long to listen, or until Ctrl-C [s]")
+    ] = 30.0,
     plot: Annotated[Path | None, typer.Option(help="Draw the currents into this picture (.png, .pdf, .svg).")] = None,
     json: JsonOption = False,
 ) -> None:

@@ -42,11 +42,14 @@ def init(
     with importing():
         from calibrator.proposal.propose import propose_layout
         from calibrator.proposal.toml_text import layout_text
+        from calibrator.recordings.frames import is_log
 
     if out is not None:
         if out.exists() or out.is_symlink():
             raise ProposalError(f"{out}: exists, and is not overwritten; choose another --out")
         require_possible_file(out)
+    if is_log(dbc) and log is not None and not is_log(log):
+        raise ProposalError(f"{dbc}: a log, and {log} is none; the DBC comes first, the log behind --log")
     proposal = propose_layout(dbc, log, _name_of(out or dbc))
     text = layout_text(proposal, out)
     names, guesses = [branch.name for branch in proposal.branches], text.count("# confirm:")

@@ -69,6 +69,8 @@ def read_frames(path: Path) -> Frames:
         If the file cannot be opened, has an unknown suffix, is damaged, cut or empty.
     """
     reader = _READERS.get(_suffix(path))
+    if reader is None and not path.exists():
+        raise LogError(f"{path}: no such file")
     if reader is None:
         raise LogError(f"{path}: not a known log format; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
     if not path.is_file():

@@ -26,7 +26,7 @@ def listen(interface: str, channel: str | None, duration_s: float) -> Frames:
     Returns
     -------
     Frames
-        At least one frame.
+        At least one frame; those until then if Ctrl-C ends it early.
 
     Raises
     ------
@@ -41,6 +41,9 @@ def listen(interface: str, channel: str | None, duration_s: float) -> Frames:
                 message = bus.recv(timeout=min(left_s, _POLL_S))
                 if message is not None:
                     collector.add(message)
+    except KeyboardInterrupt:
+        if not len(collector):
+            raise
     except (can.CanError, OSError, ValueError, TypeError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise BusError(

@@ -207,7 +207,8 @@ def test_one_car_alone_is_refused_with_what_can_be_done(fleet: Path, method: str
     assert run.returncode == 1
     (line,) = [line for line in run.stderr.splitlines() if line.startswith("calibrator:")]
     assert "1 usable vehicle to learn from, at least 2 are needed, as every vehicle is compared with its fleet" in line
-    assert "('calibrator kirchhoff' shows the sum of one)" in line
+    assert "('calibrator kirchhoff' shows the sum of one, 'ecu-node template' begins a parameter file by hand)" in line
+    assert "pass 1" not in run.stderr
     assert not (tmp_path / "x").exists()
 
 

@@ -1,4 +1,5 @@
 import json
+import signal
 import subprocess
 import sys
 import threading
@@ -40,11 +41,11 @@ def log(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -> 
         inputs={},
     )
     series = drive_series(drive, database)
-    for message, signal in (
+    for message, corrected in (
         ("HV_BatteryCorrected", "BatteryCurrentCorrected"),
         ("HV_MotorCorrected", "MotorCurrentCorrected"),
     ):
-        series.append(encode_message(database, message, TIME_S, {signal: true}))
+        series.append(encode_message(database, message, TIME_S, {corrected: true}))
     path = tmp_path_factory.mktemp("log") / "drive.log.gz"
     write_candump(path, series)
     return path
@@ -116,17 +117,23 @@ def test_a_silent_bus_and_an_unknown_interface_are_named() -> None:
     assert "cannot listen to the bus" in unknown.stderr
 
 
-def test_a_live_bus_gives_the_figures_of_its_log(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_a_live_bus_gives_the_figures_of_its_log(
+    interrupted: bool, log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     def send() -> None:
         while not channels.get("live"):  # until the command listens
             time.sleep(0.01)
         with can.Bus(interface="virtual", channel="live", preserve_timestamps=True) as bus:
             for message in can.LogReader(log):
                 bus.send(message)
+        if interrupted:
+            time.sleep(1.0)
+            signal.raise_signal(signal.SIGINT)
 
     sender = threading.Thread(target=send)
     sender.start()
-    kirchhoff(layout=LAYOUT, interface="virtual", channel="live", duration=1.5, json=True)
+    kirchhoff(layout=LAYOUT, interface="virtual", channel="live", duration=600.0 if interrupted else 1.5, json=True)
     sender.join()
     figures = json.loads(capsys.readouterr().out)
     assert figures["before"]["sum"]["mean_a"] == pytest.approx(12.0, abs=0.02)

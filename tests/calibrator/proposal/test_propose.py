@@ -138,6 +138,17 @@ def test_a_log_of_another_vehicle_is_refused(tmp_path: Path) -> None:
         propose_layout(DBC / "hv_powertrain.dbc", tmp_path / "other.log", "car")
 
 
+def test_dbc_and_log_in_the_wrong_order_are_told(tmp_path: Path) -> None:
+    with pytest.raises(
+        ProposalError, match=r"drive\.log\.gz: a log, and .*\.dbc is none; the DBC comes first, the log"
+    ):
+        CliRunner().invoke(
+            app,
+            ["layout", "init", str(tmp_path / "drive.log.gz"), "--log", str(DBC / "hv_powertrain.dbc")],
+            catch_exceptions=False,
+        )
+
+
 def test_the_command_prints_or_writes_and_never_overwrites(tmp_path: Path) -> None:
     dbc, out = str(DBC / "hv_powertrain.dbc"), tmp_path / "new" / "my car.toml"
     printed = CliRunner().invoke(app, ["layout", "init", dbc])

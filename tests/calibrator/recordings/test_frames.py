@@ -180,6 +180,7 @@ def test_an_empty_log_is_refused(tmp_path: Path, suffix: str) -> None:
 
 
 def test_an_unknown_suffix_is_refused_with_the_known_ones(tmp_path: Path) -> None:
+    (tmp_path / "drive.csv").touch()
     with pytest.raises(LogError, match=r"expected \.log, \.asc, \.blf, \.trc, \.mf4"):
         read_frames(tmp_path / "drive.csv")
     assert not is_log(tmp_path / "drive.csv")
@@ -187,8 +188,9 @@ def test_an_unknown_suffix_is_refused_with_the_known_ones(tmp_path: Path) -> Non
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match=r"nowhere\.log: no such file"):
-        read_frames(tmp_path / "nowhere.log")
+    for name in ("nowhere.log", "nowhere.lgo"):
+        with pytest.raises(LogError, match=rf"{name}: no such file"):
+            read_frames(tmp_path / name)
 
 
 def cut_log(tmp_path: Path, suffix: str, share: float) -> tuple[Path, list[bytes]]:
