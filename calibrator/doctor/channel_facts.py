@@ -10,7 +10,7 @@ from cantools.database.can import Signal
 from calibrator.doctor.read_logs import ReadLog
 from calibrator.drive import Array, Channel, Mask
 from calibrator.drives.align import TIME_RESOLUTION_S
-from calibrator.recordings.decode import bad_values, decode_signal
+from calibrator.recordings.decode import bad_values, codes_of_no_value, decode_signal
 from calibrator.recordings.e2e_profile import message_is_sound
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import SignalName
@@ -116,17 +116,18 @@ def channel_facts(
         Over all logs.
     """
     message, signal = database.signal(signal_name)
+    no_value = codes_of_no_value(database, signal_name)
     steps: list[Array] = []
     frames_of: list[int] = []
     bad = dict.fromkeys((PROTECTION, "too short", "not available", "out of range"), 0)
     clipped = 0
     for log in logs:
         frames, time_s = log.of_message(message)
-        decoded = decode_signal(message, signal, frames.data, frames.length)
+        decoded = decode_signal(message, signal, frames.data, frames.length, no_value)
         present = decoded.present
         reasons = {
             PROTECTION: ~message_is_sound(database, message, frames.data, frames.length),
-            **bad_values(message, signal, frames.data, frames.length),
+            **bad_values(message, signal, frames.data, frames.length, no_value),
         }
         counted = ~present
         for reason, mask in reasons.items():

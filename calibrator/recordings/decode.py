@@ -4,8 +4,9 @@ A signal is a run of bits: little-endian (Intel) from its lowest bit upwards, bi
 downwards. The bytes it touches are joined to one integer, shifted and masked; physical = raw * scale + offset.
 
 A value is *present* where the frame carries the signal (multiplexing), and *good* where it may be used: the frame is
-long enough, the raw value has no name that means "not available", and the physical value lies within the DBC's range
-(a range of 0 to 0 is none).
+long enough, the raw value does not stand for "no value", and the physical value lies within the DBC's range (a range of
+0 to 0 is none). Which codes stand for that, names tell that mean "not available"; of what branches are measured with,
+as on the node, any name and the layout's ``no_value``.
 """
 
 import re
@@ -18,9 +19,11 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 from calibrator.recordings.signal_range import signal_range
+from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError
+from ecu_node.layout import SignalName
 
-__all__ = ["Decoded", "bad_values", "decode_signal", "means_not_available", "raw_values"]
+__all__ = ["Decoded", "bad_values", "codes_of_no_value", "decode_signal", "means_not_available", "raw_values"]
 
 Raw = NDArray[np.int64] | NDArray[np.uint64] | NDArray[np.float64]
 
@@ -52,7 +55,38 @@ class Decoded:
     good: Mask
 
 
-def decode_signal(message: Message, signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]) -> Decoded:
+def codes_of_no_value(database: VehicleDatabase, name: SignalName) -> frozenset[int]:
+    """Raw codes of a signal that are no values.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        DBC and layout.
+    name : str
+        The signal, as MESSAGE.SIGNAL.
+
+    Returns
+    -------
+    frozenset of int
+        Of a branch's current, power, voltage or corrected signal: every code with a name and, of the measured one, its
+        ``no_value``, as :mod:`ecu_node.codes` has it. Of others, as of a gear whose positions are named: codes with a
+        name that :func:`means_not_available`.
+    """
+    signal = database.signal(name)[1]
+    branches = [item for item in database.layout.branch if name in {item.source, item.voltage, item.corrected}]
+    if not branches:
+        return _named_bad(signal)
+    extra = [code for item in branches if item.source == name for code in item.no_value]
+    return frozenset([*map(int, signal.choices or {}), *extra])
+
+
+def decode_signal(
+    message: Message,
+    signal: Signal,
+    data: NDArray[np.uint8],
+    length: NDArray[np.uint8],
+    no_value: frozenset[int] | None = None,
+) -> Decoded:
     """Decode one signal of frames of one identifier.
 
     Parameters
@@ -65,6 +99,8 @@ def decode_signal(message: Message, signal: Signal, data: NDArray[np.uint8], len
         Payloads, zeros after the length.
     length : ndarray of uint8, shape (n,)
         Payload bytes of each frame.
+    no_value : frozenset of int, optional
+        :func:`codes_of_no_value` where there is a layout; without it, names of the DBC that mean "not available".
 
     Returns
     -------
@@ -79,29 +115,33 @@ def decode_signal(message: Message, signal: Signal, data: NDArray[np.uint8], len
     present, known = _presence(message, signal, data, length)
     raw, complete = raw_values(signal, data, length)
     value = _physical(signal, raw, complete)
-    bad = _bad_values(signal, raw, value, known & complete)
+    bad = _bad_values(signal, raw, value, known & complete, no_value)
     return Decoded(value=value, present=present, good=present & ~np.any(list(bad.values()), axis=0))
 
 
 def bad_values(
-    message: Message, signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]
+    message: Message,
+    signal: Signal,
+    data: NDArray[np.uint8],
+    length: NDArray[np.uint8],
+    no_value: frozenset[int] | None = None,
 ) -> Mapping[str, Mask]:
     """Why values of one signal may not be used.
 
     Parameters
     ----------
-    message, signal, data, length :
+    message, signal, data, length, no_value :
         As for :func:`decode_signal`.
 
     Returns
     -------
     mapping of str to ndarray of bool, shape (n,)
-        By reason: ``too short``, ``not available`` (a named code), ``out of range`` (of the DBC, or no number); a frame
-        that carries the signal and has none of them is good.
+        By reason: ``too short``, ``not available`` (a code that is no value), ``out of range`` (of the DBC, or no
+        number); a frame that carries the signal and has none of them is good.
     """
     _, known = _presence(message, signal, data, length)
     raw, complete = raw_values(signal, data, length)
-    return _bad_values(signal, raw, _physical(signal, raw, complete), known & complete)
+    return _bad_values(signal, raw, _physical(signal, raw, complete), known & complete, no_value)
 
 
 def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]) -> tuple[Raw, Mask]:
@@ -174,8 +214,10 @@ def _physical(signal: Signal, raw: Raw, complete: Mask) -> Array:
         return np.where(complete, raw.astype(np.float64) * float(signal.scale) + float(signal.offset), np.nan)
 
 
-def _bad_values(signal: Signal, raw: Raw, value: Array, complete: Mask) -> dict[str, Mask]:
-    named = complete & _is_named_bad(signal, raw)
+def _bad_values(
+    signal: Signal, raw: Raw, value: Array, complete: Mask, no_value: frozenset[int] | None
+) -> dict[str, Mask]:
+    named = complete & _is_one_of(signal, raw, _named_bad(signal) if no_value is None else no_value)
     held = np.isfinite(value) & signal_range(signal).holds(value)
     return {"too short": ~complete, "not available": named, "out of range": complete & ~named & ~held}
 
@@ -213,12 +255,14 @@ def _presence(
     return present & (selected | ~complete), known & complete
 
 
-def _is_named_bad(signal: Signal, raw: Raw) -> Mask:
+def _named_bad(signal: Signal) -> frozenset[int]:
+    return frozenset(int(code) for code, name in (signal.choices or {}).items() if means_not_available(str(name)))
+
+
+def _is_one_of(signal: Signal, raw: Raw, codes: frozenset[int]) -> Mask:
     bad = np.zeros(len(raw), np.bool_)
     mask = (1 << signal.length) - 1
-    for code, name in (signal.choices or {}).items():
-        if not means_not_available(str(name)):
-            continue
+    for code in codes:
         if np.issubdtype(raw.dtype, np.floating):
             bad |= raw == code
         else:

@@ -14,7 +14,7 @@ from cantools.database.can import Message
 
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.errors import LogError
-from calibrator.recordings.decode import decode_signal
+from calibrator.recordings.decode import codes_of_no_value, decode_signal
 from calibrator.recordings.e2e_profile import message_is_sound
 from calibrator.recordings.frame_arrays import EXTENDED_BIT, Frames, frame_key
 from calibrator.recordings.frames import read_frames
@@ -192,7 +192,8 @@ class _Source:
         """One signal in the unit of the DBC, at the frames that carry it."""
         message, signal = self._database.signal(signal_name)
         frames, time_s, unspoilt = self._of_message(message)
-        decoded = decode_signal(message, signal, frames.data, frames.length)
+        no_value = codes_of_no_value(self._database, signal_name)
+        decoded = decode_signal(message, signal, frames.data, frames.length, no_value)
         kept = decoded.present
         return Channel(time_s=time_s[kept], value=decoded.value[kept], good=(decoded.good & unspoilt)[kept])
 

@@ -112,6 +112,44 @@ def test_corrected_power_is_divided_by_the_voltage_too(tmp_path: Path, power_dat
     assert recording.corrected["motor"].value.tolist() == [-11_000 / 400.0]
 
 
+def test_codes_with_any_name_and_those_of_the_layout_are_no_currents_as_on_the_node(
+    tmp_path: Path, power_database: VehicleDatabase
+) -> None:
+    names = 'VAL_ 1 Power -200 "Signal_ungueltig" ;\nVAL_ 2 Voltage 4000 "Ersatzwert" ;\n'
+    (tmp_path / "power.dbc").write_text(POWER_DBC + names)
+    (tmp_path / "power.toml").write_text(POWER_LAYOUT + "no_value = [-100, 21]\n")
+    database = read_database(read_layout(tmp_path / "power.toml"))
+    volt, good = (0.0, "002#A10F"), (0.1, "001#1400")
+    lines = [
+        volt,
+        good,
+        (0.2, "001#38FF"),
+        (0.3, "001#9CFF"),
+        (0.4, "001#1500"),
+        (0.41, "002#A00F"),
+        (0.45, "001#1400"),
+    ]
+    motor = read_motor(log_of(tmp_path / "x.log", lines), database)
+    assert motor.good.tolist() == [True, False, False, False, True]
+    np.testing.assert_allclose(motor.value[4], -10_000 / 400.1)
+    before = read_motor(log_of(tmp_path / "y.log", lines), power_database)
+    assert before.good.all()
+
+
+def test_names_of_an_input_are_values_unless_they_mean_not_available(tmp_path: Path) -> None:
+    gear = ' SG_ Gear : 16|8@1+ (1,0) [0|0] "" A\nVAL_ 2 Gear 1 "Drive" 2 "Ungueltig" 3 "SNA" ;\n'
+    (tmp_path / "power.dbc").write_text(
+        POWER_DBC.replace('[0|1000] "V" A\n', '[0|1000] "V" A\n' + gear.partition("VAL_")[0])
+    )
+    with (tmp_path / "power.dbc").open("a") as file:
+        file.write("VAL_" + gear.partition("VAL_")[2])
+    (tmp_path / "power.toml").write_text(POWER_LAYOUT + '[[input]]\nname = "gear"\nsignal = "Volt.Gear"\n')
+    database = read_database(read_layout(tmp_path / "power.toml"))
+    lines = [(0.0, "001#1400"), (0.1, "002#A00F01"), (0.2, "002#A00F02"), (0.3, "002#A00F03")]
+    drive = read_drive(log_of(tmp_path / "x.log", lines), database, vehicle="v", name="d")
+    assert drive.inputs["gear"].good.tolist() == [True, True, False]
+
+
 def test_a_voltage_older_than_the_timeout_makes_the_current_not_good(
     tmp_path: Path, power_database: VehicleDatabase
 ) -> None:
