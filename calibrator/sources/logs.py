@@ -2,7 +2,8 @@
 
 The rule: a log belongs to the vehicle that its folder is named after, and the drive has the name of the file without
 its suffixes: ``FLEET/logs/V0001/monday.log.gz`` is drive ``monday`` of vehicle ``V0001``. Folders are searched for logs
-at any depth. Vehicles whose name stands for two folders, and drives that two files claim, are left out and named.
+at any depth. Logs that lie beside the folders of vehicles, vehicles whose name stands for two folders, and drives that
+two files claim, are left out and named.
 """
 
 from collections.abc import Iterable, Sequence
@@ -55,7 +56,13 @@ def find_logs(arguments: Iterable[Path]) -> LogSources:
         except UserError as error:
             problems.append(error)
             continue
+        strays = {path for path in paths if path.parent == argument}
+        if len(strays) == len(paths):
+            strays = set()
+        problems += [_stray(path) for path in sorted(strays)]
         for path in paths:
+            if path in strays:
+                continue
             try:
                 found.setdefault(path.resolve(), _source(path))
             except UserError as error:
@@ -75,6 +82,10 @@ def _logs_of(argument: Path) -> list[Path]:
     if not paths:
         raise LogError(f"{argument}: no logs in this folder; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
     return paths
+
+
+def _stray(path: Path) -> LogError:
+    return LogError(f"{path}: beside the folders of vehicles, in none of them; move it into that of its vehicle")
 
 
 def _source(path: Path) -> DriveFile:

@@ -16,6 +16,16 @@ def test_the_folder_names_the_vehicle_and_the_file_the_drive(tmp_path: Path) -> 
     assert not found.problems
 
 
+def test_a_log_beside_the_folders_of_vehicles_is_left_out_and_named(tmp_path: Path) -> None:
+    make(tmp_path / "V1" / "a.log", tmp_path / "V2" / "a.log", tmp_path / "copy of a.log")
+    found = find_logs([tmp_path])
+    assert [log.vehicle for log in found.logs] == ["V1", "V2"]
+    (problem,) = found.problems
+    assert str(problem).startswith(
+        f"{tmp_path / 'copy of a.log'}: beside the folders of vehicles, in none of them; move"
+    )
+
+
 def test_a_file_named_twice_is_read_once(tmp_path: Path) -> None:
     make(tmp_path / "V1" / "a.log")
     found = find_logs([tmp_path / "V1", tmp_path / "V1" / "a.log", tmp_path])
