@@ -1,7 +1,7 @@
 """What the names, comments and senders of a DBC say, in words.
 
 Names of signals are split into words where case, digits or underscores change: ``SmoothBattCurrent132`` is *smooth batt
-current 132*. Abbreviations of several houses stand beside each other.
+current 132*. Abbreviations of several houses stand beside each other, in English and German.
 """
 
 import re
@@ -12,15 +12,22 @@ __all__ = ["PLACES", "is_battery", "places_of", "word_set", "words_of"]
 _SPLIT = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+")
 
 PLACES: dict[str, frozenset[str]] = {
-    "battery": frozenset({"battery", "batt", "bat", "bms", "pack", "accu", "hvb", "bdu", "traction"}),
+    "battery": frozenset({"battery", "batt", "bat", "bms", "pack", "accu", "hvb", "bdu", "traction", "batterie"}),
     "motor": frozenset(
         {"motor", "mot", "inverter", "inv", "emotor", "machine", "edu", "mcu", "drive", "dif", "dir", "emachine", "tm"}
+        | {"pulswechselrichter", "wechselrichter", "antrieb", "maschine"}
     ),
-    "heater": frozenset({"heater", "ptc", "heating", "htr"}),
-    "aircon": frozenset({"compressor", "aircon", "ac", "cmpd", "cmp", "eac", "acc", "hvac", "airconditioning", "evap"}),
-    "dcdc": frozenset({"dcdc", "lv", "apm", "ldc"}),
+    "heater": frozenset({"heater", "ptc", "heating", "htr", "heizer", "heizung", "hzg"}),
+    "aircon": frozenset(
+        {"compressor", "aircon", "ac", "cmpd", "cmp", "eac", "acc", "hvac", "airconditioning", "evap"}
+        | {"klima", "kompressor", "komp", "klimageraet", "klimakompressor"}
+    ),
+    "dcdc": frozenset({"dcdc", "lv", "apm", "ldc", "gleichspannungswandler"}),
     "auxiliary": frozenset({"auxiliary", "aux", "auxiliaries"}),
-    "charger": frozenset({"charger", "obc", "charge", "fc", "fastcharge", "evse", "chg", "cp", "cc"}),
+    "charger": frozenset(
+        {"charger", "obc", "charge", "fc", "fastcharge", "evse", "chg", "cp", "cc"}
+        | {"lader", "ladegeraet", "laden", "kombiladeeinheit"}
+    ),
 }
 """Where a current may flow, and words for it."""
 
@@ -35,12 +42,15 @@ _JOINED = {"dc dc": "dcdc", "air con": "aircon", "air conditioning": "aircon", "
 
 
 def words_of(*texts: str | None) -> tuple[str, ...]:
-    """Words of some names or sentences, in lower case; ``dc dc``, ``air con`` and ``low voltage`` are joined."""
-    found = [word.lower() for text in texts if text for word in _SPLIT.findall(text)]
-    joined = f" {' '.join(found)} "
+    """Words of some names or sentences, in lower case; ``dc dc``, ``air con`` and ``low voltage`` are joined each."""
+    return tuple(word for text in texts if text for word in _joined(text))
+
+
+def _joined(text: str) -> list[str]:
+    words = f" {' '.join(_SPLIT.findall(text)).lower()} "
     for apart, together in _JOINED.items():
-        joined = joined.replace(f" {apart} ", f" {together} ")
-    return tuple(joined.split())
+        words = words.replace(f" {apart} ", f" {together} ")
+    return words.split()
 
 
 def places_of(words: Iterable[str]) -> set[str]:

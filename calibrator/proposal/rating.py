@@ -14,7 +14,7 @@ FITS = 3.0
 POSITIONS = ("front", "rear", "left", "right")
 """Of branches that a vehicle has twice."""
 NOT_MEASURED = word_set(
-    "limit lim max maximum min minimum available avail target tgt request req requested command cmd "
+    "limit lim max maximum min minimum available avail target tgt request req requested command cmd soll grenze "
     "demand setpoint desired allowed budget capability predicted pred optimal regen reg error deviation "
     "phase peak history avg average corrected quality checksum counter waste dissipation heat qdot dbg debug rejection "
     "load limits"
