@@ -4,8 +4,9 @@ All that takes time is imported inside a function, so that Ctrl-C and a closed p
 """
 
 import signal
+import sys
 
-from calibrator.processes.interrupts import MESSAGE, ending_at_sigterm, importing
+from calibrator.processes.interrupts import ending_at_sigterm, importing, interrupted_message
 from ecu_node.errors import UserError
 from ecu_node.failures import say_error
 from ecu_node.interrupts import INTERRUPTED
@@ -31,7 +32,7 @@ def main() -> None:
         code = 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done or undone; threads only have to be joined
     if code == INTERRUPTED:
-        say_error(MESSAGE)
+        say_error(interrupted_message(sys.argv[1:]))
     raise SystemExit(code)
 
 

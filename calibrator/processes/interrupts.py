@@ -7,6 +7,7 @@ does, with a line.
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from types import FrameType
@@ -14,15 +15,33 @@ from types import FrameType
 from ecu_node.interrupts import ending_at_interrupt
 from ecu_node.wrapping import fitted
 
-__all__ = ["MESSAGE", "TERMINATED", "TERMINATED_MESSAGE", "ending_at_sigterm", "importing"]
+__all__ = ["TERMINATED", "ending_at_sigterm", "importing", "interrupted_message", "terminated_message"]
 
 TERMINATED = 143
 """Exit code that shells give to a program ended by SIGTERM."""
 SHOW_CURSOR = "\x1b[?25h"
 """A bar hides the cursor of a terminal."""
-_GOES_ON = "run the same command again; import, summarise and calibrate go on with what they had read or computed"
-MESSAGE = f"calibrator: interrupted; {_GOES_ON}"
-TERMINATED_MESSAGE = f"calibrator: ended by SIGTERM; {_GOES_ON}"
+GO_ON = ("import", "summarise", "calibrate")
+"""Commands that go on where they were."""
+KEEP_NOTHING = ("experiment", "kirchhoff", "replay")
+"""Commands of which nothing is left but what they have printed, sent, or written as a whole."""
+
+
+def interrupted_message(arguments: Sequence[str]) -> str:
+    """What is said of Ctrl-C, with what there is to do, which the command among the arguments decides."""
+    return f"calibrator: interrupted; {_afterwards(arguments)}"
+
+
+def terminated_message(arguments: Sequence[str]) -> str:
+    """The same of SIGTERM."""
+    return f"calibrator: ended by SIGTERM; {_afterwards(arguments)}"
+
+
+def _afterwards(arguments: Sequence[str]) -> str:
+    command = next((argument for argument in arguments if not argument.startswith("-")), "")
+    if command in KEEP_NOTHING:
+        return "nothing is kept of what was under way"
+    return f"run the same command again{'; it goes on with what it had read or computed' if command in GO_ON else ''}"
 
 
 def ending_at_sigterm() -> None:
@@ -30,7 +49,7 @@ def ending_at_sigterm() -> None:
 
     def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
         shown = f"{SHOW_CURSOR}\n" if os.isatty(sys.stderr.fileno()) else ""
-        os.write(sys.stderr.fileno(), f"{shown}{fitted(TERMINATED_MESSAGE, sys.stderr)}\n".encode())
+        os.write(sys.stderr.fileno(), f"{shown}{fitted(terminated_message(sys.argv[1:]), sys.stderr)}\n".encode())
         for process in _descendants():
             with suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)  # a worker that lost its parent would wait, or print a traceback
@@ -52,4 +71,4 @@ def _descendants(process: str = "self") -> list[int]:
 
 def importing() -> AbstractContextManager[None]:
     """While the block imports what a command needs, Ctrl-C ends the program at once; nothing is open yet."""
-    return ending_at_interrupt(MESSAGE)
+    return ending_at_interrupt(interrupted_message(sys.argv[1:]))

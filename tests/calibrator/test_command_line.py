@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from calibrator.cli import app, main
 from calibrator.experiments.command import RECORDED_EXPERIMENTS
 from calibrator.experiments.runner import EXPERIMENTS, Recorded
-from calibrator.processes.interrupts import MESSAGE, TERMINATED, TERMINATED_MESSAGE
+from calibrator.processes.interrupts import TERMINATED, interrupted_message, terminated_message
 from ecu_node.interrupts import INTERRUPTED
 
 ROOT = Path(__file__).parents[2]
@@ -242,7 +242,7 @@ def test_ctrl_c_during_start_up_ends_it_in_one_line() -> None:
         "main()\n"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
-    assert (run.returncode, run.stdout, run.stderr) == (INTERRUPTED, "", f"{MESSAGE}\n")
+    assert (run.returncode, run.stdout, run.stderr) == (INTERRUPTED, "", f"{interrupted_message([])}\n")
 
 
 @pytest.mark.parametrize("delay_s", [0.4, 0.8])
@@ -258,7 +258,7 @@ def test_ctrl_c_at_work_ends_workers_too_in_one_line_and_keeps_nothing(delay_s: 
         time.sleep(delay_s)
         os.killpg(process.pid, signal.SIGINT)
         _, errors = process.communicate(timeout=30)
-    assert (process.returncode, errors) == (INTERRUPTED, f"{MESSAGE}\n")
+    assert (process.returncode, errors) == (INTERRUPTED, f"{interrupted_message(command[3:])}\n")
     assert not list(tmp_path.iterdir())
 
 
@@ -291,9 +291,9 @@ def test_ctrl_c_and_sigterm_while_logs_are_read_end_readers_too_in_one_line(
         process.send_signal(how) if how is signal.SIGTERM else os.killpg(process.pid, how)
         _, errors = process.communicate(timeout=60)  # also waits for all that have its stderr
     if how is signal.SIGTERM:
-        assert (process.returncode, errors) == (TERMINATED, f"{TERMINATED_MESSAGE}\n")
+        assert (process.returncode, errors) == (TERMINATED, f"{terminated_message(command[3:])}\n")
         return
-    assert (process.returncode, errors) == (INTERRUPTED, f"{MESSAGE}\n")
+    assert (process.returncode, errors) == (INTERRUPTED, f"{interrupted_message(command[3:])}\n")
     assert not list(temporary.iterdir())
 
 
