@@ -70,7 +70,8 @@ class RecordedFleet:
     def take(self, trips: int, *, duration_s: float) -> "RecordedFleet":
         """First trips, cut to their beginnings."""
         samples = int(duration_s / self.period_s)
-        return replace(self, trips=tuple(trip.part(0, samples) for trip in self.trips[:trips]))
+        taken = tuple(trip.part(0, samples) for trip in self.trips[:trips])
+        return replace(self, name=f"the first {duration_s:g} s of {len(taken)} of {self.name}", trips=taken)
 
     def with_branches(self, count: int) -> tuple[GroundTruth, ...]:
         """Trips of a fleet of K currents, of which one takes the balance (19).
@@ -90,10 +91,17 @@ class RecordedFleet:
         FleetError
             If the trips have fewer branches.
         """
+        names = choose_branches(self.database.layout, tuple(self.trips[0].currents_a), count)
+        return tuple(with_branches(trip, names, self._balance_of(names)) for trip in self.trips)
+
+    @property
+    def balance_branch(self) -> str:
+        """The branch whose current is minus the sum of the others."""
+        return self._balance_of(tuple(self.trips[0].currents_a))
+
+    def _balance_of(self, names: tuple[str, ...]) -> str:
         layout = self.database.layout
-        names = choose_branches(layout, tuple(self.trips[0].currents_a), count)
-        balance = next((branch.name for branch in layout.branch if branch.balance and branch.name in names), names[-1])
-        return tuple(with_branches(trip, names, balance) for trip in self.trips)
+        return next((branch.name for branch in layout.branch if branch.balance and branch.name in names), names[-1])
 
     def resolution_a(self, branches: tuple[str, ...]) -> Array:
         """Steps of the signals of some branches, shape (K,); 0 where a branch has none. [A]"""

@@ -30,6 +30,12 @@ def test_trips_of_a_fleet_sum_to_zero_and_have_the_first_branches_of_the_layout(
         np.testing.assert_allclose(trip.matrix_a().sum(axis=1), 0.0, atol=1e-9)
 
 
+def test_part_of_a_fleet_says_what_it_is_a_part_of(fleet: RecordedFleet) -> None:
+    part = fleet.take(4, duration_s=60.0)
+    assert part.name == f"the first 60 s of 4 of {fleet.name}"
+    assert [len(trip) for trip in part.trips] == [600] * 4
+
+
 def test_more_branches_than_the_trips_have_are_refused(fleet: RecordedFleet) -> None:
     with pytest.raises(FleetError, match="4 currents asked for; these drives have 3"):
         fleet.with_branches(4)
