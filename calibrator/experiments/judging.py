@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from joblib import delayed
 
+from calibrator.errors import FleetError
+from calibrator.experiments.estimate_check import require_estimate
 from calibrator.experiments.methods import Method
 from calibrator.experiments.outcome import Outcome, confidence_bins, figures_of, judge, pooled
 from calibrator.experiments.result import Figure, Row
@@ -82,7 +84,13 @@ def run_settings(
     -------
     tuple of Row
         By setting, then method.
+
+    Raises
+    ------
+    FleetError
+        If methods share a name, or what one of them returns is no estimate of the fleet.
     """
+    _require_distinct_names(methods)
     seeds = range(effort.seed, effort.seed + effort.repetitions)
     tasks = (delayed(_run_trial)(setting.make_trial, methods, seed) for setting in settings for seed in seeds)
     total = len(settings) * len(seeds)
@@ -99,7 +107,16 @@ def run_settings(
 
 def _run_trial(make_trial: Callable[[int], Trial], methods: Sequence[Method], seed: int) -> list[Outcome]:
     trial = make_trial(seed)
-    return [judge(method.estimate(trial), trial) for method in methods]
+    estimates = (require_estimate(method.name, method.estimate(trial), trial.truth) for method in methods)
+    return [judge(estimate, trial) for estimate in estimates]
+
+
+def _require_distinct_names(methods: Sequence[Method]) -> None:
+    """FleetError if two methods share a name, by which tables and records tell them apart."""
+    names = [method.name for method in methods]
+    for name in names:
+        if names.count(name) > 1:
+            raise FleetError(f"{names.count(name)} methods are called '{name}'; give each method a name of its own")
 
 
 def _row(setting: Setting, method: str, trials: Sequence[Outcome], paper: Mapping[str, float]) -> Row:

@@ -11,7 +11,7 @@ from calibrator.experiments.common_drive import CommonDrive
 from calibrator.experiments.common_trial import artificial_trial, state_space_trial
 from calibrator.experiments.judging import Effort, PaperFigures, Setting, run_settings
 from calibrator.experiments.methods import PERFECT, POSTERIOR, THRESHOLD, TREE, Method
-from calibrator.experiments.result import ExperimentResult
+from calibrator.experiments.result import ExperimentResult, Settings
 from calibrator.experiments.trial import FleetLaw
 
 __all__ = [
@@ -82,6 +82,7 @@ def classifier_experiment(
         x_label=SPARSITY_LABEL,
         settings=_record(drive, law, effort),
         rows=run_settings([setting], methods, effort, paper=TABLE_1, label="classifier"),
+        paper=_best(TABLE_1),
     )
 
 
@@ -114,6 +115,7 @@ def snr_experiment(
         x_label="SNR [dB]",
         settings=_record(drive, law, effort, "snr_db"),
         rows=run_settings(settings, methods, effort, paper=FIGURE_7, label="snr"),
+        paper=_best(FIGURE_7),
     )
 
 
@@ -146,6 +148,7 @@ def sparsity_experiment(
         x_label=SPARSITY_LABEL,
         settings=_record(drive, law, effort, "sparsity"),
         rows=run_settings(settings, methods, effort, paper=FIGURE_8, label="sparsity"),
+        paper=_best(FIGURE_8),
     )
 
 
@@ -180,6 +183,7 @@ def statespace_experiment(
         x_label=SPARSITY_LABEL,
         settings=_record(drive, law, effort, "sparsity"),
         rows=run_settings(settings, methods, effort, paper=TABLE_2, label="statespace"),
+        paper=_best(TABLE_2),
     )
 
 
@@ -223,9 +227,15 @@ def asymmetry_experiment(
     )
 
 
-def _record(drive: CommonDrive, law: FleetLaw, effort: Effort, varied: str = "") -> dict[str, float | int | str]:
+def _best(figures: PaperFigures) -> dict[float, float]:
+    """Best recovery rate of the paper by x."""
+    known = {x for x, _ in figures}
+    return {x: max(each["recovery_rate"] for (at, _), each in figures.items() if at == x) for x in sorted(known)}
+
+
+def _record(drive: CommonDrive, law: FleetLaw, effort: Effort, varied: str = "") -> Settings:
     """What is needed to repeat an experiment, without what it varies."""
-    record: dict[str, float | int | str] = {
+    record: dict[str, bool | int | float | str] = {
         "seed": effort.seed,
         "repetitions": effort.repetitions,
         "drive": drive.name,
@@ -239,7 +249,7 @@ def _record(drive: CommonDrive, law: FleetLaw, effort: Effort, varied: str = "")
         "magnitude_highest": law.magnitude[1],
         "snr_db": law.snr_db,
         "sparsity": law.sparsity,
-        "balanced": str(law.balanced).lower(),
-        "symmetric": str(law.symmetric).lower(),
+        "balanced": law.balanced,
+        "symmetric": law.symmetric,
     }
     return {name: value for name, value in record.items() if name != varied}

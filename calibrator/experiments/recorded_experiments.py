@@ -8,7 +8,7 @@ from calibrator.experiments.judging import Effort, Setting, run_settings
 from calibrator.experiments.methods import CEILING, PERFECT, POSTERIOR, Method
 from calibrator.experiments.recorded_fleet import RecordedFleet
 from calibrator.experiments.recorded_trial import NOISE, RecordedCase, recorded_trial
-from calibrator.experiments.result import ExperimentResult
+from calibrator.experiments.result import ExperimentResult, Settings
 
 __all__ = ["data_experiment", "phase_experiment", "real_experiment", "recorded_settings"]
 
@@ -154,7 +154,7 @@ def data_experiment(
     )
 
 
-def recorded_settings(fleet: RecordedFleet, effort: Effort) -> dict[str, float | int | str]:
+def recorded_settings(fleet: RecordedFleet, effort: Effort) -> Settings:
     """What is needed to repeat an experiment on recorded trips, for its record."""
     return {
         "seed": effort.seed,
@@ -164,8 +164,9 @@ def recorded_settings(fleet: RecordedFleet, effort: Effort) -> dict[str, float |
         "driving_minutes": round(sum(len(trip) for trip in fleet.trips) * fleet.period_s / 60.0, 1),
         "full_scale_a": fleet.full_scale_a,
         "noise_a": NOISE * fleet.full_scale_a,
-        "balanced": "true",
-        "symmetric": "false",
+        "balance_branch": fleet.balance_branch,
+        "balanced": True,
+        "symmetric": False,
     }
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from calibrator.experiments.picture import write_picture
 from calibrator.experiments.result import ExperimentResult, decode_result
-from calibrator.experiments.table import caption, headline, markdown_table, result_markdown
+from calibrator.experiments.table import caption, headline, markdown_table, repetitions_text, result_markdown
 from ecu_node.user_files import write_atomically
 
 __all__ = ["index_path", "read_results", "write_result"]
@@ -30,7 +30,7 @@ def write_result(folder: Path, result: ExperimentResult, order: Sequence[str]) -
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / f"{result.name}.json", result.to_json())
-    write_atomically(folder / f"{result.name}.md", result_markdown(result).encode())
+    write_atomically(folder / f"{result.name}.md", result_markdown(result, picture=f"{result.name}.png").encode())
     write_picture(result, folder / f"{result.name}.png")
     write_atomically(index_path(folder), _index(folder, read_results(folder, order)).encode())
 
@@ -53,7 +53,7 @@ def _index(folder: Path, results: Sequence[ExperimentResult]) -> str:
         lines += [
             f"## [{result.title}]({folder.name}/{result.name}.md)",
             "",
-            f"`calibrator experiment {result.name}`: {settings['repetitions']} repetitions, seed {settings['seed']}, "
+            f"`calibrator experiment {result.name}`: {repetitions_text(settings)}, seed {settings['seed']}, "
             f"drive {settings['drive']}{f'; {result.made}' if result.made else ''}.",
             "",
             *markdown_table(*headline(result)),

@@ -3,7 +3,7 @@
 import os
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import msgspec
 
@@ -11,7 +11,10 @@ from calibrator.errors import FleetError
 from calibrator.time_of_run import time_of_run
 from ecu_node import __version__
 
-__all__ = ["Bin", "ExperimentResult", "Figure", "Row", "decode_result", "made_now"]
+__all__ = ["Bin", "ExperimentResult", "Figure", "Row", "Settings", "decode_result", "made_now"]
+
+Settings = Mapping[str, bool | int | float | str]
+"""What is needed to repeat an experiment, by name; records of before version 1.0 hold flags as texts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,16 +93,21 @@ class ExperimentResult:
         Seed, repetitions, fleet law, drive.
     rows : tuple of Row
         Figures.
+    paper : mapping of float to float
+        Best recovery rate that the paper prints, by x, whatever methods were run; empty in records of before version
+        1.0, whose rows say the same.
     made : str
-        Version, machine and day, as :func:`made_now` says; empty in records of before version 1.0.
+        Version, machine and day, as :func:`made_now` says, of what the command ran; empty in records of before version
+        1.0, and for an experiment that was called as a function.
     """
 
     name: str
     title: str
     x_label: str
     series_label: str = ""
-    settings: Mapping[str, float | int | str]
+    settings: Settings
     rows: tuple[Row, ...]
+    paper: Mapping[float, float] = field(default_factory=dict)
     made: str = ""
 
     def row(self, *, x: float, method: str, series: str = "") -> Row:

@@ -181,11 +181,12 @@ def run_experiments(
     for number, name in enumerate(names, start=1):
         with one_pass(number, len(names)):
             result = _calibration(done, out) if name == CALIBRATION else EXPERIMENTS[name](options)
+            result = replace(result, made=made_now())
         done.append(result)
         if console is not None:
             console.print(result_table(result))
         if out is not None:
-            write_result(out, replace(result, made=made_now()), known)
+            write_result(out, result, known)
     return done
 
 

@@ -76,7 +76,6 @@ def test_console_table_fits_80_columns(fleet: RecordedFleet) -> None:
 
 def test_page_holds_all_figures_of_all_methods(snr: ExperimentResult) -> None:
     page = result_markdown(snr)
-    assert "`calibrator experiment snr --out FOLDER`" in page
     tenths = {b.low for row in snr.rows for b in row.bins}
     assert page.count("\n| ") == 2 + 2 + 2 + len(snr.rows) + 2 + len(tenths)
     assert "(0.91)" in page
@@ -112,6 +111,51 @@ def test_captions_name_every_column(snr: ExperimentResult) -> None:
     details = result_markdown(result).partition("Of each method: ")[2].partition("\n")[0]
     for words in ("within 10 %", "within 25 %", "f2", "(hardware)", "the figures above"):
         assert words in details
+
+
+def test_page_names_command_and_picture_only_where_there_are_any(snr: ExperimentResult, tmp_path: Path) -> None:
+    by_hand = result_markdown(snr)
+    for absent in ("calibrator experiment", ".png", "--out"):
+        assert absent not in by_hand + _printed(snr)
+    assert "result_markdown shows all figures." in _printed(snr)
+    made = replace(snr, made="calibrator 1.0")
+    assert "--out writes all figures." in _printed(made)
+    write_result(tmp_path / "results", made, tuple(EXPERIMENTS))
+    page = (tmp_path / "results" / "snr.md").read_text()
+    assert "Written by `calibrator experiment snr --out FOLDER`. Share" in page
+    assert "](snr.png)" in page
+
+
+def test_harm_of_the_published_method_is_explained_where_it_is_shown(snr: ExperimentResult) -> None:
+    page = result_markdown(snr)
+    assert "gets worse on an unseen drive, however little (harmed)" in page
+    assert "counts as harmed although it is recovered." in page
+    only_default = replace(snr, rows=tuple(row for row in snr.rows if row.method == POSTERIOR.name))
+    assert "The published method corrects" not in result_markdown(only_default)
+
+
+def test_flags_are_booleans_in_records_and_words_on_pages(snr: ExperimentResult) -> None:
+    settings = json.loads(snr.to_json())["settings"]
+    assert (settings["balanced"], settings["symmetric"]) == (True, True)
+    assert "balanced true, symmetric true." in result_markdown(snr)
+
+
+def test_records_of_before_version_1_are_read_and_show_the_same(snr: ExperimentResult) -> None:
+    record = json.loads(snr.to_json())
+    del record["paper"], record["made"]
+    record["settings"].update(balanced="true", symmetric="true")
+    old = decode_result(json.dumps(record).encode(), "here")
+    assert headline(old) == headline(snr)
+    assert result_markdown(old) == result_markdown(snr)
+
+
+def test_one_repetition_is_one(snr: ExperimentResult, tmp_path: Path) -> None:
+    once = replace(snr, settings={**snr.settings, "repetitions": 1})
+    write_result(tmp_path / "results", once, tuple(EXPERIMENTS))
+    for text in (_printed(once), (tmp_path / "results.md").read_text()):
+        assert "1 repetition, seed 0" in text
+    assert "2 repetitions, seed 0" in _printed(snr)
+    assert "2 or 10 repetitions" in _printed(replace(snr, settings={**snr.settings, "repetitions": "2 or 10"}))
 
 
 def test_index_explains_what_some_of_its_tables_show(snr: ExperimentResult, tmp_path: Path) -> None:
@@ -239,8 +283,12 @@ def test_runner_runs_quick_experiments_of_both_kinds(tmp_path: Path, monkeypatch
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
     options = RunOptions(quick=True, repetitions=1, layout=LAYOUT, drive=smooth_drive(samples=2000))
     snr, real = run_experiments(["snr", "real"], options, out=tmp_path / "results")
+    assert decode_result((tmp_path / "results" / "snr.json").read_bytes(), "here") == snr
     assert snr.settings["drive"] == "smooth"
     assert real.settings["drive"] == "8 built-in trips, no recordings"
+    page = (tmp_path / "results" / "real.md").read_text()
+    assert "In every trip the current of motor is minus the sum of the other branches: it is not independent" in page
+    assert "minus the sum" not in (tmp_path / "results" / "snr.md").read_text()
     made = f"calibrator {__version__}, Python {platform.python_version()}"
     for page in ("results.md", "results/snr.md", "results/real.md"):
         assert made in (tmp_path / page).read_text()
