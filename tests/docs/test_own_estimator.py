@@ -1,25 +1,79 @@
 """The example of an estimator of one's own is short, and does what its page says."""
 
+import re
 import runpy
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from calibrator.experiments import common_drive, trial
+from calibrator.drive import Channel, Drive
+from calibrator.drives.store import write_drive
+from calibrator.experiments import common_drive, recorded_experiments, trial
+from calibrator.experiments.recorded_trial import RecordedCase
+from ecu_node.layout import read_layout
+from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "own_estimator.py"
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "own_estimator.py"
+NOTEBOOK = ROOT / "examples" / "fleet_to_node.ipynb"
+PAGE = (ROOT / "docs" / "experiments.md").read_text()
+RECORDED = re.findall(r"(?ms)^```python\n(.+?)^```", PAGE)
+MODULE = re.compile(r"(?m)^[ \"]*from ((?:calibrator|ecu_node)[\w.]*) import")
 
 
-def test_it_stands_beside_the_published_method_and_the_default(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small fleets, a short drive, one case."""
     law, drive = trial.FleetLaw, common_drive.builtin_common_drive
     monkeypatch.setattr(trial, "FleetLaw", lambda **_: law(vehicles=40))
     monkeypatch.setattr(common_drive, "builtin_common_drive", lambda: drive(duration_s=300.0))
-    runpy.run_path(str(EXAMPLE))
+    one = partial(recorded_experiments.real_experiment, cases=(RecordedCase(),))
+    monkeypatch.setattr(recorded_experiments, "real_experiment", one)
+
+
+def write_store(store: Path) -> None:
+    """Trips of a car as ``calibrator import`` leaves them."""
+    for trip in small_fleet(trips=6, samples=1800).trips:
+        channels: Any = [
+            {
+                name: Channel(time_s=trip.time_s, value=values, good=np.isfinite(values))
+                for name, values in group.items()
+            }
+            for group in (trip.currents_a, trip.inputs)
+        ]
+        drive = Drive(vehicle=trip.name, name="d", branches=channels[0], inputs=channels[1])
+        write_drive(store, drive, read_layout(LAYOUT))
+
+
+@pytest.mark.usefixtures("small")
+def test_it_stands_beside_the_published_method_and_the_default_also_on_recorded_trips(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    names = runpy.run_path(str(EXAMPLE))
     shown = capsys.readouterr().out
     for name in ("perfect", "posterior", "own"):
         assert name in shown
+    write_store(tmp_path / "build" / "i3")
+    (tmp_path / "dbc").symlink_to(ROOT / "dbc")
+    monkeypatch.chdir(tmp_path)
+    (recorded,) = RECORDED
+    exec(recorded, names)  # the text of the page
+    shown = capsys.readouterr().out
+    assert "6 vehicles, 2 repetitions, seed 0, drive 6 drives of i3" in " ".join(shown.split())
+    for name in ("perfect", "posterior", "own"):
+        assert name in shown
+
+
+@pytest.mark.parametrize(
+    "source", [EXAMPLE.read_text(), NOTEBOOK.read_text(), *RECORDED], ids=["own", "notebook", "page"]
+)
+def test_what_it_imports_is_in_the_reference_of_the_python_interface(source: str) -> None:
+    listed = re.findall(r"(?m)^   ([\w.]+)$", (ROOT / "docs" / "reference" / "api.md").read_text())
+    assert len(MODULE.findall(source)) > 3
+    assert sorted(set(MODULE.findall(source)) - set(listed)) == []
 
 
 def test_it_has_less_than_40_lines() -> None:
