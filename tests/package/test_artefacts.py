@@ -49,7 +49,8 @@ def test_the_wheel_names_its_licence_and_its_programs(wheel: Path, in_wheel: set
 def test_the_source_has_every_file_that_is_kept(unpacked: Path) -> None:
     folders = ("calibrator", "dbc", "deploy", "docs", "ecu_node", "examples", "tests", "tools", ".ci")
     kept = set().union(*(files(ROOT / folder) for folder in folders))
-    kept |= {"CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "Makefile", "README.md", "constraints.txt", "pyproject.toml"}
+    kept |= {"CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "Makefile", "README.md"}
+    kept |= {"constraints.txt", "pyproject.toml"}
     assert {name for name in kept if not (unpacked / name).is_file()} == set()
 
 
