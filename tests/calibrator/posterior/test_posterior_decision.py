@@ -1,4 +1,4 @@
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
@@ -209,3 +209,179 @@ def test_harm_is_that_of_the_worst_drive() -> None:
     both = harm(states, *estimate, mean=np.zeros((2, K)), square=np.concatenate([large, small]))[0]
     assert alone == pytest.approx([0.0, 1.0], abs=1e-12)
     assert both == pytest.approx(1.0)
+
+
+SHARP = 1e-9
+ROUNDED = (0.56, 0.34, 0.1)
+"""Weights that add up to a little more than 1."""
+
+
+def plain_estimate(states: States, least: tuple[float, float]) -> list[tuple[int, float]]:
+    """Of states without spread, by plain loops: the weight within 10 % of each, and the first of the best."""
+    found = []
+    for weight, drift, offset in zip(states.weight, states.drift, states.offset, strict=True):
+        near = np.ones((len(weight), len(weight)), bool)
+        for values, smallest in zip((drift, offset), least, strict=True):
+            apart = np.linalg.norm(values[:, None] - values[None], axis=2)
+            near &= apart <= 0.1 * np.maximum(np.linalg.norm(values, axis=1), smallest)[:, None]
+        covered = weight @ near
+        state = int(np.flatnonzero(covered >= covered.max() - 0.01)[0])
+        found.append((state, float(covered[state])))
+    return found
+
+
+def fleet_of(several: list[States]) -> States:
+    """Vehicles with as many states each."""
+    return States(*(np.concatenate([getattr(states, f.name) for states in several]) for f in fields(States)))
+
+
+def crowded_states(seed: int) -> States:
+    """Thirty states around six different explanations: many within tolerance of another, and of several."""
+    rng = np.random.default_rng(seed)
+    centres = rng.choice([-1.0, 1.0], size=(6, 2 * K)) * rng.uniform(0.05, 0.25, size=(6, 2 * K))
+    values = centres[rng.integers(0, 6, size=30)] * rng.uniform(0.9, 1.1, size=(30, 2 * K))
+    return states_of(np.sort(rng.dirichlet(np.ones(30)))[::-1], values[:, :K], values[:, K:], sd=SHARP)
+
+
+def test_each_vehicles_estimate_is_that_of_plain_loops() -> None:
+    fleet = fleet_of([crowded_states(seed) for seed in range(40)])
+    state, confidence = best_estimate(fleet, least=LEAST)
+    expected_state, expected = zip(*plain_estimate(fleet, LEAST), strict=True)
+    np.testing.assert_array_equal(state, expected_state)
+    np.testing.assert_allclose(confidence, expected, atol=1e-12)
+    assert len(set(expected_state)) > 5
+
+
+@pytest.mark.parametrize(
+    ("weight", "second_drift", "expected", "confidence"),
+    [
+        # The second is far from all others; the third and the fourth together outweigh the first.
+        ((0.35, 0.25, 0.2, 0.2), (0.1, 0.15, 0.2, 0.2004), 2, 0.4),
+        # Three pairs: the first is worse than the third by more than 1 %, the second by less, and the more probable.
+        (
+            (0.17, 0.169, 0.168, 0.1625, 0.16, 0.15, 0.0205),
+            (0.06, 0.1, 0.15, 0.1504, 0.1004, 0.0604, 0.22),
+            1,
+            0.329,
+        ),
+        # The second is near all but the last.
+        ((0.3, 0.25, 0.25, 0.2), (0.1, 0.109, 0.118, 0.135), 1, 0.8),
+    ],
+)
+def test_the_more_probable_of_equally_good_states_is_taken(
+    weight: tuple[float, ...], second_drift: tuple[float, ...], expected: int, confidence: float
+) -> None:
+    drift = np.column_stack([np.zeros(len(weight)), second_drift])
+    states = states_of(np.array(weight), drift, np.zeros_like(drift), sd=SHARP)
+    state, found = best_estimate(states, least=(0.005, 0.005))
+    assert state[0] == expected
+    assert found[0] == pytest.approx(confidence)
+
+
+def test_a_state_that_is_certain_has_all_confidence() -> None:
+    states = states_of(np.array([1.0, 0.0]), np.array([[0.1, 0.0], [0.2, 0.0]]), np.zeros((2, K)), sd=SHARP)
+    assert best_estimate(states, least=LEAST)[1][0] == 1.0
+
+
+def test_confidence_is_a_probability_where_weights_add_up_to_more_by_rounding() -> None:
+    weight = np.array(ROUNDED)
+    assert np.cumsum(weight)[-1] > 1.0
+    drift = np.tile([0.1, 0.0], (len(weight), 1))
+    assert best_estimate(states_of(weight, drift, np.zeros_like(drift), sd=SHARP), least=LEAST)[1][0] == 1.0
+
+
+@pytest.mark.parametrize("sd", [SHARP, 1e-4])
+def test_drifts_and_offsets_must_both_be_recovered(sd: float) -> None:
+    """A large drift that is told exactly does not excuse an offset that is not."""
+    states = states_of(np.array([0.6, 0.4]), np.full((2, K), 0.2), np.array([[0.02, 0.0], [0.03, 0.0]]), sd=sd)
+    assert best_estimate(states, least=(0.005, 0.005))[1][0] == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize("place", range(2 * K))
+def test_confidence_of_one_state_is_the_share_of_its_spread_that_is_recovered(place: int) -> None:
+    """Of one drift or offset x, told as 0.1: |x - 0.1| <= 0.1 |x|."""
+    values, sd = np.zeros((1, 2 * K)), 0.01
+    values[0, place] = 0.1
+    states = states_of(np.ones(1), values[:, :K], values[:, K:], sd=sd)
+    confidence = best_estimate(states, least=(0.005, 0.005))[1][0]
+    assert confidence == pytest.approx(norm.cdf(0.1 / 0.9, 0.1, sd) - norm.cdf(0.1 / 1.1, 0.1, sd), abs=0.03)
+
+
+def test_a_spread_state_five_deviations_away_adds_nothing() -> None:
+    states = states_of(np.array([0.5, 0.5]), np.array([[0.1, 0.0], [0.15, 0.0]]), np.zeros((2, K)), sd=0.0075)
+    states = replace(states, relative_sd=states.relative_sd * [[[0.0], [1.0]]])
+    assert best_estimate(states, least=LEAST)[1][0] == 0.5
+
+
+def vague(seed: int) -> States:
+    """Two states with both drifts and offsets, each with a spread of its own."""
+    rng = np.random.default_rng(seed)
+    values, sd = rng.uniform(-0.2, 0.2, size=(2, 2 * K)), rng.uniform(0.001, 0.03, size=(1, 2, 2 * K))
+    states = states_of(np.array([0.6, 0.4]), values[:, :K], values[:, K:], sd=1.0)
+    relative_sd, constant_sd = states.relative_sd.copy(), states.constant_sd.copy()
+    relative_sd[:, :, 1:], constant_sd[:, :, K - 1 :] = sd[:, :, :K], sd[:, :, K:]
+    return replace(states, relative_sd=relative_sd, constant_sd=constant_sd)
+
+
+def test_harm_of_a_fleet_is_that_of_each_vehicle_and_the_worst_drive() -> None:
+    """Some branches are not corrected, whichever vehicle or branch comes first."""
+    rng = np.random.default_rng(5)
+    several = [vague(seed) for seed in range(6)]
+    fleet = fleet_of(several)
+    drift, offset = fleet.drift[:, 0].copy(), fleet.offset[:, 0].copy()
+    drift[[0, 1]], offset[0], offset[[2, 3], 0], drift[[2, 4], 0] = 0.0, 0.0, 0.0, 0.0
+    mean = rng.uniform(-0.2, 0.2, size=(6, 4, K))
+    square = mean**2 + rng.uniform(0.001, 0.3, size=mean.shape)
+    found = harm_probability(fleet, drift, offset, mean=mean, mean_square=square)
+    for j, states in enumerate(several):
+        alone = [harm(states, drift[j], offset[j], mean=mean[j, [m]], square=square[j, [m]]) for m in range(4)]
+        np.testing.assert_allclose(found[j], np.max(alone, axis=0), atol=1e-15)
+    assert not found[0].any()
+    assert found[2, 0] == 0.0
+    assert ((found > 0.01) & (found < 0.99)).sum() > 5
+
+
+EVEN = norm.ppf((np.arange(40_000) + 0.5) / 40_000)
+"""Equally probable values of a standard normal variable."""
+
+
+@pytest.mark.parametrize("in_drift", [True, False])
+@pytest.mark.parametrize("mean", [-0.15, 0.0, 0.1])
+@pytest.mark.parametrize(
+    ("drift", "offset", "drift_hat", "offset_hat"),
+    [
+        (0.1, 0.03, 0.12, 0.02),
+        (0.1, 0.03, -0.05, 0.06),
+        (-0.12, 0.02, -0.1, -0.03),
+        (0.05, -0.03, 0.1, -0.06),
+        (0.02, 0.03, 0.0, 0.07),
+        (-0.05, 0.04, -0.11, 0.0),
+    ],
+)
+def test_harm_where_either_drift_or_offset_is_known_is_that_of_plain_points(
+    in_drift: bool, mean: float, drift: float, offset: float, drift_hat: float, offset_hat: float
+) -> None:
+    """The error of a correction is a quadratic of the other."""
+    square, sd = 0.06, 0.04 if in_drift else 0.02
+    states = states_of(np.ones(1), np.array([[drift, 0.0]]), np.array([[offset, 0.0]]), sd=sd)
+    d, o = drift + sd * EVEN * in_drift, offset + sd * EVEN * (not in_drift)
+    states = replace(states, relative_sd=states.relative_sd * in_drift, constant_sd=states.constant_sd * (not in_drift))
+    left, shift = (d - drift_hat) / (1.0 + drift_hat), (o - offset_hat) / (1.0 + drift_hat)
+    corrected = left**2 * square + 2.0 * left * shift * mean + shift**2
+    worse = np.mean(corrected > d**2 * square + 2.0 * d * o * mean + o**2)
+    moments = {"mean": np.full((1, K), mean), "square": np.full((1, K), square)}
+    found = harm(states, np.array([drift_hat, 0.0]), np.array([offset_hat, 0.0]), **moments)
+    assert found[0] == pytest.approx(worse, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_harm_of_states_with_several_spreads_is_that_of_plain_draws(seed: int) -> None:
+    states = vague(seed)
+    estimate = states.drift[0, 0] + 0.02, states.offset[0, 0] - 0.01
+    np.testing.assert_allclose(harm(states, *estimate), plain_harm(drawn(states), *estimate), atol=0.006)
+
+
+def test_harm_is_a_probability_where_weights_add_up_to_more_by_rounding() -> None:
+    weight = np.array(ROUNDED)
+    nothing = np.zeros((len(weight), K))
+    assert harm(states_of(weight, nothing, nothing, sd=0.0), np.array([0.1, 0.0]), np.zeros(K))[0] == 1.0
