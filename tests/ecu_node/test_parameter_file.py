@@ -1,6 +1,7 @@
 """Parameters of a running node: replaced by what fits, kept otherwise."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from ecu_node.parameter_file import ParameterFile
 from ecu_node.parameters import write_parameters
 from ecu_node.status import Reason
 from ecu_node.wiring import wire
-from tests.ecu_node.vehicles import parameters_for
+from tests.ecu_node.vehicles import SMALL_DBC, parameters_for
 
 
 @pytest.fixture
@@ -25,10 +26,10 @@ def path(database: VehicleDatabase, tmp_path: Path) -> Path:
 class Running:
     """A corrector with its parameter file, and what was said."""
 
-    def __init__(self, path: Path, database: VehicleDatabase) -> None:
+    def __init__(self, path: Path, database: VehicleDatabase, *, mode: Mode = Mode.OVERLAY) -> None:
         self.said: list[str] = []
-        self.file = ParameterFile(path, database, "v1", mode=Mode.OVERLAY, say=self.said.append)
-        self.corrector: Corrector = wire(database, self.file.in_force, 0.0)
+        self.file = ParameterFile(path, database, "v1", mode=mode, say=self.said.append)
+        self.corrector: Corrector = wire(database, self.file.in_force, 0.0, mode=mode)
         self.file.look(self.corrector, 0.0)
 
     @property
@@ -113,3 +114,38 @@ def test_a_file_that_can_be_read_after_all_is_noticed(path: Path, database: Vehi
     before = path.stat()
     path.chmod(0o600 if before.st_mode & 0o077 else 0o644)
     assert running.file.look(running.corrector, 2.0), "its times of content are the same"
+
+
+@pytest.mark.parametrize("mode", [Mode.OVERLAY, Mode.GATEWAY])
+def test_after_a_change_all_is_as_after_a_start(
+    make_database: Callable[..., VehicleDatabase], path: Path, mode: Mode
+) -> None:
+    """Measured and corrected signal count differently here."""
+    database = make_database(dbc=SMALL_DBC.replace("SG_ Battery : 0|16@1- (0.1,0)", "SG_ Battery : 0|16@1- (0.2,0)"))
+    write_parameters(parameters_for(database, motor=(0.0, 1.0)), path)
+    running = Running(path, database, mode=mode)
+    write_parameters(parameters_for(database, battery=(0.125, 5.0)), path)
+    assert running.file.look(running.corrector, 2.0)
+    fresh = wire(database, running.file.in_force, 2.0, mode=mode)
+    for live, new in zip(running.corrector.branches, fresh.branches, strict=True):
+        assert (live.plan, live.fault) == (new.plan, new.fault)
+        assert live.deadline_s == new.deadline_s
+
+
+def test_every_change_and_every_failure_is_counted(path: Path, database: VehicleDatabase) -> None:
+    running = Running(path, database)
+    whole = path.read_bytes()
+    for time_s, content in ((2.0, b"{"), (4.0, whole), (6.0, b"[]"), (8.0, whole)):
+        path.write_bytes(content)
+        running.file.look(running.corrector, time_s)
+    counters = running.corrector.counters
+    assert (counters.reloads, counters.reload_failures) == (2, 2)
+
+
+def test_at_start_parameters_of_another_vehicle_are_not_used_and_the_reason_is_published(
+    path: Path, database: VehicleDatabase
+) -> None:
+    path.write_bytes(path.read_bytes().replace(b'"v1"', b'"v2"'))
+    running = Running(path, database)
+    assert (running.drift, running.corrector.reason) == (0.0, Reason.WRONG_VEHICLE)
+    assert running.file.why_not == f"{path}: parameters are for vehicle 'v2', this is 'v1'"

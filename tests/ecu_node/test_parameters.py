@@ -183,7 +183,20 @@ def test_schema_and_reader_agree_wherever_any_value_is_put(
         b"not json at all\nsecond line",
         b" " * (MAX_FILE_BYTES + 1),
     ],
-    ids=lambda content: repr(content[:12]),
+    ids=[
+        "nothing",
+        "half a table",
+        "list",
+        "null",
+        "UTF-16",
+        "BOM",
+        "Latin-1",
+        "deep lists",
+        "deep lists in a table",
+        "deep tables",
+        "two lines",
+        "too long",
+    ],
 )
 def test_what_is_no_parameter_file_is_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "p.json"
@@ -192,6 +205,14 @@ def test_what_is_no_parameter_file_is_one_line(tmp_path: Path, content: bytes) -
         read_parameters(path)
     assert caught.value.reason is Reason.MALFORMED_PARAMETERS
     assert "\n" not in str(caught.value)
+
+
+def test_where_a_text_is_no_json_is_told(tmp_path: Path) -> None:
+    (tmp_path / "p.json").write_text('{"vehicle": v1}')
+    with pytest.raises(
+        UnfitError, match=r"p\.json: not a parameter file: JSON is malformed: .*\(byte 12\); correct it"
+    ):
+        read_parameters(tmp_path / "p.json")
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "9" * 400])
