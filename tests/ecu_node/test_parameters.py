@@ -441,6 +441,7 @@ def test_mistakes_of_a_file_that_was_written_by_hand_are_told(
     with pytest.raises(UnfitError, match=re.escape(words)) as caught:
         read_parameters(tmp_path / "p.json")
     assert caught.value.reason is Reason.MALFORMED_PARAMETERS
+    assert str(caught.value).startswith(f"{tmp_path}/p.json: not a parameter file: ")
     assert str(caught.value).endswith("; correct it, or write it anew with 'calibrator calibrate'")
     assert str(caught.value).isprintable()
 
