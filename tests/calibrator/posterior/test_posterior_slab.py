@@ -59,3 +59,42 @@ def test_nodes_lie_in_the_slab_and_are_balanced(dimensions: int) -> None:
 
 def test_no_open_direction_has_one_node() -> None:
     assert SLAB.nodes(0).shape == (1, 0)
+
+
+@pytest.mark.parametrize(("dimensions", "count"), [(1, 16), (2, 64), (3, 64), (5, 64)])
+def test_each_node_stands_for_its_share_of_the_slab(dimensions: int, count: int) -> None:
+    """A cube of as many equal cells has that edge, and a uniform distribution over an edge that deviation."""
+    assert len(SLAB.nodes(dimensions)) == count
+    assert SLAB.spacing(dimensions) ** dimensions * count == pytest.approx(0.4**dimensions)
+    edge = np.linspace(-0.5, 0.5, 100_001) * SLAB.spacing(dimensions)
+    assert SLAB.cell_sd(dimensions) == pytest.approx(edge.std(), rel=1e-4)
+
+
+def test_nodes_along_one_direction_lie_equally_far_apart() -> None:
+    nodes = np.sort(SLAB.nodes(1)[:, 0])
+    np.testing.assert_allclose(nodes[8:], 0.05 + 0.2 * (np.arange(8) + 0.5) / 8)
+    np.testing.assert_allclose(nodes[:8], -nodes[:7:-1])
+
+
+def test_shares_of_the_prior_run_from_the_largest_negative_value_to_the_largest() -> None:
+    np.testing.assert_allclose(
+        SLAB.at(np.array([0.0, 0.25, 0.4999, 0.5001, 0.75, 1.0])), [-0.25, -0.15, -0.05004, 0.05004, 0.15, 0.25]
+    )
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_nodes_in_space_fill_the_cube_evenly(dimensions: int) -> None:
+    """Each 64th of each direction has one of them, in its middle."""
+    unit = Slab.unit_nodes(dimensions)
+    assert unit.min() > 0.0
+    assert unit.max() < 1.0
+    for values in unit.T:
+        np.testing.assert_allclose(np.sort(values), (np.arange(64) + 0.5) / 64)
+
+
+def test_without_an_open_direction_nodes_would_lie_apart_as_along_one() -> None:
+    assert SLAB.spacing(0) == SLAB.spacing(1)
+
+
+def test_no_values_have_no_masses() -> None:
+    assert SLAB.log_mass(np.zeros((3, 0)), np.zeros((3, 0))).shape == (3, 0)
