@@ -8,7 +8,7 @@ TRIPS ?= ../shared/data/bmw_i3_summer
 PYTHONS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test coverage bench bench-quick experiments soak fuzz release-check lint types docs dist package sbom \
+.PHONY: help setup demo test coverage bench bench-quick experiments soak fuzz release-check mutants lint types docs dist package sbom \
 	licences schema constraints clean
 
 help:                    ## this list
@@ -58,6 +58,9 @@ fuzz: setup              ## 10^7 random frames through the node, 10^6 changed pa
 
 release-check: setup     ## measure again all that was promised, on this commit (hours; goes on where it stopped)
 	PYTHONPATH=tools $(BIN)/python tools/release_check.py
+
+mutants: setup           ## change the code in small ways and see that tests notice (hours; GROUPS=e2e: that part only)
+	$(BIN)/python tools/mutants.py $(GROUPS)
 
 lint: setup              ## ruff, formatting included
 	$(BIN)/ruff check .
