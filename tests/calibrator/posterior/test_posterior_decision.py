@@ -195,8 +195,11 @@ def test_harm_is_counted_by_the_errors_of_the_currents_themselves() -> None:
     np.testing.assert_allclose(rms, np.sqrt(np.mean((corrected - i) ** 2, axis=0)))
 
 
-def test_nothing_changed_does_no_harm() -> None:
-    states = states_of(*TWO_EXPLANATIONS, sd=0.05)
+@pytest.mark.parametrize("kept", [1.0, 0.9])
+def test_nothing_changed_does_no_harm(kept: float) -> None:
+    """Not even in a vehicle some of whose states were dropped."""
+    weight, *parameters = TWO_EXPLANATIONS
+    states = states_of(kept * weight, *parameters, sd=0.05)
     np.testing.assert_array_equal(harm(states, np.zeros(K), np.zeros(K)), 0.0)
 
 
@@ -385,3 +388,40 @@ def test_harm_is_a_probability_where_weights_add_up_to_more_by_rounding() -> Non
     weight = np.array(ROUNDED)
     nothing = np.zeros((len(weight), K))
     assert harm(states_of(weight, nothing, nothing, sd=0.0), np.array([0.1, 0.0]), np.zeros(K))[0] == 1.0
+
+
+def test_harm_of_what_is_known_exactly_is_certain_or_none() -> None:
+    """Of many drifts, offsets, estimates and currents: whether the corrected error is the larger one."""
+    rng = np.random.default_rng(8)
+    certain = []
+    for _ in range(300):
+        d, d_hat = rng.uniform(-0.25, 0.25, 2)
+        o, o_hat, mean = rng.uniform(-0.1, 0.1, 3)
+        square = mean**2 + rng.uniform(0.0, 0.1)
+        left, shift = (d - d_hat) / (1.0 + d_hat), (o - o_hat) / (1.0 + d_hat)
+        corrected = left**2 * square + 2.0 * left * shift * mean + shift**2
+        states = states_of(np.ones(1), np.array([[d, 0.0]]), np.array([[o, 0.0]]), sd=SHARP)
+        moments = {"mean": np.full((1, K), mean), "square": np.full((1, K), square)}
+        found = harm(states, np.array([d_hat, 0.0]), np.array([o_hat, 0.0]), **moments)
+        certain.append(found[0])
+        worse = corrected > d**2 * square + 2.0 * d * o * mean + o**2
+        assert found[0] == pytest.approx(1.0 if worse else 0.0, abs=1e-9)
+    assert 0.2 < np.mean(certain) < 0.8
+
+
+@pytest.mark.parametrize("mean", [-0.1, 0.0, 0.1])
+@pytest.mark.parametrize(("drift_sd", "offset_sd"), [(0.04, 0.008), (0.02, 0.015)])
+def test_harm_where_drift_and_offset_are_as_uncertain_as_each_other_is_that_of_plain_points(
+    mean: float, drift_sd: float, offset_sd: float
+) -> None:
+    few = norm.ppf((np.arange(600) + 0.5) / 600)
+    drift, offset, square = 0.05, 0.015, 0.06
+    d, o = np.meshgrid(drift + drift_sd * few, offset + offset_sd * few)
+    left, shift = (d - drift) / (1.0 + drift), (o - offset) / (1.0 + drift)
+    corrected = left**2 * square + 2.0 * left * shift * mean + shift**2
+    worse = np.mean(corrected > d**2 * square + 2.0 * d * o * mean + o**2)
+    states = states_of(np.ones(1), np.array([[drift, 0.0]]), np.array([[offset, 0.0]]), sd=1.0)
+    states = replace(states, relative_sd=drift_sd * states.relative_sd, constant_sd=offset_sd * states.constant_sd)
+    moments = {"mean": np.full((1, K), mean), "square": np.full((1, K), square)}
+    found = harm(states, np.array([drift, 0.0]), np.array([offset, 0.0]), **moments)
+    assert found[0] == pytest.approx(worse, abs=0.002)
