@@ -59,7 +59,7 @@ fuzz: setup              ## 10^7 random frames through the node, 10^6 changed pa
 release-check: setup     ## measure again all that was promised, on this commit (hours; goes on where it stopped)
 	PYTHONPATH=tools $(BIN)/python tools/release_check.py
 
-mutants: setup           ## change the code in small ways and see that tests notice (hours; GROUPS=e2e: that part only)
+mutants: setup           ## change the code in small ways and see that tests notice (an hour; GROUPS=e2e: that part only)
 	$(BIN)/python tools/mutants.py $(GROUPS)
 
 lint: setup              ## ruff, formatting included

@@ -2,8 +2,8 @@
 """Change the code in many small ways and see that a test fails each time: mutation testing, with mutmut.
 
 Each file of ``tools/mutation`` names modules and the tests that must notice what is changed in them. What survived is
-explained in ``docs/mutation.md``. Takes some hours; what was tried is kept in the folder, and the same command goes on
-from there.
+explained in ``docs/mutation.md``. Takes about an hour; what was tried is kept in the folder, and the same command goes
+on from there.
 """
 
 import os
