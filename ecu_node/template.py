@@ -31,7 +31,8 @@ def add_template_command(commands: "argparse._SubParsersAction[Any]") -> None:
         help="print a parameter file to be filled in by hand",
         description="Prints a parameter file that fits the layout and corrects nothing yet. Where the fault of a "
         "sensor was measured, write it there: drift [1], offset_a [A, positive into the junction], and "
-        '"apply": true; measured = (1 + drift) * true + offset. All else can stay as it is.',
+        '"apply": true; measured = (1 + drift) * true + offset. A load that no branch measures stands in '
+        "expected_a [A], as [unmeasured_load] of the layout says. All else can stay as it is.",
         epilog="Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted.",
     )
     template.add_argument(
@@ -72,10 +73,12 @@ def template_text(database: "VehicleDatabase", vehicle: str, now: datetime) -> s
     Returns
     -------
     str
-        JSON without what can be left out. The verdict is that of a file that corrects: any other would keep the node
-        from applying what is filled in.
+        JSON without what can be left out. The sum that right sensors show is the layout's unmeasured load: it takes
+        current out of the junction, so what the branches measure sums to as much above 0 A. The verdict is that of a
+        file that corrects, as it is to be once it is filled in.
     """
     layout = database.layout
+    load = layout.unmeasured_load
     document = {
         "schema_version": 1,
         "vehicle": vehicle,
@@ -85,7 +88,11 @@ def template_text(database: "VehicleDatabase", vehicle: str, now: datetime) -> s
         "verdict": "corrected",
         "branches": {name: {"drift": 0.0, "offset_a": 0.0, "apply": False} for name in layout.branch_names},
         "hardware_fault": {"suspected": False},
-        "junction_residual": {"measured_a": 0.0, "corrected_a": 0.0},
+        "junction_residual": {
+            "measured_a": 0.0,
+            "corrected_a": 0.0,
+            "expected_a": load.mean_a if load is not None else 0.0,
+        },
         "provenance": {
             "tool": f"ecu-node template {__version__}",
             "method": "by hand",

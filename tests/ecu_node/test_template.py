@@ -11,11 +11,15 @@ import pytest
 
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
+from ecu_node.guard import key_of
+from ecu_node.in_force import InForce
 from ecu_node.parameter_fit import check_fit
 from ecu_node.parameters import decode_parameters
+from ecu_node.status import Reason, State
 from ecu_node.template import template_text
 from ecu_node.trust.trial import begin_trial
-from tests.ecu_node.vehicles import LAYOUT
+from ecu_node.wiring import wire
+from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, answers
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 
@@ -46,6 +50,33 @@ def test_what_is_filled_in_is_applied(
     assert {name: (branch["drift"], branch["offset_a"]) for name, branch in found.items() if branch["applied"]} == {
         "motor": (0.04, -1.5)
     }
+
+
+@pytest.mark.parametrize(
+    ("load", "expected_a", "state"),
+    [
+        ("[unmeasured_load]\nmean_a = 6.1\nsd_a = 1.0\n", 6.1, (State.CORRECTING, Reason.NONE)),
+        ("", 0.0, (State.PASSING_THROUGH, Reason.CORRECTION_WORSE)),
+    ],
+)
+def test_the_sum_is_judged_about_the_load_that_the_layout_declares(
+    make_database: Callable[..., VehicleDatabase], load: str, expected_a: float, state: tuple[State, Reason]
+) -> None:
+    """The battery shows 4 A too little and feeds a load of 6.1 A that no branch measures: about 0 A it looks better."""
+    database = make_database(f"{SMALL_LAYOUT}{load}")
+    document = json.loads(template_text(database, "v1", NOW))
+    assert document["junction_residual"]["expected_a"] == expected_a
+    document["branches"]["battery"] = {"drift": 0.0, "offset_a": -4.0, "apply": True}
+    del document["branches"]["heater"]
+    parameters = decode_parameters(json.dumps(document).encode(), "t")
+    check_fit(parameters, database, "v1")
+    corrector = wire(database, InForce(parameters=parameters), 0.0)
+    pair = database.message("Pair")
+    for step in range(300):
+        data = pair.encode({"Battery": 20.0 + 6.1 - 4.0 + step % 2, "Motor": 20.0 + step % 2})
+        answers(corrector, Frame(key_of(pair), data), 0.05 * step)
+        corrector.look(0.05 * step)
+    assert corrector.state() == state
 
 
 def test_all_branches_stand_in_it_with_names_and_digests(make_database: Callable[..., VehicleDatabase]) -> None:
