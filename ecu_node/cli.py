@@ -110,12 +110,10 @@ def _add_run(commands: "argparse._SubParsersAction[CommandParser]") -> None:
     _add_layout(run)
     _add_vehicle(run)
     _add_bus(run)
-    run.add_argument(
-        "--gateway",
-        type=_name,
-        metavar="CHANNEL",
-        help="be a gateway: the sensors are on --channel, the rest of the vehicle on this; branch frames are passed "
-        "on with the corrected current in place, all others as they are",
+    _add_gateway(
+        run,
+        "be a gateway: the sensors are on --channel, the rest of the vehicle on this; branch frames are passed on with "
+        "the corrected current in place, all others as they are",
     )
     run.add_argument("--shadow", action="store_true", help="compute and report the corrected sum, but change nothing")
     run.add_argument(
@@ -133,7 +131,7 @@ def _add_check(commands: "argparse._SubParsersAction[CommandParser]") -> None:
         epilog="Exit codes: 0 they fit, 1 they do not, 2 wrong use, 70 internal error, 130 interrupted.",
     )
     _add_files(check)
-    check.add_argument("--gateway", action="store_true", help="as a gateway would apply them")
+    _add_gateway(check, "as a gateway would apply them; no bus is opened")
     check.add_argument("--json", action="store_true", help="print JSON")
     check.set_defaults(command=_check)
 
@@ -176,6 +174,10 @@ def _add_bus(parser: argparse.ArgumentParser) -> None:
 
 def _add_layout(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--layout", type=Path, required=True, metavar="FILE", help="layout (TOML), which names the DBC")
+
+
+def _add_gateway(parser: argparse.ArgumentParser, words: str) -> None:
+    parser.add_argument("--gateway", type=_name, metavar="CHANNEL", help=words)
 
 
 def _name(text: str) -> str:
@@ -265,7 +267,7 @@ def _check(options: argparse.Namespace) -> int:
     from ecu_node.check import check_report, report_text  # noqa: PLC0415  # after load_python_can
     from ecu_node.guard import Mode  # noqa: PLC0415
 
-    mode = Mode.GATEWAY if options.gateway else Mode.OVERLAY
+    mode = Mode.OVERLAY if options.gateway is None else Mode.GATEWAY
     report = check_report(options.params, options.layout, options.vehicle, mode)
     if options.json:
         write_output(json.dumps(report, indent=2))

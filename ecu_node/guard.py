@@ -107,7 +107,10 @@ def check_output(database: VehicleDatabase, mode: Mode) -> None:
     where = database.layout.path
     sent = transmitted(database, mode)
     if not sent and mode is Mode.OVERLAY:
-        raise LayoutError(f"{where}: nothing to publish: give branches a 'corrected' signal, or add [status]")
+        raise LayoutError(
+            f"{where}: nothing to publish: neither a branch with a 'corrected' signal nor a [status]; add them to DBC "
+            f"and layout (docs/layout.md has the lines), or be a gateway, which needs none: --gateway CHANNEL"
+        )
     _require_own_messages(database, sent)
     taken = {key: _header(database, message) for key, message in sent.items()}
     for key, message in rewritten(database).items() if mode is Mode.GATEWAY else ():

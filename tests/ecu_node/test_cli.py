@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from ecu_node import __version__
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import parameter_schema, write_parameters
-from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, parameters_for
+from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, parameters_for
 
 
 @pytest.fixture
@@ -144,6 +145,22 @@ def test_a_gateway_needs_two_buses(params: Path, capsys: pytest.CaptureFixture[s
     assert (
         capsys.readouterr().err == "ecu-node: --gateway c0 is the bus of the sensors itself; two buses are expected\n"
     )
+
+
+def test_a_layout_without_own_signals_is_refused_with_both_ways_out_and_the_gateway_is_one(
+    make_database: Callable[..., VehicleDatabase], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The options of run are those of check."""
+    bare = re.sub(r', (corrected|quality) = "[\w.]+"', "", SMALL_LAYOUT)
+    database = make_database(bare)
+    write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
+    options = ["check", "--params", str(tmp_path / "v1.json"), "--layout", str(database.layout.path)]
+    assert main(options) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "docs/layout.md" in line
+    assert line.endswith("--gateway CHANNEL")
+    assert main([*options, "--gateway", "can1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["branches"]["battery"]["target"] == "Pair.Battery"
 
 
 def test_unfit_parameters_end_in_1_and_say_why(params: Path, capsys: pytest.CaptureFixture[str]) -> None:

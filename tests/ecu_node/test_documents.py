@@ -1,15 +1,25 @@
 """What the documents name exists: tests in docs/safety.md, reasons and states in docs/node.md."""
 
+import json
 import re
 from enum import IntEnum
 from pathlib import Path
 
 import pytest
 
+from ecu_node.cli import main
 from ecu_node.status import Reason, State
 
 ROOT = Path(__file__).parents[2]
 FEWEST_HAZARDS = 15
+MEASURED = """VERSION ""
+BU_: BMS Inverter{senders}
+BO_ 256 BMS_1: 8 BMS
+ SG_ PackCurrent : 0|16@1- (0.1,0) [-3276.7|3276.7] "A" Vector__XXX
+ SG_ PackVoltage : 16|16@1+ (0.1,0) [0|1000] "V" Vector__XXX
+BO_ 272 INV_3: 8 Inverter
+ SG_ DcPower : 0|16@1- (0.02,0) [-600|600] "kW" Vector__XXX
+"""
 
 
 def hazards() -> list[str]:
@@ -36,3 +46,22 @@ def test_every_code_of_the_status_is_documented_with_its_number(kind: type[IntEn
     documented = {pair for names, numbers in rows for pair in zip(names.split(", "), numbers.split(", "), strict=True)}
     in_dbc = {("".join(part.title() for part in code.name.split("_")), str(code.value)) for code in kind}
     assert in_dbc - documented == set()
+
+
+def test_the_lines_for_corrected_currents_in_the_layout_document_are_all_that_an_overlay_node_needs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They are put in as the document says, and a template of the layout then fits."""
+    document = (ROOT / "docs" / "layout.md").read_text()
+    layout = re.findall(r"(?s)```toml\n(.*?)```", document.partition("\n## ")[0])[0]
+    section = document.partition("\n## Signals for the corrected currents\n")[2].partition("\n## ")[0]
+    dbc, branch, status = re.findall(r"(?s)```(?:toml)?\n(.*?)```", section)
+    sign = re.findall(r"(?m)^sign = 1 .*\n", layout)[0]
+    (tmp_path / "my_car.toml").write_text(f"{layout.replace(sign, sign + branch)}\n{status}")
+    (tmp_path / "my_car.dbc").write_text(f"{MEASURED.format(senders=' CorrectionNode')}\n{dbc}")
+    files = ["--layout", str(tmp_path / "my_car.toml"), "--vehicle", "V1"]
+    assert main(["template", *files]) == 0
+    (tmp_path / "V1.json").write_text(capsys.readouterr().out)
+    assert main(["check", "--params", str(tmp_path / "V1.json"), *files, "--json"]) == 0
+    targets = {name: item["target"] for name, item in json.loads(capsys.readouterr().out)["branches"].items()}
+    assert targets == {"battery": "BMS_1_Corrected.PackCurrentCorrected", "motor": None}

@@ -62,6 +62,25 @@ def test_three_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -> Non
     assert imported.returncode == 0, imported.stderr
 
 
+def test_with_one_car_the_template_of_the_guessed_layout_fits_as_the_document_types_it(tesla: Path) -> None:
+    """The commands of docs/first_minutes.md that need no bus; before them the load that it names."""
+    calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "one_car.toml"])
+    with (tesla / "one_car.toml").open("a") as file:
+        file.write("\n[unmeasured_load]\nmean_a = 4.1\nsd_a = 1.0\n")
+    section = (ROOT / "docs" / "first_minutes.md").read_text().partition("\n## With one car\n")[2]
+    typed = re.findall(r"(?m)^ecu-node (?:template|check) [^#\n]*", section.partition("\n## ")[0])
+    assert len(typed) == 2
+    environment = {"PYTHONPATH": str(ROOT), "PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin", "HOME": str(tesla)}
+    for command in typed:
+        line = command.replace("my_car.toml", "one_car.toml")
+        done = subprocess.run(
+            line, shell=True, capture_output=True, text=True, check=False, cwd=tesla, env=environment, timeout=60
+        )
+        assert (done.returncode, done.stderr) == (0, ""), command
+    assert done.stdout.startswith("vehicle V1, parameter set 1: fit\n")
+    assert json.loads((tesla / "V1.json").read_text())["junction_residual"]["expected_a"] == 4.1
+
+
 def test_the_guessed_layout_has_the_branches_and_signs_of_the_one_written_by_hand(tesla: Path) -> None:
     calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "guessed.toml"])
     by_hand = read_layout(LAYOUT)
