@@ -39,8 +39,9 @@ def check_report(params: Path, layout: Path, vehicle: str | None, mode: Mode = M
     dict
         ``fit`` [bool], ``reason`` (name in the status message), ``message`` (why not, or None), ``vehicle``,
         ``parameter_set``, ``warnings`` (texts), and ``branches``: per branch drift [1], offset_a [A], sensor_model (its
-        kind, or None), applied, target, and plan: a dict with gain, voltage_gain, bias and shift; with a gain per sign,
-        positive and negative of these; None where the branch is not written or its plan depends on the temperature.
+        kind, or None) and apply, as the file says (0 and None where it does not name the branch), applied (whether it
+        is corrected), target, and plan: a dict with gain, voltage_gain, bias and shift; with a gain per sign, positive
+        and negative of these; None where the branch is not written or its plan depends on the temperature.
 
     Raises
     ------
@@ -69,9 +70,11 @@ def report_text(report: dict[str, Any]) -> str:
     width = max(map(len, ["branch", *report["branches"]]))
     lines.append(f"{'branch':<{width}}{'drift':>11}{'offset':>13}")
     for name, branch in report["branches"].items():
-        mark = "corrected" if branch["applied"] else "passed through"
+        has_fault = branch["drift"] or branch["offset_a"] or branch["sensor_model"] is not None
+        held_back = ', "apply" is false' if has_fault and branch["apply"] is False else ""
+        mark = "corrected" if branch["applied"] else f"passed through{held_back}"
         numbers = f"{name:<{width}}{branch['drift']:>+11.4%}{branch['offset_a']:>+11.3f} A"
-        lines.append(f"{numbers}  {mark if branch['target'] is not None else 'not published'}")
+        lines.append(f"{numbers}  {mark if branch['target'] is not None else f'not published{held_back}'}")
         if branch["target"] is not None:
             lines.append(f"  target {branch['target']}")
             lines += _plan_lines(branch) if branch["applied"] else []
@@ -109,13 +112,16 @@ def _numbers(plan: dict[str, int]) -> str:
 
 
 def _branch(database: VehicleDatabase, branch: Branch, in_force: InForce, mode: Mode) -> dict[str, Any]:
+    found = in_force.parameters.branches.get(branch.name) if in_force.parameters is not None else None
+    model = found.sensor_model if found is not None else None
     fault = sensor_fault(database, in_force, branch.name)
     target = branch.corrected if mode is Mode.OVERLAY else branch.source
     plan = branch_plan(database, branch, fault, mode) if target is not None else None
     return {
-        "drift": fault.drift,
-        "offset_a": fault.offset_a,
-        "sensor_model": type(fault.model).__struct_config__.tag if fault.model is not None else None,
+        "drift": found.drift if found is not None else 0.0,
+        "offset_a": found.offset_a if found is not None else 0.0,
+        "sensor_model": type(model).__struct_config__.tag if model is not None else None,
+        "apply": found.apply if found is not None else None,
         "applied": fault.applied,
         "target": target,
         "plan": _plan(plan),

@@ -15,7 +15,7 @@ from ecu_node import __version__
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import parameter_schema, write_parameters
-from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, parameters_for
+from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, as_document, parameters_for
 
 
 @pytest.fixture
@@ -54,6 +54,24 @@ def test_the_same_as_text(params: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert lines[dcdc].endswith("passed through")
     assert lines[dcdc + 1] == "  target HV_DcdcCorrected.DcdcCurrentCorrected"
     assert max(map(len, lines)) <= 80
+
+
+def test_a_fault_that_the_file_names_and_does_not_apply_is_shown_as_such(
+    database: VehicleDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    document = as_document(parameters_for(database, battery=(-0.01, 4.1), motor=(0.0, 0.0)))
+    document["branches"]["battery"]["apply"] = document["branches"]["motor"]["apply"] = False
+    path = tmp_path / "held.json"
+    path.write_text(json.dumps(document))
+    assert main(check(path)) == 0
+    shown = [line.split(maxsplit=4) for line in capsys.readouterr().out.splitlines()[2:7] if line[0] != " "]
+    assert shown[:2] == [
+        ["battery", "-1.0000%", "+4.100", "A", 'passed through, "apply" is false'],
+        ["motor", "+0.0000%", "+0.000", "A", "passed through"],
+    ]
+    assert main(check(path, "--json")) == 0
+    found = json.loads(capsys.readouterr().out)["branches"]["battery"]
+    assert (found["drift"], found["offset_a"], found["apply"], found["applied"]) == (-0.01, 4.1, False, False)
 
 
 @pytest.fixture
