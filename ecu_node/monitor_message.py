@@ -4,13 +4,14 @@ from collections import deque
 
 from cantools.database.can import Message
 
+from ecu_node.bits import PlacedSignal
 from ecu_node.database import VehicleDatabase
 from ecu_node.e2e import Check, Receiver
 from ecu_node.e2e_profiles import protection_of
 from ecu_node.monitor_view import FrameFaults
 from ecu_node.past import REMEMBERED_FRAMES, Frames
 
-__all__ = ["HeardMessage"]
+__all__ = ["HeardMessage", "answers_when_asked"]
 
 _RATE_WINDOW_S = 2.0
 """Frame rates are means over about this long. [s]"""
@@ -77,3 +78,32 @@ class HeardMessage:
             repeated=found[Check.REPEATED],
             lost=found[Check.LOST] + found[Check.JUMPED],
         )
+
+
+def answers_when_asked(asked: Frames, signal: PlacedSignal, answers: Frames) -> Frames:
+    """Answers of the node, at the times of the frames that they answer.
+
+    Parameters
+    ----------
+    asked : deque
+        Times [s] and payloads of a branch's frames.
+    signal : PlacedSignal
+        Its current in them.
+    answers : deque
+        Times [s] and payloads of its corrected messages.
+
+    Returns
+    -------
+    deque
+        Each answer at the time of the newest frame before it that no later answer has; a node that was held up answers
+        several frames at once. Answers to frames without the current repeat what was said before, and are left out.
+    """
+    found: Frames = deque()
+    frames = reversed(asked)
+    for answer_s, answer in reversed(answers):
+        asked_s, payload = next((frame for frame in frames if frame[0] <= answer_s), (0.0, None))
+        if payload is None:
+            break
+        if signal.code(payload) is not None:
+            found.appendleft((asked_s, answer))
+    return found

@@ -1,11 +1,13 @@
 """What a listener sees of the junction and of the node, from the frames of one bus: frames and times in, a view out.
 
 Nothing of the node is asked: measured and corrected currents, their sums, rates and faults are worked out from what is
-on the bus. Sums are taken as the node takes them, of all branches in one instant of the junction; the calibrated delays
-of the branches are in the parameter file alone, and not known here. Currents are positive into the junction. Times are
+on the bus. Sums are taken as the node takes them, of all branches in one instant of the junction, and both in the same
+one: an answer counts at the time of the frame that it answers. The calibrated delays of the branches are in the
+parameter file alone, and not known here. Currents are positive into the junction. Times are
 those of one steady clock. [s]
 """
 
+from collections import deque
 from collections.abc import Sequence
 
 from cantools.database.can import Signal
@@ -20,7 +22,7 @@ from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode, key_of, received, transmitted
 from ecu_node.junction_watch import simultaneous_currents
 from ecu_node.layout import Branch, SignalName, StatusMessage
-from ecu_node.monitor_message import HeardMessage
+from ecu_node.monitor_message import HeardMessage, answers_when_asked
 from ecu_node.monitor_view import BranchView, FrameFaults, NodeView, Sums, View
 from ecu_node.past import Frames, Past
 from ecu_node.status import Quality
@@ -86,13 +88,9 @@ class BusMonitor:
             heard.count_rate(now_s)
         pairs = self._branches
         publishes = any(pair.corrected is not None and pair.corrected.is_fitted for pair in pairs)
-        after = [pair.shown for pair in pairs if pair.measured.is_fitted]
         return View(
             branches=tuple(pair.view(now_s) for pair in pairs),
-            sums=Sums(
-                measured_a=_sum([pair.measured for pair in pairs if pair.measured.is_fitted], now_s),
-                corrected_a=_sum(after, now_s) if publishes else None,
-            ),
+            sums=_sums([pair for pair in pairs if pair.measured.is_fitted], now_s, publishes=publishes),
             node=self._status.view(now_s) if self._status is not None else None,
             has_status=self._status is not None,
             publishes_corrected=publishes,
@@ -118,19 +116,28 @@ class _Pair:
             return made
 
         self.measured = current(branch.source, signals.source)
-        self._past = Past(*_followed(database, branch.source, heard))
         self._heard = _heard_of(database, branch.source, heard)
+        self._source = _followed(database, branch.source, heard)
         self.corrected: LiveBranch | None = None
+        self._answered: LiveBranch | None = None
+        self._answers: Frames = deque()
         self._corrected_heard: HeardMessage | None = None
         if branch.corrected is not None:
             self.corrected = current(branch.corrected, signals.target)
+            self._answered = current(branch.corrected, signals.target)
+            self._answered.follow(_followed(database, branch.corrected, heard)[0], self._answers)
             self._corrected_heard = _heard_of(database, branch.corrected, heard)
+        self._past = Past(*self._source)
         self._quality = bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None
 
-    @property
-    def shown(self) -> LiveBranch:
+    def answered(self) -> LiveBranch:
         """What counts in the corrected sum: the measured current where the layout publishes no corrected one."""
-        return self.measured if self.corrected is None else self.corrected
+        if self._answered is None or self._corrected_heard is None:
+            return self.measured
+        signal, frames = self._source
+        self._answers.clear()
+        self._answers.extend(answers_when_asked(frames, signal, self._corrected_heard.frames))
+        return self._answered
 
     def view(self, now_s: float) -> BranchView:
         """What is to be shown."""
@@ -226,10 +233,24 @@ def _newest(branch: LiveBranch) -> float | None:
     return currents[0] if currents is not None else None
 
 
-def _sum(branches: Sequence[LiveBranch], now_s: float) -> float | None:
-    """Sum in the newest instant that all branches have reached [A]; None while one is stale or has no value."""
-    found = simultaneous_currents(branches, {}, now_s)
-    return sum(measured_a for measured_a, _ in found[1].values()) if found is not None else None
+def _sums(pairs: Sequence[_Pair], now_s: float, *, publishes: bool) -> Sums:
+    """Sums in the newest instant that all have reached; None while a branch is stale or has no value. [A]"""
+    measured = [pair.measured for pair in pairs]
+    after = simultaneous_currents([pair.answered() for pair in pairs], {}, now_s) if publishes else None
+    if after is None:
+        before = simultaneous_currents(measured, {}, now_s)
+        return Sums(measured_a=_total([*before[1].values()]) if before is not None else None)
+    instant_s, corrected = after
+    return Sums(
+        measured_a=_total([branch.currents_at(instant_s) for branch in measured]),
+        corrected_a=_total([*corrected.values()]),
+    )
+
+
+def _total(currents: Sequence[tuple[float, float] | None]) -> float | None:
+    """Sum of the first of each [A]; None if one is not known."""
+    known = [pair[0] for pair in currents if pair is not None]
+    return sum(known) if len(known) == len(currents) else None
 
 
 def _value(codes: Codes | None, payload: bytearray) -> float | None:

@@ -50,6 +50,10 @@ REASONS = {
 }
 
 
+_PASSING = (State.PASSING_THROUGH, State.SHADOW)
+"""States in which the status tells a corrected sum that nobody publishes."""
+
+
 class Row(NamedTuple):
     """One line of the table."""
 
@@ -82,9 +86,14 @@ def notes(view: View) -> list[str]:
     """What else a reader should know."""
     if not view.is_any_branch_seen:
         return ["no frame of any branch: is the bus awake, and its bit rate the right one?"]
+    told = []
     if not view.publishes_corrected:
-        return ["no corrected messages on this bus: the currents are shown as they are on it"]
-    return []
+        told.append("no corrected messages on this bus: the currents are shown as they are on it")
+    node = view.node
+    is_passing = node is not None and not node.is_silent and node.state in _PASSING
+    if node is not None and is_passing and node.sums.corrected_a != node.sums.measured_a:
+        told.append("node's sum, corrected: what its parameters would make of it; it publishes what was measured")
+    return told
 
 
 def rows(view: View) -> list[Row]:

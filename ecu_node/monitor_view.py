@@ -70,7 +70,7 @@ class BranchView:
 
 @dataclass(frozen=True, kw_only=True)
 class Sums:
-    """Kirchhoff sum of all branches, measured and corrected [A]; None where it is not known."""
+    """Kirchhoff sum of all branches, measured and corrected, in one instant [A]; None where it is not known."""
 
     measured_a: float | None = None
     corrected_a: float | None = None

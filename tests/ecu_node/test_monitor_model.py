@@ -95,6 +95,53 @@ def test_sums_are_taken_in_one_instant(bus: Bus) -> None:
     assert sums.corrected_a == pytest.approx(0.0, abs=0.02)
 
 
+def test_while_the_node_passes_through_the_sum_after_is_the_sum_before_however_late_it_answers(bus: Bus) -> None:
+    """Currents that rise by 1000 A/s with a sum of 5 A; the motor's frames are answered three at a time."""
+    waiting: list[float] = []
+    for k in range(30):
+        t = 0.02 * k
+        bus.battery(t, 1000.0 * t + 5.0)
+        bus.motor(t + 0.003, 1000.0 * (t + 0.003))
+        waiting.append(1000.0 * (t + 0.003))
+        bus.send("HV_BatteryCorrected", t + 0.008, BatteryCurrentCorrected=1000.0 * t + 5.0, BatteryCurrentQuality=1)
+        for motor_a in waiting if k % 3 == 2 else ():
+            bus.send("HV_MotorCorrected", t + 0.012, MotorCurrentCorrected=motor_a, MotorCurrentQuality=1)
+        waiting = waiting if k % 3 != 2 else []
+        for look_s in (t + 0.001, t + 0.013):
+            sums = bus.look(look_s).sums
+            if sums.corrected_a is not None:
+                assert (sums.measured_a, sums.corrected_a) == pytest.approx((5.0, 5.0), abs=0.03)
+    assert sums.corrected_a is not None
+
+
+def test_answers_to_frames_that_came_before_the_monitor_do_not_count_in_the_sum(bus: Bus) -> None:
+    bus.send("HV_BatteryCorrected", 0.001, BatteryCurrentCorrected=500.0)
+    assert bus.look(0.002).sums == Sums()
+    bus.battery(0.02, 100.0, 95.0)
+    bus.motor(0.02, 80.0, 80.0)
+    sums = bus.look(0.03).sums
+    assert (sums.measured_a, sums.corrected_a) == pytest.approx((20.0, 15.0))
+
+
+def test_answers_to_frames_without_the_current_do_not_count_in_the_sum(
+    make_database: Callable[..., VehicleDatabase],
+) -> None:
+    """The battery's frames have its current every other time: 40 A, then 60 A, and the heater's of halfway 10 A."""
+    dbc = SMALL_DBC.replace(
+        " SG_ Battery : 7|16@0-", ' SG_ Page M : 32|8@1+ (1,0) [0|255] "" Node\n SG_ Battery m0 : 7|16@0-'
+    )
+    monitor = BusMonitor(make_database(dbc=dbc), 0.0)
+    monitor.take((258, False), bytearray([*(40000).to_bytes(2, "little")]), 0.05)
+    monitor.take((0x200, True), bytearray([*(4000).to_bytes(2, "little"), 0, 0]), 0.05)
+    for k in range(7):
+        code = 100 * (k - k % 2)
+        pair = [*code.to_bytes(2, "big", signed=True), 0, 0, k % 2, 0, 0, 0]
+        monitor.take((256, False), bytearray(pair), 0.01 * k)
+        monitor.take((512, False), bytearray([*code.to_bytes(2, "little", signed=True), 0, 0, 2, 0, 0, 0]), 0.01 * k)
+    sums = monitor.look(0.06).sums
+    assert sums.measured_a == sums.corrected_a == pytest.approx(40.0)
+
+
 def test_a_sum_is_not_known_while_a_branch_is_stale_or_unanswered(bus: Bus) -> None:
     bus.battery(0.0, 100.0, 90.0)
     bus.motor(0.0, 80.0)

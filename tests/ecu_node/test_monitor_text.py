@@ -1,6 +1,7 @@
 """The words of the monitor: every state and reason, the plain block, JSON."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -130,6 +131,15 @@ def test_faults_are_told_and_those_that_last_stand_out(shown: BranchView, faults
 
 def test_a_branch_that_is_not_published_has_no_answers() -> None:
     assert rows(a_view(branch(corrected_a=None, corrected_rate_hz=0.0)))[0].cells[6] == "-"
+
+
+@pytest.mark.parametrize("state", [State.PASSING_THROUGH, State.SHADOW])
+def test_a_corrected_sum_of_the_node_that_nobody_publishes_is_explained(state: State) -> None:
+    words = "node's sum, corrected: what its parameters would make of it; it publishes what was measured"
+    assert notes(a_view(BRANCH, node=replace(NODE, state=state))) == [words]
+    passed = replace(NODE, state=state, sums=Sums(measured_a=12.0, corrected_a=12.0))
+    assert notes(a_view(BRANCH, node=passed)) == []
+    assert notes(a_view(BRANCH)) == []
 
 
 def test_what_a_bus_lacks_is_noted() -> None:
