@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import can
@@ -107,7 +107,7 @@ def run_monitor(options: MonitorOptions) -> int:
             view = None
             while view is None or (options.once_s is None and not stop()):
                 listen(bus, monitor, time.monotonic() + period_s, stop)
-                view = monitor.look(time.monotonic())
+                view = replace(monitor.look(time.monotonic()), is_bus_open=bus.is_open)
                 bus.count_dropped()
                 show(view, _bus_notes(counters))
         finally:

@@ -66,8 +66,10 @@ class Row(NamedTuple):
 
 
 def node_line(view: View) -> str:
-    """What the node does, and why, in one line."""
+    """What the node does, and why, in one line; or that the bus cannot be listened to."""
     node = view.node
+    if not view.is_bus_open:
+        return "this computer's interface failed or is down; trying to open it again; what is shown was heard before"
     if not view.has_status:
         return "the layout has no status message: nothing is known of a node"
     if node is None:
@@ -84,7 +86,7 @@ def node_line(view: View) -> str:
 
 def notes(view: View) -> list[str]:
     """What else a reader should know."""
-    if not view.is_any_branch_seen:
+    if not view.is_any_branch_seen and view.is_bus_open:
         return ["no frame of any branch: is the bus awake, and its bit rate the right one?"]
     told = []
     if not view.publishes_corrected:

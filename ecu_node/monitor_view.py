@@ -121,6 +121,8 @@ class View:
         Whether the layout has a status message at all.
     publishes_corrected : bool
         Whether a corrected message ever came; there is none on the buses of a gateway.
+    is_bus_open : bool
+        Whether the bus can be listened to; if not, all this was heard before.
     """
 
     branches: tuple[BranchView, ...]
@@ -128,6 +130,7 @@ class View:
     node: NodeView | None
     has_status: bool
     publishes_corrected: bool
+    is_bus_open: bool = True
 
     @property
     def is_any_branch_seen(self) -> bool:

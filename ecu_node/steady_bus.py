@@ -76,6 +76,11 @@ class SteadyBus:
         opened = self._opened
         return opened is not None and opened.link.at_hand
 
+    @property
+    def is_open(self) -> bool:
+        """Whether it is there; False from when it failed until it is open again."""
+        return self._opened is not None
+
     def receive(self, timeout_s: float) -> can.Message | None:
         """Wait for a data or remote frame; None if none came in time, or the bus is gone."""
         if self._failed is not None:

@@ -1,5 +1,6 @@
 """``ecu-node monitor`` on python-can's virtual bus: plain blocks, JSON, a real terminal, exit codes."""
 
+import errno
 import json
 import os
 import pty
@@ -11,9 +12,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Never
 
 import can
 import pytest
+from can.interfaces.virtual import VirtualBus
 
 from ecu_node.cli import main
 from ecu_node.counters import Counters
@@ -40,6 +43,13 @@ def handlers() -> Iterator[None]:
 def battery_frame(database: VehicleDatabase, counter: int) -> can.Message:
     data = protected(database, "HV_Battery", counter % 15, BatteryCurrent=100.0)
     return can.Message(arbitration_id=0x110, is_extended_id=False, data=data)
+
+
+class FailingBus(VirtualBus):
+    """A bus whose interface is down, as one of SocketCAN tells it."""
+
+    def _recv_internal(self, timeout: float | None) -> Never:
+        raise can.CanOperationError("Network is down", errno.ENETDOWN)
 
 
 @contextmanager
@@ -82,6 +92,26 @@ def test_once_as_json(database: VehicleDatabase, capsys: pytest.CaptureFixture[s
     document = json.loads(capsys.readouterr().out)
     assert document["branches"][0]["measured_a"] == pytest.approx(100.0)
     assert document["branches"][0]["rate_hz"] > 0.0
+
+
+def test_that_its_own_interface_is_down_stands_in_the_head_until_it_is_back(
+    database: VehicleDatabase, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ecu_node.monitor.open_bus", lambda *_, channel, **__: FailingBus(channel))
+    assert main([*MONITOR, "--once", "0.2"]) == 1
+    captured = capsys.readouterr()
+    lines = captured.out.splitlines()
+    assert lines[0].startswith(
+        f"virtual {CHANNEL}: this computer's interface failed or is down; trying to open it again"
+    )
+    assert "is the bus awake" not in captured.out
+    assert main([*MONITOR, "--once", "0.2", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["is_bus_open"] is False
+    kinds = iter([FailingBus])
+    monkeypatch.setattr("ecu_node.monitor.open_bus", lambda *_, channel, **__: next(kinds, VirtualBus)(channel))
+    with battery_on_bus(database):
+        assert main([*MONITOR, "--once", "0.5"]) == 0
+    assert capsys.readouterr().out.startswith(f"virtual {CHANNEL}: no node on this bus\n")
 
 
 def test_a_bus_without_any_branch_ends_in_1(capsys: pytest.CaptureFixture[str]) -> None:
