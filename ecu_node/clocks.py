@@ -45,15 +45,26 @@ class TimeOfDay:
 
     def __init__(self, counters: Counters) -> None:
         self._counters = counters
-        self._ahead_s = time.time() - time.monotonic()
+        while (ahead_s := _ahead_s()) is None:
+            pass
+        self._ahead_s = ahead_s
         self._set_s = float("-inf")
 
     def ahead_s(self) -> float:
         """By how much it is ahead now [s]; infinity while frames may be waiting that were stamped before it was set."""
         now_s = time.monotonic()
-        ahead_s = time.time() - now_s
+        ahead_s = _ahead_s()
+        if ahead_s is None:
+            ahead_s = self._ahead_s
         if abs(ahead_s - self._ahead_s) > _LARGEST_JITTER_S:
             self._set_s = now_s
             self._counters.clock_steps += 1
         self._ahead_s = ahead_s
         return ahead_s if now_s - self._set_s > _OLDEST_FRAME_S else float("inf")
+
+
+def _ahead_s() -> float | None:
+    """By how much the time of day is ahead [s]; None if the process was held up between reading the two clocks."""
+    before_s = time.monotonic()
+    ahead_s = time.time() - before_s
+    return ahead_s if time.monotonic() - before_s < _LARGEST_JITTER_S else None

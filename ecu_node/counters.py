@@ -50,7 +50,7 @@ class Counters:
     reopened: int = 0
     """Times that the bus was opened again."""
     clock_steps: int = 0
-    """Times that the time of day was set; the times of reading are taken for a while after that."""
+    """Times that the time of day jumped against the steady clock; the times of reading are taken for a while then."""
     reloads: int = 0
     """Parameter files that took the place of the one before."""
     reload_failures: int = 0

@@ -3,7 +3,7 @@
 import errno
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import deepcopy
@@ -14,6 +14,7 @@ from can.interfaces.virtual import VirtualBus
 from e2e.p01 import e2e_p01_check
 
 from ecu_node.buses import open_bus, receive_filters
+from ecu_node.clocks import TimeOfDay
 from ecu_node.corrector import Corrector
 from ecu_node.counters import Counters
 from ecu_node.database import VehicleDatabase
@@ -312,6 +313,32 @@ class SetClock:
 
     def time(self) -> float:
         return time.time() + self.ahead_s
+
+
+class HeldUpClock:
+    """The module ``time`` as a process reads it that is held up for 80 ms now and then, also between two clocks."""
+
+    def __init__(self, held_up: Collection[int]) -> None:
+        self._held_up, self._now_s, self._reads = held_up, 100.0, 0
+
+    def monotonic(self) -> float:
+        self._now_s += 0.08 if self._reads in self._held_up else 0.0001
+        self._reads += 1
+        return self._now_s
+
+    def time(self) -> float:
+        return self.monotonic() + 1.7e9
+
+
+@pytest.mark.parametrize("held_up", [range(read, 100, every) for every in (7, 11, 1000) for read in range(7)])
+def test_a_process_that_is_held_up_between_two_clocks_does_not_take_that_for_a_clock_that_was_set(
+    held_up: range, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ecu_node.clocks.time", HeldUpClock(held_up))
+    counters = Counters()
+    time_of_day = TimeOfDay(counters)
+    assert [time_of_day.ahead_s() for _ in range(20)] == pytest.approx([1.7e9] * 20, abs=0.05)
+    assert counters.clock_steps == 0
 
 
 def test_a_frame_that_comes_after_the_clock_was_set_is_not_taken_for_an_old_one(
