@@ -20,7 +20,7 @@ from ecu_node.layout import read_layout
 from ecu_node.overlay_node import OverlayNode
 from ecu_node.parameter_file import ParameterFile, ParameterSource
 from ecu_node.service import Log, Requests, ServiceManager
-from ecu_node.status import Reason, State
+from ecu_node.state_changes import StateChanges
 from ecu_node.steady_bus import SteadyBus
 from ecu_node.wiring import wire
 
@@ -185,7 +185,7 @@ class _Tick:
     ) -> None:
         self._corrector, self._buses, self._file, self._requests = corrector, buses, file, requests
         self._manager, self._say = manager, say
-        self._before = corrector.latched
+        self._changes = StateChanges(corrector)
 
     def __call__(self, now_s: float, works: bool) -> None:
         corrector = self._corrector
@@ -195,26 +195,10 @@ class _Tick:
             bus.count_dropped()
         if self._file.look(corrector, now_s, asked=self._requests.take_reload()):
             self._manager.status(f"parameter set {corrector.parameter_set} is in force")
-        if corrector.latched is not self._before:
-            self._before = corrector.latched
-            text = self._text()
+        text = self._changes.news()
+        if text is not None:
             self._say(text)
             self._manager.status(text)
-
-    def _text(self) -> str:
-        corrector = self._corrector
-        which = ", ".join(corrector.latched_branches)
-        match corrector.latched:
-            case Reason.BRANCH_STALE:
-                return f"passing measured values through until the bus has slept: no frames of {which}"
-            case Reason.BRANCH_STUCK:
-                return f"passing measured values through until the bus has slept: {which} never changes"
-            case Reason.CORRECTION_WORSE:
-                return (
-                    "passing measured values through until the bus has slept: the corrected Kirchhoff sum is worse "
-                    "than the measured one"
-                )
-        return "the bus sleeps" if corrector.state()[0] is State.ASLEEP else "correcting again"
 
 
 def _what(corrector: Corrector, database: VehicleDatabase, file: ParameterSource, mode: Mode) -> str:
