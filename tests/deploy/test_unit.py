@@ -57,6 +57,19 @@ def test_systemd_finds_nothing_wrong_with_it(analyze: str, unit: Path) -> None:
     assert (result.returncode, about_it) == (0, []), result.stderr
 
 
+def test_before_the_program_is_installed_the_check_of_the_installation_document_says_so(
+    analyze: str, tmp_path: Path
+) -> None:
+    document = (UNIT.parent / "README.md").read_text()
+    assert "systemd-analyze verify /etc/systemd/system/ecu-node@.service" in document
+    unit = tmp_path / UNIT.name
+    unit.write_text(UNIT.read_text().replace("/opt/ecu-node", f"{tmp_path}/none"))
+    result = run(analyze, "verify", str(unit))
+    assert result.returncode == 1
+    assert f"Command {tmp_path}/none/bin/ecu-node is not executable" in result.stderr
+    assert "`Command ... is not executable`" in document
+
+
 def test_systemd_would_find_what_is_wrong_with_it(analyze: str, unit: Path) -> None:
     unit.write_text(unit.read_text().replace("WatchdogSec=5s", "WatchdogSec=often"))
     result = run(analyze, "verify", "--man=no", "--recursive-errors=no", str(unit))
