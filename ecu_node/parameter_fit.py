@@ -65,13 +65,15 @@ def _check_belongs(parameters: VehicleParameters, database: VehicleDatabase, veh
         raise UnfitError(
             Reason.WRONG_LAYOUT,
             f"parameters were made with layout {shown_name(parameters.layout.name)} ({parameters.layout.sha256[:12]}), "
-            f"this is {layout.path} ({layout.digest[:12]}); calibrate with this layout",
+            f"this is {layout.path} ({layout.digest[:12]}); calibrate with this layout; for a file "
+            "made by hand print a new 'ecu-node template'",
         )
     if parameters.dbc.sha256 != database.digest:
         raise UnfitError(
             Reason.WRONG_DBC,
             f"parameters were made with DBC {shown_name(parameters.dbc.name)} ({parameters.dbc.sha256[:12]}), "
-            f"this is {layout.dbc_path} ({database.digest[:12]}); calibrate with this DBC",
+            f"this is {layout.dbc_path} ({database.digest[:12]}); calibrate with this DBC; for a file "
+            "made by hand print a new 'ecu-node template'",
         )
 
 

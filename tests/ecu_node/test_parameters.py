@@ -233,8 +233,8 @@ def test_a_file_that_is_not_there_is_no_parameters(tmp_path: Path) -> None:
     ("faults", "change", "vehicle", "reason", "words"),
     [
         ({"battery": (0.1, 1.0)}, {}, "v2", Reason.WRONG_VEHICLE, "are for vehicle 'v1', this is 'v2'"),
-        ({"battery": (0.1, 1.0)}, {"layout": "0" * 64}, None, Reason.WRONG_LAYOUT, "layout .*000000000000.*calibrate"),
-        ({"battery": (0.1, 1.0)}, {"dbc": "0" * 64}, None, Reason.WRONG_DBC, "DBC .*000000000000"),
+        ({"battery": (0.1, 1.0)}, {"layout": "0" * 64}, None, Reason.WRONG_LAYOUT, "000000000000.*calibrate.*template"),
+        ({"battery": (0.1, 1.0)}, {"dbc": "0" * 64}, None, Reason.WRONG_DBC, "DBC .*000000000000.*template"),
         ({"fridge": (0.1, 1.0)}, {}, None, Reason.WRONG_LAYOUT, "branch 'fridge', which .* does not have"),
         ({"battery": (0.41, 1.0)}, {}, None, Reason.IMPLAUSIBLE_PARAMETERS, r"drift \+0.41 is beyond .* 0.4"),
         ({"motor": (0.1, -151.0)}, {}, None, Reason.IMPLAUSIBLE_PARAMETERS, "offset -151 A is beyond .* 150 A"),
