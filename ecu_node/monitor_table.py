@@ -122,4 +122,4 @@ def _cropped(lines: list[Line], height: int) -> list[Line]:
     if len(lines) <= height:
         return lines
     shown = height - 1
-    return [*lines[:shown], Line(f"{len(lines) - shown} more lines: the terminal is too low", "yellow")]
+    return [*lines[:shown], Line(f"{len(lines) - shown} more lines do not fit", "yellow")]

@@ -118,7 +118,11 @@ def test_a_line_is_marked_by_what_it_tells() -> None:
 def test_a_low_terminal_shows_the_first_lines_and_says_how_many_are_missing() -> None:
     assert drawn(80, height=12)[-1] == "error frames of the bus: 3"  # without the empty lines all have room
     low = drawn(80, height=6)
-    assert low[-2:] == [drawn(80)[5], "7 more lines: the terminal is too low"]
+    assert low[-2:] == [drawn(80)[5], "7 more lines do not fit"]
+
+
+def test_that_lines_are_missing_is_said_whole_on_a_small_terminal() -> None:
+    assert drawn(30, height=8)[-1].endswith(" more lines do not fit")
 
 
 def test_the_longest_reason_is_wrapped() -> None:
