@@ -32,7 +32,8 @@ def add_template_command(commands: "argparse._SubParsersAction[Any]") -> None:
         description="Prints a parameter file that fits the layout and corrects nothing yet. Where the fault of a "
         "sensor was measured, write it there: drift [1], offset_a [A, positive into the junction], and "
         '"apply": true; measured = (1 + drift) * true + offset. A load that no branch measures stands in '
-        "expected_a [A], as [unmeasured_load] of the layout says. All else can stay as it is.",
+        "expected_a [A], as [unmeasured_load] of the layout says. Take out branches that this vehicle does not have: "
+        "the node would wait for their frames. All else can stay as it is.",
         epilog="Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted.",
     )
     template.add_argument(

@@ -119,4 +119,6 @@ def test_help_says_what_to_fill_in(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         main(["template", "--help"])
     assert caught.value.code == 0
-    assert '"apply": true' in capsys.readouterr().out
+    words = " ".join(capsys.readouterr().out.split())
+    assert '"apply": true' in words
+    assert "Take out branches that this vehicle does not have" in words
