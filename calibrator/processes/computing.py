@@ -1,6 +1,7 @@
 """Computing in worker processes: they leave Ctrl-C to this one, as each would print a traceback."""
 
 import signal
+import warnings
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -31,6 +32,9 @@ def in_processes(tasks: Iterable[Any], *, workers: int) -> Iterator[Any]:
     FleetError
         If a process died.
     """
+    # A worker that has waited for long ends itself and is replaced: nothing that a user should read of. Where warnings
+    # are errors, the thread that replaces it would end instead, and the results never come.
+    warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
     # Not through shared files (max_nbytes), which would outlive a process that is killed.
     parallel = Parallel(n_jobs=workers, return_as="generator", max_nbytes=None)
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

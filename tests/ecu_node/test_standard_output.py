@@ -16,6 +16,11 @@ MONITOR = ["monitor", "--layout", str(LAYOUT), "--interface", "virtual", "--chan
 LINE = ": standard output: cannot write the result: File too large; give it somewhere else to go\n"
 
 
+def without_coverage() -> dict[str, str]:
+    """The environment, less what makes coverage write a file at exit: where none can be written it says so, too."""
+    return {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}
+
+
 def written_nowhere(
     tmp_path: Path, program: str, *arguments: str, unbuffered: str = ""
 ) -> subprocess.CompletedProcess[str]:
@@ -28,7 +33,7 @@ def written_nowhere(
             text=True,
             timeout=60,
             check=False,
-            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+            env={**without_coverage(), "PYTHONUNBUFFERED": unbuffered},
         )
 
 
