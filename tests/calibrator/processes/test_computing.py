@@ -1,4 +1,4 @@
-"""Results of worker processes come in order, and a worker that is replaced is nothing to warn of (warnings are errors here)."""
+"""Results of worker processes come in order; a worker that is replaced is nothing to warn of (warnings are errors)."""
 
 import warnings
 
