@@ -130,12 +130,17 @@ class Corrector:
         elif self.watch.is_worse():
             self._latch(Reason.CORRECTION_WORSE)
 
+    @property
+    def is_asleep(self) -> bool:
+        """Whether all branches are silent that were heard before."""
+        return self._silent and self._was_awake
+
     def state(self) -> tuple[State, Reason]:
         """What the node does, and why."""
         reason = self.reason if self.reason is not Reason.NONE else self.latched
         if reason is not Reason.NONE:
             return State.PASSING_THROUGH, reason
-        if self._silent and self._was_awake:
+        if self.is_asleep:
             return State.ASLEEP, Reason.NONE
         applied = [branch for branch in self.branches if branch.fault.applied]
         if not applied:

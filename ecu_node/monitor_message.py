@@ -1,6 +1,8 @@
 """One message as ``ecu-node monitor`` hears it. Times are those of one steady clock. [s]"""
 
 from collections import deque
+from collections.abc import Sequence
+from heapq import merge
 
 from cantools.database.can import Message
 
@@ -80,13 +82,15 @@ class HeardMessage:
         )
 
 
-def answers_when_asked(asked: Frames, signal: PlacedSignal, answers: Frames) -> Frames:
+def answers_when_asked(asked: Frames, others: Sequence[Frames], signal: PlacedSignal, answers: Frames) -> Frames:
     """Answers of the node, at the times of the frames that they answer.
 
     Parameters
     ----------
     asked : deque
         Times [s] and payloads of a branch's frames.
+    others : sequence of deque
+        The same of other messages that the same corrected message answers.
     signal : PlacedSignal
         Its current in them.
     answers : deque
@@ -99,11 +103,14 @@ def answers_when_asked(asked: Frames, signal: PlacedSignal, answers: Frames) -> 
         several frames at once. Answers to frames without the current repeat what was said before, and are left out.
     """
     found: Frames = deque()
-    frames = reversed(asked)
+    own = ((time_s, payload) for time_s, payload in reversed(asked))
+    sources = [own, *(((time_s, None) for time_s, _ in reversed(frames)) for frames in others)]
+    newest_first = merge(*sources, key=lambda frame: -frame[0])
     for answer_s, answer in reversed(answers):
-        asked_s, payload = next((frame for frame in frames if frame[0] <= answer_s), (0.0, None))
-        if payload is None:
+        frame = next((frame for frame in newest_first if frame[0] <= answer_s), None)
+        if frame is None:
             break
-        if signal.code(payload) is not None:
+        asked_s, payload = frame
+        if payload is not None and signal.code(payload) is not None:
             found.appendleft((asked_s, answer))
     return found

@@ -21,7 +21,7 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode, key_of, received, transmitted
 from ecu_node.junction_watch import simultaneous_currents
-from ecu_node.layout import Branch, SignalName, StatusMessage
+from ecu_node.layout import Branch, SignalName, StatusMessage, split_signal
 from ecu_node.monitor_message import HeardMessage, answers_when_asked
 from ecu_node.monitor_view import BranchView, FrameFaults, NodeView, Sums, View
 from ecu_node.past import Frames, Past
@@ -127,6 +127,15 @@ class _Pair:
             self._answered = current(branch.corrected, signals.target)
             self._answered.follow(_followed(database, branch.corrected, heard)[0], self._answers)
             self._corrected_heard = _heard_of(database, branch.corrected, heard)
+        same = [
+            other.source
+            for other in database.layout.branch
+            if branch.corrected is not None
+            and other.corrected is not None
+            and split_signal(other.corrected)[0] == split_signal(branch.corrected)[0]
+        ]
+        asked = {id(frames): frames for frames in (_heard_of(database, name, heard).frames for name in same)}
+        self._others = [frames for frames in asked.values() if frames is not self._source[1]]
         self._past = Past(*self._source)
         self._quality = bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None
 
@@ -136,7 +145,7 @@ class _Pair:
             return self.measured
         signal, frames = self._source
         self._answers.clear()
-        self._answers.extend(answers_when_asked(frames, signal, self._corrected_heard.frames))
+        self._answers.extend(answers_when_asked(frames, self._others, signal, self._corrected_heard.frames))
         return self._answered
 
     def view(self, now_s: float) -> BranchView:

@@ -1,7 +1,7 @@
 """What the log is told of the state: that the node falls back, and why, that the bus sleeps, and when that is over."""
 
 from ecu_node.corrector import Corrector
-from ecu_node.status import Reason, State
+from ecu_node.status import Reason
 
 __all__ = ["StateChanges"]
 
@@ -23,7 +23,7 @@ class StateChanges:
         """One line on what has changed since the last time; None if nothing has."""
         corrector = self._corrector
         before = self._before
-        latched, asleep = self._before = corrector.latched, corrector.told[0] is State.ASLEEP
+        latched, asleep = self._before = corrector.latched, corrector.is_asleep
         if self._before == before:
             return None
         if latched is not Reason.NONE:
@@ -31,8 +31,8 @@ class StateChanges:
         if asleep:
             return "the bus sleeps"
         if before[0] is not Reason.NONE:
-            return "correcting again"
-        return "the bus is awake again" if corrector.reason is Reason.NONE else None
+            return "correcting again" if corrector.reason is Reason.NONE else None
+        return "the bus is awake again"
 
     def _why(self) -> str:
         which = ", ".join(self._corrector.latched_branches)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ecu_node import __version__
+from ecu_node.errors import LayoutError
 from ecu_node.standard_output import write_output
 
 if TYPE_CHECKING:
@@ -80,6 +81,11 @@ def template_text(database: "VehicleDatabase", vehicle: str, now: datetime) -> s
     """
     layout = database.layout
     load = layout.unmeasured_load
+    if load is not None and load.mean_a > layout.offset_limit_a:
+        raise LayoutError(
+            f"{layout.path}: [unmeasured_load] mean_a = {load.mean_a:g} is beyond the layout's limit of "
+            f"{layout.offset_limit_a:g} A ([limits] offset_a), so that no parameters would fit; correct one of them"
+        )
     document = {
         "schema_version": 1,
         "vehicle": vehicle,

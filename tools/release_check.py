@@ -2,8 +2,8 @@
 """Measure again, on one commit, everything that was promised: one table of bar, figure, met or not.
 
 Takes some hours. What a step has measured is kept in the folder, and holds as long as the files that it ran say the
-same: the same command goes on from there, and a commit that changes documents only measures nothing again. A step that
-fails, or a figure that is missing, is a row that is not met.
+same: the same command goes on from there, and a commit that changes documents runs the tests again, and measures
+nothing anew. A step that fails is run again the next time; a figure that is missing is a row that is not met.
 """
 
 import json
@@ -51,12 +51,12 @@ def main(
         raise UserError(f"--only {', '.join(sorted(unknown))}: expected some of {', '.join(s.name for s in wanted)}")
     for step in wanted:
         if not only or step.name in only:
-            _run(step, out, commit)
+            run_step(step, out, commit)
     promises = [promise for judge in _judges(out) for promise in _judged(judge)]
     promises += [
         Promise(what=f"step {step.name!r}", bar="was run on these files", figure="was not", met=False)
         for step in wanted
-        if not _holds(step, out)
+        if not holds(step, out)
     ]
     text = _table(promises, commit, _measured_at(wanted, out))
     write_atomically(out / "release.md", text.encode())
@@ -79,44 +79,51 @@ def _judged(judge: Callable[[], Iterator[Promise]]) -> Iterator[Promise]:
     """What a judge says; one more row, not met, if it lacks a figure."""
     try:
         yield from judge()
-    except (MissingFigureError, OSError, ValueError) as error:
+    except (MissingFigureError, OSError, ValueError, LookupError, TypeError) as error:
         yield Promise(what="a figure", bar="is measured", figure=f"missing: {error}", met=False)
 
 
-def _run(step: Step, out: Path, commit: str) -> None:
+def run_step(step: Step, out: Path, commit: str) -> None:
     """Run a step unless its figures hold; what it prints and how it ended is kept."""
-    if _holds(step, out):
+    if holds(step, out):
         return
     print(f"release check: {step.name}", file=sys.stderr, flush=True)
+    for name in (step.name, *step.feeds):
+        _record(name, out).unlink(missing_ok=True)
+    inputs = digest(ROOT, step.runs)
     start_s = time.monotonic()
     with _output(out, step.name).open("wb") as output:
         code = subprocess.run(
             step.command, cwd=ROOT, stdout=output, env={**os.environ, **step.environment}, check=False
         ).returncode
     minutes = (time.monotonic() - start_s) / 60.0
-    found = {"commit": commit, "inputs": digest(ROOT, step.runs), "command": step.command, "code": code}
-    write_atomically(_record(step, out), json.dumps({**found, "minutes": minutes}, indent=2).encode())
+    found = {"commit": commit, "inputs": inputs, "command": step.command, "code": code}
+    if digest(ROOT, step.runs) != inputs:
+        raise UserError(f"{ROOT}: files of step {step.name!r} changed while it ran; run it again on one commit")
+    write_atomically(_record(step.name, out), json.dumps({**found, "minutes": minutes}, indent=2).encode())
 
 
-def _holds(step: Step, out: Path) -> bool:
-    """Whether a step was run to its end on files like those of this commit."""
-    if not _record(step, out).exists():
+def holds(step: Step, out: Path) -> bool:
+    """Whether a step did what it was to do, on files like those of this commit."""
+    if not _record(step.name, out).exists():
         return False
-    found = json.loads(_record(step, out).read_bytes())
-    return bool(found["code"] >= 0 and found["inputs"] == digest(ROOT, step.runs))
+    found = json.loads(_record(step.name, out).read_bytes())
+    return bool(
+        found["code"] == 0 and found["command"] == [*step.command] and found["inputs"] == digest(ROOT, step.runs)
+    )
 
 
 def _measured_at(measuring: list[Step], out: Path) -> dict[str, list[str]]:
     """The commits that figures are of, each with its steps."""
     found: dict[str, list[str]] = {}
     for step in measuring:
-        if _record(step, out).exists():
-            found.setdefault(json.loads(_record(step, out).read_bytes())["commit"], []).append(step.name)
+        if holds(step, out):
+            found.setdefault(json.loads(_record(step.name, out).read_bytes())["commit"], []).append(step.name)
     return found
 
 
-def _record(step: Step, out: Path) -> Path:
-    return out / f"{step.name.replace(' ', '_')}.json"
+def _record(name: str, out: Path) -> Path:
+    return out / f"{name.replace(' ', '_')}.step.json"
 
 
 def _output(out: Path, name: str) -> Path:

@@ -255,7 +255,7 @@ def _mean(facts: JunctionFacts, layout: Layout) -> Iterator[Finding]:
     spread_a = SURE * load.sd_a if load is not None else 0.0
     if unexplained_a < max(LEAST_MEAN_A, LEAST_MEAN * layout.full_scale_a, spread_a):
         return
-    beside = f" ({declared_a:g} A of it is the declared load)" if load is not None else ""
+    beside = f" ({declared_a:g} A are declared as a load)" if load is not None else ""
     yield Finding(
         severity=Severity.WARNING if unexplained_a > LARGE_MEAN * layout.full_scale_a else Severity.HINT,
         kind="mean",

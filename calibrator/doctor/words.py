@@ -37,6 +37,7 @@ def word_set(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
+_UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"})
 _JOINED = {"dc dc": "dcdc", "air con": "aircon", "air conditioning": "aircon", "e motor": "emotor", "low voltage": "lv"}
 """Words that mean something else apart."""
 
@@ -47,7 +48,7 @@ def words_of(*texts: str | None) -> tuple[str, ...]:
 
 
 def _joined(text: str) -> list[str]:
-    words = f" {' '.join(_SPLIT.findall(text)).lower()} "
+    words = f" {' '.join(_SPLIT.findall(text.translate(_UMLAUTS))).lower()} "
     for apart, together in _JOINED.items():
         words = words.replace(f" {apart} ", f" {together} ")
     return words.split()

@@ -28,6 +28,8 @@ QUANTITIES: Mapping[str, frozenset[str]] = {
     "temperature": frozenset({"degC", "°C", "C", "deg C", "Celsius"}),
 }
 """Units as DBC files write them, by quantity. Those of the first three are the layout's own."""
+MEASURED = frozenset({"current", "power", "voltage"})
+"""Of branches: no code that has a name is a value of theirs."""
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
@@ -161,7 +163,8 @@ def with_log(found: list[Candidate], frames: Frames) -> list[Candidate]:
             message = item.message
             if frame_key(message.frame_id, extended=message.is_extended_frame) != key:
                 continue
-            decoded = decode_signal(message, item.signal, part.data, part.length)
+            named = frozenset(map(int, item.signal.choices or {})) if item.quantity in MEASURED else None
+            decoded = decode_signal(message, item.signal, part.data, part.length, named)
             if decoded.present.any():
                 channel = Channel(
                     time_s=time_s[decoded.present],

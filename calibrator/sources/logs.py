@@ -50,23 +50,23 @@ def find_logs(arguments: Iterable[Path]) -> LogSources:
     """
     found: dict[Path, DriveFile] = {}
     problems: list[UserError] = []
+    strays: dict[Path, LogError] = {}
     for argument in arguments:
         try:
             paths = _logs_of(argument)
         except UserError as error:
             problems.append(error)
             continue
-        strays = {path for path in paths if path.parent == argument}
-        if len(strays) == len(paths):
-            strays = set()
-        problems += [_stray(path) for path in sorted(strays)]
+        has_folders = any(path.parent != argument for path in paths)
         for path in paths:
-            if path in strays:
+            if has_folders and path.parent == argument:
+                strays[path.resolve()] = _stray(path)
                 continue
             try:
                 found.setdefault(path.resolve(), _source(path))
             except UserError as error:
                 problems.append(error)
+    problems += [problem for path, problem in strays.items() if path not in found]
     logs = sorted(found.values(), key=lambda log: (log.vehicle, log.name, str(log.path)))
     refused = _refused_vehicles(logs, problems)
     logs = [log for log in logs if log.vehicle not in refused]
@@ -85,7 +85,10 @@ def _logs_of(argument: Path) -> list[Path]:
 
 
 def _stray(path: Path) -> LogError:
-    return LogError(f"{path}: beside the folders of vehicles, in none of them; move it into that of its vehicle")
+    return LogError(
+        f"{path}: lies beside folders with logs; move it into that of its vehicle, or name the file itself if it is of "
+        f"the vehicle {path.resolve().parent.name}"
+    )
 
 
 def _source(path: Path) -> DriveFile:

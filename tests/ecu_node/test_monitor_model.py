@@ -114,6 +114,50 @@ def test_while_the_node_passes_through_the_sum_after_is_the_sum_before_however_l
     assert sums.corrected_a is not None
 
 
+MIXED_DBC = """VERSION ""
+BU_: Node Corrector
+BO_ 1 Fast: 2 Node
+ SG_ Battery : 0|16@1- (0.1,0) [-3000|3000] "A" Node
+BO_ 2 Slow: 2 Node
+ SG_ Motor : 0|16@1- (0.1,0) [-3000|3000] "A" Node
+BO_ 3 Out: 4 Corrector
+ SG_ Battery : 0|16@1- (0.1,0) [-3000|3000] "A" Node
+ SG_ Motor : 16|16@1- (0.1,0) [-3000|3000] "A" Node
+VAL_ 3 Battery -32768 "SNA";
+VAL_ 3 Motor -32768 "SNA";
+"""
+MIXED_LAYOUT = """
+schema = 1
+name = "small"
+dbc = "small.dbc"
+full_scale_a = 400.0
+branch = [
+    { name = "battery", sign = 1, signal = "Fast.Battery", corrected = "Out.Battery" },
+    { name = "motor", sign = -1, signal = "Slow.Motor", corrected = "Out.Motor" },
+]
+"""
+
+
+def test_a_message_that_answers_two_counts_for_each_at_its_own_frames(
+    make_database: Callable[..., VehicleDatabase],
+) -> None:
+    """Currents rise by 200 A/s and sum to 0; every frame of either branch is answered by both, as they were last."""
+    monitor = BusMonitor(make_database(MIXED_LAYOUT, dbc=MIXED_DBC), 0.0)
+    latest, seen = {1: b"\0\0", 2: b"\0\0"}, 0
+    for k in range(200):
+        t = 0.01 * k
+        for identifier in (1, 2) if k % 10 == 3 else (1,):
+            latest[identifier] = round(2000.0 * t).to_bytes(2, "little", signed=True)
+            monitor.take((identifier, False), bytearray(latest[identifier]), t)
+            monitor.take((3, False), bytearray(latest[1] + latest[2]), t + 0.0005)
+        sums = monitor.look(t + 0.001).sums
+        if sums.corrected_a is not None:
+            seen += 1
+            assert sums.corrected_a == pytest.approx(sums.measured_a, abs=0.1)
+            assert k < 50 or sums.corrected_a == pytest.approx(0.0, abs=0.1)
+    assert seen > 100
+
+
 def test_answers_to_frames_that_came_before_the_monitor_do_not_count_in_the_sum(bus: Bus) -> None:
     bus.send("HV_BatteryCorrected", 0.001, BatteryCurrentCorrected=500.0)
     assert bus.look(0.002).sums == Sums()

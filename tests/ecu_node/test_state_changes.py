@@ -73,3 +73,9 @@ def test_a_correction_that_makes_it_worse_and_a_stuck_branch_are_said_and_that_i
 def test_parameters_that_are_taken_back_while_the_bus_sleeps_do_not_wake_it_up(drive: Drive) -> None:
     assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ()) == AGAIN[:1]
     assert drive.load(InForce(parameters=None, reason=Reason.REVOKED)) == [None, None]
+    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ()) == AGAIN[::-1]
+
+
+def test_parameters_that_are_taken_back_after_a_fall_back_do_not_correct_again(drive: Drive) -> None:
+    assert drive.go_on(1.0, BOTH) + drive.go_on(1.0, ("Battery",)) == [f"{FALLS_BACK}no frames of motor"]
+    assert drive.load(InForce(parameters=None, reason=Reason.REVOKED)) == [None, None]

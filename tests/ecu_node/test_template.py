@@ -11,6 +11,7 @@ import pytest
 
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
+from ecu_node.errors import LayoutError
 from ecu_node.guard import key_of
 from ecu_node.in_force import InForce
 from ecu_node.parameter_fit import check_fit
@@ -77,6 +78,16 @@ def test_the_sum_is_judged_about_the_load_that_the_layout_declares(
         answers(corrector, Frame(key_of(pair), data), 0.05 * step)
         corrector.look(0.05 * step)
     assert corrector.state() == state
+
+
+def test_a_declared_load_beyond_the_limits_is_told_before_a_file_is_filled_in_that_cannot_fit(
+    make_database: Callable[..., VehicleDatabase],
+) -> None:
+    database = make_database(f"{SMALL_LAYOUT}[unmeasured_load]\nmean_a = 161\nsd_a = 1\n")
+    with pytest.raises(
+        LayoutError, match=r"mean_a = 161 is beyond the layout's limit of 160 A \(\[limits\] offset_a\)"
+    ):
+        template_text(database, "v1", NOW)
 
 
 def test_all_branches_stand_in_it_with_names_and_digests(make_database: Callable[..., VehicleDatabase]) -> None:

@@ -1,12 +1,15 @@
 """A figure holds as long as the files that it was measured with say the same, those that they import included."""
 
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+import release_check
 from acceptance.inputs import digest, files_that_run
-from acceptance.steps import steps
+from acceptance.steps import PYTHON, Step, steps
+from ecu_node.errors import UserError
 
 ROOT = Path(__file__).parents[2]
 FILES = {
@@ -56,6 +59,34 @@ def test_figures_hold_until_something_that_they_are_made_with_changes(changed: s
 def test_an_entry_that_is_not_there_is_named(checkout: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nothing: nothing of it is committed"):
         files_that_run(checkout, ["nothing"])
+
+
+def test_a_step_is_run_again_until_it_ends_well_and_when_it_changes(
+    checkout: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(release_check, "ROOT", checkout)
+    out = checkout / "out"
+    out.mkdir()
+    code = "from pathlib import Path; print('ran'); Path('out/count.json').open('a').write('x'); "
+    good = Step(name="count", command=(PYTHON, "-c", code), runs=("dbc",))
+    bad = replace(good, command=(PYTHON, "-c", f"{code} raise SystemExit(1)"))
+    for step, runs in ((bad, 1), (bad, 2), (good, 3), (good, 3), (replace(good, name="other", feeds=("count",)), 4)):
+        release_check.run_step(step, out, "c0ffee")
+        assert (out / "count.json").read_text() == runs * "x", "what a step measures is its own"
+    assert (out / "count.txt").read_text() == "ran\n"
+    assert not release_check.holds(good, out), "what fed it was run again"
+    release_check.run_step(good, out, "c0ffee")
+    assert release_check.holds(good, out)
+    (checkout / "dbc" / "car.dbc").write_text("another")
+    assert not release_check.holds(good, out)
+
+
+def test_files_that_change_under_a_step_are_told(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(release_check, "ROOT", checkout)
+    step = Step(name="edit", command=("sh", "-c", "echo another > dbc/car.dbc"), runs=("dbc",))
+    with pytest.raises(UserError, match="files of step 'edit' changed while it ran"):
+        release_check.run_step(step, checkout, "c0ffee")
+    assert not release_check.holds(step, checkout)
 
 
 def test_every_step_names_files_of_this_checkout() -> None:

@@ -27,12 +27,15 @@ class Step:
         Files and folders of the checkout that its figures depend on, with what they import.
     environment : mapping of str to str
         Variables besides those of the caller.
+    feeds : tuple of str
+        Names of later steps that go on with what this one writes.
     """
 
     name: str
     command: tuple[str, ...]
     runs: tuple[str, ...]
     environment: Mapping[str, str] = field(default_factory=dict)
+    feeds: tuple[str, ...] = ()
 
 
 def steps(out: Path, recorded: Path) -> Iterator[Step]:
@@ -46,6 +49,7 @@ def steps(out: Path, recorded: Path) -> Iterator[Step]:
         command=(*pytest, "--numprocesses", "auto", "--dist", "worksteal", f"--junitxml={out / 'tests.xml'}"),
         runs=EVERYTHING,
         environment={"HV_REQUIRE_ALL": "1", "COVERAGE_FILE": covered},
+        feeds=("vcan", "coverage"),
     )
     fleet = str(out / "vcan_fleet")
     yield Step(
@@ -56,6 +60,7 @@ def steps(out: Path, recorded: Path) -> Iterator[Step]:
         command=("tools/with_vcan", *pytest, "tests/vcan", "--cov-append", f"--junitxml={out / 'vcan.xml'}"),
         runs=EVERYTHING,
         environment={"HV_REQUIRE_ALL": "1", "HV_CALIBRATED_FLEET": fleet, "COVERAGE_FILE": covered},
+        feeds=("coverage",),
     )
     yield Step(
         name="coverage",

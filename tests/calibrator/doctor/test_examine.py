@@ -44,7 +44,7 @@ def test_a_declared_load_is_not_told_again(declared_a: float, told: bool, log: P
         file.write(f"\n[unmeasured_load]\nmean_a = {declared_a}\nsd_a = 0.5\n")
     found = findings(examined(layout, log), "mean")
     assert bool(found) is told
-    assert all("(0.5 A of it is the declared load)" in finding.text for finding in found)
+    assert all("(0.5 A are declared as a load)" in finding.text for finding in found)
     assert all("look at the load declared in [unmeasured_load]" in finding.remedy for finding in found)
 
 

@@ -31,6 +31,8 @@ def test_places_are_known_by_the_words_of_several_houses() -> None:
     assert places_of(words_of("INV_DcPower")) == {"motor"}
     assert places_of(words_of("Odometer")) == set()
     assert places_of(words_of("PWR_LeistDC", "DC-Leistung Pulswechselrichter")) == {"motor"}
+    assert places_of(words_of("LadegStrom", "HV-Ladegerät")) == {"charger"}
+    assert words_of("Längsbeschleunigung") == ("laengsbeschleunigung",)
     assert places_of(words_of("BAT_StromIst", "HV-Batteriestrom am Shunt")) == {"battery"}
 
 

@@ -21,9 +21,15 @@ def test_a_log_beside_the_folders_of_vehicles_is_left_out_and_named(tmp_path: Pa
     found = find_logs([tmp_path])
     assert [log.vehicle for log in found.logs] == ["V1", "V2"]
     (problem,) = found.problems
-    assert str(problem).startswith(
-        f"{tmp_path / 'copy of a.log'}: beside the folders of vehicles, in none of them; move"
-    )
+    assert str(problem).startswith(f"{tmp_path / 'copy of a.log'}: lies beside folders with logs; move it")
+
+
+def test_a_log_that_is_named_itself_is_of_its_folder_whatever_lies_beside_it(tmp_path: Path) -> None:
+    make(tmp_path / "V1" / "a.log", tmp_path / "V1" / "old" / "b.log")
+    found = find_logs([tmp_path / "V1", tmp_path / "V1" / "a.log"])
+    assert [(log.vehicle, log.name) for log in found.logs] == [("V1", "a"), ("old", "b")]
+    assert not found.problems
+    assert len(find_logs([tmp_path / "V1"]).problems) == 1
 
 
 def test_a_file_named_twice_is_read_once(tmp_path: Path) -> None:
