@@ -118,13 +118,17 @@ MIXED_DBC = """VERSION ""
 BU_: Node Corrector
 BO_ 1 Fast: 2 Node
  SG_ Battery : 0|16@1- (0.1,0) [-3000|3000] "A" Node
-BO_ 2 Slow: 2 Node
+BO_ 2 Middle: 2 Node
  SG_ Motor : 0|16@1- (0.1,0) [-3000|3000] "A" Node
-BO_ 3 Out: 4 Corrector
+BO_ 3 Slow: 2 Node
+ SG_ Heater : 0|16@1- (0.1,0) [-3000|3000] "A" Node
+BO_ 4 Out: 6 Corrector
  SG_ Battery : 0|16@1- (0.1,0) [-3000|3000] "A" Node
  SG_ Motor : 16|16@1- (0.1,0) [-3000|3000] "A" Node
-VAL_ 3 Battery -32768 "SNA";
-VAL_ 3 Motor -32768 "SNA";
+ SG_ Heater : 32|16@1- (0.1,0) [-3000|3000] "A" Node
+VAL_ 4 Battery -32768 "SNA";
+VAL_ 4 Motor -32768 "SNA";
+VAL_ 4 Heater -32768 "SNA";
 """
 MIXED_LAYOUT = """
 schema = 1
@@ -133,28 +137,33 @@ dbc = "small.dbc"
 full_scale_a = 400.0
 branch = [
     { name = "battery", sign = 1, signal = "Fast.Battery", corrected = "Out.Battery" },
-    { name = "motor", sign = -1, signal = "Slow.Motor", corrected = "Out.Motor" },
+    { name = "motor", sign = -1, signal = "Middle.Motor", corrected = "Out.Motor" },
+    { name = "heater", sign = -1, signal = "Slow.Heater", corrected = "Out.Heater" },
 ]
 """
 
 
-def test_a_message_that_answers_two_counts_for_each_at_its_own_frames(
+def test_a_message_that_answers_several_counts_for_each_at_its_own_frames(
     make_database: Callable[..., VehicleDatabase],
 ) -> None:
-    """Currents rise by 200 A/s and sum to 0; every frame of either branch is answered by both, as they were last."""
+    """At 100, 50 and 10 Hz currents rise and sum to 0; every frame is answered by all three, as they were last."""
     monitor = BusMonitor(make_database(MIXED_LAYOUT, dbc=MIXED_DBC), 0.0)
-    latest, seen = {1: b"\0\0", 2: b"\0\0"}, 0
+    latest, seen = {1: bytes(2), 2: bytes(2), 3: bytes(2)}, 0
     for k in range(200):
-        t = 0.01 * k
-        for identifier in (1, 2) if k % 10 == 3 else (1,):
-            latest[identifier] = round(2000.0 * t).to_bytes(2, "little", signed=True)
-            monitor.take((identifier, False), bytearray(latest[identifier]), t)
-            monitor.take((3, False), bytearray(latest[1] + latest[2]), t + 0.0005)
-        sums = monitor.look(t + 0.001).sums
-        if sums.corrected_a is not None:
+        for identifier, every, late_s, codes_per_s in (
+            (1, 1, 0.0, 4000.0),
+            (2, 2, 0.003, 2000.0),
+            (3, 10, 0.006, 2000.0),
+        ):
+            t = 0.01 * k + late_s
+            if k % every == 0:
+                latest[identifier] = round(codes_per_s * t).to_bytes(2, "little", signed=True)
+                monitor.take((identifier, False), bytearray(latest[identifier]), t)
+                monitor.take((4, False), bytearray(b"".join(latest.values())), t + 0.0005)
+        sums = monitor.look(0.01 * k + 0.007).sums
+        if k > 50 and sums.corrected_a is not None:
             seen += 1
-            assert sums.corrected_a == pytest.approx(sums.measured_a, abs=0.1)
-            assert k < 50 or sums.corrected_a == pytest.approx(0.0, abs=0.1)
+            assert (sums.measured_a, sums.corrected_a) == pytest.approx((0.0, 0.0), abs=0.3)
     assert seen > 100
 
 
