@@ -4,11 +4,12 @@ Workers leave Ctrl-C to the parent, and end when the parent does, whatever ended
 """
 
 import tempfile
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 from calibrator.processes.crew import crew_of
-from calibrator.processes.held_interrupts import noticed_interrupts
+from calibrator.processes.held_interrupts import interrupts_held, noticed_interrupts
 from calibrator.processes.messages import Raised, Unread
 
 __all__ = ["TIME_LIMIT_S", "read_in_processes"]
@@ -50,7 +51,7 @@ def read_in_processes(
     """
     with (
         noticed_interrupts() as noticed,
-        tempfile.TemporaryDirectory(prefix="calibrator-") as folder,
+        _own_folder() as folder,
         crew_of(read, folder, workers, limit_s) as crew,
     ):
         waiting = enumerate(sources)
@@ -72,6 +73,18 @@ def read_in_processes(
                 done |= crew.collect()
                 if noticed():
                     raise KeyboardInterrupt
+
+
+@contextmanager
+def _own_folder() -> Iterator[str]:
+    """A folder that is gone after the block. Ctrl-C waits while it is made and removed, so that nothing is left."""
+    with interrupts_held():
+        folder = tempfile.TemporaryDirectory(prefix="calibrator-")
+    try:
+        yield folder.name
+    finally:
+        with interrupts_held():
+            folder.cleanup()
 
 
 def _result(outcome: "_Content | Unread | Raised") -> "_Content | Unread":
