@@ -8,8 +8,8 @@ TRIPS ?= ../shared/data/bmw_i3_summer
 PYTHONS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test coverage bench bench-quick experiments soak fuzz release-check mutants lint types docs dist package sbom \
-	licences schema constraints clean
+.PHONY: help setup demo test coverage bench bench-quick experiments soak fuzz release-check mutants lint types docs dist \
+	package sbom licences schema constraints clean
 
 help:                    ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -27,7 +27,7 @@ demo: setup              ## a fleet, its calibration, and the Kirchhoff sum befo
 	$(BIN)/python tools/demo.py --drives $(DRIVES) --out $(OUT)
 
 test: setup              ## all tests; those of SocketCAN on a kernel that has it
-	$(BIN)/python -m pytest --numprocesses auto --dist worksteal
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal --durations 20
 	$(BIN)/python -m tests.vcan.calibrated_fleet build/vcan_fleet
 	HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan --or-skip $(BIN)/python -m pytest tests/vcan
 

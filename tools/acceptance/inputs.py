@@ -3,7 +3,9 @@
 import ast
 import hashlib
 import subprocess
+import sys
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 
 __all__ = ["digest", "files_that_run"]
@@ -64,21 +66,26 @@ def _files(root: Path, entry: str) -> list[Path]:
 
 
 def _imported(root: Path, path: Path) -> Iterator[Path]:
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for name in _names(path.read_text(encoding="utf-8")):
+        yield from _modules(root, name)
+
+
+@cache
+def _names(source: str) -> tuple[str, ...]:
+    """What a source imports, with what it takes out of each module: these may be modules, too."""
+    found: list[str] = []
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
-            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-        else:
-            continue
-        for name in names:
-            yield from _modules(root, name)
+            found += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return tuple(found)
 
 
 def _modules(root: Path, name: str) -> Iterator[Path]:
     """The file of a module of this checkout and of the packages around it; nothing for what is installed."""
     parts = name.split(".")
-    for source in SOURCES:
+    for source in SOURCES if parts[0] not in sys.stdlib_module_names else ():
         for depth in range(1, len(parts) + 1):
             place = (root / source).joinpath(*parts[:depth])
             candidates = (place / "__init__.py", place.with_suffix(".py"))
