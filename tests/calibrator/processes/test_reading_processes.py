@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,11 @@ def refused(number: int) -> int:
     if number > 1:
         raise ValueError(f"number {number}")
     return number
+
+
+def readers() -> list[multiprocessing.process.BaseProcess]:
+    """Processes that read; those that another test has left to compute wait for more to do."""
+    return [child for child in multiprocessing.active_children() if isinstance(child, ForkServerProcess)]
 
 
 def not_to_be_sent(number: int) -> Callable[[], int]:
@@ -154,7 +160,7 @@ def test_processes_killed_at_rest_or_while_they_hand_over_cost_one_file(tmp_path
     with closing(read_in_processes(partial(many_bytes, marker=marker), range(8), workers=2)) as results:
         assert next(results) == b""
         wait_until(marker.exists)
-        for process in multiprocessing.active_children():
+        for process in readers():
             os.kill(process.pid or 0, signal.SIGKILL)
             process.join()
         rest = list(results)
@@ -175,7 +181,7 @@ def test_an_error_of_the_reader_is_raised_here_at_its_turn() -> None:
         with pytest.raises(ValueError, match="number 2") as caught:
             next(results)
     assert "in refused" in caught.value.__notes__[0]
-    assert not multiprocessing.active_children()
+    assert not readers()
 
 
 def test_what_cannot_be_handed_over_is_an_error_too() -> None:
@@ -194,8 +200,8 @@ def test_no_process_stays_when_nobody_wants_more_results(endless: Path, tmp_path
     good.write_text("good")
     with closing(read_in_processes(text_of, [good, endless, endless], workers=2)) as results:
         assert next(results) == "good"
-        assert multiprocessing.active_children()
-    assert not multiprocessing.active_children()
+        assert readers()
+    assert not readers()
 
 
 def test_what_a_killed_reader_started_and_left_goes_with_it(endless: Path, tmp_path: Path) -> None:
