@@ -120,19 +120,20 @@ class Trial:
         measured = {name: pair[0] for name, pair in currents.items()}
         if max(map(abs, measured.values())) < self._rules.least_current_a:
             return None
-        corrected = [self._corrected(name, current) for name, current in measured.items()]
+        corrected = [self._corrected(name, current, now_s) for name, current in measured.items()]
         if any(current is None for current in corrected):
             return None
         self._add(sum(measured.values()), sum(current for current in corrected if current is not None))
         self._time_s += min(passed_s, _LONGEST_STEP_S)
         return self._result() if self._time_s >= self._rules.duration_s else None
 
-    def _corrected(self, name: str, current: float) -> float | None:
+    def _corrected(self, name: str, current: float, now_s: float) -> float | None:
         fault = self._faults.get(name)
         if fault is None:
             return current
         sensor = next(branch.temperature for branch in self._branches if branch.name == name)
-        return fault.true_current(current, sensor.value() if sensor is not None else None)
+        # From its frames: it need not be known at once to a branch of which nothing in force depends on it.
+        return fault.true_current(current, sensor.value_at(now_s) if sensor is not None else None)
 
     def _add(self, measured_a: float, corrected_a: float) -> None:
         self._looks += 1

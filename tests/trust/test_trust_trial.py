@@ -1,6 +1,7 @@
 """A parameter set on trial in a node: what is right comes in force, what is wrong does not, and why."""
 
 import math
+import shutil
 from collections.abc import Iterator
 from datetime import timedelta
 from itertools import count
@@ -9,10 +10,12 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from ecu_node.database import VehicleDatabase
+from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode
+from ecu_node.layout import read_layout
 from ecu_node.parameters import JunctionResidual, VehicleParameters
+from ecu_node.sensor_models import TemperatureDrift
 from ecu_node.status import Reason, State
 from ecu_node.trust.activation import accept
 from ecu_node.trust.parameter_store import ParameterStore
@@ -39,16 +42,24 @@ class Drive:
         self._steps: Iterator[int] = count()
 
     def go_on(
-        self, duration_s: float, *, load_a: float = 0.0, drift: float = DRIFT, offset_a: float = OFFSET_A
+        self,
+        duration_s: float,
+        *,
+        load_a: float = 0.0,
+        drift: float = DRIFT,
+        offset_a: float = OFFSET_A,
+        celsius: float = 0.0,
+        contactor: int = 0,
     ) -> None:
         """Drive; a load that nobody measures takes its share from the battery."""
+        others = {"JunctionBoxTemperature": celsius, "ContactorState": contactor}
         for _ in range(round(duration_s / PERIOD_S)):
             k = next(self._steps)
             now_s = PERIOD_S * k
             motor_a = 100.0 * math.sin(0.3 * k) + 40.0
             battery_a = (1.0 + drift) * (motor_a + load_a) + offset_a
             frames = {
-                0x110: ("HV_Battery", {"BatteryCurrent": battery_a}),
+                0x110: ("HV_Battery", {"BatteryCurrent": battery_a, **others}),
                 0x120: ("HV_Motor", {"MotorCurrent": motor_a}),
             }
             for identifier, (message, values) in frames.items():
@@ -161,6 +172,47 @@ def test_a_set_that_takes_away_an_error_and_leaves_another_is_not_of_this_vehicl
     (told,) = (line for line in drive.said if "its trial" in line)
     assert "has failed" in told
     assert "at most 2 A were to be left" in told
+
+
+def test_a_set_that_does_not_say_what_it_changes_may_leave_anything(
+    state: Path, signers: Signers, database: VehicleDatabase
+) -> None:
+    """As one that was written by hand: what is taken away is measured all the same."""
+    unknown = JunctionResidual(measured_a=4.0, corrected_a=0.5)
+    put_on_trial(state, signers, replace(right(database), junction_residual=unknown), database, 5)
+    drive = Drive(state, database)
+    drive.go_on(330.0, load_a=-0.5)
+    assert any("number 5 has passed its trial" in line for line in drive.said)
+
+
+def test_a_trial_waits_for_the_temperature_that_a_set_needs(
+    state: Path, signers: Signers, database: VehicleDatabase
+) -> None:
+    found = right(database)
+    model = TemperatureDrift(drift_per_k=0.0001, reference_c=0.0)
+    battery = replace(found.branches["battery"], sensor_model=model)
+    put_on_trial(state, signers, replace(found, branches={**found.branches, "battery": battery}), database, 5)
+    drive = Drive(state, database)
+    drive.go_on(330.0, celsius=215.0)
+    assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
+    drive.go_on(330.0, celsius=0.0)
+    assert drive.told == (State.CORRECTING, Reason.NONE)
+
+
+def test_a_trial_waits_while_a_current_is_not_measured(
+    state: Path, signers: Signers, database: VehicleDatabase, tmp_path: Path
+) -> None:
+    """As while the vehicle charges, where the layout says so."""
+    shutil.copy(database.layout.dbc_path, tmp_path)
+    text = database.layout.path.read_text() + '\n[watch]\ninput = "contactor_state"\nvalid = [2]\n'
+    (tmp_path / "watched.toml").write_text(text)
+    own = read_database(read_layout(tmp_path / "watched.toml"))
+    put_on_trial(state, signers, right(own), own, 5)
+    drive = Drive(state, own)
+    drive.go_on(330.0, contactor=1)
+    assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
+    drive.go_on(330.0, contactor=2)
+    assert drive.told == (State.CORRECTING, Reason.NONE)
 
 
 def test_standing_is_no_trial(state: Path, signers: Signers, database: VehicleDatabase) -> None:
