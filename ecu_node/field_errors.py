@@ -9,6 +9,9 @@ import difflib
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 import msgspec
@@ -43,7 +46,7 @@ def field_error(error: msgspec.ValidationError, document: Any, schema: Any, plac
     error : msgspec.ValidationError
         From converting the document.
     document : object
-        The document as plain dicts, lists, texts and numbers.
+        The document as plain dicts, lists, texts and numbers, without a key that stood twice in its file.
     schema : type
         What it was converted to.
     place : callable
@@ -56,7 +59,7 @@ def field_error(error: msgspec.ValidationError, document: Any, schema: Any, plac
     """
     match = _MESSAGE.fullmatch(str(error))
     assert match is not None, "the pattern matches every text"
-    steps = _steps(match["path"] or "", str(error), document, schema)
+    steps = _steps(match["path"] or "", document, schema)
     words = place(document, steps)
     what = _what(match["what"], _found(document, steps), _kind(schema, document, steps))
     return f"{words}: {what}" if words else what
@@ -96,29 +99,31 @@ def _step_words(step: Step) -> str:
     return f"entry number {step + 1}" if isinstance(step, int) else step
 
 
-def _steps(path: str, text: str, document: Any, schema: Any) -> Place:
-    """Steps of a path; where msgspec writes ``[...]`` for any key of a dict, the key that gives the same error."""
+def _steps(path: str, document: Any, schema: Any) -> Place:
+    """Steps of a path; where msgspec writes ``[...]`` for any key of a dict, the key that the error is about."""
     steps: Place = ()
     for match in _STEP.finditer(path):
         if match["any"]:
-            key = _culprit(document, steps, text, schema)
-            if key is None:
-                break
-            steps = (*steps, key)
+            steps += _culprit(document, steps, schema)
         else:
-            steps = (*steps, int(match["index"]) if match["index"] else match["key"])
+            steps += (int(match["index"]) if match["index"] else match["key"],)
     return steps
 
 
-def _culprit(document: Any, steps: Place, text: str, schema: Any) -> str | None:
+def _culprit(document: Any, steps: Place, schema: Any) -> Place:
+    """The first key of a dict with which alone the document does not fit either."""
     table = _found(document, steps)
-    for key in table if isinstance(table, Mapping) else ():
-        try:
-            msgspec.convert(_replaced(document, steps, {key: table[key]}), schema)
-        except msgspec.ValidationError as error:
-            if str(error) == text:
-                return str(key)
-    return None
+    entries = table.items() if isinstance(table, Mapping) else ()
+    alone = ((key, _replaced(document, steps, {key: value})) for key, value in entries)
+    return next(((key,) for key, changed in alone if not _fits(changed, schema)), ())
+
+
+def _fits(document: Any, schema: Any) -> bool:
+    try:
+        msgspec.convert(document, schema)
+    except msgspec.ValidationError:
+        return False
+    return True
 
 
 def _replaced(document: Any, steps: Place, value: Any) -> Any:
@@ -132,12 +137,10 @@ def _replaced(document: Any, steps: Place, value: Any) -> Any:
 
 def _found(document: Any, steps: Place) -> Any:
     """Value at a place; None where there is none."""
-    for step in steps:
-        try:
-            document = document[step]
-        except (LookupError, TypeError):
-            return None
-    return document
+    found = None
+    with suppress(LookupError, TypeError):
+        found = reduce(getitem, steps, document)
+    return found
 
 
 def _kind(schema: Any, document: Any, steps: Place) -> inspect.Type | None:
@@ -210,9 +213,8 @@ def _pattern_words(text: str) -> str:
 
 
 def _unknown_key(key: str, kind: inspect.Type | None) -> str:
-    allowed = []
-    if isinstance(kind, inspect.StructType):
-        allowed = [*([kind.tag_field] if kind.tag_field else []), *(field.encode_name for field in kind.fields)]
+    fields, tag = (kind.fields, kind.tag_field) if isinstance(kind, inspect.StructType) else ((), None)
+    allowed = [*([tag] if tag else []), *(field.encode_name for field in fields)]
     near = difflib.get_close_matches(key, allowed, n=1)
     hint = f"did you mean '{near[0]}'? " if near else ""
     return f"unknown key '{key}'; {hint}allowed are {', '.join(allowed)}"

@@ -228,8 +228,12 @@ def decode_parameters(content: bytes, where: str) -> VehicleParameters:
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise _malformed(where, _why_not(error, content)) from None
     if (twice := repeated_key(content)) is not None:
-        raise _malformed(where, f"'{shown_name(twice)}' stands there twice in one place")
+        raise _malformed(where, _stands_twice(twice))
     return found
+
+
+def _stands_twice(key: str) -> str:
+    return f"'{shown_name(key)}' stands there twice in one place"
 
 
 def _malformed(where: str, why: str) -> UnfitError:
@@ -241,9 +245,11 @@ def _why_not(error: Exception, content: bytes) -> str:
     if not isinstance(error, msgspec.ValidationError):
         return json_error(error, content)
     try:
-        document = msgspec.json.decode(content)
+        document, twice = msgspec.json.decode(content), repeated_key(content)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as first:
         return json_error(first, content)
+    if twice is not None:  # the document keeps the last of the two, and the error may be about the first
+        return _stands_twice(twice)
     if isinstance(document, dict) and {"payload", "payloadType", "signatures"} <= document.keys():
         return _SIGNED
     return field_error(error, document, VehicleParameters, quoted_place)

@@ -426,6 +426,7 @@ def test_what_was_decided_may_be_applied(database: VehicleDatabase, verdict: Ver
         (b'"number":300', b'"number":299,"number":300', "'number' stands there twice in one place"),
         (b'"number":300', b'"number":299,"numbe\\u0072":300', "'number' stands there twice in one place"),
         (b'"battery":{', b'"battery":{"drift":0.5,', "'drift' stands there twice in one place"),
+        (b'"battery":{', b'"battery":{"drift":"x"},"battery":{', "'battery' stands there twice in one place"),
         (b'"number":300', b'"number":9007199254740992', "'number': "),
         (b'"number":300', b'"number":' + b"[" * 100_000 + b"]" * 100_000, "it is nested too deeply"),
         (b'"v1"', b'"' + b"v" * 300 + b'"', "at most 64 characters is expected, found"),
