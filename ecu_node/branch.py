@@ -195,9 +195,7 @@ class LiveBranch:
 
     @property
     def lacks_input(self) -> bool:
-        """Whether a fault is applied to it, and yet it is not corrected now: something that this needs is missing."""
-        if not self.fault.applied:
-            return False
+        """Whether a branch with a fault to correct is not corrected now: something that this needs is missing."""
         no_voltage = self.voltage is not None and self.plan.needs_voltage and self.voltage.code is None
         return self.quality is not Quality.CORRECTED or no_voltage or (self.seen and self.latest() is None)
 

@@ -89,7 +89,7 @@ def _by_profile(entry: EndToEnd, message: Message, where: str) -> Protection:
             return _p02(entry, bytes(entry.data_id_list[message.name]))
         case ProfileP05():
             return _p05(entry, _data_id(entry.data_id, message))
-        case CounterCrc8():
+        case _:
             return _counter_crc8(entry, message, where)
 
 

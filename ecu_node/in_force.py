@@ -67,7 +67,7 @@ def put_in_force(
     now_s : float
         Now; branches that the parameters name are waited for from here. [s]
     mode : Mode
-        Where corrected values go.
+        Where corrected values go, as when the corrector was built: what can be wrong with layout and DBC was said then.
     """
     parameters = in_force.parameters
     found = parameters.branches if parameters is not None else {}

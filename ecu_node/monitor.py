@@ -192,5 +192,4 @@ def _live_table(where: str) -> Iterator[_Show]:
             live.update(Group(*drawn), refresh=True)
 
         yield show
-    if last:
-        write_output(last)  # what was seen last stays on the screen
+    write_output(last)  # what was seen last stays on the screen

@@ -6,7 +6,7 @@ from typing import Protocol
 
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import UnfitError, UserError
+from ecu_node.errors import UnfitError
 from ecu_node.guard import Mode
 from ecu_node.in_force import InForce, put_in_force
 from ecu_node.parameter_fit import check_fit
@@ -123,15 +123,11 @@ class ParameterFile:
             return False
         self._seen = seen
         in_force, why_not = choose_parameters(self._path, self._database, self._vehicle)
-        if why_not is None:
-            try:
-                put_in_force(corrector, self._database, in_force, now_s, mode=self._mode)
-            except UserError as error:
-                why_not = str(error)
         if why_not is not None:
             corrector.counters.reload_failures += 1
             self._say(f"new parameters are not used, those before stay in force: {why_not}")
             return False
+        put_in_force(corrector, self._database, in_force, now_s, mode=self._mode)
         self.in_force, self.why_not = in_force, None
         corrector.counters.reloads += 1
         assert in_force.parameters is not None

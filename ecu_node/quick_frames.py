@@ -224,20 +224,15 @@ def quick_answer(signals: QuickSignals, message: Message, target: "Target", othe
 
 def _cells(target: "Target") -> tuple[Order, int, list[tuple[int, int]]] | None:
     """Byte order of a target, its payload with the quality of values and no value, and shift and ones of each value."""
-    length, orders, places = len(target.data), set(), []
-    payload = bytearray(length)
+    length, orders = len(target.data), {field.place.order for field in target.fields}
+    words = [word for field in target.fields if (word := field.place.in_word(length)) is not None]
+    if len(words) < len(target.fields) or len(orders) != 1:
+        return None
+    payload, order = bytearray(length), orders.pop()
     for field in target.fields:
-        word = field.place.in_word(length)
-        if word is None:
-            return None
-        orders.add(field.place.order)
-        places.append((word.shift, word.ones))
         if field.quality is not None:
             field.quality.put(payload, field.branch.quality)
-    if len(orders) != 1:
-        return None
-    order = orders.pop()
-    return order, int.from_bytes(payload, order), places
+    return order, int.from_bytes(payload, order), [(word.shift, word.ones) for word in words]
 
 
 def _in_order(message: Message) -> Callable[[bytearray], bool]:

@@ -8,7 +8,7 @@ in [1]_. How the node computes it, in integers, is in :mod:`ecu_node.correction`
 
 from dataclasses import dataclass
 
-from ecu_node.sensor_models import GainBySign, SensorModel, TemperatureDrift
+from ecu_node.sensor_models import GainBySign, SensorModel
 
 __all__ = ["NO_FAULT", "SensorFault"]
 
@@ -54,10 +54,10 @@ class SensorFault:
                 return self.drift
             case GainBySign():
                 return self.model.drift_positive if current_a >= 0.0 else self.model.drift_negative
-            case TemperatureDrift():
+            case model:
                 if temperature_c is None:
                     return None
-                drift = self.drift + self.model.drift_per_k * (temperature_c - self.model.reference_c)
+                drift = self.drift + model.drift_per_k * (temperature_c - model.reference_c)
                 return drift if abs(drift) <= self.largest_drift else None
 
     def true_current(self, i_m: float, temperature_c: float | None = None) -> float | None:

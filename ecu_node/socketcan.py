@@ -141,9 +141,8 @@ class SocketCanLink:
         batch.reset(self._came)
         self._next = self._came = 0
         came = _libc.recvmmsg(self._socket.fileno(), batch.headers, MOST_AT_ONCE, socket.MSG_DONTWAIT, None)
-        if came <= 0:
-            if came < 0:
-                _raise_unless_empty()
+        if came < 0:
+            _raise_unless_empty()
             return False
         self.read_s = time.monotonic()
         self._came, self._had_no_more = came, came < MOST_AT_ONCE

@@ -167,10 +167,8 @@ class SteadyBus:
     def _gone(self, error: Exception) -> None:
         self._say(f"{self.channel}: the bus failed: {error_text(error)}; trying to open it again")
         self._retry_s, self._pause_s = time.monotonic() + _FIRST_PAUSE_S, _FIRST_PAUSE_S
-        try:
+        with contextlib.suppress(can.CanError, OSError):
             self.close()
-        except (can.CanError, OSError):
-            self._opened = None
 
     def _reopened(self, timeout_s: float) -> can.Message | None:
         """Open it again if it is time to, and receive; wait no longer than the timeout."""
@@ -215,9 +213,8 @@ class _Opened:
             return 0
         try:
             info = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_DROPS + 1))
-        except OSError:  # closed meanwhile, or a kernel before 4.12
+            (dropped,) = struct.unpack_from("=I", info, 4 * _DROPS)
+        except (OSError, struct.error):  # closed meanwhile, or a kernel before 4.12
             return 0
-        if len(info) < 4 * (_DROPS + 1):
-            return 0
-        before, self._dropped = self._dropped, int(struct.unpack(f"={_DROPS + 1}I", info)[_DROPS])
+        before, self._dropped = self._dropped, int(dropped)
         return max(self._dropped - before, 0)

@@ -125,7 +125,7 @@ def _drift(branch: BranchParameters) -> str:
             return f"drift {model.drift_positive:+.4g} into and {model.drift_negative:+.4g} out of the junction"
         case TemperatureDrift() as model:
             return f"drift {branch.drift:+.4g} at {model.reference_c:g} degC, {model.drift_per_k:+.4g} per K"
-        case None:
+        case _:
             return f"drift {branch.drift:+.4g}"
 
 

@@ -90,7 +90,7 @@ def judge(arrival: Arrival, database: VehicleDatabase, kinds: tuple[type[Stateme
             return _take_keys(arrival, keys, by)
         case Revocation() as revocation:
             return _take_revocation(arrival, revocation, by)
-        case SignedParameters() as parameters:
+        case parameters:
             return _take_parameters(arrival, parameters, by, database)
 
 

@@ -71,6 +71,6 @@ def _applied(branch: BranchParameters | None) -> tuple[tuple[float, ...], float]
                 for temperature_c in (_COLDEST_C, _HOTTEST_C)
             )
             drifts = (cold, cold, hot, hot)
-        case None:
+        case _:
             drifts = (branch.drift,) * 4
     return drifts, branch.offset_a

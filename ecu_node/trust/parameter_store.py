@@ -139,12 +139,7 @@ class ParameterStore:
         self._say_revoked(state, number)
         is_other, is_other_number = in_force != self.in_force, number != self._number
         if is_other:
-            try:
-                put_in_force(corrector, self._database, in_force, now_s, mode=self._mode)
-            except UserError as error:
-                corrector.counters.reload_failures += 1
-                self._say(f"new parameters are not used, those before stay in force: {error}")
-                return False
+            put_in_force(corrector, self._database, in_force, now_s, mode=self._mode)
             corrector.counters.reloads += 1
         self.in_force, self.why_not, self._number = in_force, why_not, number
         found = in_force.parameters

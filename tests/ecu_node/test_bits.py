@@ -59,6 +59,7 @@ def test_a_frame_too_short_gives_none_and_is_left_alone(case: tuple[Message, Sig
     before = bytes(payload)
     assert place.extract(payload) is None
     assert not place.put(payload, 0)
+    assert place.in_word(len(payload)) is None
     assert payload == before
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ecu_node.buses import connect
+from ecu_node.buses import carries_fd, connect
 from ecu_node.counters import Counters
 from ecu_node.errors import BusError
 from ecu_node.steady_bus import SteadyBus
@@ -24,3 +24,8 @@ def test_a_bus_is_named_in_messages(interface: str, channel: str, name: str) -> 
         assert bus.channel == name
     finally:
         bus.close()
+
+
+@pytest.mark.parametrize(("interface", "channel"), [("virtual", "can0"), ("socketcan", "nobus0")])
+def test_of_a_bus_of_which_nothing_is_known_no_can_fd_is_claimed(interface: str, channel: str) -> None:
+    assert not carries_fd(interface, channel)

@@ -115,6 +115,19 @@ def test_check_warns_of_a_correction_that_is_not_published(
     assert warning.startswith(words)
 
 
+def test_check_shows_how_an_offset_of_a_power_is_corrected_with_the_voltage(
+    make_database: Callable[..., VehicleDatabase], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    database = make_database()
+    write_parameters(parameters_for(database, heater=(0.0, 2.0)), tmp_path / "v1.json")
+    files = ["--params", str(tmp_path / "v1.json"), "--layout", str(database.layout.path)]
+    assert main(["check", *files, "--gateway", "can1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    heater = next(index for index, line in enumerate(lines) if line.startswith("heater"))
+    assert "voltage gain " in lines[heater + 2]
+    assert lines[-1] == "  of a power: + voltage code * voltage gain in the parentheses"
+
+
 def test_check_says_that_run_needs_fd(small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", *small(SMALL_DBC.replace("PairOut: 8", "PairOut: 16"))]) == 0
     assert "warning: CAN FD messages (PairOut): 'ecu-node run' needs --fd" in capsys.readouterr().out
@@ -155,6 +168,13 @@ def test_an_empty_vehicle_is_wrong_use(
     assert caught.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "--vehicle: the identity of this vehicle is expected, found none; or leave it out; see 'ecu-node " in line
+
+
+def test_a_vehicle_with_control_characters_is_wrong_use(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(check(params, "--vehicle", "v\x1b[2J"))
+    assert caught.value.code == 2
+    assert r"'v\x1b[2J': the identity of this vehicle is a text without control" in capsys.readouterr().err
 
 
 def test_a_gateway_needs_two_buses(params: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from cantools.database.conversion import BaseConversion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ecu_node.codes import Codes, not_available_code, read_codes, require_reach, writable_range
+from ecu_node.codes import Codes, impossible_values, not_available_code, read_codes, require_reach, writable_range
 from ecu_node.correction import LARGEST_ERROR, IntegerPlan, Line, Signals, correction_plan
 from ecu_node.correction import integer_plan as plan_of_line
 from ecu_node.errors import DatabaseError
@@ -309,6 +309,17 @@ def test_a_range_that_ends_at_a_name_has_no_hole(names: dict[int, str]) -> None:
 def test_a_scale_of_zero_is_refused() -> None:
     with pytest.raises(DatabaseError, match="signal I has scale 0"):
         current(0.0)
+
+
+def test_a_range_that_no_code_reaches_is_refused() -> None:
+    with pytest.raises(DatabaseError, match="test: no code of signal I lies in its range in the DBC"):
+        current(limits=(1000.0, 2000.0))
+
+
+def test_a_floating_point_number_may_have_any_value() -> None:
+    signal = Signal("S", start=0, length=32, conversion=BaseConversion.factory(is_float=True))
+    assert impossible_values(signal, [0.1, -1e30]) == []
+    assert impossible_values(Signal("S", start=0, length=2), [3.0, 4.0]) == [4.0]
 
 
 def test_a_unit_of_another_quantity_is_refused() -> None:

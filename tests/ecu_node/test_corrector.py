@@ -674,6 +674,11 @@ STATUS_TABLE = '\n[status]\nmessage = "PairOut"\nstate = "Quality"\nreason = "Ba
         (SMALL_LAYOUT, SMALL_DBC.replace("Quality : 32|2", "Quality : 32|1"), "Quality holds at most 1; 3 must fit"),
         (
             SMALL_LAYOUT,
+            SMALL_DBC.replace(" SG_ Quality", ' SG_ Page M : 40|8@1+ (1,0) [0|1] "" Node\n SG_ Quality m1'),
+            "signal PairOut.Quality is multiplexed; what the node sends in its own name must be in every frame",
+        ),
+        (
+            SMALL_LAYOUT,
             SMALL_DBC.replace('512 Motor -32768 "SNA"', '512 Motor 32767 "Max"'),
             "Motor needs a code named SNA",
         ),
@@ -711,6 +716,17 @@ def test_a_layout_that_would_disturb_the_bus_is_refused(
 def test_messages_of_one_control_unit_or_of_none_may_be_sent(make_database: MakeDatabase, old: str, new: str) -> None:
     database = make_database(SMALL_LAYOUT + OWN_STATUS, OTHER_SENDER.replace(old, new))
     assert corrector_for(database).status() is not None
+
+
+def test_a_status_counts_as_far_as_its_counter_reaches_and_without_a_table_there_is_none(
+    make_database: MakeDatabase,
+) -> None:
+    assert corrector_for(make_database()).status() is None
+    counted = OTHER_SENDER.replace("8 Other", "8 Corrector") + ' SG_ Count : 16|2@1+ (1,0) [0|3] "" Node\n'
+    database = make_database(SMALL_LAYOUT + OWN_STATUS + 'alive_counter = "Count"\n', counted)
+    corrector = corrector_for(database)
+    found = [status[1][2] for _ in range(6) if (status := corrector.status()) is not None]
+    assert found == [0, 1, 2, 3, 0, 1]
 
 
 def test_a_layout_that_publishes_nothing_is_refused(make_database: MakeDatabase) -> None:

@@ -1,5 +1,6 @@
 """One line for every error, the traceback only with --debug."""
 
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -8,8 +9,9 @@ import pytest
 
 from ecu_node import cli
 from ecu_node.cli import main
-from ecu_node.errors import LayoutError, UserError
+from ecu_node.errors import LayoutError, TrustError, UserError
 from ecu_node.failures import FAILED, INTERNAL_ERROR, end_of, split_debug
+from ecu_node.status import Reason
 from tests.ecu_node.vehicles import LAYOUT
 
 
@@ -27,6 +29,11 @@ def test_each_error_is_one_line(error: Exception, code: int, text: str, capsys: 
     assert end_of("prog", error, debug=False) == code
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(text)
+
+
+def test_parameters_that_are_unfit_are_so_for_another_process_too() -> None:
+    found = pickle.loads(pickle.dumps(TrustError(Reason.REVOKED, "number 5 was revoked")))
+    assert (type(found), found.reason, str(found)) == (TrustError, Reason.REVOKED, "number 5 was revoked")
 
 
 def main_of_nothing() -> None:
@@ -71,6 +78,12 @@ def test_the_node_takes_debug_before_and_after_the_command(
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "Traceback (most recent call last):"
     assert lines[-1].startswith(f"ecu-node: {missing}: cannot read the layout")
+
+
+def test_where_standard_error_is_closed_the_exit_code_tells_it() -> None:
+    command = f'"{sys.executable}" -m ecu_node check --params p --layout missing.toml 2>&-'
+    done = subprocess.run(["/bin/sh", "-c", command], stdout=subprocess.PIPE, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout) == (FAILED, "")
 
 
 def test_a_file_that_must_not_be_read_is_no_internal_error(tmp_path: Path) -> None:

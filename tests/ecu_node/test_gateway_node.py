@@ -206,6 +206,17 @@ def test_a_bus_that_takes_no_more_loses_what_it_does_not_take_and_goes_on() -> N
     far.close()
 
 
+def test_of_a_socket_that_was_closed_just_now_no_dropped_frames_are_known() -> None:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    counters = Counters()
+    bus = SteadyBus(lambda: PairBus(near), counters)
+    bus.count_dropped()
+    near.close()
+    bus.count_dropped()
+    assert counters.dropped == 0
+    far.close()
+
+
 class ChoosyBus(VirtualBus):
     """A bus that does not take CAN FD."""
 
@@ -307,6 +318,20 @@ def test_frames_that_came_before_it_was_at_work_are_too_old_to_be_passed_on(
             assert early < 10, "those of the listening, more than 10, are not passed on"
 
 
+def test_a_frame_of_a_branch_that_waited_too_long_is_not_passed_on(
+    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+) -> None:
+    _, vehicle = ends
+    with gateway(database, request.node.name) as (corrector, _):
+        with VirtualBus(f"{request.node.name} a", preserve_timestamps=True) as sensors:
+            for counter, age_s in enumerate((5.0, 0.0)):
+                data = protected(database, "HV_Battery", counter, BatteryCurrent=100.0 * counter)
+                sensors.send(can.Message(time.time() - age_s, arbitration_id=0x110, is_extended_id=False, data=data))
+        (passed,) = received(vehicle, 1)
+    assert decoded(database, "HV_Battery", bytes(passed.data))["BatteryCurrent"] == pytest.approx(76.0)
+    assert corrector.counters.late == 1
+
+
 def test_a_remote_frame_passes_whatever_its_identifier(
     database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
 ) -> None:
@@ -348,6 +373,17 @@ def test_a_branch_frame_from_the_vehicle_ends_it(
         with pytest.raises(BusError, match=WORDS):
             running.result(LONGEST_WAIT_S)
     assert sensors.recv(0.0) is None, "it was not passed on"
+
+
+def test_a_status_from_the_sensors_bus_ends_it(
+    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+) -> None:
+    sensors, vehicle = ends
+    with gateway(database, request.node.name) as (_, running):
+        received(vehicle, 1, status=True)
+        sensors.send(can.Message(arbitration_id=0x5F0, is_extended_id=False, data=bytes(8)))
+        with pytest.raises(BusError, match=WORDS):
+            running.result(LONGEST_WAIT_S)
 
 
 def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest) -> None:

@@ -2,7 +2,9 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import cantools
 import pytest
 
 from ecu_node.database import VehicleDatabase, read_database
@@ -25,6 +27,7 @@ def test_the_projects_own_layout_is_read() -> None:
 def test_a_power_branch_is_named_by_its_power(make_database: MakeDatabase) -> None:
     layout = make_database().layout
     assert layout.find_branch("heater").source == "Heater.Power"
+    assert [make_database().current_step_a(name) for name in layout.branch_names] == [0.1, -0.05, 0.0]
     assert layout.offset_limit_a == pytest.approx(0.4 * 400.0)
 
 
@@ -75,6 +78,7 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
             '\n]\n[e2e]\nprofile = "P01"\nmessages = ["Net"]\ndata_id = { Pair = 1 }\n',
             "e2e\\], data_id: Pair is not in",
         ),
+        ("full_scale_a", 'contactor = { input = "x", open = [1] }\nfull_scale_a', r"\[contactor\] input: 'x' is no"),
         ("full_scale_a", 'model_inputs = ["speed"]\nfull_scale_a', "model_inputs: speed is no"),
         ("full_scale_a", 'derived = [{ name = "d", formula = "speed * 2" }]\nfull_scale_a', "speed is no input"),
         (
@@ -164,6 +168,30 @@ def test_a_dbc_that_lacks_what_the_layout_names_is_refused(make_database: MakeDa
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.filterwarnings("ignore:.*diagnostics.Database is deprecated:DeprecationWarning")
+def test_a_database_of_diagnostics_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL_LAYOUT.replace("small.dbc", "small.cdd"))
+    (tmp_path / "small.cdd").write_text("<CANDELA><ECUDOC><ECU><VAR/></ECU></ECUDOC></CANDELA>")
+    with pytest.raises(DatabaseError, match=r"small\.cdd: a diagnostics database; a CAN database \(DBC\) is needed"):
+        read_database(read_layout(tmp_path / "small.toml"))
+
+
+def test_a_dbc_that_is_replaced_while_it_is_read_is_refused(
+    make_database: MakeDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else its digest would be of another text than what is used."""
+
+    def load_and_change(path: Path, *, strict: bool) -> Any:
+        found = load_file(path, strict=strict)
+        path.write_text(SMALL_DBC.replace("Node", "Knot"))
+        return found
+
+    load_file = cantools.database.load_file
+    monkeypatch.setattr(cantools.database, "load_file", load_and_change)
+    with pytest.raises(DatabaseError, match=r"small\.dbc: the DBC was changed while it was read; try again"):
+        make_database()
+
+
 def test_a_missing_dbc_is_named_with_its_layout(tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL_LAYOUT)
     with pytest.raises(DatabaseError, match=r'small\.dbc: .* No such file .* line dbc = "small\.dbc" of .*\.toml$'):
@@ -186,7 +214,8 @@ def test_arithmetic_is_understood(text: str, names: list[str]) -> None:
 @pytest.mark.parametrize(
     "text",
     ["", "a b", "a; b", "a if b else c", "a.b", "a[0]", "f(a)", "sqrt(a, b)", "a ** b", "'x'", "True",
-     "lambda: 1", "__import__('os')", "a < b", "a // b", "(" * 500 + "a" + ")" * 500, "-" * 5000 + "a", "\0"],
+     "lambda: 1", "__import__('os')", "a < b", "a // b", "(" * 500 + "a" + ")" * 500, "-" * 5000 + "a", "\0",
+     "a" + " + a" * 1500],
 )  # fmt: skip
 def test_everything_else_is_refused(text: str) -> None:
     with pytest.raises(LayoutError, match="formula") as caught:

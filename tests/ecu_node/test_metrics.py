@@ -14,8 +14,13 @@ import pytest
 
 from ecu_node.cli import main
 from ecu_node.counters import Counters
+from ecu_node.database import VehicleDatabase
+from ecu_node.frames import FrameKey
+from ecu_node.in_force import InForce
+from ecu_node.metrics import serve_metrics
 from ecu_node.status import Reason, State
-from tests.ecu_node.vehicles import LAYOUT
+from ecu_node.wiring import wire
+from tests.ecu_node.vehicles import LAYOUT, Frame, answers, parameters_for, protected
 
 
 def command(tmp_path: Path, port: int) -> list[str]:
@@ -59,6 +64,17 @@ def test_every_counter_is_told_and_the_state(node: int) -> None:
     assert told["ecu_node_reason"] == Reason.NO_PARAMETERS
     assert told["ecu_node_parameter_set"] == 0.0
     assert "ecu_node_sum_measured_amperes" not in told
+
+
+def test_the_sums_of_the_junction_are_told_while_they_are_known(database: VehicleDatabase, free_port: int) -> None:
+    corrector = wire(database, InForce(parameters=parameters_for(database, battery=(0.25, 5.0))), 0.0)
+    data = protected(database, "HV_Battery", 0, BatteryCurrent=80.0)
+    answers(corrector, Frame(FrameKey(0x110, False), data), 0.0)
+    corrector.look(0.0)
+    serve_metrics(corrector, free_port)
+    told = asked(free_port)
+    assert told["ecu_node_sum_measured_amperes"] == pytest.approx(80.0)
+    assert told["ecu_node_sum_corrected_amperes"] == pytest.approx(60.0)
 
 
 def test_only_this_machine_is_answered(node: int) -> None:

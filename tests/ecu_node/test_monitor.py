@@ -5,6 +5,8 @@ import json
 import os
 import pty
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -16,6 +18,7 @@ from typing import Never
 
 import can
 import pytest
+from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
 from ecu_node.cli import main
@@ -112,6 +115,37 @@ def test_that_its_own_interface_is_down_stands_in_the_head_until_it_is_back(
     with battery_on_bus(database):
         assert main([*MONITOR, "--once", "0.5"]) == 0
     assert capsys.readouterr().out.startswith(f"virtual {CHANNEL}: no node on this bus\n")
+
+
+class SlowSocket(socket.socket):
+    """A socket of which the kernel says that it has dropped three frames; a local one itself drops none."""
+
+    def getsockopt(self, level: int, name: int, length: int = 4) -> bytes:  # type: ignore[override]
+        return struct.pack("=9I", *8 * [0], 3) if name == 55 else super().getsockopt(level, name, length)
+
+
+class FullBus(SocketcanBus):
+    """A bus as of SocketCAN with an error frame."""
+
+    def __init__(self) -> None:
+        near, self.far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket, self.channel_info = SlowSocket(fileno=near.detach()), "a pair of sockets"
+        self.far.send(struct.pack("=IB3x8s", 0x20000004, 8, bytes(8)))
+
+    def shutdown(self) -> None:
+        self.socket.close()
+        self.far.close()
+
+
+def test_error_frames_and_frames_that_were_not_read_in_time_are_told_below(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ecu_node.monitor.open_bus", lambda *_, **__: FullBus())
+    assert main([*MONITOR, "--once", "0.2"]) == 1
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        "error frames of the bus: 1; a wrong bit rate, or a fault in the wiring?",
+        "frames that this computer was too slow to read: 3; they count as lost above",
+    ]
 
 
 def test_a_bus_without_any_branch_ends_in_1(capsys: pytest.CaptureFixture[str]) -> None:

@@ -108,6 +108,11 @@ def test_every_width_shows_every_current_quality_and_fault(width: int) -> None:
         assert words in text
 
 
+def test_in_a_terminal_too_narrow_for_the_currents_lines_are_cut() -> None:
+    lines = drawn(16, height=60)
+    assert lines[lines.index(16 * "─") + 1] == "battery     +100"
+
+
 def test_a_line_is_marked_by_what_it_tells() -> None:
     styles = {
         line.text.split(":")[0].split()[0]: line.style for line in picture(VIEW, "can0", width=80, height=24)[5:8]

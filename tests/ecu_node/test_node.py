@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import deepcopy
+from typing import Never
 
 import can
 import pytest
@@ -418,6 +419,59 @@ def test_a_bus_of_which_only_sending_tells_that_it_is_gone_is_opened_again(
     with node_on(database, "", lambda: next(buses)) as corrector:
         receive(peer, 0x5F0, 3)
     assert corrector.counters.reopened == 1
+
+
+class GoneForBothBus(VirtualBus):
+    """A bus that is gone: who sends learns it later than who receives."""
+
+    sending, let_go = threading.Event(), threading.Event()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self.sending.set()
+        assert self.let_go.wait(LONGEST_WAIT_S)
+        raise can.CanOperationError("No such device or address", errno.ENXIO)
+
+    def _recv_internal(self, timeout: float | None) -> Never:
+        raise can.CanOperationError("Network is down", errno.ENETDOWN)
+
+
+def test_a_bus_that_is_gone_for_both_threads_is_opened_again_once(request: pytest.FixtureRequest) -> None:
+    channel = request.node.name
+    gone, said, counters = GoneForBothBus(channel), list[str](), Counters()
+    buses = iter([gone, VirtualBus(channel)])
+    bus = SteadyBus(lambda: next(buses), counters, said.append)
+    bus.send(can.Message(arbitration_id=1, is_extended_id=False))
+    with ThreadPoolExecutor(2) as pool:
+        sent = pool.submit(bus.flush)
+        assert gone.sending.wait(LONGEST_WAIT_S)
+        received = pool.submit(bus.receive, 0.01)
+        wait_until(lambda: len(said) == 1)
+        gone.let_go.set()
+        assert (sent.result(LONGEST_WAIT_S), received.result(LONGEST_WAIT_S)) == ((0, 1), None)
+    wait_until(lambda: bus.receive(0.01) is None and bus.is_open)
+    bus.close()
+    assert (len(said), counters.reopened) == (2, 1)
+
+
+class StubbornBus(BrokenBus):
+    """A bus that is gone, and cannot be closed either."""
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        raise can.CanOperationError("No such device")
+
+
+def test_a_bus_that_cannot_be_closed_is_opened_again_and_an_error_frame_that_waits_there_is_counted(
+    request: pytest.FixtureRequest,
+) -> None:
+    channel, counters = request.node.name, Counters()
+    noisy = VirtualBus(channel)
+    noisy.queue.put(can.Message(arbitration_id=0x40, is_error_frame=True))
+    buses = iter([StubbornBus(channel), StubbornBus(channel), noisy])
+    bus = SteadyBus(lambda: next(buses), counters)
+    wait_until(lambda: bus.receive(0.01) is None and counters.reopened == 1)
+    bus.close()
+    assert (counters.bus_errors, counters.bus_off) == (1, 1)
 
 
 def test_a_bus_that_the_other_thread_has_just_closed_is_no_surprise(request: pytest.FixtureRequest) -> None:

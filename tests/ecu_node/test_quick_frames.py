@@ -113,8 +113,24 @@ def test_an_overlay_node_sends_the_same(
     assert asdict(one.counters) == asdict(other.counters)
 
 
-def test_a_message_that_is_not_ordinary_has_no_quick_functions(make_database: Callable[..., VehicleDatabase]) -> None:
-    database = make_database(dbc=SMALL_DBC.replace("Motor : 23|16@0-", "Motor : 16|16@1-"))
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("Motor : 23|16@0-", "Motor : 16|16@1-"),
+        ('VAL_ 256 Battery -32768 "SNA"', 'VAL_ 256 Battery -32768 "SNA" 7 "Odd"'),  # a name amid the values
+    ],
+)
+def test_a_message_that_is_not_ordinary_has_no_quick_functions(
+    make_database: Callable[..., VehicleDatabase], old: str, new: str
+) -> None:
+    database = make_database(dbc=SMALL_DBC.replace(old, new))
     source = wire(database, InForce(parameters=parameters_for(database, battery=(0.1, 0.0))), 0.0).sources[(256, False)]
     assert source.forward == source._forward
+    assert source.answer == source._answer
+
+
+def test_an_answer_in_two_byte_orders_is_not_ordinary(make_database: Callable[..., VehicleDatabase]) -> None:
+    database = make_database(dbc=SMALL_DBC.replace("Battery : 0|16@1-", "Battery : 7|16@0-"))
+    source = wire(database, InForce(parameters=parameters_for(database, battery=(0.1, 0.0))), 0.0).sources[(256, False)]
+    assert source.forward != source._forward
     assert source.answer == source._answer

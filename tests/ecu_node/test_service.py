@@ -10,7 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from ecu_node.database import VehicleDatabase
+from ecu_node.guard import Mode
+from ecu_node.parameter_file import ParameterFile
+from ecu_node.run import _Tick
 from ecu_node.service import Log, Requests, ServiceManager
+from ecu_node.wiring import wire
 
 WATCHDOG_S = 4.0
 
@@ -75,6 +80,20 @@ def test_a_watchdog_that_is_none_or_another_process_s_is_not_fed(
         monkeypatch.setenv(variable, value)
     ServiceManager().alive(1.0)
     assert managed.told() == []
+
+
+def test_a_node_that_does_not_do_its_work_does_not_feed_the_watchdog(
+    managed: Manager, database: VehicleDatabase, requests: Requests, tmp_path: Path
+) -> None:
+    said = list[str]()
+    file = ParameterFile(tmp_path / "none.json", database, None, mode=Mode.GATEWAY, say=said.append)
+    corrector = wire(database, file.in_force, 0.0, mode=Mode.GATEWAY)
+    tick = _Tick(corrector=corrector, buses=[], file=file, requests=requests, manager=ServiceManager(), say=said.append)
+    found = []
+    for works in (False, True):
+        tick(1000.0, works)
+        found.append("WATCHDOG=1" in managed.told())
+    assert found == [False, True]
 
 
 def test_an_abstract_address_is_understood(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,6 +162,19 @@ def test_a_line_that_comes_and_goes_is_seen_to(
     for text in ("a", "b", "a", "c"):
         log.say(text)
     assert capsys.readouterr().err.splitlines() == ["ecu-node: a", "ecu-node: b", "ecu-node: a", "ecu-node: c"]
+
+
+def test_of_more_lines_than_it_remembers_each_is_said(
+    clock: Callable[[float], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Else a log of ever other lines would take ever more memory."""
+    clock(0.0)
+    log = Log()
+    for text in (*5 * ["a"], *map(str, range(100)), "a"):
+        log.say(text)
+    assert len(log._said) <= 100
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [f"ecu-node: {text}" for text in (*3 * ["a"], *map(str, range(100)), "a")]
 
 
 def test_a_log_that_is_gone_does_not_end_the_node(monkeypatch: pytest.MonkeyPatch) -> None:

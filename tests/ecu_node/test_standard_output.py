@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from ecu_node import __version__
+from ecu_node.errors import UserError
+from ecu_node.standard_output import drop_output, write_output
 from tests.ecu_node.vehicles import LAYOUT
 
 FULL = "import resource, runpy, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
@@ -54,13 +56,33 @@ def test_the_calibrator_says_it_the_same_way(tmp_path: Path, arguments: list[str
     assert (done.returncode, done.stderr) == (1, f"calibrator{LINE}")
 
 
-@pytest.mark.parametrize("program", ["ecu_node", "calibrator"])
-def test_where_standard_output_is_closed_nothing_is_said(program: str) -> None:
+@pytest.mark.parametrize("command", ["ecu_node --version", "ecu_node schema", "calibrator --version"])
+def test_where_standard_output_is_closed_nothing_is_said(command: str) -> None:
     done = subprocess.run(
-        ["/bin/sh", "-c", f'"$0" -m {program} --version >&-', sys.executable],
+        ["/bin/sh", "-c", f'"$0" -m {command} >&-', sys.executable],
         stderr=subprocess.PIPE,
         text=True,
         timeout=60,
         check=False,
     )
     assert (done.returncode, done.stderr.removeprefix(f"ecu-node {__version__}\n")) == (0, "")
+
+
+def test_a_full_disk_that_shows_when_the_output_is_written_out_is_told_and_leaves_nothing_behind(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        with pytest.raises(UserError, match=r"^standard output: cannot write the result: No space left on device;"):
+            write_output("x")
+        write_output("what follows is dropped")
+
+
+def test_a_reader_that_has_left_is_no_error_of_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as left:
+        monkeypatch.setattr(sys, "stdout", left)
+        with pytest.raises(BrokenPipeError):
+            write_output("x")
+        drop_output()

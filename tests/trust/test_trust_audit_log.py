@@ -12,6 +12,7 @@ from pathlib import Path
 from random import Random
 
 import pytest
+from msgspec.structs import replace
 
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
@@ -20,7 +21,7 @@ from ecu_node.trust import storage
 from ecu_node.trust.activation import accept, conclude
 from ecu_node.trust.audit import REFUSED, End, add_entry, broken_line, end_of_log, event_now, next_entry
 from ecu_node.trust.log_lines import lines, lines_from_the_end
-from ecu_node.trust.state import audit_path, read_state
+from ecu_node.trust.state import audit_path, read_state, write_state
 from ecu_node.trust.storage import locked
 from tests.trust.damage import a_folder, a_loop, a_pipe, without
 from tests.trust.signing import NOW, Run, Signers, on
@@ -103,6 +104,22 @@ def test_the_last_change_that_a_power_cut_kept_from_the_log_is_no_alarm(two_slot
         code, out, err = run("inspect", two_slots)
         assert (code, err) == (0, ""), content[-80:]
         assert ("the next command adds it: in force" in out) == (content != whole[:-1])
+
+
+def test_a_state_that_does_not_say_what_has_made_it_so_is_used(
+    two_slots: Path, signers: Signers, database: VehicleDatabase, run: Run
+) -> None:
+    """As the key is one that may be left out."""
+    write_state(two_slots, replace(read_state(two_slots), made_by=None))
+    assert run("inspect", two_slots)[::2] == (0, "")
+    accept(two_slots, signers.revocation(7, 6), "f", database, datetime.now(UTC))
+    assert run("inspect", two_slots)[::2] == (0, "")
+
+
+def test_a_log_on_a_disk_that_fails_is_one_line() -> None:
+    """The first page of a process cannot be read, as a block of such a disk."""
+    with pytest.raises(UserError, match=r"^/proc/self/mem: cannot read the audit log: Input/output error$"):
+        list(lines(Path("/proc/self/mem")))
 
 
 def test_a_refusal_is_kept_with_the_number_that_the_file_gives_itself(

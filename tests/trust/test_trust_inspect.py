@@ -115,4 +115,10 @@ def test_signatures_are_verified_with_a_key_set(
         else:
             assert (code, len(err.splitlines()), words in err) == (1, 1, True)
     assert run("inspect", trusted, "--keys", trusted)[0] == 1
+    rotated = tmp_path / "keys-2.json"
+    rotated.write_bytes(signers.key_set(signers.keys("ab", version=2)))
+    assert run("inspect", file, "--keys", rotated)[1].splitlines()[-1] == "signed by a, b; enough, 2 of a, b are needed"
+    code, out, err = run("inspect", file, "--keys", file)
+    assert (code, out, len(err.splitlines())) == (1, "", 1)
+    assert f"{file}: " in err
     assert run("inspect", tmp_path, "--keys", trusted)[0] == 2

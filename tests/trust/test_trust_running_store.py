@@ -154,13 +154,13 @@ def test_a_trial_begins_once_the_clock_is_set(
     accept(two_slots, signers.parameters(parameters, 7, not_before=now - DAY), "f", database, now)
     running = Running(two_slots, database, now=lambda: now - 1000 * DAY)
     assert running.corrector.reason is Reason.NOT_VALID_NOW
-    for now_s in range(0, 50, 2):
+    for now_s in range(0, 110, 2):  # it is tried again each minute, and told once
         running.store.look(running.corrector, float(now_s))
     (line,) = running.said
     assert line.startswith("no trial yet: ")
     assert "is the clock set?" in line
     running.now = lambda: now
-    for now_s in range(50, 70, 2):
+    for now_s in range(110, 130, 2):
         running.store.look(running.corrector, float(now_s))
     assert (running.drift, running.corrector.reason) == (DRIFT, Reason.NONE)
     assert "number 7 is on trial: parameter set 300" in running.said

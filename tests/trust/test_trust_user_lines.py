@@ -1,5 +1,6 @@
 """One line for each mistake, whatever a name or a file is made of; and what a node says of revocations."""
 
+import errno
 import os
 import shutil
 import subprocess
@@ -79,8 +80,15 @@ def test_a_disk_that_must_not_be_written_is_not_taken_for_another_folder(
     def read_only(*_: object) -> int:
         raise OSError(30, os.strerror(30))
 
+    def no_locks(*_: object) -> None:  # as a folder of another machine
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
     with pytest.raises(UserError, match="name a folder made by 'ecu-node provision'"), locked(in_force / "none"):
         pass
+    with monkeypatch.context() as without_locks:
+        without_locks.setattr("ecu_node.trust.storage.fcntl.flock", no_locks)
+        with pytest.raises(UserError, match=r"cannot be used as state: No locks available$"), locked(in_force):
+            pass
     monkeypatch.setattr(storage, "_open", read_only)
     with pytest.raises(UserError, match=r"cannot be used as state: Read-only file system$"), locked(in_force):
         pass
