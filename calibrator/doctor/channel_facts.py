@@ -139,8 +139,6 @@ def channel_facts(
     values = _good_values(channels)
     if (other := sum(frames_of) - sum(bad.values()) - len(values)) > 0:
         bad["no voltage"] = other
-    step = np.concatenate([np.zeros(0), *steps])
-    period_s = float(np.median(step)) if len(step) else np.nan
     return ChannelFacts(
         name=name,
         signal=signal_name,
@@ -148,17 +146,25 @@ def channel_facts(
         frames=sum(frames_of),
         in_logs=sum(count > 0 for count in frames_of),
         logs=len(logs),
-        period_s=period_s,
-        jitter_s=float(np.quantile(np.abs(step - period_s), 0.95)) if len(step) else np.nan,
-        gap_s=float(step.max()) if len(step) else np.nan,
-        late=int(np.sum(step > timeout_s + TIME_RESOLUTION_S)),
-        same_time=int(np.sum(step <= 0.0)),
+        **_spacing(np.concatenate([np.zeros(0), *steps]), timeout_s),
         bad={reason: count for reason, count in bad.items() if count},
         low=float(values.min()) if len(values) else np.nan,
         high=float(values.max()) if len(values) else np.nan,
         moves=bool(len(values) and values.max() > values.min()),
         clipped=clipped,
     )
+
+
+def _spacing(step_s: Array, timeout_s: float) -> dict[str, Any]:
+    """Figures of the distances of frames, by the names of :class:`ChannelFacts`."""
+    period_s = float(np.median(step_s)) if len(step_s) else np.nan
+    return {
+        "period_s": period_s,
+        "jitter_s": float(np.quantile(np.abs(step_s - period_s), 0.95)) if len(step_s) else np.nan,
+        "gap_s": float(step_s.max()) if len(step_s) else np.nan,
+        "late": int(np.sum(step_s > timeout_s + TIME_RESOLUTION_S)),
+        "same_time": int(np.sum(step_s <= 0.0)),
+    }
 
 
 def _good_values(channels: Sequence[Channel | None]) -> Array:

@@ -11,6 +11,8 @@ PYTHON = sys.executable
 LAYOUT = "dbc/hv_powertrain.toml"
 CODE = ("calibrator", "ecu_node", "dbc")
 EVERYTHING = (".",)
+TOOLS = {"PYTHONPATH": "tools"}
+SINGLE = {**TOOLS, "OMP_NUM_THREADS": "1"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +42,19 @@ class Step:
 
 def steps(out: Path, recorded: Path) -> Iterator[Step]:
     """What measures, in an order that shows the most first."""
-    tools = {"PYTHONPATH": "tools"}
-    single = {**tools, "OMP_NUM_THREADS": "1"}
+    yield from _tests(out)
+    yield Step(
+        name="bench",
+        command=(PYTHON, "-m", "bench.all", "--out", str(out / "bench.json")),
+        runs=("tools/bench", "tools/with_vcan", *CODE),
+        environment=SINGLE,
+    )
+    yield from _experiments(out, recorded)
+    yield from _trials()
+
+
+def _tests(out: Path) -> Iterator[Step]:
+    """All tests, and what they reach."""
     pytest = (PYTHON, "-m", "pytest", "-q", "--cov", "--cov-report=")
     covered = str(out / "coverage")
     yield Step(
@@ -68,18 +81,16 @@ def steps(out: Path, recorded: Path) -> Iterator[Step]:
         runs=EVERYTHING,
         environment={"COVERAGE_FILE": covered},
     )
-    yield Step(
-        name="bench",
-        command=(PYTHON, "-m", "bench.all", "--out", str(out / "bench.json")),
-        runs=("tools/bench", "tools/with_vcan", *CODE),
-        environment=single,
-    )
+
+
+def _experiments(out: Path, recorded: Path) -> Iterator[Step]:
+    """The recorded trips as drives, and every experiment."""
     trips, layout = str(out / "i3"), ("--layout", LAYOUT)
     yield Step(
         name="trips",
         command=(PYTHON, "tools/import_bmw_i3.py", str(recorded), *layout, "--out", trips),
         runs=("tools/import_bmw_i3.py", "dbc"),
-        environment=tools,
+        environment=TOOLS,
     )
     options = ("--drives", trips, *layout, "--out", str(out / "experiments"))
     yield Step(
@@ -87,29 +98,33 @@ def steps(out: Path, recorded: Path) -> Iterator[Step]:
         command=(PYTHON, "-m", "calibrator", "experiment", "all", *options),
         runs=("calibrator/experiments", "tools/import_bmw_i3.py", "dbc"),
     )
+
+
+def _trials() -> Iterator[Step]:
+    """A fleet from its drives to the road, random frames and files, and a million vehicles."""
     chain = ("--vehicles", "500", "--minutes", "5", "--unseen-minutes", "3", "--unmeasured", "2", "0.5", "--json")
     yield Step(
         name="chain",
         command=(PYTHON, "tools/trust_chain.py", *chain),
         runs=("tools/trust_chain.py", *CODE),
-        environment=tools,
+        environment=TOOLS,
     )
     yield Step(
         name="trust fuzz",
         command=(PYTHON, "-m", "bench.trust_fuzz", "--seed", "7"),
         runs=("tools/bench/trust_fuzz.py", "dbc"),
-        environment=tools,
+        environment=TOOLS,
     )
     for seed in ("31", "32"):
         yield Step(
             name=f"node fuzz {seed}",
             command=(PYTHON, "-m", "bench.node_fuzz", "--frames", "5000000", "--seed", seed),
             runs=("tools/bench/node_fuzz.py", "dbc"),
-            environment=tools,
+            environment=TOOLS,
         )
     yield Step(
         name="million",
         command=(PYTHON, "-m", "bench.fleet_run"),
         runs=("tools/bench/fleet_run.py", "calibrator/calibration", "dbc"),
-        environment=single,
+        environment=SINGLE,
     )
