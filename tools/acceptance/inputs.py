@@ -39,11 +39,16 @@ def files_that_run(root: Path, entries: Sequence[str]) -> frozenset[Path]:
     root = root.resolve()
     waiting = [path for entry in entries for path in _files(root, entry)]
     found: set[Path] = set()
+    imported: set[str] = set()
     while waiting:
         path = waiting.pop()
-        if path not in found:
-            found.add(path)
-            waiting += _imported(root, path) if path.suffix == ".py" else ()
+        if path in found:
+            continue
+        found.add(path)
+        if path.suffix == ".py":
+            names = set(_names(path.read_text(encoding="utf-8"))) - imported
+            imported |= names
+            waiting += [module for name in names for module in _modules(root, name)]
     return frozenset(found)
 
 
@@ -63,11 +68,6 @@ def _files(root: Path, entry: str) -> list[Path]:
     if not names:
         raise FileNotFoundError(f"{root / entry}: nothing of it is committed")
     return [root / name for name in names]
-
-
-def _imported(root: Path, path: Path) -> Iterator[Path]:
-    for name in _names(path.read_text(encoding="utf-8")):
-        yield from _modules(root, name)
 
 
 @cache
