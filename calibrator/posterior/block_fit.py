@@ -135,7 +135,6 @@ def weigh_nodes(
     number = nodes.counts[held]
     start = rows.level[1] + 0.5 * (fitted * LOG_2PI - cholesky(rows.A, room.fitted, fitted, room.L)) - math.log(number)
     least = _follow_pivots(rows, fitted, held, room)
-    log_density = -math.log(2.0 * (nodes.high - nodes.low))
     if not nodes.logarithmic:
         for i in range(fitted):
             start += math.log(unit[room.fitted[i]])
@@ -148,7 +147,7 @@ def weigh_nodes(
                 room.right[i] -= room.lever[i, j] * nodes.values[held, q, j]
             if nodes.logarithmic:
                 value += room.right[i]
-        if not value + fitted * log_density >= floor:
+        if not value + fitted * nodes.log_density >= floor:
             out[q] = -np.inf
             continue
         if not has_variances:
@@ -157,7 +156,8 @@ def weigh_nodes(
         for i in range(fitted):
             scale = math.exp(room.right[i]) if nodes.logarithmic else unit[room.fitted[i]]
             mean = scale - 1.0 if nodes.logarithmic else room.right[i] * scale
-            value += log_mass(mean, math.sqrt(room.variance[i]) * scale, nodes.low, nodes.high)
+            smaller = nodes.smaller if room.fitted[i] >= nodes.hardware else 0.0
+            value += log_mass(mean, math.sqrt(room.variance[i]) * scale, nodes.low, nodes.high, smaller)
         out[q] = value
     return int(number)
 

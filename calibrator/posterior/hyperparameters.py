@@ -46,6 +46,8 @@ MEDIAN_SHARE = 2.0 / np.pi
 """Vehicles of a mean as sure as the median of one: efficiency of the median. [1]"""
 PSEUDO_VEHICLES = 1.0
 """Weight of the guesses of the shares of faults, in vehicles."""
+PSEUDO_FAULTS = 1.0
+"""Weight of the guess of the share of smaller faults, in faults."""
 GUESSED_HARDWARE_SHARE = 0.3
 """Share of vehicles with a hardware fault before anything is known. [1]"""
 DECAY = 0.7
@@ -192,8 +194,10 @@ def _next_prior(states: States, prior: FaultPrior) -> FaultPrior:
     counts = _tallies(states, prior)
     return FaultPrior(
         counts=counts / counts.sum(),
-        relative=_next_slab(states.relative, states.relative_sd, states.weight, prior.relative),
-        constant=_next_slab(states.constant, states.constant_sd, states.weight, prior.constant),
+        relative=_next_slab(states.relative, states.relative_sd, states.weight, prior.relative, hardware=1),
+        constant=_next_slab(
+            states.constant, states.constant_sd, states.weight, prior.constant, hardware=states.branches - 1
+        ),
     )
 
 
@@ -218,7 +222,7 @@ def _drawn_slab(rng: np.random.Generator, slab: Slab, faults: float) -> Slab:
     """Bounds farther out, as far as so many draws of a uniform distribution may miss its ends by."""
     margin = (slab.high - slab.low) / (faults + 1.0)
     low, high = slab.low - margin * rng.exponential(), slab.high + margin * rng.exponential()
-    return Slab(max(low, WIDEST.low), min(high, WIDEST.high))
+    return replace(slab, low=max(low, WIDEST.low), high=min(high, WIDEST.high))
 
 
 def _faults(parameters: Array, weight: Array) -> float:
@@ -226,7 +230,7 @@ def _faults(parameters: Array, weight: Array) -> float:
     return float(np.sum(weight[:, :, None] * (parameters != 0.0)))
 
 
-def _next_slab(parameters: Array, sd: Array, weight: Array, slab: Slab) -> Slab:
+def _next_slab(parameters: Array, sd: Array, weight: Array, slab: Slab, *, hardware: int) -> Slab:
     """Most likely bounds: each candidate weighs the states anew; first the lower bound, then the upper one.
 
     Both are then moved outwards by what the extremes of so many draws of a uniform distribution fall short of its ends.
@@ -235,26 +239,43 @@ def _next_slab(parameters: Array, sd: Array, weight: Array, slab: Slab) -> Slab:
     faults = _faults(parameters, weight)
     if faults < 1.0:
         return slab
-    before = np.where(parameters != 0.0, slab.log_mass(parameters, sd), 0.0).sum(axis=2)
+    smaller = np.where(np.arange(parameters.shape[2]) < hardware, 0.0, slab.smaller)
+    within = np.where(smaller, slab.log_mass(parameters, sd), replace(slab, smaller=0.0).log_mass(parameters, sd))
+    before = np.where(parameters != 0.0, within, 0.0).sum(axis=2)
     others = np.log(np.maximum(weight, np.finfo(float).tiny)) - before
     parameters, sd = np.ascontiguousarray(parameters), np.ascontiguousarray(sd)
 
     def log_evidence(candidate: Slab) -> float:
-        return _log_evidence(others, parameters, sd, candidate.low, candidate.high)
+        return _log_evidence(others, parameters, sd, smaller, (candidate.low, candidate.high))
 
     for coarse in (True, False):
         lows, highs = (LOWS, HIGHS) if coarse else (slab.low * FINE, slab.high * FINE)
-        slab = max([slab, *(Slab(float(x), slab.high) for x in lows if x < 0.7 * slab.high)], key=log_evidence)
-        slab = max([slab, *(Slab(slab.low, float(x)) for x in highs if x > 1.4 * slab.low)], key=log_evidence)
+        slab = max([slab, *(replace(slab, low=float(x)) for x in lows if x < 0.7 * slab.high)], key=log_evidence)
+        slab = max([slab, *(replace(slab, high=float(x)) for x in highs if x > 1.4 * slab.low)], key=log_evidence)
     margin = (slab.high - slab.low) / (faults + 1.0)
-    return Slab(max(slab.low - margin, WIDEST.low), min(slab.high + margin, WIDEST.high))
+    return replace(
+        slab,
+        low=max(slab.low - margin, WIDEST.low),
+        high=min(slab.high + margin, WIDEST.high),
+        smaller=_share_below(parameters[:, :, hardware:], sd[:, :, hardware:], weight, slab),
+    )
+
+
+def _share_below(parameters: Array, sd: Array, weight: Array, slab: Slab) -> float:
+    """Share of the sensors' faults that are smaller than the slab; the guess counted in."""
+    inside = replace(slab, smaller=0.0).log_mass(parameters, sd) + np.log1p(-slab.smaller)
+    below = 1.0 - np.exp(inside - slab.log_mass(parameters, sd))
+    present = weight[:, :, None] * (parameters != 0.0)
+    number = float(np.sum(present * below)) + PSEUDO_FAULTS * WIDEST.smaller
+    return number / (float(np.sum(present)) + PSEUDO_FAULTS)
 
 
 @in_place
-def _log_evidence(others: Array, parameters: Array, sd: Array, low: float, high: float) -> float:
+def _log_evidence(others: Array, parameters: Array, sd: Array, smaller: Array, bounds: tuple[float, float]) -> float:
     """Logarithm of the evidence of N vehicles under a slab.
 
-    ``others`` (N, S) is what the states owe to all else, ``parameters`` and ``sd`` (N, S, P) are zero where not active.
+    ``others`` (N, S) is what the states owe to all else, ``parameters`` and ``sd`` (N, S, P) are zero where not active,
+    ``smaller`` (P,) is the share of faults below the slab.
     """
     total = 0.0
     for j in range(len(others)):
@@ -263,7 +284,7 @@ def _log_evidence(others: Array, parameters: Array, sd: Array, low: float, high:
             value = others[j, s]
             for p in range(parameters.shape[2]):
                 if parameters[j, s, p] != 0.0:
-                    value += _log_density(parameters[j, s, p], sd[j, s, p], low, high)
+                    value += _log_density(parameters[j, s, p], sd[j, s, p], *bounds, smaller[p])
             if value > best:
                 best, sum_ = value, sum_ * math.exp(best - value) + 1.0
             else:
@@ -273,7 +294,7 @@ def _log_evidence(others: Array, parameters: Array, sd: Array, low: float, high:
 
 
 @inner
-def _log_density(mean: float, sd: float, low: float, high: float) -> float:
+def _log_density(mean: float, sd: float, low: float, high: float, smaller: float) -> float:
     """Of one parameter under the slab; not below the least one."""
-    mass = log_mass(mean, sd, low, high)
+    mass = log_mass(mean, sd, low, high, smaller)
     return max(mass, LOG_LEAST_DENSITY) + math.log1p(math.exp(-abs(mass - LOG_LEAST_DENSITY)))

@@ -1,5 +1,6 @@
 """Nodes of a slab, for any number of open directions, as compiled functions take them."""
 
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -15,20 +16,26 @@ __all__ = ["SlabNodes", "slab_nodes"]
 class SlabNodes(NamedTuple):
     """A slab, and its nodes for 0 .. D open directions; both logarithms and values where they stand for drifts.
 
+    The first ``hardware`` parameters are the hardware's, of which none is smaller than the slab. No density is larger
+    than the one whose logarithm is ``log_density``.
+
     ``values`` (D + 1, Q, D), of which ``counts[d]`` are used; ``sd`` (D + 1, Q, D) what each stands for; ``spacing``
     (D + 1,) how far they lie apart if there is one direction more.
     """
 
     low: float
     high: float
+    smaller: float
+    log_density: float
     logarithmic: bool
+    hardware: int
     counts: Places
     values: Array
     sd: Array
     spacing: Array
 
 
-def slab_nodes(slab: Slab, directions: int, *, logarithmic: bool) -> SlabNodes:
+def slab_nodes(slab: Slab, directions: int, *, logarithmic: bool, hardware: int) -> SlabNodes:
     """Nodes of a slab for up to so many open directions.
 
     Parameters
@@ -39,6 +46,8 @@ def slab_nodes(slab: Slab, directions: int, *, logarithmic: bool) -> SlabNodes:
         Most directions that can be open.
     logarithmic : bool
         Whether the rows are linear in the logarithm of 1 + parameter.
+    hardware : int
+        How many of the parameters, the first ones, are the hardware's.
 
     Returns
     -------
@@ -55,7 +64,10 @@ def slab_nodes(slab: Slab, directions: int, *, logarithmic: bool) -> SlabNodes:
     return SlabNodes(
         low=slab.low,
         high=slab.high,
+        smaller=slab.smaller,
+        log_density=float(np.log(max(replace(slab, smaller=0.0).density, slab.density_below))),
         logarithmic=logarithmic,
+        hardware=hardware,
         counts=np.array([len(unit) for unit in units]),
         values=values,
         sd=sd,

@@ -163,15 +163,18 @@ def normal_mass(low: float, high: float) -> float:
 
 
 @inner
-def log_mass(mean: float, sd: float, low: float, high: float) -> float:
+def log_mass(mean: float, sd: float, low: float, high: float, smaller: float) -> float:
     """As :meth:`calibrator.posterior.slab.Slab.log_mass`, of one value."""
-    spread, magnitude = max(sd, LEAST_DEVIATION), abs(mean)
+    spread, magnitude, density = max(sd, LEAST_DEVIATION), abs(mean), 0.5 * (1.0 - smaller) / (high - low)
     if low + NEVER * spread < magnitude < high - NEVER * spread:
-        return -math.log(2.0 * (high - low))
+        return math.log(density)
     mass = normal_mass((low - magnitude) / spread, (high - magnitude) / spread)
     if spread * NEVER > low + magnitude:
         mass += normal_mass((low + magnitude) / spread, (high + magnitude) / spread)
-    return math.log(max(mass, _LEAST_MASS) * 0.5 / (high - low))
+    mass = max(mass, _LEAST_MASS) * density
+    if smaller > 0.0:
+        mass += normal_mass((-low - magnitude) / spread, (low - magnitude) / spread) * 0.5 * smaller / low
+    return math.log(mass)
 
 
 @inner

@@ -79,7 +79,7 @@ def fitted(
     """Relative rows without a scale, else constant ones; directions are open as under the covariance ``sharp``."""
     P, precision = design.shape[1], np.linalg.inv(R)
     unit = np.ones(P) if scale is None else scale
-    nodes = slab_nodes(slab or SLAB, P, logarithmic=scale is None)
+    nodes = slab_nodes(slab or SLAB, P, logarithmic=scale is None, hardware=0)
     density = -0.5 * (len(y) * np.log(2.0 * np.pi) + np.linalg.slogdet(R)[1])
     rows = Normal(design.T @ precision @ design, design.T @ precision @ y, np.array([y @ precision @ y, density]))
     room, out, places = scratch_of(max(design.shape)), np.zeros(nodes.values.shape[1]), np.array(active, np.int64)

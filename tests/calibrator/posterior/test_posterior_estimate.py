@@ -9,6 +9,7 @@ from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, with_load_spre
 from calibrator.faults import Faults
 from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
 from calibrator.posterior.hyperparameters import draw_hyperparameters, estimate_hyperparameters
+from calibrator.posterior.slab import WIDEST
 from calibrator.posterior.spread_starts import trusted_spread
 from calibrator.posterior.unmeasured_load import unmeasured_load
 from calibrator.score import recovered
@@ -204,6 +205,36 @@ def test_a_fleet_without_faults_gets_no_corrections() -> None:
     assert np.abs(posterior.faults.drift).max() < 0.005
     assert np.abs(posterior.faults.offset_a).max() < 0.005 * FULL_SCALE_A
     assert posterior.sensor_fault.mean() < 0.1
+
+
+def fleet_with_small_offsets(seed: int, vehicles: int = 100) -> Faults:
+    """Sensors alone are faulty: drifts of 7 to 25 %, offsets of 3 to 10 A, and of two branches of 0.3 to 0.9 A only."""
+    rng, branches = np.random.default_rng(seed), 3
+    largest = np.concatenate([np.full(branches, 0.25), FULL_SCALE_A * np.array([0.025, 0.0022, 0.0022])])
+    faults = np.zeros((vehicles, 2 * branches))
+    for vehicle in range(vehicles):
+        for place in rng.choice(2 * branches, rng.choice(3, p=[0.45, 0.4, 0.15]), replace=False):
+            faults[vehicle, place] = largest[place] * rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 1.0)
+    none = np.zeros((vehicles, branches))
+    return Faults(
+        hardware_drift=none[:, 0], hardware_offset_a=none, drift=faults[:, :branches], offset_a=faults[:, branches:]
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_offsets_smaller_than_the_smallest_looked_for_are_no_hardware_fault(seed: int) -> None:
+    """A hardware current and an offset that cancel on one branch would leave the same small offset of another."""
+    faults = fleet_with_small_offsets(seed)
+    small = ((faults.offset_a != 0.0) & (np.abs(faults.offset_a) < WIDEST.low * FULL_SCALE_A)).any(axis=1)
+    posterior = estimate(faults, seed=seed, errors=Errors(intercept=0.0006, junction=0.00005))
+    assert small.sum() > 15
+    assert posterior.hardware_fault.max() < 0.1
+    assert posterior.hyperparameters.prior.hardware_share < 0.02
+    found = np.abs(posterior.faults.offset_a - faults.offset_a).max(axis=1) < 0.3
+    assert found[small].mean() > 0.6
+    corrected = (posterior.harm < 1e-3) & (posterior.faults.offset_a != 0.0)
+    left = np.abs(posterior.faults.offset_a - faults.offset_a)
+    assert (left < np.abs(faults.offset_a))[corrected].all()
 
 
 def test_an_error_of_the_reference_common_to_all_is_taken_out(truth: Faults, posterior: FleetPosterior) -> None:

@@ -23,6 +23,15 @@ def test_density_integrates_to_one() -> None:
     assert 2.0 * (SLAB.high - SLAB.low) * SLAB.density == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(("mean", "sd"), [(0.1, 0.02), (0.05, 0.001), (0.0, 0.1), (0.01, 0.002), (-0.02, 1e-6)])
+def test_a_share_of_smaller_faults_lies_evenly_below_the_slab(mean: float, sd: float) -> None:
+    slab = Slab(0.05, 0.25, smaller=0.01)
+    below = norm.cdf(0.05, mean, sd) - norm.cdf(-0.05, mean, sd)
+    expected = 0.99 * np.exp(SLAB.log_mass(np.array(mean), np.array(sd))) + 0.01 * below / 0.1
+    assert slab.log_mass(np.array(mean), np.array(sd)) == pytest.approx(np.log(expected), abs=1e-9)
+    assert 2.0 * (0.2 * slab.density + 0.05 * slab.density_below) == pytest.approx(1.0)
+
+
 def test_sign_does_not_matter_and_a_common_unit_only_shifts() -> None:
     mean, sd = np.linspace(-0.4, 0.4, 17), np.full(17, 0.03)
     plain = SLAB.log_mass(mean, sd)

@@ -54,8 +54,8 @@ def mass_between(low: float, high: float) -> float:
 
 
 @in_place
-def log_mass_of(mean: float, sd: float, low: float, high: float) -> float:
-    return log_mass(mean, sd, low, high)
+def log_mass_of(mean: float, sd: float, low: float, high: float, smaller: float) -> float:
+    return log_mass(mean, sd, low, high, smaller)
 
 
 @in_place
@@ -141,11 +141,12 @@ def test_the_mass_beyond_a_value_reaches_to_infinity() -> None:
 
 
 @pytest.mark.parametrize("sd", [0.0, 1e-4, 0.004, 0.02, 0.1, 1.0, 30.0])
-@pytest.mark.parametrize("slab", [Slab(0.05, 0.25), Slab(0.002, 0.45)])
+@pytest.mark.parametrize("slab", [Slab(0.05, 0.25), Slab(0.002, 0.45), Slab(0.05, 0.25, 0.01), Slab(0.002, 0.45, 0.4)])
 def test_the_mass_of_one_value_is_that_of_the_slab(slab: Slab, sd: float) -> None:
     for mean in np.linspace(-0.5, 0.5, 42):
         expected = float(slab.log_mass(np.array(mean), np.array(sd)))
-        assert log_mass_of(float(mean), sd, slab.low, slab.high) == pytest.approx(expected, abs=1e-6)
+        told = log_mass_of(float(mean), sd, slab.low, slab.high, slab.smaller)
+        assert told == pytest.approx(expected, abs=1e-6)
 
 
 def share_of_draws(square: float, linear: float, constant: float, mean: float, sd: float) -> float:
