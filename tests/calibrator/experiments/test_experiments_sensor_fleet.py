@@ -76,16 +76,17 @@ def test_what_is_corrected_is_what_was_put_in_and_its_harm_is_below_the_limit(be
 
 def test_the_junction_sum_told_is_that_of_what_is_applied(bent: Calibrated) -> None:
     fleet, parameters, _ = bent
-    for j, _ in deployed(bent):
+    noise_a = 0.4 * np.random.default_rng(1).standard_normal(fleet.learnt[0].measured_a.shape)
+    for (j, _), model in deployed(bent).items():
         told, trip = parameters[fleet.names[j]], fleet.learnt[j]
         faults = [sensor_fault(fleet.recorded.database, InForce(parameters=told), name) for name in fleet.branches]
         currents = [
             [fault.true_current(i_m, at_c) for i_m, at_c in zip(values, trip.temperature_c.tolist(), strict=True)]
-            for fault, values in zip(faults, trip.measured_a.T.tolist(), strict=True)
+            for fault, values in zip(faults, (trip.measured_a + noise_a).T.tolist(), strict=True)
         ]
-        without_noise_a = float(np.sqrt(np.mean(np.sum(np.array(currents, dtype=float), axis=0) ** 2)))
-        noise_a = 0.4 * float(np.sqrt(len(fleet.branches)))
-        assert told.junction_residual.corrected_a == pytest.approx(np.hypot(without_noise_a, noise_a), rel=0.1)
+        residual_a = float(np.sqrt(np.mean(np.sum(np.array(currents, dtype=float), axis=0) ** 2)))
+        near = 0.15 if isinstance(model, GainBySign) else 0.03  # by sign: where noise changes the sign, only nearly
+        assert told.junction_residual.corrected_a == pytest.approx(residual_a, rel=near)
 
 
 def test_the_node_takes_the_parameters_and_shows_their_models(
