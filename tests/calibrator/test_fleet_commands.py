@@ -3,9 +3,6 @@
 import gzip
 import json
 import shutil
-import subprocess
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -17,13 +14,9 @@ from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameter_fit import check_fit
 from ecu_node.parameters import read_parameters
+from tests.calibrator.command_here import calibrator
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
-
-
-def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command: Sequence[str] = [sys.executable, "-m", "calibrator", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
 
 
 @pytest.fixture(scope="module")

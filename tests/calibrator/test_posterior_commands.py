@@ -1,8 +1,6 @@
 """The default method as a user types it: a fleet with delays and a load that no sensor measures."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,14 +12,10 @@ from ecu_node.database import read_database
 from ecu_node.layout import file_digest, read_layout
 from ecu_node.parameter_fit import check_fit
 from ecu_node.parameters import VehicleParameters, read_parameters
+from tests.calibrator.command_here import calibrator
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 DELAY_TOLERANCE_S = 0.005
-
-
-def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "calibrator", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,7 @@ from ecu_node.parameter_fit import check_fit
 from ecu_node.parameters import VehicleParameters, read_parameters
 from ecu_node.sensor_models import GainBySign
 from ecu_node.wiring import wire
+from tests.calibrator.command_here import calibrator
 
 pytest.importorskip("fastsim")
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
@@ -45,8 +46,7 @@ def calibrate_here(store: Path, out: Path, settings: CalibrationSettings) -> Cal
 
 
 def calibrate(store: Path, out: Path, *options: str) -> Calibrated:
-    command = [sys.executable, "-m", "calibrator", "calibrate", store, "--layout", LAYOUT, "--out", out, *options]
-    run = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False, timeout=120)
+    run = calibrator("calibrate", store, "--layout", LAYOUT, "--out", out, *options)
     assert run.returncode == 0, run.stderr
     return {path.stem: read_parameters(path) for path in sorted((out / "params").iterdir())}
 

@@ -20,6 +20,7 @@ from calibrator.results.run_record import read_run
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.calibration.test_run_passes import faults_of_vehicle
+from tests.calibrator.command_here import calibrator
 from tests.calibrator.evidence.simulated_drives import Conditions, summaries_of
 from tests.calibrator.summaries.small_stores import random_faults, record_of, small_store
 
@@ -35,6 +36,10 @@ def command(*arguments: object) -> list[str]:
 def calibrate(store: str, out: Path, *options: object) -> subprocess.CompletedProcess[str]:
     line = command("calibrate", store, "--layout", LAYOUT, "--out", out, *options)
     return subprocess.run(line, capture_output=True, text=True, check=False, timeout=300, env=ENVIRONMENT)
+
+
+def refused(store: str, out: Path, *options: object) -> subprocess.CompletedProcess[str]:
+    return calibrator("calibrate", store, "--layout", LAYOUT, "--out", out, *options)
 
 
 def contents(result: Path) -> dict[str, bytes]:
@@ -130,7 +135,7 @@ def test_a_second_run_to_the_same_place_is_refused(store: SummaryStore, tmp_path
 def test_what_summaries_do_not_tell_is_refused_in_one_line(
     store: SummaryStore, tmp_path: Path, options: tuple[str, ...], code: int, message: str
 ) -> None:
-    run = calibrate(store.url, tmp_path / "out", *options)
+    run = refused(store.url, tmp_path / "out", *options)
     assert run.returncode == code
     assert message in run.stderr.splitlines()[-1]
     assert "Traceback" not in run.stderr
@@ -177,7 +182,7 @@ def test_a_vehicle_that_cannot_be_used_stops_neither_pass(
 def test_since_a_result_without_its_parameters_is_refused(store: SummaryStore, result: Path, tmp_path: Path) -> None:
     shutil.copytree(result, tmp_path / "earlier")
     shutil.rmtree(tmp_path / "earlier" / "parameters")
-    run = calibrate(store.url, tmp_path / "out", "--since", tmp_path / "earlier")
+    run = refused(store.url, tmp_path / "out", "--since", tmp_path / "earlier")
     assert run.returncode == 1
     assert "earlier/parameters: no such folder; expected the parameters of the earlier result: give" in run.stderr
     assert not (tmp_path / ".out.unfinished").exists()
@@ -194,11 +199,11 @@ def test_a_place_that_is_no_fleet_is_told_in_words(store: SummaryStore, tmp_path
         ("both", 1, "both: holds drives (drives) and summaries (summaries.json); move one of them elsewhere"),
         ("empty", 1, "empty: the store of summaries is empty; add drives with 'calibrator summarise'"),
     ):
-        run = calibrate(str(tmp_path / place), tmp_path / "out")
+        run = refused(str(tmp_path / place), tmp_path / "out")
         assert (run.returncode, message in run.stderr.splitlines()[-1]) == (code, True), run.stderr
         assert not (tmp_path / ".out.unfinished").exists()
     for place, code, message in (("", 2, "an empty name; give the path"), ("file://", 1, "'file://': names no place")):
-        run = calibrate(place, tmp_path / "out")
+        run = refused(place, tmp_path / "out")
         assert (run.returncode, message in run.stderr.splitlines()[-1]) == (code, True), run.stderr
 
 
@@ -210,12 +215,9 @@ def test_drives_are_not_summarised_into_a_folder_that_holds_something_else(resul
         ("memory://m", 1, "memory://m: is gone when the command ends"),
         ("", 2, "an empty name; give the path of a folder"),
     ):
-        line = command("summarise", tmp_path / "fleet", "--layout", LAYOUT, "--out", out)
-        run = subprocess.run(line, capture_output=True, text=True, check=False, timeout=120, env=ENVIRONMENT)
+        run = calibrator("summarise", tmp_path / "fleet", "--layout", LAYOUT, "--out", out)
         assert (run.returncode, message in run.stderr.splitlines()[-1]) == (code, True), run.stderr
-    run = subprocess.run(
-        command("summarise", "", "--layout", LAYOUT, "--out", "x"), capture_output=True, text=True, check=False
-    )
+    run = calibrator("summarise", "", "--layout", LAYOUT, "--out", "x")
     assert (run.returncode, "an empty name" in run.stderr) == (2, True)
 
 
@@ -255,7 +257,7 @@ def test_a_full_disk_is_told_with_what_to_do(tmp_path: Path, error: OSError) -> 
 
 
 def test_since_what_is_no_result_is_refused(store: SummaryStore, tmp_path: Path) -> None:
-    run = calibrate(store.url, tmp_path / "out", "--since", tmp_path / "nothing")
+    run = refused(store.url, tmp_path / "out", "--since", tmp_path / "nothing")
     assert run.returncode == 1
     assert "not a result of 'calibrator calibrate'" in run.stderr
     assert "Traceback" not in run.stderr

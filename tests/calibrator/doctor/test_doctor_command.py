@@ -1,12 +1,12 @@
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from calibrator.doctor.text import examination_text
 from ecu_node.database import VehicleDatabase
+from tests.calibrator.command_here import calibrator
 from tests.calibrator.doctor.artificial_logs import examined, true_drive, write_layout, write_log
 
 
@@ -16,8 +16,7 @@ def log(tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase) -> 
 
 
 def doctor(*arguments: object) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "calibrator", "doctor", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return calibrator("doctor", *arguments)
 
 
 def test_exit_code_0_without_errors_and_1_with_one(log: Path, tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 import json
 import signal
 import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -16,6 +15,7 @@ from calibrator.kirchhoff.command import kirchhoff
 from calibrator.recordings.canlog import encode_message, write_candump
 from calibrator.recordings.drive_log import drive_series
 from ecu_node.database import VehicleDatabase
+from tests.calibrator.command_here import calibrator
 
 ROOT = Path(__file__).parents[3]
 LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
@@ -23,8 +23,7 @@ TIME_S = np.arange(0.0, 10.0, 0.05)
 
 
 def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "calibrator", "kirchhoff", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    return calibrator("kirchhoff", *arguments)
 
 
 @pytest.fixture(scope="module")

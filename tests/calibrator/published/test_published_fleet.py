@@ -1,8 +1,6 @@
 """What the published method says of a fleet whose mean is hardly a reference."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +9,10 @@ import pytest
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.faults import slopes_and_intercepts
 from calibrator.published.fleet import LEAST_VEHICLES, SLOPE_SPREAD, few_vehicles_notice
+from tests.calibrator.command_here import calibrator
 
 LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
+FILES = ("--layout", LAYOUT, "--workers", 1)
 
 
 def test_spread_of_slopes_is_that_of_the_default_faults() -> None:
@@ -36,15 +36,12 @@ def test_few_vehicles_are_told_with_the_error_of_their_mean() -> None:
     assert few_vehicles_notice(LEAST_VEHICLES) == ()
 
 
-def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "calibrator", *map(str, arguments), "--layout", str(LAYOUT), "--workers", "1"]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
-
-
 @pytest.fixture(scope="module")
 def small_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("small") / "fleet"
-    calibrator("simulate", "--vehicles", 3, "--minutes", 3, "--unseen-minutes", 0.1, "--common-drive", "--out", out)
+    calibrator(
+        "simulate", "--vehicles", 3, "--minutes", 3, "--unseen-minutes", 0.1, "--common-drive", *FILES, "--out", out
+    )
     return out
 
 
@@ -53,7 +50,7 @@ def test_small_fleet_is_noticed_on_the_screen_and_in_the_record(
     small_fleet: Path, options: list[str], notices: int, tmp_path: Path
 ) -> None:
     method = ["--method", "published", "--classifier", "threshold", *options]
-    run = calibrator("calibrate", small_fleet, *method, "--out", tmp_path / "result")
+    run = calibrator("calibrate", small_fleet, *method, "--out", tmp_path / "result", *FILES)
     record = json.loads((tmp_path / "result" / "run.json").read_text())
     told = [notice for notice in record["notices"] if notice.startswith("3 vehicles are few")]
     assert len(told) == notices
