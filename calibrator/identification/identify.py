@@ -14,6 +14,7 @@
    from input-output data", Automatica 30 (1994) 61-74.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +41,8 @@ BLOCK_ROWS = 10
 """Past and future samples that the subspace step sees: more than the largest order needs. [1]"""
 RIDGE = 1e-12
 """Added to standardised second moments: above rounding, far below any signal. [1]"""
+LARGEST_RIDGE = 1e-9
+"""The same where rounding is larger: still far below any signal. [1]"""
 ROWS_PER_COLUMN = 2
 """Least ratio of rows to columns of lagged data for the moments to mean anything. [1]"""
 TRAIN_SHARE = 0.8
@@ -249,10 +252,18 @@ def observability(moments: LaggedMoments, *, inputs: int) -> Array:
     past = index[:s].ravel()
     rows = np.concatenate([future_u, past, future_y])
     gram = moments.gram[np.ix_(rows, rows)] / moments.rows
-    L = np.linalg.cholesky(gram + RIDGE * np.eye(size))
+    L = _cholesky(gram)
     block = L[-len(future_y) :, len(future_u) : len(future_u) + len(past)]
     left, singular, _ = np.linalg.svd(block)
     return np.asarray(left[:, : len(singular)] * np.sqrt(singular))
+
+
+def _cholesky(gram: Array) -> Array:
+    """Lower triangle; where rounding leaves moments indefinite (inputs that hardly move), with a larger ridge."""
+    for ridge in (RIDGE, 10.0 * RIDGE, 100.0 * RIDGE):
+        with suppress(np.linalg.LinAlgError):
+            return np.linalg.cholesky(gram + ridge * np.eye(len(gram)))
+    return np.linalg.cholesky(gram + LARGEST_RIDGE * np.eye(len(gram)))
 
 
 def subspace_modes(observed: Array, branches: int, order: int) -> Modes:

@@ -12,6 +12,9 @@ LAYOUT = "dbc/hv_powertrain.toml"
 CODE = ("calibrator", "ecu_node", "dbc")
 EVERYTHING = (".",)
 TOOLS = {"PYTHONPATH": "tools"}
+PAPER = ("classifier", "snr", "sparsity", "statespace", "asymmetry")
+RECORDED = ("real", "delay", "data", "phase")
+"""Experiments on drives that all vehicles share, and on recorded trips."""
 SINGLE = {**TOOLS, "OMP_NUM_THREADS": "1"}
 
 
@@ -92,12 +95,15 @@ def _experiments(out: Path, recorded: Path) -> Iterator[Step]:
         runs=("tools/import_bmw_i3.py", "dbc"),
         environment=TOOLS,
     )
-    options = ("--drives", trips, *layout, "--out", str(out / "experiments"))
-    yield Step(
-        name="experiments",
-        command=(PYTHON, "-m", "calibrator", "experiment", "all", *options),
-        runs=("calibrator/experiments", "tools/import_bmw_i3.py", "dbc"),
-    )
+    recordings = ("--drives", trips, *layout)
+    for name in (*PAPER, *RECORDED, "calibration"):
+        options = (*(recordings if name in RECORDED else ()), "--out", str(out / "experiments"))
+        yield Step(
+            name=f"experiment {name}",
+            command=(PYTHON, "-m", "calibrator", "experiment", name, *options),
+            runs=("calibrator/experiments", "tools/import_bmw_i3.py", "dbc"),
+            feeds=() if name == "calibration" else ("experiment calibration",),
+        )
 
 
 def _trials() -> Iterator[Step]:

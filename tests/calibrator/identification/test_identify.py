@@ -1,10 +1,18 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from calibrator.drive import Array
 from calibrator.errors import DriveError
-from calibrator.identification.identify import choose_order, identify
+from calibrator.identification.identify import (
+    choose_order,
+    identify,
+    observability,
+    standardised_moments,
+    subspace_modes,
+)
 from calibrator.identification.state_space import StateSpaceModel, simulation_snr_db
 
 SAMPLES, INPUTS, BRANCHES = 12_000, 5, 4
@@ -122,6 +130,22 @@ def test_constant_and_equal_inputs_and_a_dead_current_do_no_harm() -> None:
     assert simulation_snr_db(noisy, simulated[:, :BRANCHES]).min() > 29.0
     np.testing.assert_allclose(simulated[:, BRANCHES], 0.0, atol=1e-6)
     assert np.isnan(model.snr_db[BRANCHES])
+
+
+def test_moments_that_rounding_leaves_indefinite_tell_the_same_system() -> None:
+    inputs, _, noisy = recording(2, 30.0, 3)
+    inputs[:, 4] = 0.0
+    inputs[0, 4] = 1.0  # for a moment only, as an air conditioning that was being switched off
+    moments = standardised_moments(inputs, noisy, np.ones(len(inputs), np.bool_))
+    values, vectors = np.linalg.eigh(moments.gram)
+    rounding = 2e-11 * moments.rows * np.outer(vectors[:, 0], vectors[:, 0])
+    rounded = dataclasses.replace(moments, gram=moments.gram - rounding)
+    assert values[0] < 1e-12 * moments.rows, "some of the lagged inputs never move"
+    assert np.linalg.eigvalsh(rounded.gram)[0] < -1e-11 * moments.rows
+    exact, found = (
+        subspace_modes(observability(each, inputs=INPUTS), BRANCHES, 2).poles for each in (moments, rounded)
+    )
+    assert found == pytest.approx(exact, abs=1e-6)
 
 
 def test_samples_outside_the_mask_are_not_looked_at() -> None:
