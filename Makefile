@@ -35,7 +35,8 @@ coverage: setup          ## the same, and which lines and branches they reach: a
 	rm -rf build/coverage
 	$(BIN)/python -m pytest --cov --cov-report= --numprocesses auto --dist worksteal
 	$(BIN)/python -m tests.vcan.calibrated_fleet build/vcan_fleet
-	HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan $(BIN)/python -m pytest --cov --cov-append --cov-report= tests/vcan
+	HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan \
+		$(BIN)/python -m pytest --cov=ecu_node --cov-append --cov-report= tests/vcan
 	$(BIN)/coverage report --include='ecu_node/*' --fail-under=100
 	$(BIN)/coverage report --include='calibrator/*' --fail-under=95
 

@@ -22,18 +22,18 @@ def short_trials(folder: Path) -> Path:
 
 
 def test_no_vehicle_of_a_fleet_is_made_worse(tmp_path: Path) -> None:
-    options = ["--layout", str(short_trials(tmp_path)), "--vehicles", "40", "--minutes", "5", "--unseen-minutes", "3"]
+    options = ["--layout", str(short_trials(tmp_path)), "--vehicles", "24", "--minutes", "5", "--unseen-minutes", "3"]
     result = CliRunner().invoke(trust_chain.app, [*options, "--unmeasured", "2", "0.5", "--json"])
     assert result.exit_code == 0, result.output
     counts = json.loads(result.stdout)
-    assert counts["vehicles"] == 40
-    assert counts["with_corrections"] > 25
+    assert counts["vehicles"] == 24
+    assert counts["with_corrections"] > 15
     assert counts["refused"] == 0
     assert counts["deployed"] >= 0.9 * counts["with_corrections"]
     assert counts["made_worse"] == 0
     assert counts["error_median_published_a"] < 0.2 * counts["error_median_measured_a"]
     for kind in ("signs_turned", "of_another_vehicle"):
-        assert counts[f"wrong_sets_on_trial_{kind}"] > 15
+        assert counts[f"wrong_sets_on_trial_{kind}"] > 8
         assert counts[f"of_these_passed_{kind}"] < 0.2 * counts[f"wrong_sets_on_trial_{kind}"]
 
 
