@@ -21,6 +21,7 @@ from calibrator.terminal.text import print_report
 from chain.fleet import draw_fleet
 from chain.whole import drive_chain
 from ecu_node.database import read_database
+from ecu_node.errors import UserError
 from ecu_node.layout import read_layout
 
 app = command_app()
@@ -47,6 +48,9 @@ def main(
 ) -> None:
     """Drive a fleet through the whole chain, and count what became of its vehicles."""
     database = read_database(read_layout(layout))
+    trial_s = database.layout.activation.trial_s
+    if 60.0 * unseen_minutes <= trial_s:
+        raise UserError(f"--unseen-minutes {unseen_minutes:g}: the trial alone takes {trial_s:g} s ({layout}); give more")
     trips = choose_trips(
         drives,
         database.layout,

@@ -37,6 +37,12 @@ def test_no_vehicle_of_a_fleet_is_made_worse(tmp_path: Path) -> None:
         assert counts[f"of_these_passed_{kind}"] < 0.2 * counts[f"wrong_sets_on_trial_{kind}"]
 
 
+def test_trips_that_end_before_the_trial_does_are_refused() -> None:
+    result = CliRunner().invoke(trust_chain.app, ["--layout", str(LAYOUT), "--unseen-minutes", "5"])
+    assert result.exit_code != 0
+    assert "--unseen-minutes 5: the trial alone takes 300 s" in str(result.exception)
+
+
 def test_a_layout_that_is_not_there_is_told_in_one_line() -> None:
     result = CliRunner().invoke(trust_chain.app, ["--layout", "missing.toml"])
     assert result.exit_code != 0

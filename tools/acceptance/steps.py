@@ -109,7 +109,7 @@ def _experiments(out: Path, recorded: Path) -> Iterator[Step]:
 
 def _trials() -> Iterator[Step]:
     """A fleet from its drives to the road, random frames and files, and a million vehicles."""
-    chain = ("--vehicles", "500", "--minutes", "5", "--unseen-minutes", "3", "--unmeasured", "2", "0.5", "--json")
+    chain = ("--vehicles", "500", "--minutes", "5", "--unmeasured", "2", "0.5", "--json")
     yield Step(
         name="chain",
         command=(PYTHON, "tools/trust_chain.py", *chain),
