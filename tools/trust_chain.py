@@ -50,7 +50,9 @@ def main(
     database = read_database(read_layout(layout))
     trial_s = database.layout.activation.trial_s
     if 60.0 * unseen_minutes <= trial_s:
-        raise UserError(f"--unseen-minutes {unseen_minutes:g}: the trial alone takes {trial_s:g} s ({layout}); give more")
+        raise UserError(
+            f"--unseen-minutes {unseen_minutes:g}: the trial of {layout} alone takes {trial_s:g} s; give more"
+        )
     trips = choose_trips(
         drives,
         database.layout,

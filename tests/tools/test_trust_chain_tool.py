@@ -40,7 +40,7 @@ def test_no_vehicle_of_a_fleet_is_made_worse(tmp_path: Path) -> None:
 def test_trips_that_end_before_the_trial_does_are_refused() -> None:
     result = CliRunner().invoke(trust_chain.app, ["--layout", str(LAYOUT), "--unseen-minutes", "5"])
     assert result.exit_code != 0
-    assert "--unseen-minutes 5: the trial alone takes 300 s" in str(result.exception)
+    assert f"--unseen-minutes 5: the trial of {LAYOUT} alone takes 300 s" in str(result.exception)
 
 
 def test_a_layout_that_is_not_there_is_told_in_one_line() -> None:
