@@ -4,9 +4,7 @@ import subprocess
 from contextlib import redirect_stderr, redirect_stdout
 from io import BytesIO, TextIOWrapper
 
-import pytest
-
-from calibrator.cli import main
+from tests.calibrator.conftest import run_command
 
 __all__ = ["calibrator"]
 
@@ -14,10 +12,9 @@ __all__ = ["calibrator"]
 def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
     """Run a command; how it starts and ends as a process is for test_command_line.py."""
     output, errors = TextIOWrapper(BytesIO(), encoding="utf-8"), TextIOWrapper(BytesIO(), encoding="utf-8")
-    line = ["calibrator", *map(str, arguments)]
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(output), redirect_stderr(errors):
-        patch.setattr("sys.argv", line)
-        code = main()
+    line = [*map(str, arguments)]
+    with redirect_stdout(output), redirect_stderr(errors):
+        code = run_command(line)
     return subprocess.CompletedProcess(line, code, said(output), said(errors))
 
 

@@ -363,27 +363,18 @@ def test_the_status_goes_to_the_vehicle_alone(
 WORDS = "another node sends frames 0x(110|5F0), which only this one may send there; two nodes on one bus, or two buses"
 
 
-def test_a_branch_frame_from_the_vehicle_ends_it(
-    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+@pytest.mark.parametrize(("origin", "identifier"), [("vehicle", 0x110), ("sensors", 0x5F0)])
+def test_a_frame_that_only_it_may_send_ends_it(
+    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest, origin: str, identifier: int
 ) -> None:
     sensors, vehicle = ends
     with gateway(database, request.node.name) as (_, running):
         received(vehicle, 1, status=True)
-        vehicle.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=bytes(8)))
+        sender = vehicle if origin == "vehicle" else sensors
+        sender.send(can.Message(arbitration_id=identifier, is_extended_id=False, data=bytes(8)))
         with pytest.raises(BusError, match=WORDS):
             running.result(LONGEST_WAIT_S)
     assert sensors.recv(0.0) is None, "it was not passed on"
-
-
-def test_a_status_from_the_sensors_bus_ends_it(
-    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
-) -> None:
-    sensors, vehicle = ends
-    with gateway(database, request.node.name) as (_, running):
-        received(vehicle, 1, status=True)
-        sensors.send(can.Message(arbitration_id=0x5F0, is_extended_id=False, data=bytes(8)))
-        with pytest.raises(BusError, match=WORDS):
-            running.result(LONGEST_WAIT_S)
 
 
 def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest) -> None:
