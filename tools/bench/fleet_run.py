@@ -4,6 +4,7 @@ Every run is the command that a user types, watched from outside: its processes'
 """
 
 import argparse
+import contextlib
 import os
 import random
 import shutil
@@ -26,6 +27,8 @@ QUICK_FLEETS = (500, 1_000)
 KILLED_FLEET, KILLS = 2_000, 20
 QUICK_KILLED_FLEET, QUICK_KILLS = 500, 2
 WORKERS = 2
+"""Processes that make fleets, and that calibrate them; the time per vehicle is that of one process: of several, the
+later ones are still starting while the first one is done with a small fleet."""
 WATCH_EVERY_S, WATCHED_SHARE = 0.02, 0.05
 """Least time between two looks at a run, and the largest share of the time that is spent on them. [s], [1]"""
 MEBIBYTE = 1024.0**2
@@ -40,7 +43,7 @@ class Watched:
     whole_s : float
         From start to end. [s]
     steady_s : float
-        From when half of the chunks are there to the last one: all workers have started by then. [s]
+        From when half of the chunks were written to the last one: all has been loaded by then. [s]
     share : float
         Of the chunks that came within that time. [1]
     peak_bytes : float
@@ -64,8 +67,8 @@ def rows(*, quick: bool) -> list[Row]:
     Returns
     -------
     list of Row
-        Per fleet size the time per vehicle once the reference is known, that of the whole run, and the peak memory,
-        against those of the smallest fleet; and how many of the killed runs gave the same result.
+        Per fleet size, in one process, the time per vehicle once the reference is known, that of the whole run, and the
+        peak memory, against those of the smallest fleet; and how many of the killed runs gave the same result.
     """
     found: list[Row] = []
     first: tuple[float, float] | None = None
@@ -101,42 +104,44 @@ def rows(*, quick: bool) -> list[Row]:
 
 
 def measure(folder: Path, vehicles: int) -> tuple[Watched, float]:
-    """Run once; what was seen, and the time per vehicle once all workers are at it. [s]"""
+    """Run once, in one process; what was seen, and the time per vehicle in the later half. [s]"""
     store, out = folder / f"store-{vehicles}", folder / f"result-{vehicles}"
     make_store(store, vehicles=vehicles, workers=WORKERS)
-    seen = watch(store, out)
+    seen = watch(store, out, workers=1)
     shutil.rmtree(store)
     shutil.rmtree(out)
     return seen, seen.steady_s / (seen.share * vehicles)
 
 
-def watch(store: Path, out: Path) -> Watched:
+def watch(store: Path, out: Path, *, workers: int = WORKERS) -> Watched:
     """Calibrate, and look at it from outside."""
     chunks = out.with_name(f".{out.name}.unfinished") / "chunks"
     total = len(list((store / "buckets").iterdir()))
     start = time.monotonic()
-    seen: list[tuple[float, int]] = []
+    written_s: dict[str, float] = {}
     peak = 0.0
-    with subprocess.Popen(_command(store, out), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
+    with subprocess.Popen(_command(store, out, workers), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
         while run.poll() is None:
             look_s = time.monotonic()
             peak = max(peak, resident_bytes(run.pid))
-            if not seen or seen[-1][1] < total:
-                done = len(list(chunks.glob("*.rows.parquet")))
-                if done and (not seen or done > seen[-1][1]):
-                    seen.append((time.monotonic(), done))
+            with contextlib.suppress(FileNotFoundError):  # the result is there, and the chunks are gone
+                for chunk in chunks.glob("*.rows.parquet"):
+                    if chunk.name not in written_s:
+                        written_s[chunk.name] = chunk.stat().st_mtime
             time.sleep(max(WATCH_EVERY_S, (time.monotonic() - look_s) / WATCHED_SHARE))
         whole_s = time.monotonic() - start
         assert run.stderr is not None
         errors = run.stderr.read().decode()
     if run.returncode:
         raise RuntimeError(errors)
-    (first_s, first), (last_s, last) = next(item for item in seen if 2 * item[1] >= total), seen[-1]
-    return Watched(whole_s=whole_s, steady_s=last_s - first_s, share=(last - first) / total, peak_bytes=peak)
+    later_s = sorted(written_s.values())[total // 2 - 1 :]
+    return Watched(
+        whole_s=whole_s, steady_s=later_s[-1] - later_s[0], share=(len(later_s) - 1) / total, peak_bytes=peak
+    )
 
 
-def _command(store: Path, out: Path) -> list[str]:
-    options = ["--layout", str(LAYOUT), "--out", str(out), "--workers", str(WORKERS)]
+def _command(store: Path, out: Path, workers: int = WORKERS) -> list[str]:
+    options = ["--layout", str(LAYOUT), "--out", str(out), "--workers", str(workers)]
     return [sys.executable, "-m", "calibrator", "calibrate", str(store), *options]
 
 
