@@ -23,7 +23,7 @@ from acceptance.estimation import estimation_promises
 from acceptance.inputs import digest
 from acceptance.row import MissingFigureError, Promise
 from acceptance.speed import million_promises, speed_promises
-from acceptance.steps import Step, steps
+from acceptance.steps import BENCHES, Step, bench_file, steps
 from acceptance.tried import chain_promises, coverage_promises, fuzz_promises, promises_of_tests
 from calibrator.terminal.command_line import command_app, run_tool
 from ecu_node.errors import UserError
@@ -69,7 +69,7 @@ def _judges(out: Path) -> Iterator[Callable[[], Iterator[Promise]]]:
     yield lambda: promises_of_tests(out / "tests.xml", out / "vcan.xml")
     yield lambda: coverage_promises(out / "coverage.json")
     yield lambda: estimation_promises(out / "experiments")
-    yield lambda: speed_promises(out / "bench.json")
+    yield lambda: speed_promises(*(bench_file(out, name) for name in BENCHES))
     yield lambda: million_promises(_output(out, "million"))
     yield lambda: fuzz_promises([_output(out, f"node fuzz {seed}") for seed in (31, 32)], _output(out, "trust fuzz"))
     yield lambda: chain_promises(_output(out, "chain"))

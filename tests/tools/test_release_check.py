@@ -7,7 +7,7 @@ import pytest
 
 from acceptance.estimation import estimation_promises
 from acceptance.row import MissingFigureError, at_least, at_most
-from acceptance.speed import million_promises
+from acceptance.speed import million_promises, speed_promises
 from acceptance.tried import chain_promises, coverage_promises, fuzz_promises, promises_of_tests
 
 RECORDED = Path(__file__).parents[2] / "docs" / "results"
@@ -44,6 +44,18 @@ def test_printed_figures_are_judged(tmp_path: Path) -> None:
     million.write_text("killed\n")
     with pytest.raises(MissingFigureError, match="no figure of 1000000 vehicles"):
         list(million_promises(million))
+
+
+def test_rows_of_benchmarks_are_judged_wherever_they_stand(tmp_path: Path) -> None:
+    measured = {"times": ("identify a vehicle", (1200, 29)), "errors": ("slope error at SNR 20", (2, 3))}
+    for name, (what, ratios) in measured.items():
+        peers = zip(("nfoursid 1", "sippy 1"), ratios, strict=True)
+        rows = [{"name": what, "value": 1.0, "unit": "", "peer": peer, "ratio": ratio} for peer, ratio in peers]
+        (tmp_path / name).write_text(json.dumps(rows))
+    judged = speed_promises(tmp_path / "times", tmp_path / "errors")
+    assert [next(judged).met, next(judged).met] == [False, True]
+    with pytest.raises(MissingFigureError, match="0 rows of identify a vehicle, nfoursid; one is expected"):
+        next(speed_promises(tmp_path / "errors"))
 
 
 def test_coverage_is_judged_by_lines_and_branches_of_each_package(tmp_path: Path) -> None:

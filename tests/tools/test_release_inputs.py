@@ -8,7 +8,8 @@ import pytest
 
 import release_check
 from acceptance.inputs import digest, files_that_run
-from acceptance.steps import PYTHON, Step, steps
+from acceptance.steps import BENCHES, PYTHON, Step, steps
+from bench.all import GROUPS
 from ecu_node.errors import UserError
 
 ROOT = Path(__file__).parents[2]
@@ -97,3 +98,7 @@ def test_every_step_names_files_of_this_checkout() -> None:
     assert Path("calibrator/posterior/decision.py") in files["experiment real"]
     assert Path("calibrator/report/page.py") not in files["experiment real"]
     assert Path("tests/tools/test_release_inputs.py") in files["tests"]
+
+
+def test_every_group_of_benchmarks_is_a_step() -> None:
+    assert list(BENCHES) == list(GROUPS)

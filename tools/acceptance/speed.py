@@ -1,4 +1,4 @@
-"""Promises about time, memory and load, from ``bench.json`` and what the long benchmarks print."""
+"""Promises about time, memory and load, from ``bench.all`` and what the long benchmarks print."""
 
 import json
 import re
@@ -11,17 +11,17 @@ from acceptance.row import MissingFigureError, Promise, at_least, at_most
 __all__ = ["million_promises", "speed_promises"]
 
 Found = dict[str, Any]
-"""One row of ``bench.json``, see :class:`bench.row.Row`."""
+"""One row of ``bench.all``, see :class:`bench.row.Row`."""
 
 
-def speed_promises(path: Path) -> Iterator[Promise]:
-    """Judge the rows that ``bench.all`` wrote."""
-    rows: list[Found] = json.loads(path.read_text(encoding="utf-8"))
+def speed_promises(*paths: Path) -> Iterator[Promise]:
+    """Judge the rows that ``bench.all`` wrote, in one file or in several."""
+    rows: list[Found] = [row for path in paths for row in json.loads(path.read_text(encoding="utf-8"))]
 
     def row(*words: str) -> Found:
         found = [each for each in rows if all(word in f"{each['name']} {each['peer'] or ''}" for word in words)]
         if len(found) != 1:
-            raise MissingFigureError(f"{path}: {len(found)} rows of {', '.join(words)}; one is expected")
+            raise MissingFigureError(f"bench: {len(found)} rows of {', '.join(words)}; one is expected")
         return found[0]
 
     yield from _calibrator(row, rows)

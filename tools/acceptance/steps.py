@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-__all__ = ["PYTHON", "Step", "steps"]
+__all__ = ["BENCHES", "PYTHON", "Step", "bench_file", "steps"]
 
 PYTHON = sys.executable
 LAYOUT = "dbc/hv_powertrain.toml"
@@ -15,6 +15,19 @@ TOOLS = {"PYTHONPATH": "tools"}
 PAPER = ("classifier", "snr", "sparsity", "statespace", "asymmetry")
 RECORDED = ("real", "delay", "data", "phase")
 """Experiments on drives that all vehicles share, and on recorded trips."""
+BENCHES = {
+    "identification": ("tools/bench/identification.py", "dbc"),
+    "posterior": ("tools/bench/posterior.py", "dbc"),
+    "ingest": ("tools/bench/ingest.py", "dbc"),
+    "fleet run": ("tools/bench/fleet_run.py", "calibrator/calibration", "dbc"),
+    "node": (
+        *(f"tools/bench/node{part}.py" for part in ("", "_child", "_peer", "_socketcan")),
+        "tools/with_vcan",
+        "ecu_node",
+    ),
+    "fleet report": ("tools/bench/fleet_report.py", "dbc"),
+}
+"""Groups of ``bench.all``, and what they run."""
 SINGLE = {**TOOLS, "OMP_NUM_THREADS": "1"}
 
 
@@ -46,14 +59,20 @@ class Step:
 def steps(out: Path, recorded: Path) -> Iterator[Step]:
     """What measures, in an order that shows the most first."""
     yield from _tests(out)
-    yield Step(
-        name="bench",
-        command=(PYTHON, "-m", "bench.all", "--out", str(out / "bench.json")),
-        runs=("tools/bench", "tools/with_vcan", *CODE),
-        environment=SINGLE,
-    )
+    for name, runs in BENCHES.items():
+        yield Step(
+            name=f"bench {name}",
+            command=(PYTHON, "-m", "bench.all", "--only", name, "--out", str(bench_file(out, name))),
+            runs=runs,
+            environment=SINGLE,
+        )
     yield from _experiments(out, recorded)
     yield from _trials()
+
+
+def bench_file(out: Path, name: str) -> Path:
+    """Rows of a group of ``bench.all``."""
+    return out / f"bench_{name.replace(' ', '_')}.json"
 
 
 def _tests(out: Path) -> Iterator[Step]:
