@@ -223,7 +223,11 @@ class ParameterStore:
             )
             return
         self._result, self._due_s = None, float("-inf")
-        self._say(f"number {number} {'has passed' if result.passed else 'has failed'} its trial: {result.text}")
+        in_force = self._state.slots[self._state.in_force].sequence if self._state.in_force else None
+        if result.passed and in_force != number:
+            self._say(f"number {number} is not in force, though its trial went well: the end of the audit log says why")
+        else:
+            self._say(f"number {number} {'has passed' if result.passed else 'has failed'} its trial: {result.text}")
 
     def _start(self, work: Callable[[], TrustState]) -> "Future[TrustState]":
         if self._background is not None:

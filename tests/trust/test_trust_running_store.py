@@ -240,6 +240,7 @@ def test_a_set_that_expires_during_its_trial_leaves_what_was_in_force(
         ended.store.look(ended.corrector, now_s)
     assert (ended.drift, read_state(two_slots).in_force, read_state(two_slots).on_trial) == (DRIFT, "b", None)
     assert "expired at" in audit_path(two_slots).read_text().splitlines()[-1]
+    assert ended.said[-1].startswith("number 8 is not in force, though its trial went well")
 
 
 def test_sums_that_no_vehicle_has_are_refused_and_end_no_node(
