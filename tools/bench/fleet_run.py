@@ -27,8 +27,8 @@ QUICK_FLEETS = (500, 1_000)
 KILLED_FLEET, KILLS = 2_000, 20
 QUICK_KILLED_FLEET, QUICK_KILLS = 500, 2
 WORKERS = 2
-"""Processes that make fleets, and that calibrate them; the time per vehicle is that of one process: of several, the
-later ones are still starting while the first one is done with a small fleet."""
+"""Processes that make fleets and calibrate them. The time per vehicle is that of one process: of several, the later
+ones are still starting while the first one is done with a small fleet."""
 WATCH_EVERY_S, WATCHED_SHARE = 0.02, 0.05
 """Least time between two looks at a run, and the largest share of the time that is spent on them. [s], [1]"""
 MEBIBYTE = 1024.0**2
@@ -67,7 +67,7 @@ def rows(*, quick: bool) -> list[Row]:
     Returns
     -------
     list of Row
-        Per fleet size, in one process, the time per vehicle once the reference is known, that of the whole run, and the
+        Per fleet size the time per vehicle once the reference is known (in one process), that of the whole run, and the
         peak memory, against those of the smallest fleet; and how many of the killed runs gave the same result.
     """
     found: list[Row] = []
@@ -104,16 +104,18 @@ def rows(*, quick: bool) -> list[Row]:
 
 
 def measure(folder: Path, vehicles: int) -> tuple[Watched, float]:
-    """Run once, in one process; what was seen, and the time per vehicle in the later half. [s]"""
+    """What was seen of a run, and of one in one process the time per vehicle in its later half. [s]"""
     store, out = folder / f"store-{vehicles}", folder / f"result-{vehicles}"
     make_store(store, vehicles=vehicles, workers=WORKERS)
-    seen = watch(store, out, workers=1)
-    shutil.rmtree(store)
+    seen = watch(store, out, workers=WORKERS)
     shutil.rmtree(out)
-    return seen, seen.steady_s / (seen.share * vehicles)
+    alone = watch(store, out, workers=1)
+    shutil.rmtree(out)
+    shutil.rmtree(store)
+    return seen, alone.steady_s / (alone.share * vehicles)
 
 
-def watch(store: Path, out: Path, *, workers: int = WORKERS) -> Watched:
+def watch(store: Path, out: Path, *, workers: int) -> Watched:
     """Calibrate, and look at it from outside."""
     chunks = out.with_name(f".{out.name}.unfinished") / "chunks"
     total = len(list((store / "buckets").iterdir()))
@@ -140,7 +142,7 @@ def watch(store: Path, out: Path, *, workers: int = WORKERS) -> Watched:
     )
 
 
-def _command(store: Path, out: Path, workers: int = WORKERS) -> list[str]:
+def _command(store: Path, out: Path, workers: int) -> list[str]:
     options = ["--layout", str(LAYOUT), "--out", str(out), "--workers", str(workers)]
     return [sys.executable, "-m", "calibrator", "calibrate", str(store), *options]
 
@@ -169,21 +171,25 @@ def killed_runs(folder: Path, vehicles: int, kills: int) -> int:
     make_store(store, vehicles=vehicles, workers=WORKERS)
     environment = {**os.environ, "SOURCE_DATE_EPOCH": "1700000000"}
     start = time.monotonic()
-    subprocess.run(_command(store, folder / "whole"), check=True, capture_output=True, env=environment)
+    subprocess.run(_command(store, folder / "whole", WORKERS), check=True, capture_output=True, env=environment)
     whole_s = time.monotonic() - start
     expected, chance = _contents(folder / "whole"), random.Random(0)  # noqa: S311 (moments, no secrets)
     same = 0
     for number in range(kills):
         out = folder / f"killed-{number}"
         with subprocess.Popen(
-            _command(store, out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment, process_group=0
+            _command(store, out, WORKERS),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env=environment,
+            process_group=0,
         ) as run:
             try:
                 run.wait(chance.uniform(0.0, whole_s))
             except subprocess.TimeoutExpired:
                 os.killpg(run.pid, signal.SIGKILL)
         if not out.exists():
-            subprocess.run(_command(store, out), check=True, capture_output=True, env=environment)
+            subprocess.run(_command(store, out, WORKERS), check=True, capture_output=True, env=environment)
         same += _contents(out) == expected
         shutil.rmtree(out)
     return same
@@ -205,7 +211,7 @@ def main() -> None:
         store = folder / f"store-{arguments.vehicles}"
         if not store.exists():
             make_store(store, vehicles=arguments.vehicles, workers=WORKERS)
-        seen = watch(store, folder / f"result-{arguments.vehicles}")
+        seen = watch(store, folder / f"result-{arguments.vehicles}", workers=WORKERS)
     print(f"{arguments.vehicles} vehicles: {seen.whole_s:.0f} s, {seen.peak_bytes / MEBIBYTE:.0f} MiB")
 
 
