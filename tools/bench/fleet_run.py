@@ -126,10 +126,9 @@ def watch(store: Path, out: Path, *, workers: int) -> Watched:
         while run.poll() is None:
             look_s = time.monotonic()
             peak = max(peak, resident_bytes(run.pid))
-            with contextlib.suppress(FileNotFoundError):  # the result is there, and the chunks are gone
-                for chunk in chunks.glob("*.rows.parquet"):
-                    if chunk.name not in written_s:
-                        written_s[chunk.name] = chunk.stat().st_mtime
+            if len(written_s) < total:
+                with contextlib.suppress(FileNotFoundError):  # the result is there, and the chunks are gone
+                    written_s |= {chunk.name: chunk.stat().st_mtime for chunk in chunks.glob("*.rows.parquet")}
             time.sleep(max(WATCH_EVERY_S, (time.monotonic() - look_s) / WATCHED_SHARE))
         whole_s = time.monotonic() - start
         assert run.stderr is not None
