@@ -58,7 +58,7 @@ def main(
         for step in wanted
         if not holds(step, out)
     ]
-    text = _table(promises, commit, _measured_at(wanted, out))
+    text = _table(promises, commit) + steps_table([step for step in wanted if holds(step, out)], out)
     write_atomically(out / "release.md", text.encode())
     print(text)
     if not all(promise.met for promise in promises):
@@ -113,15 +113,6 @@ def holds(step: Step, out: Path) -> bool:
     )
 
 
-def _measured_at(measuring: list[Step], out: Path) -> dict[str, list[str]]:
-    """The commits that figures are of, each with its steps."""
-    found: dict[str, list[str]] = {}
-    for step in measuring:
-        if holds(step, out):
-            found.setdefault(json.loads(_record(step.name, out).read_bytes())["commit"], []).append(step.name)
-    return found
-
-
 def _record(name: str, out: Path) -> Path:
     return out / f"{name.replace(' ', '_')}.step.json"
 
@@ -142,19 +133,30 @@ def _commit() -> str:
     ).stdout.strip()
 
 
-def _table(promises: list[Promise], commit: str, measured_at: dict[str, list[str]]) -> str:
-    """The table as Markdown, with commit, machine and date; commits before, whose files are the same, are named."""
+def _table(promises: list[Promise], commit: str) -> str:
+    """The promises as Markdown, with commit, machine and date."""
     met = sum(promise.met for promise in promises)
     cells = [(promise.what, promise.bar, promise.figure, "yes" if promise.met else "**no**") for promise in promises]
-    earlier = [f"{', '.join(names)} at {other[:12]}" for other, names in measured_at.items() if other != commit]
     lines = [
         f"Commit {commit[:12]}, {os.cpu_count()} cores, Python {platform.python_version()}, "
         f"{datetime.now(UTC):%Y-%m-%d}: {met} of {len(promises)} met.",
-        *(["", f"Measured before, on files that are the same: {'; '.join(earlier)}."] if earlier else []),
         "",
         "| what | bar | figure | met |",
         "|---|---|---|---|",
         *(f"| {' | '.join(row)} |" for row in cells),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def steps_table(measured: list[Step], out: Path) -> str:
+    """How long each step took, and at which commit; an earlier one has files that are the same."""
+    records = [(step.name, json.loads(_record(step.name, out).read_bytes())) for step in measured]
+    lines = [
+        "",
+        "| step | minutes | measured at commit |",
+        "|---|---:|---|",
+        *(f"| {name} | {record['minutes']:.1f} | {record['commit'][:12]} |" for name, record in records),
         "",
     ]
     return "\n".join(lines)

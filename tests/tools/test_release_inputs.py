@@ -82,6 +82,13 @@ def test_a_step_is_run_again_until_it_ends_well_and_when_it_changes(
     assert not release_check.holds(good, out)
 
 
+def test_of_each_step_it_is_told_how_long_it_took_and_at_which_commit(tmp_path: Path) -> None:
+    step = Step(name="node fuzz 31", command=("true",), runs=("dbc",))
+    (tmp_path / "node_fuzz_31.step.json").write_text('{"commit": "c0ffee0123456789", "minutes": 40.917}')
+    rows = release_check.steps_table([step], tmp_path).splitlines()
+    assert rows[-1] == "| node fuzz 31 | 40.9 | c0ffee012345 |"
+
+
 def test_files_that_change_under_a_step_are_told(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(release_check, "ROOT", checkout)
     step = Step(name="edit", command=("sh", "-c", "echo another > dbc/car.dbc"), runs=("dbc",))
