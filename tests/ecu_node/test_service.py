@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 
 from ecu_node.database import VehicleDatabase
-from ecu_node.guard import Mode
+from ecu_node.guard import Mode, key_of
 from ecu_node.parameter_file import ParameterFile
 from ecu_node.run import _Tick
 from ecu_node.service import Log, Requests, ServiceManager
 from ecu_node.wiring import wire
+from tests.ecu_node.vehicles import Frame, answers, protected
 
 WATCHDOG_S = 4.0
 
@@ -94,6 +95,26 @@ def test_a_node_that_does_not_do_its_work_does_not_feed_the_watchdog(
         tick(1000.0, works)
         found.append("WATCHDOG=1" in managed.told())
     assert found == [False, True]
+
+
+def test_what_changes_is_said_in_the_log_and_to_the_manager(
+    managed: Manager, database: VehicleDatabase, requests: Requests, tmp_path: Path
+) -> None:
+    said = list[str]()
+    file = ParameterFile(tmp_path / "none.json", database, None, mode=Mode.OVERLAY, say=said.append)
+    corrector = wire(database, file.in_force, 0.0, mode=Mode.OVERLAY)
+    tick = _Tick(corrector=corrector, buses=[], file=file, requests=requests, manager=ServiceManager(), say=said.append)
+    found = []
+    for look in range(20):
+        if look < 10:
+            for name in ("Battery", "Motor"):
+                data = protected(database, f"HV_{name}", look, **{f"{name}Current": 20.0})
+                answers(corrector, Frame(key_of(database.message(f"HV_{name}")), data), 0.1 * look)
+        corrector.look(0.1 * look)
+        tick(0.1 * look, works=False)
+        found += managed.told()
+    assert said == ["the bus sleeps"]
+    assert found == ["STATUS=the bus sleeps"]
 
 
 def test_an_abstract_address_is_understood(monkeypatch: pytest.MonkeyPatch) -> None:
