@@ -1,1 +1,32 @@
-"""Off-board side: learns from recorded drives what each vehicle's high-voltage current sensors do wrong."""
+"""Learn from recorded drives what each vehicle's high-voltage current sensors do wrong.
+
+Twelve vehicles from data frames (currents positive into the junction, in A) to what their sensors do wrong:
+
+    from calibrator import Fleet, FleetCalibrator, Junction
+
+    junction = Junction(branches=["battery", "motor"], full_scale_a=400.0)
+    fleet = Fleet.from_frames({"V1": frame, "V2": frames, ...}, junction, inputs=["speed", "torque"])
+    found = FleetCalibrator().fit(fleet)
+    found.parameters_
+
+Importing the package is quick; what takes time is imported when it is used.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from calibrator.estimator.fleet import Fleet, FleetCalibrator, Junction, read_log
+
+__all__ = ["Fleet", "FleetCalibrator", "Junction", "read_log"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'calibrator' has no attribute {name!r}; it offers {', '.join(__all__)}")
+    from calibrator.estimator import fleet  # noqa: PLC0415 (so that other commands need not wait for it)
+
+    return getattr(fleet, name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -5,12 +5,12 @@ from typing import Annotated
 
 import typer
 
-from calibrator.artificial.command import score, simulate
-from calibrator.calibration.command import calibrate, params
+from calibrator.artificial.command import simulate
 from calibrator.doctor.command import doctor
-from calibrator.experiments.command import experiment
+from calibrator.estimator.command import calibrate, params
+from calibrator.estimator.identify_command import identify
+from calibrator.experiments.command import experiment, score
 from calibrator.export.command import export
-from calibrator.identification.command import identify
 from calibrator.kirchhoff.command import kirchhoff
 from calibrator.proposal.command import layout as layout_commands
 from calibrator.recordings.command import replay

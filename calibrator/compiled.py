@@ -1,8 +1,6 @@
 """Compilation of numerical loops: what is written as plain Python runs as machine code.
 
-A function so marked may use numbers, arrays, tuples and other such functions only. If it makes no new array, and writes
-its results into those that it is given, numba need not count references to arrays at every call, which takes several
-times as long as the arithmetic of small matrices.
+A function so marked may use numbers, arrays, tuples and other such functions only.
 
 Compilation of the estimator takes about half a minute. The result is kept in the user's cache folder, one folder per
 state of source, Python, numba and processor. Of several processes that need it at once one compiles, and others wait.
@@ -25,7 +23,7 @@ from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar, cast
 import llvmlite.binding
 import numba as _numba
 
-__all__ = ["compiled", "in_place", "inlined", "inner"]
+__all__ = ["compiled", "compiled_with_notice", "inlined", "inner"]
 
 numba: Any = _numba  # its type hints leave out options and the compilation for given types
 
@@ -39,8 +37,10 @@ SOURCES = (
     "score.py",
     "drives/charge.py",
     "drives/delay_fit.py",
-    "evidence/rows.py",
-    "posterior/*.py",
+    "estimator/decision.py",
+    "estimator/explanations.py",
+    "estimator/posterior.py",
+    "estimator/prior.py",
     "summaries/bank_state.py",
     "summaries/summariser.py",
     "summaries/white_noise.py",
@@ -55,7 +55,6 @@ PREFIX = "compiled-"
 class compiled(Generic[_Parameters, _Result]):  # noqa: N801 (a decorator)
     """Compile a function that Python calls, when it is first called; division by zero gives infinity, as in arrays."""
 
-    makes_arrays = True
     takes_long = False
 
     def __init__(self, function: Callable[_Parameters, _Result]) -> None:
@@ -72,7 +71,7 @@ class compiled(Generic[_Parameters, _Result]):  # noqa: N801 (a decorator)
         """Machine code for arguments of these types, from the cache if it is there."""
         if numba.config.DISABLE_JIT:  # to debug what is compiled
             return self._function
-        plan, folder = _Plan(self._function, types, {"_nrt": self.makes_arrays}), _cache_folder()
+        plan, folder = _Plan(self._function, types), _cache_folder()
         if folder is None:
             if self.takes_long:
                 _say(f"in every run, as its cache cannot be written; {CACHE_VARIABLE} can name another folder")
@@ -86,16 +85,15 @@ class compiled(Generic[_Parameters, _Result]):  # noqa: N801 (a decorator)
             return cast("Callable[_Parameters, _Result]", _from_cache(plan, folder))
 
 
-class in_place(compiled[_Parameters, _Result]):  # noqa: N801 (a decorator)
-    """The same for the estimator: a function that makes no array, and whose compilation the user is told of."""
+class compiled_with_notice(compiled[_Parameters, _Result]):  # noqa: N801 (a decorator)
+    """The same for the estimator, whose compilation takes so long that the user is told of it."""
 
-    makes_arrays = False
     takes_long = True
 
 
 def inner(function: _Function) -> _Function:
-    """Compile a function that compiled functions alone call, and that makes no array."""
-    return cast("_Function", _dispatcher(function, no_cpython_wrapper=True, _nrt=False))
+    """Compile a function that compiled functions alone call."""
+    return cast("_Function", _dispatcher(function, no_cpython_wrapper=True))
 
 
 def inlined(function: _Function) -> _Function:
@@ -104,16 +102,14 @@ def inlined(function: _Function) -> _Function:
 
 
 def _dispatcher(function: Callable[..., object], **options: Any) -> Any:
-    # _nrt: numba's run time, which makes arrays and counts references to them.
     return numba.njit(error_model="numpy", no_cfunc_wrapper=True, **options)(function)
 
 
 class _Plan(NamedTuple):
-    """What is to be compiled, for arguments of which types, and how."""
+    """What is to be compiled, for arguments of which types."""
 
     function: Callable[..., object]
     types: tuple[Any, ...]
-    options: dict[str, Any]
 
 
 def _from_cache(plan: _Plan, folder: Path) -> Any:
@@ -129,7 +125,7 @@ def _from_cache(plan: _Plan, folder: Path) -> Any:
 
 
 def _without_cache(plan: _Plan) -> Any:
-    dispatcher = _dispatcher(plan.function, **plan.options)
+    dispatcher = _dispatcher(plan.function)
     dispatcher.compile(plan.types)
     return dispatcher
 
@@ -137,7 +133,7 @@ def _without_cache(plan: _Plan) -> Any:
 def _cached_dispatcher(plan: _Plan, folder: Path) -> Any:
     before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
     try:
-        return _dispatcher(plan.function, cache=True, **plan.options)
+        return _dispatcher(plan.function, cache=True)
     finally:
         numba.config.CACHE_DIR = before
 

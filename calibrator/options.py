@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 
-__all__ = ["Classifier", "ExperimentName", "ExportFormat", "Method"]
+__all__ = ["Classifier", "ExportFormat", "Method"]
 
 
 class Method(StrEnum):
@@ -18,22 +18,6 @@ class Classifier(StrEnum):
     THRESHOLD = "threshold"
     TREE = "tree"
     PERFECT = "perfect"
-
-
-class ExperimentName(StrEnum):
-    """Experiments of the paper (table 1, figure 7, figure 8, table 2), those beyond it, and all of them."""
-
-    CLASSIFIER = "classifier"
-    SNR = "snr"
-    SPARSITY = "sparsity"
-    STATESPACE = "statespace"
-    ASYMMETRY = "asymmetry"
-    REAL = "real"
-    DELAY = "delay"
-    DATA = "data"
-    PHASE = "phase"
-    CALIBRATION = "calibration"
-    ALL = "all"
 
 
 class ExportFormat(StrEnum):

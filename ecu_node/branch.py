@@ -8,7 +8,7 @@ from collections.abc import Callable
 from ecu_node.auxiliary import Auxiliary
 from ecu_node.bits import PlacedSignal
 from ecu_node.codes import Codes
-from ecu_node.correction import AS_IT_IS, CodePlan, CorrectionPlan, IntegerPlan, TemperaturePlans
+from ecu_node.correction import AS_IT_IS, IntegerPlan
 from ecu_node.counters import Counters
 from ecu_node.past import Frames, Past
 from ecu_node.plan_function import plan_function
@@ -19,8 +19,6 @@ __all__ = ["LiveBranch"]
 
 _LEAST_VOLTAGE_V = 10.0
 """Below this the HV net is switched off, and power / voltage says nothing of the current. [V]"""
-_TEMPERATURES = 256
-"""Plans that are kept, one per code of the temperature."""
 
 
 class LiveBranch:
@@ -38,8 +36,8 @@ class LiveBranch:
         Without a frame for this long the branch is stale. [s]
     start_s : float
         So long after the bus has woken up its first frame may come, if that is longer. [s]
-    voltage, temperature : Auxiliary or None
-        The voltage of a branch that is a power; the temperature of its sensor.
+    voltage : Auxiliary or None
+        Of a branch that is a power.
     """
 
     def __init__(
@@ -51,10 +49,9 @@ class LiveBranch:
         timeout_s: float,
         start_s: float = 0.0,
         voltage: Auxiliary | None = None,
-        temperature: Auxiliary | None = None,
     ) -> None:
         self.name, self.codes, self.timeout_s, self._start_s = name, codes, timeout_s, start_s
-        self.voltage, self.temperature = voltage, temperature
+        self.voltage = voltage
         self.fault = NO_FAULT
         self.delay_s = 0.0
         self.out: int | None = None
@@ -68,24 +65,18 @@ class LiveBranch:
         self._is_named = False
         self._time_s = self._awake_s = self._waited_s = float("-inf")
         self._scale, self._offset = float(sign * codes.scale), float(sign * codes.offset)
-        self._passing: CodePlan = AS_IT_IS
-        self._correcting: CodePlan | None = None
+        self._passing = self._correcting = AS_IT_IS
         self._fix = plan_function(codes, AS_IT_IS, voltage, Counters())
-        self.plan: CodePlan = AS_IT_IS
+        self.plan = AS_IT_IS
         """What is done now."""
-        self._active = False
-        self._plans: TemperaturePlans | None = None
-        self._per_temperature: dict[int, IntegerPlan | None] = {}
         self.counters = Counters()
         """Where results beyond the ends are counted."""
-        if temperature is not None:
-            temperature.when_changed.append(self._at_temperature)
 
     def put_in_force(
         self,
         *,
         fault: SensorFault,
-        plan: CorrectionPlan,
+        plan: IntegerPlan,
         passing: IntegerPlan,
         delay_s: float,
         expected_since_s: float | None,
@@ -97,7 +88,7 @@ class LiveBranch:
         ----------
         fault : SensorFault
             What is corrected.
-        plan : CorrectionPlan
+        plan : IntegerPlan
             The same in integers.
         passing : IntegerPlan
             What is written where nothing is corrected.
@@ -112,19 +103,13 @@ class LiveBranch:
         self._is_named = expected_since_s is not None
         if expected_since_s is not None:
             self._waited_s = max(self._waited_s, expected_since_s)
-        self._passing, self.counters = passing, counters
-        self._plans = plan if isinstance(plan, TemperaturePlans) else None
-        self._per_temperature = {}
-        self._correcting = None if isinstance(plan, TemperaturePlans) else plan
+        self._passing, self._correcting, self.counters = passing, plan, counters
         self.activate(active=False)
-        if self.temperature is not None:
-            self._at_temperature(self.temperature.code)
 
     def activate(self, *, active: bool) -> None:
         """Correct, or pass through."""
-        self._active = active
-        corrects = active and self.fault.applied and self._correcting is not None
-        self.plan = self._correcting if corrects and self._correcting is not None else self._passing
+        corrects = active and self.fault.applied
+        self.plan = self._correcting if corrects else self._passing
         self.quality = Quality.CORRECTED if corrects else Quality.PASSED_THROUGH
         self._fix = plan_function(self.codes, self.plan, self.voltage, self.counters)
         latest = None if self._spoilt else self.latest()
@@ -230,9 +215,7 @@ class LiveBranch:
             if volts is None or volts < _LEAST_VOLTAGE_V:
                 return None
             measured /= volts
-        temperature = self.temperature.value() if self.temperature is not None else None
-        corrected = self.fault.true_current(measured, temperature)
-        return measured, measured if corrected is None else corrected
+        return measured, self.fault.true_current(measured)
 
     def _code_at(self, time_s: float) -> float | None:
         """Code at a time, between codes too; None if it is not known."""
@@ -247,14 +230,3 @@ class LiveBranch:
                 return code + (time_s - seen_s) / (later[0] - seen_s) * (later[1] - code)
             later = sample
         return later[1] if later is not None and later[0] - time_s <= self.timeout_s else None
-
-    def _at_temperature(self, code: int | None) -> None:
-        """Take the plan of a temperature; without one the branch is passed through."""
-        if self._plans is None:
-            return
-        if code is not None and code not in self._per_temperature:
-            if len(self._per_temperature) >= _TEMPERATURES:
-                self._per_temperature.clear()
-            self._per_temperature[code] = self._plans.at(code)
-        self._correcting = None if code is None else self._per_temperature[code]
-        self.activate(active=self._active)

@@ -1,11 +1,11 @@
 """What each branch of a layout is read from and written to, and its correction in the codes of these signals."""
 
 from ecu_node.codes import as_written, require_reach
-from ecu_node.correction import AS_IT_IS, CorrectionPlan, IntegerPlan, Signals, correction_plan
+from ecu_node.correction import AS_IT_IS, IntegerPlan, Signals, correction_plan
 from ecu_node.database import VehicleDatabase
 from ecu_node.guard import Mode
 from ecu_node.layout import Branch
-from ecu_node.layout_signals import signal_codes, temperature_codes
+from ecu_node.layout_signals import signal_codes
 from ecu_node.sensor_fault import NO_FAULT, SensorFault
 from ecu_node.units import AMPERE, VOLT, WATT
 
@@ -47,7 +47,7 @@ def branch_signals(database: VehicleDatabase, branch: Branch, mode: Mode) -> Sig
     return Signals(source=source, target=target, sign=branch.sign, voltage=voltage)
 
 
-def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault, mode: Mode) -> CorrectionPlan:
+def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault, mode: Mode) -> IntegerPlan:
     """Integer plan of one branch.
 
     Parameters
@@ -63,7 +63,7 @@ def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault, m
 
     Returns
     -------
-    CorrectionPlan
+    IntegerPlan
         From measured to written codes, see :func:`ecu_node.correction.correction_plan`.
 
     Raises
@@ -71,16 +71,14 @@ def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault, m
     LayoutError, DatabaseError
         If the node cannot read or write one of the signals.
     """
-    return correction_plan(branch_signals(database, branch, mode), fault, temperature=temperature_codes(database))
+    return correction_plan(branch_signals(database, branch, mode), fault)
 
 
 def passing_plan(database: VehicleDatabase, branch: Branch, mode: Mode) -> IntegerPlan:
     """What is written of a branch where nothing is corrected: its code, or the same current in the target's codes."""
     if mode is Mode.GATEWAY or branch.corrected is None:
         return AS_IT_IS
-    plan = branch_plan(database, branch, NO_FAULT, mode)
-    assert isinstance(plan, IntegerPlan)
-    return plan
+    return branch_plan(database, branch, NO_FAULT, mode)
 
 
 def require_branch_reach(database: VehicleDatabase, mode: Mode) -> None:

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from ecu_node.branch_plans import branch_plan
-from ecu_node.correction import CorrectionPlan, IntegerPlan, SignPlan
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import printable
 from ecu_node.guard import Mode, needs_fd
-from ecu_node.in_force import InForce, no_temperature, not_published, sensor_fault
+from ecu_node.in_force import InForce, not_published, sensor_fault
 from ecu_node.layout import Branch, read_layout
 from ecu_node.parameter_file import choose_parameters
 from ecu_node.wiring import wire
@@ -19,7 +18,6 @@ from ecu_node.wiring import wire
 __all__ = ["check_report", "report_text", "warnings_of"]
 
 _WHY_NOT_PUBLISHED = "the parameters apply a fault to it, but the layout has no 'corrected' for it"
-_WHY_NO_TEMPERATURE = "its fault depends on the temperature, and the layout names no 'temperature'"
 
 
 def check_report(params: Path, layout: Path, vehicle: str | None, mode: Mode = Mode.OVERLAY) -> dict[str, Any]:
@@ -38,10 +36,9 @@ def check_report(params: Path, layout: Path, vehicle: str | None, mode: Mode = M
     -------
     dict
         ``fit`` [bool], ``reason`` (name in the status message), ``message`` (why not, or None), ``vehicle``,
-        ``parameter_set``, ``warnings`` (texts), and ``branches``: per branch drift [1], offset_a [A], sensor_model (its
-        kind, or None) and apply, as the file says (0 and None where it does not name the branch), applied (whether it
-        is corrected), target, and plan: a dict with gain, voltage_gain, bias and shift; with a gain per sign, positive
-        and negative of these; None where the branch is not written or its plan depends on the temperature.
+        ``parameter_set``, ``warnings`` (texts), and ``branches``: per branch drift [1], offset_a [A] and apply, as the
+        file says (0 and None where it does not name the branch), applied (whether it is corrected), target, and plan: a
+        dict with gain, voltage_gain, bias and shift; None where the branch is not written.
 
     Raises
     ------
@@ -70,14 +67,14 @@ def report_text(report: dict[str, Any]) -> str:
     width = max(map(len, ["branch", *report["branches"]]))
     lines.append(f"{'branch':<{width}}{'drift':>11}{'offset':>13}")
     for name, branch in report["branches"].items():
-        has_fault = branch["drift"] or branch["offset_a"] or branch["sensor_model"] is not None
+        has_fault = branch["drift"] or branch["offset_a"]
         held_back = ', "apply" is false' if has_fault and branch["apply"] is False else ""
         mark = "corrected" if branch["applied"] else f"passed through{held_back}"
         numbers = f"{name:<{width}}{branch['drift']:>+11.4%}{branch['offset_a']:>+11.3f} A"
         lines.append(f"{numbers}  {mark if branch['target'] is not None else f'not published{held_back}'}")
         if branch["target"] is not None:
             lines.append(f"  target {branch['target']}")
-            lines += _plan_lines(branch) if branch["applied"] else []
+            lines += [f"  {_numbers(branch['plan'])}"] if branch["applied"] else []
     lines.append("corrected code = (measured code * gain + bias + 2^(shift - 1)) >> shift")
     if any("voltage gain" in line for line in lines):
         lines.append("  of a power: + voltage code * voltage gain in the parentheses")
@@ -88,22 +85,9 @@ def warnings_of(database: VehicleDatabase, in_force: InForce, mode: Mode, *, fd:
     """What a user should know of parameters that fit: what of them is not done, and what the bus must be able to do."""
     hidden = not_published(database, in_force) if mode is Mode.OVERLAY else []
     texts = [f"branch {name} is not published: {_WHY_NOT_PUBLISHED}" for name in hidden]
-    names = no_temperature(database, in_force)
-    texts += [f"branch {name} is passed through: {_WHY_NO_TEMPERATURE}" for name in names]
     if not fd and (names := needs_fd(database, mode)):
         texts.append(f"CAN FD messages ({', '.join(names)}): 'ecu-node run' needs --fd")
     return texts
-
-
-def _plan_lines(branch: dict[str, Any]) -> list[str]:
-    plan, model = branch["plan"], branch["sensor_model"]
-    if plan is None:
-        return [f"  sensor model {model!r}: a plan for each code of the temperature"]
-    if "positive" in plan:
-        return [
-            f"  sensor model {model!r}, {side} currents: {_numbers(plan[side])}" for side in ("positive", "negative")
-        ]
-    return [f"  {_numbers(plan)}"]
 
 
 def _numbers(plan: dict[str, int]) -> str:
@@ -113,25 +97,16 @@ def _numbers(plan: dict[str, int]) -> str:
 
 def _branch(database: VehicleDatabase, branch: Branch, in_force: InForce, mode: Mode) -> dict[str, Any]:
     found = in_force.parameters.branches.get(branch.name) if in_force.parameters is not None else None
-    model = found.sensor_model if found is not None else None
-    fault = sensor_fault(database, in_force, branch.name)
+    fault = sensor_fault(in_force, branch.name)
     target = branch.corrected if mode is Mode.OVERLAY else branch.source
     plan = branch_plan(database, branch, fault, mode) if target is not None else None
     return {
         "drift": found.drift if found is not None else 0.0,
         "offset_a": found.offset_a if found is not None else 0.0,
-        "sensor_model": type(model).__struct_config__.tag if model is not None else None,
         "apply": found.apply if found is not None else None,
         "applied": fault.applied,
         "target": target,
-        "plan": _plan(plan),
+        "plan": None
+        if plan is None
+        else {"gain": plan.gain, "voltage_gain": plan.voltage_gain, "bias": plan.bias, "shift": plan.shift},
     }
-
-
-def _plan(plan: CorrectionPlan | None) -> dict[str, Any] | None:
-    match plan:
-        case IntegerPlan():
-            return {"gain": plan.gain, "voltage_gain": plan.voltage_gain, "bias": plan.bias, "shift": plan.shift}
-        case SignPlan():
-            return {"positive": _plan(plan.positive), "negative": _plan(plan.negative)}
-    return None

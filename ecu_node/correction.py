@@ -17,31 +17,22 @@ Rounding rule: the exact line, rounded to the nearest code, halves up. The integ
 by less than :data:`LARGEST_ERROR` of a code, so that an exact half is never rounded down; an exact result that lies
 less than that below a half is rounded up. Where 64 bits allow it, the approach is closer by far.
 
-A sensor whose gain depends on the sign of the true current has two plans, and an exact rule which one holds; one whose
-gain depends on its temperature has a plan per code of the temperature signal.
-
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 
 from ecu_node.codes import Codes, as_written, writable_range
 from ecu_node.sensor_fault import SensorFault
-from ecu_node.sensor_models import GainBySign, TemperatureDrift
 
 __all__ = [
     "AS_IT_IS",
     "LARGEST_ERROR",
-    "CodePlan",
-    "CorrectionPlan",
     "IntegerPlan",
     "Line",
-    "SignPlan",
     "Signals",
-    "TemperaturePlans",
     "correction_plan",
     "integer_plan",
 ]
@@ -125,51 +116,7 @@ AS_IT_IS = IntegerPlan(gain=2, bias=0, shift=1, lowest=-_EVERYTHING, highest=_EV
 """Writes every value as it was measured."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SignPlan:
-    """Correction of a sensor with one gain per sign of the true current.
-
-    Attributes
-    ----------
-    positive, negative : IntegerPlan
-        For true currents into and out of the junction.
-    weights : tuple of int
-        The current is into the junction, or 0, if code * w0 + voltage_code * w1 + w2 >= 0.
-    """
-
-    positive: IntegerPlan
-    negative: IntegerPlan
-    weights: tuple[int, int, int]
-
-    @property
-    def needs_voltage(self) -> bool:
-        """Whether it depends on the voltage which plan holds."""
-        return self.weights[1] != 0
-
-    def plan(self, code: int, voltage_code: int = 0) -> IntegerPlan:
-        """The plan that holds for a code."""
-        of_code, of_voltage, constant = self.weights
-        into = code * of_code + voltage_code * of_voltage + constant >= 0
-        return self.positive if into else self.negative
-
-
-CodePlan = IntegerPlan | SignPlan
-"""What corrects a code without asking for more than a voltage."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TemperaturePlans:
-    """Correction of a sensor whose gain depends on its temperature: a plan for each code of the temperature signal."""
-
-    at: Callable[[int], IntegerPlan | None]
-    """Plan for a code; None where the drift is beyond the layout's limit."""
-
-
-CorrectionPlan = CodePlan | TemperaturePlans
-"""Any of them."""
-
-
-def correction_plan(signals: Signals, fault: SensorFault, *, temperature: Codes | None = None) -> CorrectionPlan:
+def correction_plan(signals: Signals, fault: SensorFault) -> IntegerPlan:
     """Build the plan of one branch, once at start.
 
     Parameters
@@ -178,12 +125,10 @@ def correction_plan(signals: Signals, fault: SensorFault, *, temperature: Codes 
         What is read and written.
     fault : SensorFault
         What is corrected; :data:`~ecu_node.sensor_fault.NO_FAULT` to pass through.
-    temperature : Codes or None
-        Of the temperature signal, which a fault with temperature needs. [degC]
 
     Returns
     -------
-    IntegerPlan, SignPlan or TemperaturePlans
+    IntegerPlan
         For every valid code its error is at most half a code + 2^-10.
 
     Raises
@@ -191,25 +136,7 @@ def correction_plan(signals: Signals, fault: SensorFault, *, temperature: Codes 
     DatabaseError
         If the target's value table leaves no values around 0.
     """
-    model = fault.model
-    offset = as_written(fault.offset_a)
-    if isinstance(model, GainBySign):
-        return SignPlan(
-            positive=integer_plan(signals, _line(signals, as_written(model.drift_positive), offset)),
-            negative=integer_plan(signals, _line(signals, as_written(model.drift_negative), offset)),
-            weights=_sign_weights(signals, offset),
-        )
-    if isinstance(model, TemperatureDrift):
-        assert temperature is not None, "a fault with temperature is not applied without one"
-        codes, drift, per_k = temperature, as_written(fault.drift), as_written(model.drift_per_k)
-        reference, limit = as_written(model.reference_c), as_written(fault.largest_drift)
-
-        def at(code: int) -> IntegerPlan | None:
-            hot = drift + per_k * (codes.scale * code + codes.offset - reference)
-            return integer_plan(signals, _line(signals, hot, offset)) if abs(hot) <= limit else None
-
-        return TemperaturePlans(at=at)
-    return integer_plan(signals, _line(signals, as_written(fault.drift), offset))
+    return integer_plan(signals, _line(signals, as_written(fault.drift), as_written(fault.offset_a)))
 
 
 def integer_plan(signals: Signals, line: Line) -> IntegerPlan:
@@ -265,16 +192,6 @@ def _line(signals: Signals, drift: Fraction, offset_a: Fraction) -> Line:
         voltage_slope=-per_volt * slope / target.scale,
         constant=((source.offset - at_zero) * slope - target.offset) / target.scale,
     )
-
-
-def _sign_weights(signals: Signals, offset_a: Fraction) -> tuple[int, int, int]:
-    """Integers of the exact rule: the current is into the junction where the line without gain is not negative."""
-    unscaled = replace(signals.target, scale=Fraction(1), offset=Fraction(0))
-    line = _line(replace(signals, target=unscaled), Fraction(0), offset_a)
-    weights = [signals.sign * weight for weight in (line.slope, line.voltage_slope, line.constant)]
-    common = math.lcm(*(weight.denominator for weight in weights))
-    of_code, of_voltage, constant = (int(weight * common) for weight in weights)
-    return of_code, of_voltage, constant
 
 
 def _shift(ranges: list[tuple[Fraction, Codes]], constant: Fraction) -> int:

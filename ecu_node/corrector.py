@@ -49,7 +49,7 @@ class Corrector:
     branches : sequence of LiveBranch
         All branches of the layout.
     auxiliaries : sequence of Auxiliary
-        Voltages and temperatures.
+        Voltages, and the state that the watch depends on.
     status_fields : StatusFields or None
         Status message, if the layout has one.
     watch : JunctionWatch

@@ -10,7 +10,7 @@ class Counters:
     """Counted by the core and by the loop around it."""
 
     frames_in: int = 0
-    """Frames of branches, their voltages and temperatures received."""
+    """Frames of branches, their voltages and the state of [watch] received."""
     answers: int = 0
     """Corrected messages that an overlay node made, those with values passed through or not available included."""
     rewritten: int = 0

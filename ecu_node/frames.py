@@ -155,9 +155,7 @@ class Source:
     def _renew(self) -> None:
         """Put together anew what is quick: a plan has changed."""
         self.answer, self.forward = self._answer, self._forward
-        if any(auxiliary.is_needed for auxiliary, _ in self._auxiliaries):
-            return
-        found = quick_signals(self._branches, self._message.length)
+        found = None if self._auxiliaries else quick_signals(self._branches, self._message.length)
         if found is None:
             return
         self.forward = quick_forward(found, self._message, self._forward)
@@ -222,7 +220,7 @@ class Source:
         return check
 
     def _read(self, payload: bytearray, now_s: float) -> None:
-        """Let everybody take what is theirs; auxiliary signals first, as plans may depend on them."""
+        """Dispatch the signals of a frame; auxiliary signals first, as corrections may need them."""
         self._history.append((now_s, payload))
         for auxiliary, signal in self._auxiliaries:
             code = signal.code(payload)

@@ -60,7 +60,7 @@ def received(database: VehicleDatabase) -> dict[FrameKey, Message]:
     """Messages that carry the branches and what else the node needs of the vehicle, by identifier."""
     layout = database.layout
     names = [name for branch in layout.branch for name in (branch.source, branch.voltage) if name is not None]
-    names += [item.signal for item in layout.input if item.name in {layout.temperature, layout.watch.input}]
+    names += [item.signal for item in layout.input if item.name == layout.watch.input]
     return {key_of(message): message for message, _ in map(database.signal, names)}
 
 

@@ -3,16 +3,14 @@
 from dataclasses import dataclass
 
 from ecu_node.branch_plans import branch_plan, passing_plan
-from ecu_node.correction import TemperaturePlans
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
 from ecu_node.guard import PARAMETER_SETS, Mode
 from ecu_node.parameters import VehicleParameters
 from ecu_node.sensor_fault import NO_FAULT, SensorFault
-from ecu_node.sensor_models import TemperatureDrift
 from ecu_node.status import Reason
 
-__all__ = ["InForce", "no_temperature", "not_published", "put_in_force", "sensor_fault"]
+__all__ = ["InForce", "not_published", "put_in_force", "sensor_fault"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,32 +21,16 @@ class InForce:
     reason: Reason = Reason.NONE
 
 
-def sensor_fault(database: VehicleDatabase, in_force: InForce, branch: str) -> SensorFault:
-    """What is corrected on one branch; NO_FAULT where the parameters apply none, or it cannot be applied."""
+def sensor_fault(in_force: InForce, branch: str) -> SensorFault:
+    """What is corrected on one branch; NO_FAULT where the parameters apply none."""
     found = in_force.parameters.branches.get(branch) if in_force.parameters is not None else None
-    if found is None or not found.apply:
-        return NO_FAULT
-    if isinstance(found.sensor_model, TemperatureDrift) and database.layout.temperature is None:
-        return NO_FAULT
-    return SensorFault(
-        drift=found.drift,
-        offset_a=found.offset_a,
-        model=found.sensor_model,
-        largest_drift=database.layout.limits.drift,
-    )
+    return SensorFault(drift=found.drift, offset_a=found.offset_a) if found is not None and found.apply else NO_FAULT
 
 
 def not_published(database: VehicleDatabase, in_force: InForce) -> list[str]:
     """Branches with a fault to correct, but no signal to publish the result in; it counts in the status' sum alone."""
     names = [branch.name for branch in database.layout.branch if branch.corrected is None]
-    return [name for name in names if sensor_fault(database, in_force, name).applied]
-
-
-def no_temperature(database: VehicleDatabase, in_force: InForce) -> list[str]:
-    """Branches whose fault depends on a temperature that the layout does not name; they are passed through."""
-    found = in_force.parameters.branches if in_force.parameters is not None else {}
-    names = [name for name, item in found.items() if item.apply and isinstance(item.sensor_model, TemperatureDrift)]
-    return names if database.layout.temperature is None else []
+    return [name for name in names if sensor_fault(in_force, name).applied]
 
 
 def put_in_force(
@@ -73,12 +55,8 @@ def put_in_force(
     found = parameters.branches if parameters is not None else {}
     plans = []  # all of them before the first is put in force: either all or none
     for branch in database.layout.branch:
-        fault = sensor_fault(database, in_force, branch.name)
+        fault = sensor_fault(in_force, branch.name)
         plans.append((branch, fault, branch_plan(database, branch, fault, mode)))
-    hot = any(isinstance(plan, TemperaturePlans) for _, _, plan in plans)
-    for live in corrector.branches:
-        if live.temperature is not None:
-            live.temperature.is_needed = hot
     for (branch, fault, plan), live in zip(plans, corrector.branches, strict=True):
         delay_s = found[branch.name].delay_s if branch.name in found else None
         live.put_in_force(

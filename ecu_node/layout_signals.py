@@ -7,9 +7,8 @@ from ecu_node.codes import Codes, read_codes
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
 from ecu_node.layout import SignalName
-from ecu_node.units import CELSIUS
 
-__all__ = ["input_signal", "signal_codes", "temperature_codes"]
+__all__ = ["input_signal", "signal_codes"]
 
 
 def signal_codes(
@@ -55,9 +54,3 @@ def signal_codes(
 def input_signal(database: VehicleDatabase, name: str | None) -> SignalName | None:
     """Signal of the input of this name; None if there is none."""
     return next((item.signal for item in database.layout.input if item.name == name), None)
-
-
-def temperature_codes(database: VehicleDatabase) -> Codes | None:
-    """Codes of the sensors' temperature [degC]; None if the layout names none. Errors as for :func:`signal_codes`."""
-    name = input_signal(database, database.layout.temperature)
-    return None if name is None else signal_codes(database, name, CELSIUS, "temperature")

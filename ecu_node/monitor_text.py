@@ -41,7 +41,7 @@ REASONS = {
     Reason.BRANCH_STALE: "a branch has sent nothing for longer than its timeout",
     Reason.CORRECTION_WORSE: "the corrected Kirchhoff sum is worse than the measured one",
     Reason.BRANCH_STUCK: "a branch never changes while the others do",
-    Reason.INPUT_MISSING: "a voltage or temperature, or a value of a branch, is missing; not everything is corrected",
+    Reason.INPUT_MISSING: "a voltage, or a value of a branch, is missing; not everything is corrected",
     Reason.NOT_SIGNED: "the parameters are not what trusted signers have signed",
     Reason.NOT_VALID_NOW: "the parameters have expired, or do not hold yet",
     Reason.REPLAYED: "the parameters are older than what was accepted before",

@@ -4,7 +4,6 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UnfitError, shown_name
 from ecu_node.layout import Layout
 from ecu_node.parameters import BranchParameters, VehicleParameters, Verdict
-from ecu_node.sensor_models import GainBySign
 from ecu_node.status import Reason
 
 __all__ = ["check_fit"]
@@ -89,20 +88,14 @@ def _check_branch(name: str, branch: BranchParameters, layout: Layout) -> None:
         )
     if not branch.apply:
         return
-    for drift in _drifts(branch):
-        if not abs(drift) <= layout.limits.drift:
-            raise UnfitError(
-                Reason.IMPLAUSIBLE_PARAMETERS,
-                f"branch {name}: drift {drift:+.4g} is beyond the layout's limit of {layout.limits.drift:g}",
-            )
+    if not abs(branch.drift) <= layout.limits.drift:
+        raise UnfitError(
+            Reason.IMPLAUSIBLE_PARAMETERS,
+            f"branch {name}: drift {branch.drift:+.4g} is beyond the layout's limit of {layout.limits.drift:g}",
+        )
     if not abs(branch.offset_a) <= layout.offset_limit_a:
         raise UnfitError(
             Reason.IMPLAUSIBLE_PARAMETERS,
             f"branch {name}: offset {branch.offset_a:+.4g} A is beyond the layout's limit of "
             f"{layout.offset_limit_a:g} A",
         )
-
-
-def _drifts(branch: BranchParameters) -> tuple[float, ...]:
-    model = branch.sensor_model
-    return (model.drift_positive, model.drift_negative) if isinstance(model, GainBySign) else (branch.drift,)

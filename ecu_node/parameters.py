@@ -13,7 +13,6 @@ import msgspec
 from ecu_node.errors import ParameterError, UnfitError, printable, shown_name
 from ecu_node.field_errors import field_error, json_error, quoted_place
 from ecu_node.repeated_keys import repeated_key
-from ecu_node.sensor_models import SensorModel
 from ecu_node.status import Reason
 from ecu_node.user_files import UnsuitableFileError, read_user_file, write_atomically
 
@@ -21,6 +20,7 @@ __all__ = [
     "BranchParameters",
     "Explanation",
     "FileReference",
+    "Finding",
     "HardwareFault",
     "HeldBack",
     "JunctionResidual",
@@ -46,12 +46,13 @@ _SIGNED_ADVICE = "use 'ecu-node activate' and --state, or name the file that was
 Verdict = Literal["no sensor fault", "corrected", "cannot tell", "not enough data"]
 """What was found of the sensors of one vehicle."""
 
-HeldBack = Literal[
-    "beyond the limits", "not linear", "no temperature", "reference in doubt", "moved too little", "harm limit"
-]
-"""Why a branch in which a fault was found is passed through."""
+_NO_MODELS = "sensors that are not linear are not corrected any more"
+
+HeldBack = Literal["beyond the limits", "does not fit", "reference in doubt", "moved too little", "harm limit"]
+"""Why a branch in which a fault was found is passed through; "does not fit": no gain error and offset explain it."""
 
 _Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$", description="SHA-256, line ends counted as LF")]
+_Text64 = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 _Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 _NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 _MeanSum = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # no vehicle has such currents, and squares are still finite
@@ -69,7 +70,10 @@ class BranchParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     held_back: Annotated[
         HeldBack | None, msgspec.Meta(description="why a fault that was found is not applied; null: none, or it is")
     ] = None
-    sensor_model: Annotated[SensorModel | None, msgspec.Meta(description="null: linear")] = None
+    sensor_model: Annotated[
+        msgspec.UnsetType | None,
+        msgspec.Meta(description="always null; only files of version 1.0 have it"),
+    ] = msgspec.UNSET
     delay_s: Annotated[
         float | None, msgspec.Meta(description="how much later than the largest branch it is seen [s]; null: unknown")
     ] = None
@@ -104,6 +108,17 @@ class Explanation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     offset_a: Annotated[dict[str, float], msgspec.Meta(description="of the same [A]")] = {}
     hardware_drift: Annotated[float, msgspec.Meta(description="[1]")] = 0.0
     hardware_offset_a: Annotated[dict[str, float], msgspec.Meta(description="[A]")] = {}
+
+
+class Finding(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a check found in the recordings that no gain error and offset explain; the node ignores it."""
+
+    branch: Annotated[
+        _Text64 | None, msgspec.Meta(description="whose sensor it is about; null: the vehicle as a whole")
+    ] = None
+    cause: Annotated[_Text64, msgspec.Meta(description="what it looks like, such as 'inverted' or 'clipped'")]
+    probability: Annotated[_Share, msgspec.Meta(description="probability of this cause")]
+    text: Annotated[str, msgspec.Meta(min_length=1, max_length=500, description="the same in a sentence")]
 
 
 class JunctionResidual(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -177,6 +192,9 @@ class VehicleParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     deciding_evidence: Annotated[
         str, msgspec.Meta(description="what would tell the explanations apart; empty if nothing has to")
     ] = ""
+    findings: Annotated[
+        list[Finding], msgspec.Meta(max_length=64, description="what a workshop should look at; no correction mends it")
+    ] = []
     junction_residual: JunctionResidual
     provenance: Provenance
 
@@ -252,7 +270,8 @@ def _why_not(error: Exception, content: bytes) -> str:
         return _stands_twice(twice)
     if isinstance(document, dict) and {"payload", "payloadType", "signatures"} <= document.keys():
         return _SIGNED
-    return field_error(error, document, VehicleParameters, quoted_place)
+    why = field_error(error, document, VehicleParameters, quoted_place)
+    return f"{why}: {_NO_MODELS}" if str(error).endswith(".sensor_model`") else why
 
 
 def encode_parameters(parameters: VehicleParameters, where: str) -> bytes:

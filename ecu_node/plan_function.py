@@ -1,10 +1,10 @@
-"""A plan as a function of measured codes: its kind is asked for once, when it is put in force, and not per frame."""
+"""A plan as a function of measured codes; whether it needs a voltage is asked once, when it is put in force."""
 
 from collections.abc import Callable
 
 from ecu_node.auxiliary import Auxiliary
 from ecu_node.codes import Codes
-from ecu_node.correction import CodePlan, IntegerPlan, SignPlan
+from ecu_node.correction import IntegerPlan
 from ecu_node.counters import Counters
 
 __all__ = ["PlanFunction", "plan_function"]
@@ -13,15 +13,15 @@ PlanFunction = Callable[[int], int | None]
 """From a measured code to the one to write; None where there is none."""
 
 
-def plan_function(codes: Codes, plan: CodePlan, voltage: Auxiliary | None, counters: Counters) -> PlanFunction:
+def plan_function(codes: Codes, plan: IntegerPlan, voltage: Auxiliary | None, counters: Counters) -> PlanFunction:
     """Make the function; what it looks up in every frame is bound to it.
 
     Parameters
     ----------
     codes : Codes
         Of the measured signal.
-    plan : IntegerPlan or SignPlan
-        Correction in integers; that of one temperature where it depends on it.
+    plan : IntegerPlan
+        Correction in integers.
     voltage : Auxiliary or None
         Of a branch that is a power.
     counters : Counters
@@ -32,8 +32,6 @@ def plan_function(codes: Codes, plan: CodePlan, voltage: Auxiliary | None, count
     callable
         Takes a measured code, and returns the one to write; None where the code, or a voltage, is no value.
     """
-    if isinstance(plan, SignPlan):
-        return _of_sign_plan(codes, plan, voltage, counters)
     if voltage is not None and plan.needs_voltage:
         return _with_voltage(codes, plan, voltage, counters)
 
@@ -52,19 +50,5 @@ def _with_voltage(codes: Codes, plan: IntegerPlan, voltage: Auxiliary, counters:
             return None
         counters.saturated += plan.saturates(code, voltage.code)
         return plan.apply(code, voltage.code)
-
-    return fix
-
-
-def _of_sign_plan(codes: Codes, plan: SignPlan, voltage: Auxiliary | None, counters: Counters) -> PlanFunction:
-    needs_voltage = plan.needs_voltage
-
-    def fix(code: int) -> int | None:
-        voltage_code = voltage.code if voltage is not None and needs_voltage else 0
-        if voltage_code is None or not codes.is_value(code):
-            return None
-        chosen = plan.plan(code, voltage_code)
-        counters.saturated += chosen.saturates(code, voltage_code)
-        return chosen.apply(code, voltage_code)
 
     return fix

@@ -1,7 +1,7 @@
 """Frames of ordinary messages, quickly: functions made for one message, with all that they need bound to them.
 
-Ordinary is a message of the length that the DBC says, whose branches are corrected by one integer plan each, are in
-every frame, and have one byte order. Its payload is one integer. With the sign bits of two's complements turned over, a
+Ordinary is a message of the length that the DBC says, whose branches need no voltage, are in every frame, and have one
+byte order. Its payload is one integer. With the sign bits of two's complements turned over, a
 code is an unsigned number less the weight of its sign bit, and ``word += (out - code) << shift`` writes one code in the
 place of another. What is not ordinary the functions hand over to those of :mod:`ecu_node.frames`, before they change
 anything.
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ecu_node.bits import Order, PlacedSignal
 from ecu_node.branch import LiveBranch
-from ecu_node.correction import IntegerPlan
 from ecu_node.counters import Counters
 from ecu_node.e2e import Protection, Receiver
 
@@ -74,7 +73,7 @@ def quick_signals(branches: Sequence[tuple[LiveBranch, PlacedSignal]], length: i
 
 def _field(branch: LiveBranch, signal: PlacedSignal, length: int) -> _Field | None:
     word, codes, plan = signal.place.in_word(length), branch.codes, branch.plan
-    if not isinstance(plan, IntegerPlan) or plan.voltage_gain or word is None or signal.above:
+    if plan.voltage_gain or word is None or signal.above:
         return None
     lowest, highest = codes.lowest, codes.highest
     while lowest in codes.named:

@@ -1,4 +1,4 @@
-"""Units of the DBC, as factors that turn them into A, V, W or degC."""
+"""Units of the DBC, as factors that turn them into A, V or W."""
 
 from collections.abc import Mapping
 
@@ -6,12 +6,11 @@ from cantools.database.can import Signal
 
 from ecu_node.errors import DatabaseError
 
-__all__ = ["AMPERE", "CELSIUS", "VOLT", "WATT", "unit_factor"]
+__all__ = ["AMPERE", "VOLT", "WATT", "unit_factor"]
 
 AMPERE: Mapping[str, float] = {"A": 1.0, "mA": 1e-3, "kA": 1e3}
 VOLT: Mapping[str, float] = {"V": 1.0, "mV": 1e-3, "kV": 1e3}
 WATT: Mapping[str, float] = {"W": 1.0, "kW": 1e3, "mW": 1e-3, "MW": 1e6}
-CELSIUS: Mapping[str, float] = dict.fromkeys(("degC", "°C", "C", "deg C", "Celsius"), 1.0)
 
 
 def unit_factor(signal: Signal, known: Mapping[str, float], where: str) -> float:
@@ -22,7 +21,7 @@ def unit_factor(signal: Signal, known: Mapping[str, float], where: str) -> float
     signal : Signal
         A signal of the DBC. A signal without unit counts as being in the base unit.
     known : mapping of str to float
-        One of :data:`AMPERE`, :data:`VOLT`, :data:`WATT`, :data:`CELSIUS`.
+        One of :data:`AMPERE`, :data:`VOLT`, :data:`WATT`.
     where : str
         What the signal is for, for the message of the error.
 

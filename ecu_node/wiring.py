@@ -21,7 +21,7 @@ from ecu_node.guard import Mode, check_output, is_fd, key_of, received
 from ecu_node.in_force import InForce, put_in_force
 from ecu_node.junction_watch import JunctionWatch
 from ecu_node.layout import SignalName, split_signal
-from ecu_node.layout_signals import input_signal, signal_codes, temperature_codes
+from ecu_node.layout_signals import input_signal, signal_codes
 from ecu_node.units import AMPERE, VOLT
 
 __all__ = ["wire"]
@@ -124,10 +124,6 @@ def _parts(database: VehicleDatabase) -> _Parts:
             codes = signal_codes(database, branch.voltage, VOLT, f"branch {branch.name}")
             timeout_s = max(item.timeout_s for item in layout.branch if item.voltage == branch.voltage)
             voltages[branch.voltage] = auxiliary(branch.voltage, codes, timeout_s)
-    temperature_name, its_codes = input_signal(database, layout.temperature), temperature_codes(database)
-    temperature = None  # after the voltages, as a new temperature makes values anew, with the voltage of its frame
-    if temperature_name is not None and its_codes is not None:
-        temperature = auxiliary(temperature_name, its_codes, layout.max_age_s)
     for branch in layout.branch:
         signals = branch_signals(database, branch, Mode.GATEWAY)
         live = LiveBranch(
@@ -137,7 +133,6 @@ def _parts(database: VehicleDatabase) -> _Parts:
             timeout_s=branch.timeout_s,
             start_s=layout.watch.start_s,
             voltage=voltages[branch.voltage] if branch.voltage is not None else None,
-            temperature=temperature,
         )
         parts.branches[branch.name] = live
         parts.signals.append((branch.source, live))

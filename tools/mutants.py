@@ -148,7 +148,7 @@ def copy_changed(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copy2(source, target)
     if source.is_relative_to(ROOT / "calibrator") and source.suffix == ".py":
-        target.write_text(re.sub(r"(?m)^@(compiled|in_place|inner|inlined)\n", "", source.read_text()))
+        target.write_text(re.sub(r"(?m)^@(compiled|compiled_with_notice|inner|inlined)\n", "", source.read_text()))
         shutil.copystat(source, target)
 
 

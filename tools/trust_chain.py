@@ -12,11 +12,18 @@ from typing import Annotated
 
 import typer
 
-from calibrator.artificial.options import MAX_MINUTES, CurrentsOption, SparsityOption, UnmeasuredOption
+from calibrator.artificial.options import MAX_MINUTES, CurrentsOption, UnmeasuredOption
 from calibrator.artificial.simulate import FleetPlan
 from calibrator.artificial.trips import choose_trips
 from calibrator.terminal.command_line import command_app, run_tool
-from calibrator.terminal.options import MAX_VEHICLES, SeedOption, WorkersOption, number_option, whole_option
+from calibrator.terminal.options import (
+    MAX_VEHICLES,
+    SeedOption,
+    SparsityOption,
+    WorkersOption,
+    number_option,
+    whole_option,
+)
 from calibrator.terminal.text import print_report
 from chain.fleet import draw_fleet
 from chain.whole import drive_chain

@@ -1,4 +1,4 @@
-"""``calibrator simulate`` and ``calibrator score``: an artificial fleet, and a result beside its truth."""
+"""``calibrator simulate``: an artificial fleet with known faults."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,11 +12,8 @@ from calibrator.artificial.options import (
     CurrentsOption,
     DelayOption,
     DrivesOption,
-    MagnitudeOption,
     MinutesOption,
     NoiseOption,
-    SparsityOption,
-    SymmetricOption,
     UnmeasuredOption,
     UnseenMinutesOption,
     VehiclesOption,
@@ -24,15 +21,23 @@ from calibrator.artificial.options import (
 from calibrator.files.folders import require_new_folder
 from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
-from calibrator.terminal.options import JsonOption, LayoutOption, SeedOption, WorkersOption
+from calibrator.terminal.options import (
+    JsonOption,
+    LayoutOption,
+    MagnitudeOption,
+    SeedOption,
+    SparsityOption,
+    SymmetricOption,
+    WorkersOption,
+)
 from calibrator.terminal.progress import progress_bar
-from calibrator.terminal.text import dumps, print_report
+from calibrator.terminal.text import dumps
 from ecu_node.standard_output import write_output, write_text
 
 if TYPE_CHECKING:
     from calibrator.fleet_truth import FleetTruth
 
-__all__ = ["score", "simulate"]
+__all__ = ["simulate"]
 
 
 def simulate(
@@ -87,19 +92,6 @@ def simulate(
     with progress_bar("simulate", vehicles, "vehicles") as progress:
         truth = simulate_fleet(plan, trips, database, out, workers=workers, progress=progress)
     _print_fleet(truth, out, trips.notices, json=json)
-
-
-def score(
-    result: Annotated[Path, typer.Argument(help="Folder that 'calibrator calibrate' wrote.")],
-    truth: Annotated[Path, typer.Option("--truth", help="truth.json that 'calibrator simulate' wrote.")],
-    json: JsonOption = False,
-) -> None:
-    """Compare a result with the truth of its artificial fleet."""
-    with importing():
-        from calibrator.artificial.result_score import score_result
-
-    figures = score_result(result, truth)
-    print_report(figures, json=json)
 
 
 def _print_fleet(truth: "FleetTruth", out: Path, notices: Sequence[str], *, json: bool) -> None:

@@ -12,11 +12,8 @@ __all__ = [
     "CurrentsOption",
     "DelayOption",
     "DrivesOption",
-    "MagnitudeOption",
     "MinutesOption",
     "NoiseOption",
-    "SparsityOption",
-    "SymmetricOption",
     "UnmeasuredOption",
     "UnseenMinutesOption",
     "VehiclesOption",
@@ -30,12 +27,6 @@ MAX_UNMEASURED_A = 1000.0
 """More than the full scale of any car's junction. [A]"""
 
 
-def _magnitude(value: tuple[float, float]) -> tuple[float, float]:
-    if not 0 <= value[0] <= value[1] < 1:
-        raise typer.BadParameter(f"{value[0]:g} {value[1]:g}: expected 0 <= LO <= HI < 1")
-    return value
-
-
 def _unmeasured(value: tuple[float, float]) -> tuple[float, float]:
     if not all(0 <= number <= MAX_UNMEASURED_A for number in value):
         raise typer.BadParameter(
@@ -47,19 +38,6 @@ def _unmeasured(value: tuple[float, float]) -> tuple[float, float]:
 VehiclesOption = Annotated[int, whole_option("--vehicles", 1, MAX_VEHICLES, "Number of vehicles N")]
 CurrentsOption = Annotated[int, whole_option("--currents", 2, MAX_CURRENTS, "Number of branches K")]
 DrivesOption = Annotated[str, typer.Option("--drives", help="Drive store with the trips to drive, or 'builtin'.")]
-SymmetricOption = Annotated[bool, typer.Option("--symmetric", help="The fleet's mean is the ideal vehicle (22).")]
-SparsityOption = Annotated[
-    float, number_option("--sparsity", 0, 100, "Share of zero fault parameters of an artificial fleet [%]")
-]
-MagnitudeOption = Annotated[
-    tuple[float, float],
-    typer.Option(
-        "--magnitude",
-        metavar="LO HI",
-        callback=_magnitude,
-        help="Range of its fault magnitudes, 0 <= LO <= HI < 1: drifts, and offsets as fractions of full scale.",
-    ),
-]
 NoiseOption = Annotated[float, number_option("--noise", 0, 1, "Sensor noise (sd), fraction of full scale")]
 DelayOption = Annotated[float, number_option("--delay", 0, MAX_DELAY_MS, "Largest delay of a branch [ms]")]
 UnmeasuredOption = Annotated[

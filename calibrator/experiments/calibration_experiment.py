@@ -5,12 +5,14 @@ from collections.abc import Hashable, Iterable, Sequence
 from calibrator.errors import FleetError
 from calibrator.experiments.methods import POSTERIOR
 from calibrator.experiments.outcome import BINS, calibration_figures
-from calibrator.experiments.result import Bin, ExperimentResult, Figure, Row
+from calibrator.experiments.result import Bin, ExperimentResult, Figure, Row, share
 
-__all__ = ["ALL", "calibration_experiment", "pooled_bins"]
+__all__ = ["ALL", "NOT_POOLED", "calibration_experiment", "pooled_bins", "pooled_share"]
 
 ALL = "all together"
 NAME = "calibration"
+NOT_POOLED = (NAME, "attacks")
+"""Attacks are worlds that the estimator does not expect; what becomes of confidences there is in their own table."""
 
 
 def calibration_experiment(results: Sequence[ExperimentResult]) -> ExperimentResult:
@@ -40,7 +42,7 @@ def calibration_experiment(results: Sequence[ExperimentResult]) -> ExperimentRes
     rows_by_name = {
         result.name: [row for row in result.rows if row.method == POSTERIOR.name and row.bins]
         for result in results
-        if result.name != NAME
+        if result.name not in NOT_POOLED
     }
     used = {name: rows for name, rows in rows_by_name.items() if rows}
     if not used:
@@ -87,32 +89,41 @@ def _row(name: str, rows: Sequence[Row]) -> Row:
     bins = pooled_bins(rows)
     vehicles = sum(b.count for b in bins)
     figures = {
-        "recovery_rate": sum(b.count * b.recovered for b in bins) / vehicles,
-        "confidence": sum(b.count * b.confidence for b in bins) / vehicles,
+        "recovery_rate": Figure(mean=sum(b.count * b.recovered for b in bins) / vehicles),
+        "confidence": Figure(mean=sum(b.count * b.confidence for b in bins) / vehicles),
         **_sure(rows, vehicles),
         **calibration_figures(bins),
     }
+    wrong = pooled_share(rows, "sure_wrong")
     return Row(
         x=vehicles,
         series=name,
         method=POSTERIOR.name,
-        figures={key: Figure(mean=value, sd=0.0) for key, value in figures.items()},
+        figures=figures if wrong is None else {**figures, "sure_wrong": wrong},
         bins=bins,
     )
 
 
-def _sure(rows: Sequence[Row], vehicles: int) -> dict[str, float]:
+def pooled_share(rows: Iterable[Row], name: str) -> Figure | None:
+    """A share over several rows together; None if they do not count it, as in records of before version 2."""
+    figures = [row.figures[name] for row in rows if name in row.figures]
+    of = sum(figure.of or 0 for figure in figures)
+    known = [figure.expected for figure in figures if figure.expected is not None]
+    return share(sum(figure.hits or 0 for figure in figures), of, sum(known) if known else None) if of else None
+
+
+def _sure(rows: Sequence[Row], vehicles: int) -> dict[str, Figure]:
     """Share of vehicles above 0.95, their mean confidence and the share of them that is recovered."""
     counts = [row.figures["sure"].mean * sum(b.count for b in row.bins) for row in rows]
     total = sum(counts)
     if not total:
-        return {"sure": 0.0}
+        return {"sure": Figure(mean=0.0)}
 
-    def mean(name: str) -> float:
-        return sum(n * row.figures[name].mean for n, row in zip(counts, rows, strict=True) if n) / total
+    def mean(name: str) -> Figure:
+        return Figure(mean=sum(n * row.figures[name].mean for n, row in zip(counts, rows, strict=True) if n) / total)
 
     return {
-        "sure": total / vehicles,
+        "sure": Figure(mean=total / vehicles),
         "sure_confidence": mean("sure_confidence"),
         "sure_recovered": mean("sure_recovered"),
     }

@@ -1,5 +1,6 @@
-"""``calibrator experiment``: the paper's tables and figures, and ours."""
+"""``calibrator experiment`` and ``calibrator score``: the paper's figures and ours; a result beside its truth."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -7,14 +8,36 @@ import typer
 from rich.console import Console
 
 from calibrator.files.folders import require_possible_folder
-from calibrator.options import ExperimentName
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import JsonOption, SeedOption, WorkersOption, given_options, whole_option
+from calibrator.terminal.text import print_report
 from ecu_node.standard_output import write_output
 
-__all__ = ["experiment"]
+__all__ = ["RECORDED_EXPERIMENTS", "ExperimentName", "experiment", "score"]
 
-RECORDED_EXPERIMENTS = (ExperimentName.REAL, ExperimentName.DELAY, ExperimentName.DATA, ExperimentName.PHASE)
+
+class ExperimentName(StrEnum):
+    """Experiments of the paper (table 1, figure 7, figure 8, table 2), those beyond it, and all of them."""
+
+    CLASSIFIER = "classifier"
+    SNR = "snr"
+    SPARSITY = "sparsity"
+    STATESPACE = "statespace"
+    ASYMMETRY = "asymmetry"
+    REAL = "real"
+    DELAY = "delay"
+    DATA = "data"
+    PHASE = "phase"
+    ATTACKS = "attacks"
+    COVERAGE = "coverage"
+    CALIBRATION = "calibration"
+    ALL = "all"
+
+
+RECORDED_EXPERIMENTS = (
+    ExperimentName.REAL, ExperimentName.DELAY, ExperimentName.DATA, ExperimentName.PHASE, ExperimentName.ATTACKS,
+    ExperimentName.COVERAGE,
+)  # fmt: skip
 """Those on recorded trips; the others take the built-in vehicle."""
 RECORDED_OPTIONS = ("drives", "layout")
 """What only experiments on recorded trips heed."""
@@ -72,6 +95,19 @@ def experiment(
     if json:
         texts = [result.to_json().decode().rstrip() for result in results]
         write_output(texts[0] if len(texts) == 1 else f"[{','.join(texts)}]")
+
+
+def score(
+    result: Annotated[Path, typer.Argument(help="Folder that 'calibrator calibrate' wrote.")],
+    truth: Annotated[Path, typer.Option("--truth", help="truth.json that 'calibrator simulate' wrote.")],
+    json: JsonOption = False,
+) -> None:
+    """Compare a result with the truth of its artificial fleet."""
+    with importing():
+        from calibrator.experiments.result_score import score_result
+
+    figures = score_result(result, truth)
+    print_report(figures, json=json)
 
 
 def require_heeded_options(context: typer.Context, name: ExperimentName) -> None:

@@ -1,5 +1,16 @@
 """Trials in which all vehicles make one drive, sections IV-A to IV-D of [1]_.
 
+The evidence rows of the default are made of simulations over the fleet reference, and of the junction law. The
+reference is not the mean r of the fleet (3), which a fleet without symmetry shifts, but c_0 r + c_1 with the densest
+cluster of slopes and of intercepts as c_0 and c_1, branch by branch: vehicles that agree with each other. Slopes and
+intercepts a, b over r become
+
+    a' = a / c_0,    b' = b - a c_1 / c_0
+
+The measured currents of these experiments hold no noise, so the junction law on their second moments is exact: with
+(.)_1 the first branch and (.)_r the others, g = M_rr^-1 M_r1 and c = mean_1 - g^T mean_r, M the covariance of the
+measured currents.
+
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
@@ -9,17 +20,23 @@ from functools import partial
 import numpy as np
 
 from calibrator.drive import Array
+from calibrator.estimator.clusters import densest_clusters
+from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows
+from calibrator.estimator.state_space import choose_order, identify
 from calibrator.experiments.common_drive import CommonDrive
-from calibrator.experiments.common_rows import common_rows, measured_moments
-from calibrator.experiments.trial import FleetLaw, Trial, unseen_drive
+from calibrator.experiments.trial import CommonEvidence, FleetLaw, Trial, unseen_drive
 from calibrator.faults import Faults, slopes_and_intercepts
-from calibrator.identification.identify import choose_order, identify
-from calibrator.posterior.estimate import FleetPosterior, Moments, estimate_fleet
-from calibrator.posterior.fault_prior import FaultPrior
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean, junction_mean_square
 from calibrator.random_streams import Purpose, random_stream
 
-__all__ = ["artificial_trial", "noise_sd_a", "state_space_trial"]
+__all__ = ["artificial_trial", "common_rows", "measured_moments", "noise_sd_a", "state_space_trial"]
+
+GAIN_VARIANCE, CONSTANT_VARIANCE = 1e-10, 1e-12
+"""Of the exact junction law: above rounding, far below any fault. [1]"""
+ROUNDS = 3
+"""Over a better reference, vehicles agree more closely; more rounds change nothing. [1]"""
+LEAST_SD = 1e-6
+"""Of slopes [1] and intercepts [A] of simulations without noise."""
 
 
 def noise_sd_a(drive: CommonDrive, snr_db: float) -> float:
@@ -83,20 +100,17 @@ def _trial(drive: CommonDrive, law: FleetLaw, simulated: Iterable[Array], truth:
         full_scale_a=drive.full_scale_a,
         truth=truth,
         unseen=unseen_drive(drive.unseen.mean(axis=0), np.mean(drive.unseen**2, axis=0), truth),
-        posterior=partial(_posterior, drive, evidence, reference.mean(axis=0), truth),
+        record=partial(_record, drive, evidence, reference.mean(axis=0), truth),
         collect=lambda: evidence,
         training=partial(_training, drive, law, seed),
     )
 
 
-def _posterior(
-    drive: CommonDrive, evidence: FleetEvidence, reference_mean_a: Array, truth: Faults, given: FaultPrior | None
-) -> FleetPosterior:
-    """Default method on the simulations, and on the moments of what the vehicles measured on the unity drive."""
-    measured = measured_moments(drive.unity, truth)
-    rows = common_rows(evidence, reference_mean_a, measured, full_scale_a=drive.full_scale_a)
-    moments = Moments(mean_a=measured.mean_a, mean_square_a2=measured.mean_square_a2)
-    return estimate_fleet(rows, moments, full_scale_a=drive.full_scale_a, given=given)
+def _record(drive: CommonDrive, evidence: FleetEvidence, reference_mean_a: Array, truth: Faults) -> CommonEvidence:
+    """Rows of the simulations, and the moments of what the vehicles measured on the unity drive."""
+    mean_a, covariance_a2 = measured_moments(drive.unity, truth)
+    rows = common_rows(evidence, reference_mean_a, mean_a, covariance_a2, full_scale_a=drive.full_scale_a)
+    return CommonEvidence(rows=rows, mean_a=mean_a, covariance_a2=covariance_a2)
 
 
 def _artificial_fleet(
@@ -140,3 +154,89 @@ class _ArtificialSimulation:
         for j, measured in enumerate(_measured(self._unity, self._truth)):
             noise = random_stream(self._stream, self._seed, j).standard_normal(measured.shape)
             yield measured + self._noise_a * noise
+
+
+def measured_moments(i_s: Array, truth: Faults) -> tuple[Array, Array]:
+    """Moments of what the vehicles measure on a drive, (14) and (15).
+
+    Parameters
+    ----------
+    i_s : ndarray of shape (T, K)
+        Ideal currents. [A]
+    truth : Faults
+        Of N vehicles.
+
+    Returns
+    -------
+    mean_a : ndarray of shape (N, K)
+        [A]
+    covariance_a2 : ndarray of shape (N, K, K)
+        [A^2]
+    """
+    slope, intercept = slopes_and_intercepts(truth)
+    centred = i_s - i_s.mean(axis=0)
+    covariance = centred.T @ centred / len(i_s)
+    return slope * i_s.mean(axis=0) + intercept, slope[:, :, None] * covariance * slope[:, None, :]
+
+
+def common_rows(
+    evidence: FleetEvidence, reference_mean_a: Array, mean_a: Array, covariance_a2: Array, *, full_scale_a: float
+) -> EvidenceRows:
+    """Evidence rows of a fleet on its common drive.
+
+    Parameters
+    ----------
+    evidence : FleetEvidence
+        Slopes and intercepts of the simulations over the fleet mean, with white residuals.
+    reference_mean_a : ndarray of shape (K,)
+        Mean of the fleet mean on the unity drive. [A]
+    mean_a, covariance_a2 : ndarray of shape (N, K) and (N, K, K)
+        Moments of the measured currents of the same vehicles. [A], [A^2]
+    full_scale_a : float
+        Full scale of the junction. [A]
+
+    Returns
+    -------
+    EvidenceRows
+        Without bench readings.
+    """
+    N, K = evidence.slopes.shape
+    slope, intercept_a, of_line = _over_cluster(evidence, reference_mean_a)
+    # junction law: gains of the other branches (N, K - 1) and constant (N, 1) in the first branch's measured current
+    gain = np.linalg.solve(covariance_a2[:, 1:, 1:], covariance_a2[:, 1:, :1])[:, :, 0]
+    constant_a = mean_a[:, :1] - np.sum(gain * mean_a[:, 1:], axis=1, keepdims=True)
+    nothing = np.zeros((N, K))
+    covariance = np.tile(np.diag(np.full(5 * K, UNKNOWN_VARIANCE)), (N, 1, 1))
+    for k in range(K):
+        unit = np.array([np.ones(N), np.full(N, 1.0 / full_scale_a)]).T / slope[:, k, None]
+        place = np.array([k, 3 * K - 1 + k])
+        covariance[:, place[:, None], place] = of_line[:, k] * unit[:, :, None] * unit[:, None, :]
+    for row in range(K, 2 * K - 1):
+        covariance[:, row, row] = GAIN_VARIANCE
+    covariance[:, 4 * K - 1, 4 * K - 1] = CONSTANT_VARIANCE
+    return EvidenceRows(
+        relative=np.concatenate([np.log(slope), np.log(-gain), nothing], axis=1),
+        constant=np.concatenate([intercept_a / full_scale_a, constant_a / full_scale_a, nothing], axis=1),
+        covariance=covariance,
+        means=np.zeros((N, 2, K)),
+    )
+
+
+def _over_cluster(evidence: FleetEvidence, reference_mean_a: Array) -> tuple[Array, Array, Array]:
+    """Slopes (N, K), intercepts (N, K) [A] over the densest cluster, and the covariance of both (N, K, 2, 2)."""
+    slope, intercept_a = evidence.slopes, evidence.intercepts_a
+    covariance = np.empty((*slope.shape, 2, 2))
+    covariance[..., 0, 0] = np.maximum(evidence.slope_variances, LEAST_SD**2)
+    covariance[..., 1, 1] = np.maximum(evidence.intercept_variances_a2, LEAST_SD**2)
+    covariance[..., 0, 1] = covariance[..., 1, 0] = -reference_mean_a * evidence.slope_variances
+    for _ in range(ROUNDS):
+        sd = np.sqrt(np.einsum("nkii->nki", covariance))
+        scale, zero = (
+            np.array([densest_clusters(values[:, k], sd[:, k, i])[0].centre for k in range(values.shape[1])])
+            for i, values in enumerate((slope, intercept_a))
+        )
+        jacobian = np.zeros((len(scale), 2, 2))
+        jacobian[:, 0, 0], jacobian[:, 1, 0], jacobian[:, 1, 1] = 1.0 / scale, -zero / scale, 1.0
+        slope, intercept_a = slope / scale, intercept_a - slope * zero / scale
+        covariance = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+    return slope, intercept_a, covariance

@@ -1,20 +1,24 @@
 """Methods that experiments compare: a trial in, estimated faults out."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
-from calibrator.calibration_settings import HARM_LIMIT
 from calibrator.drive import Array, Mask
-from calibrator.experiments.trial import Trial
+from calibrator.estimator.fleet_estimate import HARM_LIMIT, estimate_rows, estimate_vehicles, learn_fleet
+from calibrator.estimator.learning import learn_laws
+from calibrator.estimator.prior import Prior, known_prior
+from calibrator.experiments.trial import CommonEvidence, FaultDistribution, Trial
 from calibrator.faults import Faults
-from calibrator.posterior.estimate import FleetPosterior
 from calibrator.published.classify import Classification, FaultTrees, classify_by_threshold, classify_by_truth
 from calibrator.published.recovery import recover_fleet
 
-__all__ = ["CEILING", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "Estimate", "Method", "Posterior", "Published"]
+__all__ = [
+    "CEILING", "LEFT_IN", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "Estimate", "Method", "Posterior", "Published",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +37,15 @@ class Estimate:
         Probability of being recovered; None: the method does not say.
     failed : int
         Vehicles whose optimisation failed.
+    drift_sd, offset_sd_a : ndarray of shape (N, K) or None
+        Standard deviations of the sensors' parameters, if the method states them. [1], [A]
+    pit : callable or None
+        Probability integral transform of true faults under the posterior, (drift, offset) each of shape (N, K); None:
+        that of a normal distribution with these standard deviations.
+    findings : sequence of N sequences of str
+        Causes that the method names of each vehicle, besides faults; empty if it names none.
+    redraw : callable or None
+        Draws the faults of so many vehicles from the prior that the method has learnt.
     """
 
     faults: Faults
@@ -40,6 +53,11 @@ class Estimate:
     corrected: Mask
     confidence: Array | None
     failed: int
+    drift_sd: Array | None = None
+    offset_sd_a: Array | None = None
+    pit: Callable[[Faults], tuple[Array, Array]] | None = None
+    findings: Sequence[Sequence[str]] = ()
+    redraw: Callable[[np.random.Generator, int], Faults] | None = None
 
 
 class Method(Protocol):
@@ -74,7 +92,7 @@ class Published:
         return Estimate(
             faults=recovery.faults,
             hardware=recovery.classification.hardware,
-            corrected=_changed(recovery.faults),
+            corrected=(recovery.faults.drift != 0.0) | (recovery.faults.offset_a != 0.0),
             confidence=None,
             failed=len(recovery.failed),
         )
@@ -97,27 +115,67 @@ class Posterior:
 
     def estimate(self, trial: Trial) -> Estimate:
         """Estimate, and correct the branches that are hardly ever made worse."""
-        posterior = trial.posterior(trial.law if self.knows_law else None)
-        return Estimate(
-            faults=posterior.faults,
-            hardware=posterior.hardware_fault > 0.5,
-            corrected=_deployed(posterior),
-            confidence=posterior.confidence,
-            failed=0,
-        )
+        return _estimate(trial, trial.drawn_from if self.knows_law else None)
 
 
-def _deployed(posterior: FleetPosterior) -> Mask:
-    """Branches that the default corrects, as the product does; the limits of a layout apart."""
-    corrected = _changed(posterior.faults) & posterior.identifiable & (posterior.harm < HARM_LIMIT)
-    if posterior.health is not None:
-        corrected[:, list(posterior.health.doubtful)] = False
-    return np.asarray(corrected)
+def _estimate(trial: Trial, known: FaultDistribution | None) -> Estimate:
+    """Run the estimator on a trial: the only place of the experiments that knows its interface."""
+    prior = None if known is None else known_prior(known.counts, known.gain)
+    if isinstance(trial.recorded, CommonEvidence):
+        return _of_rows(trial.recorded, prior, trial.full_scale_a)
+    names = [f"{k + 1}" for k in range(trial.truth.drift.shape[1])]
+    reference = learn_fleet(trial.recorded, full_scale_a=trial.full_scale_a, branches=names, known=prior)
+    found = estimate_vehicles(trial.recorded, reference)
+    return Estimate(
+        faults=Faults(
+            hardware_drift=found.hardware_drift,
+            hardware_offset_a=found.hardware_offset_a,
+            drift=found.drift,
+            offset_a=found.offset_a,
+        ),
+        hardware=found.hardware_probability > 0.5,
+        corrected=found.corrected,
+        confidence=found.confidence,
+        failed=0,
+        drift_sd=found.drift_sd,
+        offset_sd_a=found.offset_sd_a,
+        pit=lambda truth: found.pit(truth.drift, truth.offset_a),
+        findings=[[finding.cause for finding in findings] for findings in found.findings],
+        redraw=partial(_learnt(reference.laws[0].prior).draw, full_scale_a=trial.full_scale_a),
+    )
 
 
-def _changed(faults: Faults) -> Mask:
-    changed: Mask = (faults.drift != 0.0) | (faults.offset_a != 0.0)
-    return changed
+def _of_rows(recorded: CommonEvidence, known: Prior | None, full_scale_a: float) -> Estimate:
+    """The same for vehicles that all make one drive: their rows are at hand, and nothing is checked."""
+    feed = int(np.argmax(np.median(recorded.mean_a, axis=0)))
+    laws = learn_laws(recorded.rows, feed=feed, known=known)
+    mean = recorded.mean_a / full_scale_a
+    square = np.einsum("nkk->nk", recorded.covariance_a2) / full_scale_a**2 + mean**2
+    usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
+    found = estimate_rows(recorded.rows, laws, feed=feed, mean=mean, mean_square=square, usual=usual)
+    faulty = (found.drift != 0.0) | (found.offset != 0.0)
+    return Estimate(
+        faults=Faults(
+            hardware_drift=found.hardware_drift,
+            hardware_offset_a=found.hardware_offset * full_scale_a,
+            drift=found.drift,
+            offset_a=found.offset * full_scale_a,
+        ),
+        hardware=found.hardware_probability > 0.5,
+        corrected=faulty & found.identifiable & (found.harm_probability < HARM_LIMIT),
+        confidence=found.confidence,
+        failed=0,
+        drift_sd=found.drift_sd,
+        offset_sd_a=found.offset_sd * full_scale_a,
+        redraw=partial(_learnt(laws[0].prior).draw, full_scale_a=full_scale_a),
+    )
+
+
+def _learnt(prior: Prior) -> FaultDistribution:
+    """Distribution of the faults that was learnt, for drawing from it."""
+    return FaultDistribution(
+        counts=prior.counts, gain=(prior.gain.low, prior.gain.high), offset=(prior.offset.low, prior.offset.high)
+    )
 
 
 def _by_threshold(trial: Trial) -> Classification:
@@ -139,3 +197,4 @@ TREE = Published(name="published/tree", classify=_by_tree)
 PERFECT = Published(name="published/perfect", classify=_by_truth)
 POSTERIOR = Posterior()
 CEILING = Posterior(name="posterior/law known", knows_law=True)
+LEFT_IN = Posterior(name="posterior, delays left in")

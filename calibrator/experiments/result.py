@@ -6,15 +6,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import msgspec
+from scipy.stats import beta
 
 from calibrator.errors import FleetError
 from calibrator.time_of_run import time_of_run
 from ecu_node import __version__
 
-__all__ = ["Bin", "ExperimentResult", "Figure", "Row", "Settings", "decode_result", "made_now"]
+__all__ = ["BOUND", "Bin", "ExperimentResult", "Figure", "Row", "Settings", "decode_result", "made_now", "share"]
 
 Settings = Mapping[str, bool | int | float | str]
 """What is needed to repeat an experiment, by name; records of before version 1.0 hold flags as texts."""
+
+
+BOUND = 0.95
+"""One-sided confidence of the upper bounds beside rare counts. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +32,30 @@ class Figure:
         Over all vehicles of all repetitions, and standard deviation over repetitions; 0 for a single one.
     paper : float or None
         What the paper states, where it does.
+    hits, of : int or None
+        Of a share: how many of how many it is; None in records of before version 2.
+    expected : float or None
+        How many hits the method itself expects.
     """
 
     mean: float
-    sd: float
+    sd: float = 0.0
     paper: float | None = None
+    hits: int | None = None
+    of: int | None = None
+    expected: float | None = None
+
+    @property
+    def upper(self) -> float | None:
+        """Upper bound of the share with a confidence of 95 % (Clopper and Pearson), also for 0 of n; else None."""
+        if self.hits is None or not self.of:
+            return None
+        return 1.0 if self.hits == self.of else float(beta.ppf(BOUND, self.hits + 1, self.of - self.hits))
+
+
+def share(hits: int, of: int, expected: float | None = None) -> Figure:
+    """Share as a figure; NaN of nothing."""
+    return Figure(mean=hits / of if of else float("nan"), hits=hits, of=of, expected=expected)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +94,8 @@ class Row:
         By the names of :mod:`calibrator.experiments.outcome`, those that have a meaning here.
     bins : tuple of Bin
         Vehicles by confidence; empty for a method without one.
+    pit : tuple of int
+        Deployed parameters by tenths of their probability integral transform; equal if the posterior is right.
     """
 
     x: float
@@ -77,6 +103,7 @@ class Row:
     method: str
     figures: Mapping[str, Figure]
     bins: tuple[Bin, ...] = ()
+    pit: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +123,8 @@ class ExperimentResult:
     paper : mapping of float to float
         Best recovery rate that the paper prints, by x, whatever methods were run; empty in records of before version
         1.0, whose rows say the same.
+    note : str
+        What is to be known of the settings, for the captions.
     made : str
         Version, machine and day, as :func:`made_now` says, of what the command ran; empty in records of before version
         1.0, and for an experiment that was called as a function.
@@ -108,6 +137,7 @@ class ExperimentResult:
     settings: Settings
     rows: tuple[Row, ...]
     paper: Mapping[float, float] = field(default_factory=dict)
+    note: str = ""
     made: str = ""
 
     def row(self, *, x: float, method: str, series: str = "") -> Row:

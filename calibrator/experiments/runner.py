@@ -1,4 +1,4 @@
-"""Run experiments by name: tables on the console; pages, JSON and pictures in a folder."""
+"""Run experiments by name: tables on the console; in a folder NAME.json, NAME.md and NAME.png, with an index beside."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,18 +19,32 @@ from calibrator.experiments.paper_experiments import (
     sparsity_experiment,
     statespace_experiment,
 )
-from calibrator.experiments.recorded_experiments import data_experiment, phase_experiment, real_experiment
+from calibrator.experiments.picture import write_picture
+from calibrator.experiments.recorded_experiments import (
+    attacks_experiment,
+    coverage_experiment,
+    data_experiment,
+    phase_experiment,
+    real_experiment,
+)
 from calibrator.experiments.recorded_fleet import RecordedFleet, builtin_fleet, read_fleet
 from calibrator.experiments.recorded_trial import RecordedCase
-from calibrator.experiments.records import read_results, write_result
-from calibrator.experiments.result import ExperimentResult, made_now
-from calibrator.experiments.table import result_table
+from calibrator.experiments.result import ExperimentResult, decode_result, made_now
+from calibrator.experiments.table import (
+    caption,
+    headline,
+    markdown_table,
+    repetitions_text,
+    result_markdown,
+    result_table,
+)
 from calibrator.experiments.trial import FleetLaw
 from calibrator.terminal.progress import one_pass
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
+from ecu_node.user_files import write_atomically
 
-__all__ = ["CALIBRATION", "EXPERIMENTS", "Recorded", "RunOptions", "run_experiments"]
+__all__ = ["CALIBRATION", "EXPERIMENTS", "Recorded", "RunOptions", "read_results", "run_experiments", "write_result"]
 
 REPETITIONS, QUICK_REPETITIONS = 10, 2
 QUICK_DURATION_S = 300.0
@@ -136,6 +150,10 @@ EXPERIMENTS: Mapping[str, Callable[[RunOptions], ExperimentResult]] = {
     "delay": Recorded(run=delay_experiment, quick={"delays_ms": (0.0, 300.0)}),
     "data": Recorded(run=data_experiment, quick={"minutes": (2.0, 5.0), "fleet_sizes": (10,)}),
     "phase": Recorded(run=phase_experiment, quick={"sparsities": (60.0, 80.0), "magnitudes": ((0.05, 0.25),)}),
+    "attacks": Recorded(
+        run=attacks_experiment, quick={"worlds": ("load 5 A in 30%", "inverted in 10%"), "branches": (2,)}
+    ),
+    "coverage": Recorded(run=coverage_experiment, quick={"cases": (RecordedCase(),)}),
 }
 """All but ``calibration``, which pools the others."""
 
@@ -219,3 +237,54 @@ def _recorded_fleet(options: RunOptions) -> RecordedFleet:
     if options.quick:
         return builtin_fleet(database, trips=QUICK_TRIPS, duration_s=QUICK_DURATION_S)
     return builtin_fleet(database)
+
+
+def write_result(folder: Path, result: ExperimentResult, order: Sequence[str]) -> None:
+    """Write one result, and the index of all results of the folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if missing.
+    result : ExperimentResult
+        Of one experiment.
+    order : sequence of str
+        Names of the experiments in the order of the index.
+
+    Raises
+    ------
+    FleetError
+        If another record of the folder is damaged.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / f"{result.name}.json", result.to_json())
+    write_atomically(folder / f"{result.name}.md", result_markdown(result, picture=f"{result.name}.png").encode())
+    write_picture(result, folder / f"{result.name}.png")
+    write_atomically(_index_path(folder), _index(folder, read_results(folder, order)).encode())
+
+
+def read_results(folder: Path, order: Sequence[str]) -> list[ExperimentResult]:
+    """Read the records of a folder in the given order; those that are not there are left out."""
+    paths = [folder / f"{name}.json" for name in order]
+    return [decode_result(path.read_bytes(), str(path)) for path in paths if path.is_file()]
+
+
+def _index_path(folder: Path) -> Path:
+    """Page beside the folder: ``docs/results.md`` for ``docs/results``."""
+    return folder.parent / f"{folder.name}.md"
+
+
+def _index(folder: Path, results: Sequence[ExperimentResult]) -> str:
+    lines = ["# Results of the experiments", "", f"Written by `calibrator experiment`. {caption(results)}", ""]
+    for result in results:
+        settings = result.settings
+        lines += [
+            f"## [{result.title}]({folder.name}/{result.name}.md)",
+            "",
+            f"`calibrator experiment {result.name}`: {repetitions_text(settings)}, seed {settings['seed']}, "
+            f"drive {settings['drive']}{f'; {result.made}' if result.made else ''}.",
+            "",
+            *markdown_table(*headline(result)),
+            "",
+        ]
+    return "\n".join(lines)

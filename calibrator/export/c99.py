@@ -36,7 +36,7 @@ def c99_files(checked: Checked) -> dict[str, str]:
     LayoutError, DatabaseError
         If the node refuses layout or DBC.
     ExportError
-        If a temperature signal has too many codes, a signal is too wide, or two names would be one in C.
+        If a signal is too wide, or two names would be one in C.
     """
     program = c_program(checked)
     header, source = header_body(program), source_body(program)

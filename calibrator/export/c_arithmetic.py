@@ -2,19 +2,18 @@
 
 A plan whose sums stay below 2^63 for every value of its signals is written in int64_t. One that needs more, as those of
 currents with 32 bits do, is written with products of 128 bits made of halves. What does not fit into these either is
-refused; so are plans by temperature that do not fit into int64_t, as their table is made of such numbers.
+refused.
 """
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from calibrator.errors import ExportError
 from calibrator.export.c_bits import literal
-from calibrator.export.c_model import CBranch, SignRule
+from calibrator.export.c_model import CBranch
 from ecu_node.codes import Codes
 from ecu_node.correction import IntegerPlan
 
-__all__ = ["Arithmetic", "arithmetic_of", "is_no_value", "outcome", "rule_test"]
+__all__ = ["Arithmetic", "arithmetic_of", "is_no_value", "outcome"]
 
 _WORD, _WIDE = 64, 128
 _LIMIT, _WIDE_LIMIT = 1 << (_WORD - 1), 1 << (_WIDE - 1)
@@ -23,7 +22,7 @@ _LIMIT, _WIDE_LIMIT = 1 << (_WORD - 1), 1 << (_WIDE - 1)
 
 @dataclass(frozen=True, kw_only=True)
 class Arithmetic:
-    """How the plans of one branch are computed.
+    """How the plan of one branch is computed.
 
     Attributes
     ----------
@@ -39,12 +38,12 @@ class Arithmetic:
 
 
 def arithmetic_of(branch: CBranch) -> Arithmetic:
-    """Find out what the plans of a branch need.
+    """Find out what the plan of a branch needs.
 
     Parameters
     ----------
     branch : CBranch
-        A branch with plans.
+        A branch with a plan.
 
     Returns
     -------
@@ -56,23 +55,17 @@ def arithmetic_of(branch: CBranch) -> Arithmetic:
     ExportError
         If nothing is, naming the signal.
     """
-    plans = [plan for plan in branch.plans if plan is not None]
-    numbers = [branch.codes.lowest, branch.codes.highest, *(number for plan in plans for number in _factors(plan))]
-    bound = max((_bound(branch, plan) for plan in plans), default=0)
-    result = max((_bound(branch, plan) >> plan.shift for plan in plans), default=0)
-    wide = bound >= _LIMIT
-    fits = bound < _WIDE_LIMIT and result < _LIMIT - 1 and all(-_LIMIT <= number < _LIMIT for number in numbers)
-    by_temperature = isinstance(branch.rule, int)
-    if not fits or (wide and by_temperature):
+    plan, codes = branch.plan, branch.codes
+    assert plan is not None
+    numbers = (codes.lowest, codes.highest, plan.gain, plan.voltage_gain, plan.lowest, plan.highest)
+    bound = _bound(branch, plan)
+    result = bound >> plan.shift
+    if not (bound < _WIDE_LIMIT and result < _LIMIT - 1 and all(-_LIMIT <= number < _LIMIT for number in numbers)):
         raise ExportError(
-            f"branch {branch.name}: signal {branch.signal} has {branch.codes.place.length} bits, and its correction "
-            f"needs more than the {_WORD if by_temperature else _WIDE} bits that C computes it with; give the signal "
-            f"its true range in the DBC"
+            f"branch {branch.name}: signal {branch.signal} has {codes.place.length} bits, and its correction "
+            f"needs more than the {_WIDE} bits that C computes it with; give the signal its true range in the DBC"
         )
-    _require_exact_rule(branch)
-    ends = {(plan.lowest, plan.highest) for plan in plans} or {(0, 0)}
-    lowest, highest = ends.pop()
-    return Arithmetic(wide=wide, lowest=lowest, highest=highest)
+    return Arithmetic(wide=bound >= _LIMIT, lowest=plan.lowest, highest=plan.highest)
 
 
 def outcome(plan: IntegerPlan, *, wide: bool, with_voltage: bool) -> str:
@@ -89,14 +82,6 @@ def outcome(plan: IntegerPlan, *, wide: bool, with_voltage: bool) -> str:
     for name, gain in factors:
         text = f"wide_sum(wide_product({name}, {literal(gain)}), {text})"
     return f"wide_floor_shift({text}, {plan.shift}U)"
-
-
-def rule_test(rule: SignRule) -> str:
-    """Condition for the first of two plans."""
-    if rule.of_voltage == 0:
-        comparison = ">=" if rule.of_code > 0 else "<="
-        return f"code {comparison} {literal(-rule.of_code * rule.constant)}"
-    return f"code * {literal(rule.of_code)} + voltage_code * {literal(rule.of_voltage)} >= {literal(-rule.constant)}"
 
 
 def is_no_value(name: str, codes: Codes) -> str:
@@ -119,10 +104,6 @@ def is_no_value(name: str, codes: Codes) -> str:
     return " || ".join([*tests, *(f"{name} == {literal(code)}" for code in inside)])
 
 
-def _factors(plan: IntegerPlan) -> Iterator[int]:
-    yield from (plan.gain, plan.voltage_gain, plan.lowest, plan.highest)
-
-
 def _bound(branch: CBranch, plan: IntegerPlan) -> int:
     """Magnitude that no partial sum of a plan exceeds, for any values."""
     total = abs(plan.gain) * _largest(branch.codes) + abs(plan.bias) + (1 << (plan.shift - 1))
@@ -133,19 +114,3 @@ def _bound(branch: CBranch, plan: IntegerPlan) -> int:
 
 def _largest(codes: Codes) -> int:
     return max(abs(codes.lowest), abs(codes.highest))
-
-
-def _require_exact_rule(branch: CBranch) -> None:
-    rule = branch.rule
-    if not isinstance(rule, SignRule) or rule.of_voltage == 0 or branch.voltage is None:
-        return
-    parts: Iterable[int] = (
-        abs(rule.of_code) * _largest(branch.codes),
-        abs(rule.of_voltage) * _largest(branch.voltage.codes),
-        abs(rule.constant),
-    )
-    if sum(parts) >= _LIMIT:
-        raise ExportError(
-            f"branch {branch.name}: the sign of its current, a power over a voltage, takes more than {_WORD} bits to "
-            f"tell; write its offset with fewer digits in the parameter file"
-        )

@@ -19,9 +19,9 @@ _PREAMBLE = """\
  *                     bit has changed. Codes that are no values, and signals that the payload does not have, stay.
  * hv_correct_BRANCH   corrects one code; one that is no value comes back as it is.
  * hv_read_MESSAGE_SIGNAL
- *                     reads a voltage or a temperature that others need. It returns true and writes the code if the
- *                     payload has the signal; else it returns false and leaves *code as it was, so that the code of
- *                     the frame before stays. Write HV_NO_CODE there yourself at the start, and when the last code
+ *                     reads a voltage that others need. It returns true and writes the code if the payload has the
+ *                     signal; else it returns false and leaves *code as it was, so that the code of the frame before
+ *                     stays. Write HV_NO_CODE there yourself at the start, and when the last code
  *                     has become too old.
  *
  * End-to-end protection is NOT part of this. Check CRC and counter of a frame before, and write its CRC anew afterwards
@@ -47,7 +47,7 @@ def header_body(program: CProgram) -> str:
         _PREAMBLE.rstrip(),
         "#include <stdbool.h>\n#include <stddef.h>\n#include <stdint.h>",
         "\n".join(_provenance(program)),
-        "/* stands for a voltage or a temperature of which no value is known */\n#define HV_NO_CODE INT64_MIN",
+        "/* stands for a voltage of which no value is known */\n#define HV_NO_CODE INT64_MIN",
         *("\n".join(_message(message)) for message in program.messages),
         *("\n".join(_input(item)) for item in program.inputs),
     ]
@@ -57,7 +57,6 @@ def header_body(program: CProgram) -> str:
 def branch_prototype(branch: CBranch) -> str:
     """Prototype of the function of a branch, without semicolon."""
     more = ", int64_t voltage_code" if branch.voltage is not None else ""
-    more += ", int64_t temperature_code" if branch.temperature is not None else ""
     return f"int64_t hv_correct_{branch.name}(int64_t code{more})"
 
 
@@ -68,7 +67,7 @@ def message_prototype(item: CMessage) -> str:
 
 
 def input_prototype(item: CInput) -> str:
-    """Prototype of the function that reads a voltage or a temperature, without semicolon."""
+    """Prototype of the function that reads a voltage, without semicolon."""
     return f"bool hv_read_{item.name}(const uint8_t *payload, size_t length, int64_t *code)"
 
 
@@ -89,7 +88,8 @@ def _message(item: CMessage) -> Iterator[str]:
     yield f"/* {message.name}: {kind} 0x{message.frame_id:X}, {message.length} bytes */"
     yield f"#define HV_ID_{message.name} 0x{message.frame_id:X}UL"
     for branch in item.branches:
-        yield f"{branch_prototype(branch)}; /* {branch.signal}, {'corrected' if branch.plans else 'passes through'} */"
+        what = "passes through" if branch.plan is None else "corrected"
+        yield f"{branch_prototype(branch)}; /* {branch.signal}, {what} */"
     yield f"{message_prototype(item)};"
 
 

@@ -4,7 +4,7 @@ C99 leaves open what a right shift of a negative number gives, and a conversion 
 neither is used here.
 """
 
-__all__ = ["AS_SIGNED", "CLAMP", "FLOOR_SHIFT", "PLAN", "WIDE"]
+__all__ = ["AS_SIGNED", "CLAMP", "FLOOR_SHIFT", "WIDE"]
 
 CLAMP = """\
 static int64_t clamp(int64_t value, int64_t lowest, int64_t highest)
@@ -27,16 +27,6 @@ static int64_t as_signed(uint64_t raw)
 {
     return raw <= (uint64_t)INT64_MAX ? (int64_t)raw : -1 - (int64_t)(UINT64_MAX - raw);
 }
-"""
-
-PLAN = """\
-/* correction at one temperature; shift 0: passes through */
-struct plan {
-    int64_t gain;
-    int64_t voltage_gain;
-    int64_t bias;
-    unsigned int shift;
-};
 """
 
 WIDE = """\

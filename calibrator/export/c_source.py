@@ -1,4 +1,4 @@
-"""The source file of the C export: one function per branch, per message, and per voltage or temperature."""
+"""The source file of the C export: one function per branch, per message, and per voltage."""
 
 import re
 from collections import Counter
@@ -6,18 +6,18 @@ from collections.abc import Iterator, Mapping
 
 from calibrator.errors import ExportError
 from calibrator.export import c_helpers
-from calibrator.export.c_arithmetic import Arithmetic, arithmetic_of, is_no_value, outcome, rule_test
+from calibrator.export.c_arithmetic import Arithmetic, arithmetic_of, is_no_value, outcome
 from calibrator.export.c_bits import literal, presence_function, put_function, reading_function
 from calibrator.export.c_header import branch_prototype, input_prototype, message_prototype
-from calibrator.export.c_model import CBranch, CInput, CMessage, CProgram, SignRule
+from calibrator.export.c_model import CBranch, CInput, CMessage, CProgram
 from ecu_node.bits import BitPlace
 
 __all__ = ["source_body"]
 
 _LONGEST_CODE = 64
 """[bit]"""
-_DEFINED = re.compile(r"^(?:static )?(?:const )?(?:struct )?\w+ (\w+)[(\[]", re.MULTILINE)
-"""Begin of a function or table."""
+_DEFINED = re.compile(r"^(?:static )?\w+ (\w+)\(", re.MULTILINE)
+"""Begin of a function."""
 
 
 def source_body(program: CProgram) -> str:
@@ -38,10 +38,10 @@ def source_body(program: CProgram) -> str:
     ExportError
         If a signal is too wide for exact arithmetic, naming it, or two things would have one name.
     """
-    corrected = {branch.name: arithmetic_of(branch) for branch in program.branches if branch.plans}
+    corrected = {branch.name: arithmetic_of(branch) for branch in program.branches if branch.plan is not None}
     blocks = [text.rstrip() for text in _helpers(program, corrected)]
     for branch in program.branches:
-        if branch.plans:
+        if branch.plan is not None:
             blocks += _bit_functions(branch)
         blocks.append("\n".join(_branch_function(branch, corrected.get(branch.name))))
     blocks += ["\n".join(_message_function(message)) for message in program.messages]
@@ -55,7 +55,7 @@ def source_body(program: CProgram) -> str:
 
 
 def _require_own_names(text: str) -> None:
-    """Refuse names of branches and signals of which two functions or tables would have one name."""
+    """Refuse names of branches and signals of which two functions would have one name."""
     names = Counter(_DEFINED.findall(text))
     name, times = names.most_common(1)[0]
     if times > 1:
@@ -70,15 +70,13 @@ def _helpers(program: CProgram, corrected: Mapping[str, Arithmetic]) -> Iterator
         yield c_helpers.CLAMP
     if not all(item.wide for item in corrected.values()):
         yield c_helpers.FLOOR_SHIFT
-    if any(isinstance(branch.rule, int) for branch in program.branches):
-        yield c_helpers.PLAN
     if wide:
         yield c_helpers.WIDE
 
 
 def _places_read(program: CProgram) -> Iterator[BitPlace]:
-    signals = [branch.placed for branch in program.branches if branch.plans] + [item.placed for item in program.inputs]
-    for signal in signals:
+    corrected = [branch.placed for branch in program.branches if branch.plan is not None]
+    for signal in [*corrected, *(item.placed for item in program.inputs)]:
         yield signal.place
         yield from (item.place for item in signal.above)
 
@@ -88,44 +86,23 @@ def _bit_functions(branch: CBranch) -> Iterator[str]:
     yield "\n".join(presence_function(f"present_{branch.name}", branch.placed))
     yield "\n".join(reading_function(f"measured_{branch.name}", place))
     yield "\n".join(put_function(f"put_{branch.name}", place))
-    if isinstance(branch.rule, int):
-        yield "\n".join(_table(branch))
-
-
-def _table(branch: CBranch) -> Iterator[str]:
-    yield f"static const struct plan plans_{branch.name}[{len(branch.plans)}] = {{"
-    for plan in branch.plans:
-        if plan is None:
-            yield "    { 0, 0, 0, 0U },"
-        else:
-            bias = plan.bias + (1 << (plan.shift - 1))
-            yield f"    {{ {literal(plan.gain)}, {literal(plan.voltage_gain)}, {literal(bias)}, {plan.shift}U }},"
-    yield "};"
 
 
 def _branch_function(branch: CBranch, arithmetic: Arithmetic | None) -> Iterator[str]:
     yield branch_prototype(branch)
     yield "{"
-    if arithmetic is None:
-        yield from (f"    (void){name};" for name in _argument_names(branch))
+    needs_voltage = branch.plan is not None and branch.plan.needs_voltage
+    if branch.voltage is not None and not needs_voltage:
+        yield "    (void)voltage_code;"
+    if branch.plan is None or arithmetic is None:
         yield "    return code;"
-    elif isinstance(branch.rule, int):
-        yield from _by_temperature(branch, branch.rule, arithmetic)
     else:
-        if branch.voltage is not None and not branch.needs_voltage:
-            yield "    (void)voltage_code;"
         yield from _return_unless_value("code", is_no_value("code", branch.codes))
-        if branch.voltage is not None and branch.needs_voltage:
+        if branch.voltage is not None and needs_voltage:
             yield from _return_unless_value("voltage_code", is_no_value("voltage_code", branch.voltage.codes))
-        yield from _by_plan(branch, arithmetic)
+        text = outcome(branch.plan, wide=arithmetic.wide, with_voltage=branch.voltage is not None)
+        yield f"    return clamp({text},\n        {literal(arithmetic.lowest)}, {literal(arithmetic.highest)});"
     yield "}"
-
-
-def _argument_names(branch: CBranch) -> Iterator[str]:
-    if branch.voltage is not None:
-        yield "voltage_code"
-    if branch.temperature is not None:
-        yield "temperature_code"
 
 
 def _return_unless_value(name: str, condition: str) -> Iterator[str]:
@@ -134,46 +111,9 @@ def _return_unless_value(name: str, condition: str) -> Iterator[str]:
     yield "    }"
 
 
-def _by_plan(branch: CBranch, arithmetic: Arithmetic) -> Iterator[str]:
-    """The only plan, or one of two by the sign of the current."""
-    texts = [
-        _clamped(outcome(plan, wide=arithmetic.wide, with_voltage=branch.voltage is not None), arithmetic)
-        for plan in branch.plans
-        if plan is not None
-    ]
-    if isinstance(branch.rule, SignRule):
-        yield f"    if ({rule_test(branch.rule)}) {{"
-        yield f"        return {texts[0]};"
-        yield "    }"
-    yield f"    return {texts[-1]};"
-
-
-def _by_temperature(branch: CBranch, first: int, arithmetic: Arithmetic) -> Iterator[str]:
-    last = first + len(branch.plans) - 1
-    yield "    const struct plan *plan;"
-    yield ""
-    yield from _return_unless_value("code", is_no_value("code", branch.codes))
-    outside = f"temperature_code < {literal(first)} || temperature_code > {literal(last)}"
-    yield from _return_unless_value("temperature_code", outside)
-    yield f"    plan = &plans_{branch.name}[temperature_code - {literal(first)}];"
-    yield "    if (plan->shift == 0U) {"
-    yield "        return code;"
-    yield "    }"
-    total = "code * plan->gain + plan->bias"
-    if branch.voltage is not None:
-        no_value = is_no_value("voltage_code", branch.voltage.codes)
-        yield from _return_unless_value("voltage_code", f"plan->voltage_gain != 0 && ({no_value})")
-        total = "code * plan->gain + voltage_code * plan->voltage_gain + plan->bias"
-    yield f"    return {_clamped(f'floor_shift({total}, plan->shift)', arithmetic)};"
-
-
-def _clamped(text: str, arithmetic: Arithmetic) -> str:
-    return f"clamp({text},\n        {literal(arithmetic.lowest)}, {literal(arithmetic.highest)})"
-
-
 def _message_function(item: CMessage) -> Iterator[str]:
-    corrected = [branch for branch in item.branches if branch.plans]
-    used = {other.name for branch in corrected for other in branch.inputs}
+    corrected = [branch for branch in item.branches if branch.plan is not None]
+    used = {branch.voltage.name for branch in corrected if branch.voltage is not None}
     yield message_prototype(item)
     yield "{"
     if corrected:
@@ -182,7 +122,7 @@ def _message_function(item: CMessage) -> Iterator[str]:
         yield "    (void)payload;"
         yield "    (void)length;"
     for branch in corrected:
-        name, more = branch.name, "".join(f", {other.name}_code" for other in branch.inputs)
+        name, more = branch.name, "" if branch.voltage is None else f", {branch.voltage.name}_code"
         yield f"    const bool there_{name} = present_{name}(payload, length);"
         yield f"    const int64_t from_{name} = there_{name} ? measured_{name}(payload) : 0;"
         yield f"    const int64_t to_{name} = there_{name} ? hv_correct_{name}(from_{name}{more}) : 0;"

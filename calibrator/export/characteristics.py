@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from calibrator.errors import ExportError
 from calibrator.export.checked import Checked
 from ecu_node.parameters import BranchParameters
-from ecu_node.sensor_models import GainBySign, TemperatureDrift
 
 __all__ = ["Characteristic", "Note", "characteristics", "notes"]
 
@@ -109,28 +108,20 @@ def notes(checked: Checked) -> list[Note]:
 def _in_force(checked: Checked, branch: str, found: BranchParameters) -> Iterator[Characteristic]:
     """What is corrected: zeros where nothing is."""
     layout, applied = checked.database.layout, checked.is_applied(branch)
-    of_drift = -layout.limits.drift, layout.limits.drift
-    numbers: list[tuple[str, str, str, float, tuple[float, float] | None]] = []
-    match found.sensor_model:
-        case GainBySign() as model:
-            numbers += [
-                ("drift_positive", "drift, current into the junction", _NO_UNIT, model.drift_positive, of_drift),
-                ("drift_negative", "drift, current out of the junction", _NO_UNIT, model.drift_negative, of_drift),
-            ]
-        case TemperatureDrift() as model:
-            numbers += [
-                ("drift", "drift at the reference temperature", _NO_UNIT, found.drift, of_drift),
-                ("drift_per_k", "change of the drift with temperature", "1/K", model.drift_per_k, None),
-                ("drift_reference", "temperature at which the drift holds", "degC", model.reference_c, None),
-            ]
-        case None:
-            numbers.append(("drift", "measured = (1 + drift) * true + offset", _NO_UNIT, found.drift, of_drift))
-    of_offset = -layout.offset_limit_a, layout.offset_limit_a
-    numbers.append(("offset", "offset, positive into the junction", "A", found.offset_a, of_offset))
+    numbers = (
+        ("drift", "measured = (1 + drift) * true + offset", _NO_UNIT, found.drift, layout.limits.drift),
+        ("offset", "offset, positive into the junction", "A", found.offset_a, layout.offset_limit_a),
+    )
     yield Characteristic(name=f"HV.{branch}.applied", text="whether it is corrected", branch=branch, value=applied)
-    for name, text, unit, value, limits in numbers:
-        used = value if applied else 0.0
-        yield Characteristic(name=f"HV.{branch}.{name}", text=text, branch=branch, unit=unit, value=used, limits=limits)
+    for name, text, unit, value, limit in numbers:
+        yield Characteristic(
+            name=f"HV.{branch}.{name}",
+            text=text,
+            branch=branch,
+            unit=unit,
+            value=value if applied else 0.0,
+            limits=(-limit, limit),
+        )
 
 
 def _found(branch: str, found: BranchParameters) -> Iterator[Characteristic]:

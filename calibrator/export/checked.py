@@ -3,10 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from ecu_node.check import warnings_of
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError, printable
-from ecu_node.guard import Mode
 from ecu_node.in_force import InForce, sensor_fault
 from ecu_node.parameter_fit import check_fit
 from ecu_node.parameters import VehicleParameters, decode_parameters, parameter_bytes
@@ -68,21 +66,20 @@ class Checked:
 
     def fault(self, branch: str) -> SensorFault:
         """What the node corrects on a branch; :data:`NO_FAULT` where it passes it through."""
-        return sensor_fault(self.database, self.in_force, branch)
+        return sensor_fault(self.in_force, branch)
 
     def is_applied(self, branch: str) -> bool:
         """Whether the node corrects a branch."""
         return self.fault(branch) is not NO_FAULT
 
     def notices(self) -> list[str]:
-        """What of the parameters a node does not do, and what was not checked of them, one line each."""
-        texts = warnings_of(self.database, self.in_force, Mode.GATEWAY, fd=True)
-        if self.signed is not None:
-            texts.append(
-                f"signed, number {self.signed.sequence}, to hold from {self.signed.not_before} to "
-                f"{self.signed.expires}; signatures, number and times were not checked, 'ecu-node verify' does"
-            )
-        return [f"{printable(self.name)}: {text}" for text in texts]
+        """What was not checked of the parameters, one line each."""
+        if self.signed is None:
+            return []
+        return [
+            f"{printable(self.name)}: signed, number {self.signed.sequence}, to hold from {self.signed.not_before} to "
+            f"{self.signed.expires}; signatures, number and times were not checked, 'ecu-node verify' does"
+        ]
 
 
 def read_checked(path: Path, database: VehicleDatabase, vehicle: str | None) -> Checked:

@@ -8,7 +8,6 @@ from calibrator.errors import ExportError
 from calibrator.export.checked import Checked
 from ecu_node.errors import printable
 from ecu_node.parameters import BranchParameters
-from ecu_node.sensor_models import GainBySign, TemperatureDrift
 
 __all__ = ["COLUMNS", "csv_text"]
 
@@ -24,11 +23,6 @@ COLUMNS = (
     "offset_sd_a",
     "applied",
     "held_back",
-    "sensor_model",
-    "drift_positive",
-    "drift_negative",
-    "drift_per_k",
-    "reference_c",
     "delay_s",
     "delay_sd_s",
     "fault_probability",
@@ -113,24 +107,9 @@ def _row(checked: Checked, name: str, found: BranchParameters) -> dict[str, _Cel
         "offset_sd_a": found.offset_sd_a,
         "applied": checked.is_applied(name),
         "held_back": found.held_back,
-        **_model(found),
         "delay_s": found.delay_s,
         "delay_sd_s": found.delay_sd_s,
         "fault_probability": found.fault_probability,
         "harm_probability": found.harm_probability,
         "identifiable": found.identifiable,
     }
-
-
-def _model(found: BranchParameters) -> dict[str, _Cell]:
-    match found.sensor_model:
-        case GainBySign() as model:
-            numbers: dict[str, _Cell] = {
-                "drift_positive": model.drift_positive,
-                "drift_negative": model.drift_negative,
-            }
-        case TemperatureDrift() as model:
-            numbers = {"drift_per_k": model.drift_per_k, "reference_c": model.reference_c}
-        case None:
-            return {"sensor_model": "linear"}
-    return {"sensor_model": type(model).__struct_config__.tag, **numbers}

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calibrator.drive import Array
-from calibrator.evidence.vehicle_evidence import VehicleEvidence
+from calibrator.estimator.vehicle_evidence import VehicleEvidence
 from calibrator.report.figures import AFTER, BEFORE
 from calibrator.report.traces import Traces
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array
 from calibrator.errors import FleetError
+from calibrator.estimator.results import PARTS
 from calibrator.report.fleet_table import FleetTable
-from calibrator.results.parameter_parts import PARTS
 from calibrator.terminal.progress import shown
 from ecu_node.parameters import Explanation
 
-__all__ = ["Evidence", "explanation_text", "ratio_count", "read_evidence"]
+__all__ = ["Evidence", "ratio_count", "read_evidence"]
 
 _COLUMNS = ("evidence_value", "evidence_sd", "evidence_explained")
 
@@ -105,24 +105,6 @@ def read_evidence(result: Path, table: FleetTable, listed: NDArray[np.int64]) ->
 def ratio_count(names: Sequence[str]) -> int:
     """How many of the rows of evidence are ratios: those before the intercepts."""
     return sum(not name.startswith(("intercept ", "junction ", "offset ")) for name in names)
-
-
-def explanation_text(explanation: Explanation) -> str:
-    """One explanation in words, without its probability."""
-    parts = [
-        *(
-            f"{name} sensor: {_fault(explanation.drift.get(name), explanation.offset_a.get(name))}"
-            for name in dict.fromkeys([*explanation.drift, *explanation.offset_a])
-        ),
-        *([f"hardware: all currents {explanation.hardware_drift:+.2%}"] if explanation.hardware_drift else []),
-        *(f"hardware: {name} {value:+.2f} A" for name, value in explanation.hardware_offset_a.items()),
-    ]
-    return "; ".join(parts) or "no fault"
-
-
-def _fault(drift: float | None, offset_a: float | None) -> str:
-    told = ([f"drift {drift:+.2%}"] if drift else []) + ([f"offset {offset_a:+.2f} A"] if offset_a else [])
-    return ", ".join(told)
 
 
 def _read(part: Path) -> pa.Table:

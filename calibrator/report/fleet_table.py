@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
-from calibrator.results.counts import Counts, count_rows, deployed_rms_a
-from calibrator.results.rows import SCHEMA
-from calibrator.results.run_record import RunRecord, read_run
+from calibrator.estimator.results import SCHEMA, Counts, RunRecord, count_rows, deployed_rms_a, read_run
 
 __all__ = ["FleetTable", "read_fleet_table"]
 

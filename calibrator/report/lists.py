@@ -34,8 +34,8 @@ MOST_WORKSHOP = 500
 MOST_MOVED = 200
 MOST_HOLDING = 10
 """Rows of the lists; all of them stand in ``results.parquet``."""
-TO_REPLACE = ("beyond the limits", "not linear")
-"""Why a fault is held back that no parameter of a linear correction mends."""
+TO_REPLACE = ("beyond the limits", "does not fit")
+"""Why a fault is held back that no gain error and offset mend."""
 
 
 @dataclass(frozen=True, kw_only=True)

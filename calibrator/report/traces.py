@@ -16,7 +16,7 @@ from calibrator.drive import Array, DriveFile
 from calibrator.drives.align import align
 from calibrator.drives.delays import without_delays
 from calibrator.errors import FleetError
-from calibrator.evidence.vehicle_evidence import VehicleEvidence
+from calibrator.estimator.vehicle_evidence import VehicleEvidence
 from calibrator.report.window import IdealWindow
 from calibrator.sources.fleet_source import find_fleet, load_drive
 from calibrator.summaries.unity import WINDOW_S, UnityWindow, liveliest_window
@@ -165,7 +165,7 @@ def _inputs(layout: Layout) -> set[str]:
 
 
 def _corrected(measured_a: Array, parameters: VehicleParameters) -> Array:
-    """Correct with what the node applies (25); of a sensor that is not linear with its linear part."""
+    """Correct with what the node applies (25)."""
     branches = parameters.branches.values()
     gain = np.array([1.0 + branch.drift if branch.apply else 1.0 for branch in branches])
     offset_a = np.array([branch.offset_a if branch.apply else 0.0 for branch in branches])

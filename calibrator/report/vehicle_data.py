@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrator.drive import Array
-from calibrator.report.evidence_columns import Evidence, explanation_text
+from calibrator.estimator.vehicle_report import explanation_text
+from calibrator.report.evidence_columns import Evidence
 from calibrator.report.fleet_table import FleetTable
 from calibrator.report.packing import Packed, as_text, pack
 

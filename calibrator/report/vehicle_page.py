@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 from markupsafe import Markup
 
-from calibrator.evidence.vehicle_evidence import VehicleEvidence
-from calibrator.posterior.verdict import SUSPECTED
+from calibrator.estimator.fleet_estimate import SUSPECTED
+from calibrator.estimator.vehicle_evidence import VehicleEvidence
+from calibrator.estimator.vehicle_report import explanation_text
 from calibrator.report.drawings import draw_evidence, draw_traces
-from calibrator.report.evidence_columns import explanation_text
 from calibrator.report.templates import asset, template
 from calibrator.report.traces import Traces
 from calibrator.terminal.text import few

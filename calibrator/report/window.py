@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from calibrator.drive import Array
-from calibrator.results.run_record import RunRecord
+from calibrator.estimator.results import RunRecord
 from calibrator.summaries.unity import UNITY_FILE, UnityWindow, decode_window
 
 __all__ = ["IdealWindow", "ideal_window", "read_out_of", "read_unity"]

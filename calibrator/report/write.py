@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from calibrator.errors import FleetError
+from calibrator.estimator.results import read_run, written_of
 from calibrator.report.evidence_columns import ratio_count, read_evidence
 from calibrator.report.fleet_table import FleetTable, read_fleet_table
 from calibrator.report.overview import Overview, Protection, overview_of, protection_of
@@ -15,8 +16,6 @@ from calibrator.report.protection import Margins, margins
 from calibrator.report.traces import recorded_traces, unity_traces
 from calibrator.report.vehicle_page import vehicle_page
 from calibrator.report.window import ideal_window, read_out_of, read_unity
-from calibrator.results.run_record import read_run
-from calibrator.results.vehicle import written_of
 from calibrator.summaries.unity import UnityWindow
 from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase

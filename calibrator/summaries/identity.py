@@ -12,7 +12,7 @@ from ecu_node.layout import Layout
 
 __all__ = ["SCHEMA_VERSION", "StoreIdentity", "read_identity", "store_identity", "write_identity"]
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 FILE = "summaries.json"
 FEWEST_BUCKETS, MOST_BUCKETS = 16, 32_768
 """Of a store: few vehicles are lost with one that is not finished, and a folder can still be listed."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from calibrator.drive import Array
 from calibrator.errors import DriveError
+from calibrator.summaries.fit_sums import FitSums
 
 __all__ = ["BLOCK_S", "DriveSummary", "common_bank"]
 
@@ -35,8 +36,8 @@ class DriveSummary:
         Distance of the samples. [s]
     bank : str
         Identity of the filter bank, see :class:`~calibrator.summaries.filter_bank.FilterBank`.
-    extra : ndarray of shape (B, E, M + K + 1 + E), or None
-        Sums of the products of E extra columns with (inputs, measured currents [A], 1, extra columns).
+    fit : FitSums or None
+        What the check of fit needs; None: moments that were not made of samples, nothing is checked.
     """
 
     moments: Array
@@ -44,7 +45,7 @@ class DriveSummary:
     branches: int
     period_s: float
     bank: str
-    extra: Array | None = None
+    fit: FitSums | None = None
 
     @property
     def inputs(self) -> int:
@@ -87,32 +88,23 @@ class DriveSummary:
             If they were made with different banks, or with different branches or columns.
         """
         common_bank([self, other])
-        shapes = [(part.branches, part.moments.shape[1:], part.extra_shape) for part in (self, other)]
+        shapes = [(part.branches, part.moments.shape[1:]) for part in (self, other)]
         if shapes[0] != shapes[1]:
             raise DriveError(
                 f"summaries of {self.branches} and {other.branches} branches with moments of shape "
-                f"{self.moments.shape[1:]} and {other.moments.shape[1:]}, extra columns {self.extra_shape} and "
-                f"{other.extra_shape}, do not add up; summarise the drives alike"
+                f"{self.moments.shape[1:]} and {other.moments.shape[1:]} do not add up; summarise the drives alike"
             )
-        extra = None
-        if self.extra is not None and other.extra is not None:
-            extra = np.concatenate([self.extra, other.extra])
         return DriveSummary(
             moments=np.concatenate([self.moments, other.moments]),
             noise_a2=np.concatenate([self.noise_a2, other.noise_a2]),
             branches=self.branches,
             period_s=self.period_s,
             bank=self.bank,
-            extra=extra,
+            fit=None if self.fit is None or other.fit is None else self.fit + other.fit,
         )
 
-    @property
-    def extra_shape(self) -> tuple[int, ...]:
-        """Shape of one block's extra products; empty if there are none."""
-        return () if self.extra is None else self.extra.shape[1:]
-
     def take_branches(self, order: Sequence[int]) -> "DriveSummary":
-        """Return the same summary for some branches, in another order, without extra columns."""
+        """Return the same summary for some branches, in another order."""
         columns = [*range(self.inputs), *(self.inputs + k for k in order), self.inputs + self.branches]
         return DriveSummary(
             moments=self.moments[:, columns][:, :, columns],
@@ -120,6 +112,7 @@ class DriveSummary:
             branches=len(order),
             period_s=self.period_s,
             bank=self.bank,
+            fit=None if self.fit is None else self.fit.take_branches(order),
         )
 
 

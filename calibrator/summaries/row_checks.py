@@ -21,7 +21,7 @@ def row_problem(row: Mapping[str, Any], summary: DriveSummary | None, branches: 
     Parameters
     ----------
     row : mapping of str to values
-        Columns of a record that has no problem, but ``moments`` and ``noise_a2``.
+        Columns of a record that has no problem, but ``moments``, ``noise_a2`` and those of the fit sums.
     summary : DriveSummary or None
         Made of these two; None if they are not of a whole number of blocks.
     branches : sequence of str
@@ -44,7 +44,7 @@ def row_problem(row: Mapping[str, Any], summary: DriveSummary | None, branches: 
 
 def _spoilt_columns(row: Mapping[str, Any], summary: DriveSummary | None, branches: Sequence[str]) -> list[str]:
     """Columns in which values are missing, or which have too few or too many."""
-    spoilt = ["moments and noise_a2"] if summary is None else []
+    spoilt = ["moments, noise_a2 and fit sums"] if summary is None else []
     spoilt += [name for name in NAMES if row[name] is None or None in row[name]]
     if not spoilt and len(row["drives"]) != len(row["sources"]):
         spoilt.append("sources")
@@ -57,6 +57,15 @@ def _possible_moments(summary: DriveSummary) -> bool:
     """Every sum is finite, no sum of squares negative, every block has samples, noise is a variance of a current."""
     moments, noise = summary.moments, summary.noise_a2
     squares = np.diagonal(moments, axis1=1, axis2=2)
+    fit = summary.fit
+    if fit is not None and not (
+        np.abs(fit.levels).max() < MOST_MOMENT
+        and fit.levels[..., -1].min() >= 0.0
+        and np.abs(fit.fast_a2).max() < MOST_MOMENT
+        and 0.0 <= fit.spikes.min() <= fit.spikes.max() < math.inf
+        and not np.isinf(fit.temperature_c).any()
+    ):
+        return False
     return bool(
         np.abs(moments).max() < MOST_MOMENT  # nor is not-a-number
         and squares.min() >= 0.0

@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
 from calibrator.errors import FleetError
+from calibrator.summaries.fit_sums import LEVEL_EDGES_A, FitSums
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import Outline, Record, name_problem, outline_of, stored_problem
@@ -25,10 +26,13 @@ from calibrator.summaries.row_checks import row_problem
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.summaries.zero_current import ZeroCurrent
 
-__all__ = ["MOST_BLOCKS", "SCHEMA", "decode_outlines", "decode_records", "encode_records"]
+__all__ = ["FIT_COLUMNS", "MOST_BLOCKS", "SCHEMA", "decode_outlines", "decode_records", "encode_records"]
 
 MOST_BLOCKS = 256
 """Of a record: two hours and more; their spread is known to a tenth. [1]"""
+
+FIT_COLUMNS = ("levels", "fast_a2", "spikes", "temperature_c", "starts")
+"""Columns with the fields of :class:`~calibrator.summaries.fit_sums.FitSums`; null where a record has none."""
 
 _FLOATS, _NAMES = pa.list_(pa.float64()), pa.list_(pa.string())
 SCHEMA = pa.schema(
@@ -40,6 +44,11 @@ SCHEMA = pa.schema(
         pa.field("duration_s", pa.float64(), metadata={"unit": "s"}),
         pa.field("moments", _FLOATS, metadata={"shape": "(B, p (p + 1) / 2), p: filtered inputs, branches [A], 1"}),
         pa.field("noise_a2", _FLOATS, metadata={"shape": "(B, K)", "unit": "A^2"}),
+        pa.field("levels", _FLOATS, metadata={"shape": "(K, L, p + 1), p and the square of the current", "unit": "A"}),
+        pa.field("fast_a2", _FLOATS, metadata={"shape": "(B, K, K)", "unit": "A^2"}),
+        pa.field("spikes", _FLOATS, metadata={"shape": "(B, K, 2)"}),
+        pa.field("temperature_c", _FLOATS, metadata={"shape": "(B,), NaN where not known", "unit": "degC"}),
+        pa.field("starts", pa.list_(pa.bool_()), metadata={"shape": "(B,)"}),
         pa.field("delay_reference", pa.string()),
         pa.field("delay_s", _FLOATS, metadata={"shape": "(K,)", "unit": "s"}),
         pa.field("delay_sd_s", _FLOATS, metadata={"shape": "(K,), infinite where not known", "unit": "s"}),
@@ -163,6 +172,7 @@ def _row(record: Record, identity: StoreIdentity) -> dict[str, Any]:
         "duration_s": summary.duration_s,
         "moments": summary.moments[:, upper[0], upper[1]].ravel(),
         "noise_a2": summary.noise_a2.ravel(),
+        **({} if summary.fit is None else {name: getattr(summary.fit, name).ravel() for name in FIT_COLUMNS}),
         "delay_reference": found.delays.branches[0],
         "delay_s": found.delays.delay_s[place],
         "delay_sd_s": np.where(found.delays.known, found.delays.sd_s, np.inf)[place],
@@ -180,11 +190,12 @@ def _shortened(summary: DriveSummary) -> DriveSummary:
     first = np.arange(0, count, -(-count // MOST_BLOCKS))
     samples = summary.moments[:, -1, -1]
     noise = np.add.reduceat(summary.noise_a2 * samples[:, None], first) / np.add.reduceat(samples, first)[:, None]
-    return replace(summary, moments=np.add.reduceat(summary.moments, first), noise_a2=noise, extra=None)
+    fit = None if summary.fit is None else summary.fit.joined(first, samples)
+    return replace(summary, moments=np.add.reduceat(summary.moments, first), noise_a2=noise, fit=fit)
 
 
 def _records(table: pa.Table, identity: StoreIdentity) -> Iterable[Record]:
-    rows = table.drop_columns(["moments", "noise_a2"]).to_pylist()
+    rows = table.drop_columns(["moments", "noise_a2", *FIT_COLUMNS]).to_pylist()
     for row, summary in zip(rows, _summaries(table, identity), strict=True):
         name = row["vehicle"] or ""
         drives, sources = _drives(row)
@@ -211,25 +222,46 @@ def _summaries(table: pa.Table, identity: StoreIdentity) -> list[DriveSummary | 
     values, triangle = _lengths(table, "noise_a2"), p * (p + 1) // 2
     blocks = values // K
     whole = (blocks > 0) & (values == K * blocks) & (_lengths(table, "moments") == triangle * blocks)
+    has_fit = np.minimum(_lengths(table, FIT_COLUMNS[0]), 1)
+    L = len(LEVEL_EDGES_A) + 1
+    sizes = {"levels": K * L * (p + 1), "fast_a2": blocks * K * K, "spikes": 2 * blocks * K}
+    for name in FIT_COLUMNS:
+        whole &= _lengths(table, name) == has_fit * sizes.get(name, blocks)
     bank = identity.bank.identity
-    kept = table.select(["moments", "noise_a2"]).filter(pa.array(whole))
+    kept = table.select(["moments", "noise_a2", *FIT_COLUMNS]).filter(pa.array(whole))
     triangles, noise = _numbers(kept, "moments").reshape(-1, triangle), _numbers(kept, "noise_a2").reshape(-1, K)
     moments, upper = np.empty((len(triangles), p, p)), np.triu_indices(p)
     moments[:, upper[0], upper[1]] = moments[:, upper[1], upper[0]] = triangles
-    blocks = blocks * whole
-    stops = np.cumsum(blocks)
-    return [
-        DriveSummary(
-            moments=moments[start:stop],
-            noise_a2=noise[start:stop],
+    levels = _numbers(kept, "levels").reshape(-1, K, L, p + 1)
+    fast, spikes = (_numbers(kept, name).reshape(-1, K, w) for name, w in (("fast_a2", K), ("spikes", 2)))
+    warm_c, starts = _numbers(kept, "temperature_c"), _numbers(kept, "starts") > 0.0
+    found: list[DriveSummary | None] = []
+    start = fit_start = record = 0
+    for count, is_whole, with_fit in zip(blocks.tolist(), whole.tolist(), has_fit.tolist(), strict=True):
+        if not is_whole:
+            found.append(None)
+            continue
+        own, own_fit, fit = slice(start, start + count), slice(fit_start, fit_start + count), None
+        if with_fit:
+            fit = FitSums(
+                levels=levels[record],
+                fast_a2=fast[own_fit],
+                spikes=spikes[own_fit],
+                temperature_c=warm_c[own_fit],
+                starts=starts[own_fit],
+            )
+            record, fit_start = record + 1, own_fit.stop
+        summary = DriveSummary(
+            moments=moments[own],
+            noise_a2=noise[own],
             branches=K,
             period_s=identity.bank.period_s,
             bank=bank,
+            fit=fit,
         )
-        if start < stop
-        else None
-        for start, stop in zip((stops - blocks).tolist(), stops.tolist(), strict=True)
-    ]
+        found.append(summary)
+        start = own.stop
+    return found
 
 
 def _lengths(table: pa.Table, name: str) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":

@@ -1,11 +1,11 @@
 """From the drives of one vehicle to its summary: delays between branches, zero-current windows, second moments."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibrator.drive import Array, Drive, DriveFile
+from calibrator.drive import Array, Channel, Drive, DriveFile
 from calibrator.drives.align import Samples, align
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
@@ -18,7 +18,7 @@ from calibrator.terminal.text import counted
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
-__all__ = ["VehicleSummary", "read_samples", "read_vehicle_summary"]
+__all__ = ["VehicleSummary", "read_samples", "read_vehicle_summary", "summarise_drives"]
 
 LEAST_DURATION_S = 120.0
 """Valid data below which a vehicle is left out: fewer than four blocks do not tell how sure anything is. [s]"""
@@ -73,7 +73,7 @@ def read_samples(entries: Sequence[DriveFile], equipment: Equipment, database: V
     UserError
         If a drive cannot be read, or there is too little valid data; the message says which and how much.
     """
-    return _aligned(entries, equipment, database).samples
+    return _aligned([load_drive(entry, database) for entry in entries], equipment, database).samples
 
 
 def read_vehicle_summary(
@@ -102,29 +102,38 @@ def read_vehicle_summary(
     UserError
         If a drive cannot be read, or there is too little valid data; the message says which and how much.
     """
-    vehicle = _aligned(entries, equipment, database)
+    found = summarise_drives([load_drive(entry, database) for entry in entries], equipment, database, bank=bank)
+    return replace(found, vehicle=entries[0].vehicle, drives=tuple(entry.name for entry in entries))
+
+
+def summarise_drives(
+    drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase, *, bank: FilterBank | None = None
+) -> VehicleSummary:
+    """Summarise drives of one vehicle that were read already; as :func:`read_vehicle_summary`."""
+    vehicle = _aligned(drives, equipment, database)
     return VehicleSummary(
-        vehicle=entries[0].vehicle,
-        drives=tuple(entry.name for entry in entries),
-        summary=summarise(vehicle.samples, period_s=database.layout.period_s, bank=bank),
+        vehicle=drives[0].vehicle,
+        drives=tuple(drive.name for drive in drives),
+        summary=summarise(
+            vehicle.samples, period_s=database.layout.period_s, bank=bank, temperatures_c=vehicle.temperatures_c
+        ),
         delays=vehicle.delays,
-        zero_current=zero_current_offsets(vehicle.drives, equipment.branches, database),
-        recorded=frozenset.intersection(*(_recorded(drive) for drive in vehicle.drives)),
+        zero_current=zero_current_offsets(drives, equipment.branches, database),
+        recorded=frozenset.intersection(*(_recorded(drive) for drive in drives)),
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class _AlignedDrives:
-    """Drives of one vehicle as they are, the delays of its branches, and the drives on one time base without them."""
+    """Delays of the branches of one vehicle, its drives on one time base without them, temperatures if recorded."""
 
-    drives: list[Drive]
     delays: BranchDelays
     samples: list[Samples]
+    temperatures_c: list[Array] | None
 
 
-def _aligned(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> _AlignedDrives:
+def _aligned(drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase) -> _AlignedDrives:
     layout = database.layout
-    drives = [load_drive(entry, database) for entry in entries]
     for drive in drives:
         _require_possible(drive, layout)
     delays = estimate_delays(drives, _most_moving_first(drives, equipment.branches))
@@ -135,10 +144,21 @@ def _aligned(entries: Sequence[DriveFile], equipment: Equipment, database: Vehic
     duration_s = layout.period_s * sum(int(part.valid.sum()) for part in samples)
     if duration_s < LEAST_DURATION_S:
         raise DriveError(
-            f"{duration_s:.1f} s of usable data in {counted(len(entries), 'drive')}; at least "
+            f"{duration_s:.1f} s of usable data in {counted(len(drives), 'drive')}; at least "
             f"{LEAST_DURATION_S:.0f} s are needed"
         )
-    return _AlignedDrives(drives=drives, delays=delays, samples=samples)
+    temperatures_c = None
+    if layout.temperature is not None:
+        pairs = zip(drives, samples, strict=True)
+        temperatures_c = [_temperature_c(drive.inputs.get(layout.temperature), part) for drive, part in pairs]
+    return _AlignedDrives(delays=delays, samples=samples, temperatures_c=temperatures_c)
+
+
+def _temperature_c(channel: Channel | None, samples: Samples) -> Array:
+    """Temperature at the instants of samples, NaN if it was not recorded; it changes slowly, so gaps do not matter."""
+    if channel is None or not channel.good.any():
+        return np.full(len(samples.time_s), np.nan)
+    return np.interp(samples.time_s, channel.time_s[channel.good], channel.value[channel.good])
 
 
 def _require_possible(drive: Drive, layout: Layout) -> None:

@@ -19,8 +19,11 @@ __all__ = [
     "FleetOrSummariesArgument",
     "JsonOption",
     "LayoutOption",
+    "MagnitudeOption",
     "SeedOption",
+    "SparsityOption",
     "StoreOption",
+    "SymmetricOption",
     "TimeLimitOption",
     "WorkersOption",
     "given_options",
@@ -87,6 +90,12 @@ def _branches(value: str | None) -> str | None:
     return None if value is None else ",".join(names)
 
 
+def _magnitude(value: tuple[float, float]) -> tuple[float, float]:
+    if not 0 <= value[0] <= value[1] < 1:
+        raise typer.BadParameter(f"{value[0]:g} {value[1]:g}: expected 0 <= LO <= HI < 1")
+    return value
+
+
 def _named(value: str) -> str:
     if not value.strip():
         raise typer.BadParameter("an empty name; give the path of a folder, '.' for this one")
@@ -126,6 +135,19 @@ BranchesOption = Annotated[
 ]
 BankOption = Annotated[
     Path | None, typer.Option("--bank", help="Filter bank to use, a file that 'identify --out' wrote.")
+]
+SymmetricOption = Annotated[bool, typer.Option("--symmetric", help="The fleet's mean is the ideal vehicle (22).")]
+SparsityOption = Annotated[
+    float, number_option("--sparsity", 0, 100, "Share of zero fault parameters of an artificial fleet [%]")
+]
+MagnitudeOption = Annotated[
+    tuple[float, float],
+    typer.Option(
+        "--magnitude",
+        metavar="LO HI",
+        callback=_magnitude,
+        help="Range of its fault magnitudes, 0 <= LO <= HI < 1: drifts, and offsets as fractions of full scale.",
+    ),
 ]
 
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
 
-__all__ = ["bar_line", "numbered_passes", "one_pass", "progress_bar", "rate_text", "shown"]
+__all__ = ["bar_line", "no_progress", "numbered_passes", "one_pass", "progress_bar", "rate_text", "shown"]
 
 LINE_EVERY_S = 10.0
 DRAWN_EVERY_S = 0.1
@@ -30,6 +30,18 @@ _active: ContextVar[Progress | None] = ContextVar("active", default=None)
 """The bars on the terminal; a step within a step adds its own to them."""
 _number: ContextVar[Callable[[], str]] = ContextVar("number", default=str)
 """What stands before the label of the next pass; nothing outside of numbered passes."""
+_silent: ContextVar[bool] = ContextVar("silent", default=False)
+"""Whether nothing is shown."""
+
+
+@contextmanager
+def no_progress() -> Iterator[None]:
+    """Within the block no progress is shown, as in a library."""
+    before = _silent.set(True)
+    try:
+        yield
+    finally:
+        _silent.reset(before)
 
 
 @contextmanager
@@ -73,7 +85,7 @@ def progress_bar(label: str, total: int | None, unit: str = "", *, begun: int = 
     callable
         To be called with the number of units done.
     """
-    if sys.stderr is None:  # closed by who started the program
+    if sys.stderr is None or _silent.get():  # closed by who started the program
         yield lambda _: None
         return
     label, console = f"{_number.get()()}{label}", Console(stderr=True)

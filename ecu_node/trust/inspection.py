@@ -10,8 +10,6 @@ from typing import Any
 import msgspec
 
 from ecu_node.errors import UnfitError
-from ecu_node.parameters import BranchParameters
-from ecu_node.sensor_models import GainBySign, TemperatureDrift
 from ecu_node.trust.audit import End, broken_line, end_of_log
 from ecu_node.trust.canonical import read_bytes, read_canonical
 from ecu_node.trust.key_set import KEY_SET, KeySet, check_key_set
@@ -115,18 +113,8 @@ def _statement_lines(statement: Statement) -> list[str]:
     lines += ["may differ a lot from what is in force"] * statement.allow_large_step
     for name, branch in parameters.branches.items():
         applied = "applied" if branch.apply else f"not applied ({branch.held_back or 'no fault'})"
-        lines.append(f"branch {name}: {_drift(branch)}, offset {branch.offset_a:+.4g} A, {applied}")
+        lines.append(f"branch {name}: drift {branch.drift:+.4g}, offset {branch.offset_a:+.4g} A, {applied}")
     return lines
-
-
-def _drift(branch: BranchParameters) -> str:
-    match branch.sensor_model:
-        case GainBySign() as model:
-            return f"drift {model.drift_positive:+.4g} into and {model.drift_negative:+.4g} out of the junction"
-        case TemperatureDrift() as model:
-            return f"drift {branch.drift:+.4g} at {model.reference_c:g} degC, {model.drift_per_k:+.4g} per K"
-        case _:
-            return f"drift {branch.drift:+.4g}"
 
 
 def inspect_state(folder: Path, now: datetime) -> Inspection:

@@ -5,14 +5,10 @@ from pathlib import Path
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError
 from ecu_node.parameters import BranchParameters, VehicleParameters
-from ecu_node.sensor_models import GainBySign, TemperatureDrift
 from ecu_node.status import Reason
 from ecu_node.trust.state import TrustState, signed_parameters
 
 __all__ = ["require_small_step"]
-
-_COLDEST_C, _HOTTEST_C = -40.0, 125.0
-"""Of sensors in vehicles. Between the two no drift differs by more than at one of them. [degC]"""
 
 
 def require_small_step(
@@ -46,9 +42,8 @@ def require_small_step(
     except TrustError:
         return  # what is damaged is not in force, and must not keep its successor out
     for name in layout.branch_names:
-        (old_drifts, old_a), (new_drifts, new_a) = (_applied(item.branches.get(name)) for item in (before, new))
-        drift = max(abs(a - b) for a, b in zip(old_drifts, new_drifts, strict=True))
-        offset_a = abs(old_a - new_a)
+        (old_drift, old_a), (new_drift, new_a) = (_applied(item.branches.get(name)) for item in (before, new))
+        drift, offset_a = abs(old_drift - new_drift), abs(old_a - new_a)
         if drift > layout.activation.step_drift or offset_a > layout.step_offset_a:
             raise TrustError(
                 Reason.IMPLAUSIBLE_PARAMETERS,
@@ -58,19 +53,6 @@ def require_small_step(
             )
 
 
-def _applied(branch: BranchParameters | None) -> tuple[tuple[float, ...], float]:
-    """Drifts as they are applied, cold and hot, to currents into and out of the junction [1], and the offset [A]."""
-    if branch is None or not branch.apply:
-        return (0.0,) * 4, 0.0
-    match branch.sensor_model:
-        case GainBySign() as model:
-            drifts = (model.drift_positive, model.drift_negative) * 2
-        case TemperatureDrift() as model:
-            cold, hot = (
-                branch.drift + model.drift_per_k * (temperature_c - model.reference_c)
-                for temperature_c in (_COLDEST_C, _HOTTEST_C)
-            )
-            drifts = (cold, cold, hot, hot)
-        case _:
-            drifts = (branch.drift,) * 4
-    return drifts, branch.offset_a
+def _applied(branch: BranchParameters | None) -> tuple[float, float]:
+    """Drift [1] and offset [A] as they are applied."""
+    return (branch.drift, branch.offset_a) if branch is not None and branch.apply else (0.0, 0.0)

@@ -22,7 +22,7 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.in_force import InForce, sensor_fault
 from ecu_node.junction_watch import aligned_currents
 from ecu_node.parameters import JunctionResidual, VehicleParameters
-from ecu_node.sensor_fault import SensorFault
+from ecu_node.sensor_fault import NO_FAULT, SensorFault
 
 __all__ = ["Trial", "TrialResult", "TrialRules", "begin_trial"]
 
@@ -120,20 +120,10 @@ class Trial:
         measured = {name: pair[0] for name, pair in currents.items()}
         if max(map(abs, measured.values())) < self._rules.least_current_a:
             return None
-        corrected = [self._corrected(name, current, now_s) for name, current in measured.items()]
-        if any(current is None for current in corrected):
-            return None
-        self._add(sum(measured.values()), sum(current for current in corrected if current is not None))
+        corrected = [self._faults.get(name, NO_FAULT).true_current(current) for name, current in measured.items()]
+        self._add(sum(measured.values()), sum(corrected))
         self._time_s += min(passed_s, _LONGEST_STEP_S)
         return self._result() if self._time_s >= self._rules.duration_s else None
-
-    def _corrected(self, name: str, current: float, now_s: float) -> float | None:
-        fault = self._faults.get(name)
-        if fault is None:
-            return current
-        sensor = next(branch.temperature for branch in self._branches if branch.name == name)
-        # From its frames: it need not be known at once to a branch of which nothing in force depends on it.
-        return fault.true_current(current, sensor.value_at(now_s) if sensor is not None else None)
 
     def _add(self, measured_a: float, corrected_a: float) -> None:
         self._looks += 1
@@ -198,7 +188,7 @@ def begin_trial(parameters: VehicleParameters, database: VehicleDatabase, branch
         To be asked at each look at the junction.
     """
     layout = database.layout
-    faults = {name: sensor_fault(database, InForce(parameters=parameters), name) for name in layout.branch_names}
+    faults = {name: sensor_fault(InForce(parameters=parameters), name) for name in layout.branch_names}
     return Trial(
         branches,
         {name: fault for name, fault in faults.items() if fault.applied},

@@ -8,8 +8,8 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from calibrator.estimator.results import read_results
 from calibrator.fleet_truth import read_truth
-from calibrator.results.rows import read_results
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameter_fit import check_fit

@@ -45,11 +45,9 @@ def current(
 
 
 def integer_plan(source: Codes, target: Codes, *, sign: int, drift: float, offset_a: float) -> IntegerPlan:
-    plan = correction_plan(
+    return correction_plan(
         Signals(source=source, target=target, sign=sign), SensorFault(drift=drift, offset_a=offset_a)
     )
-    assert isinstance(plan, IntegerPlan)
-    return plan
 
 
 def exact(source: Codes, target: Codes, code: int, *, sign: int, drift: str, offset_a: str) -> Fraction:
@@ -258,6 +256,26 @@ def test_the_plan_of_a_power_takes_the_voltage_into_account() -> None:
     assert [plan.apply(1, volts) for volts in (-60, 0, 1, 60)] == [100, 1, -1, -100]
     assert [plan.saturates(1, volts) for volts in (-50, -49, 50, 51)] == [True, False, False, True]
     assert (plan.apply(1), plan.saturates(133), plan.saturates(134)) == (plan.apply(1, 0), False, True)
+
+
+@settings(deadline=None)
+@given(
+    code=st.integers(-30000, 30000),
+    volts=st.integers(0, 50000),
+    drift=st.floats(-0.4, 0.4),
+    offset=st.floats(-150, 150),
+    sign=st.sampled_from([1, -1]),
+)
+def test_a_power_is_corrected_as_a_current_and_written_back_as_a_power(
+    code: int, volts: int, drift: float, offset: float, sign: int
+) -> None:
+    power, voltage = current(2.0, limits=(-60000, 60000)), current(0.02, signed=False, limits=(0, 1000))
+    signals = Signals(source=power, target=power, sign=sign, voltage=voltage)
+    plan = correction_plan(signals, SensorFault(drift=drift, offset_a=offset))
+    offset_w = sign * Fraction(repr(offset)) * voltage.scale * volts
+    wanted = (power.scale * code - offset_w) / (1 + Fraction(repr(drift))) / power.scale
+    clamped = min(max(wanted, Fraction(plan.lowest)), Fraction(plan.highest))
+    assert abs(plan.apply(code, volts) - clamped) <= HALF + LARGEST_ERROR
 
 
 def test_named_codes_and_codes_out_of_range_are_no_values() -> None:

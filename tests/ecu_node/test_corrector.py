@@ -16,7 +16,6 @@ from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode
 from ecu_node.in_force import InForce, put_in_force
 from ecu_node.parameters import JunctionResidual
-from ecu_node.sensor_models import TemperatureDrift
 from ecu_node.status import Quality, Reason, State
 from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, Frame, answers, decoded, parameters_for, protected
@@ -295,22 +294,6 @@ def test_a_stray_frame_of_a_branch_that_the_car_lacks_counts_for_one_drive_only(
     assert corrector.state() == (State.CORRECTING, Reason.NONE)
 
 
-def test_a_temperature_at_which_the_drift_cannot_be_is_no_error(database: VehicleDatabase) -> None:
-    parameters = parameters_for(database, motor=(0.0, 0.0), battery=(0.0, 0.0))
-    model = TemperatureDrift(drift_per_k=0.02, reference_c=25.0)
-    bent = {**parameters.branches, "battery": replace(parameters.branches["battery"], sensor_model=model)}
-    corrector = wire(database, InForce(parameters=replace(parameters, branches=bent)), start_s=0.0)
-    for k, celsius in enumerate((25.0, -25.0, -10.0)):
-        data = protected(database, "HV_Battery", k, BatteryCurrent=100.0, JunctionBoxTemperature=celsius)
-        (answer,) = answers(corrector, Frame(BATTERY, data), 0.01 * k)
-        answers(corrector, motor(database, k), 0.01 * k)
-        corrector.look(0.01 * k)
-        assert decoded(database, "HV_BatteryCorrected", answer.data)["BatteryCurrentCorrected"] == 100.0
-        assert corrector.watch.sums is not None
-        assert corrector.watch.sums.corrected_a == pytest.approx(0.0), "the sum is of what is published"
-        assert corrector.state() == (State.CORRECTING, Reason.NONE if k == 0 else Reason.INPUT_MISSING)
-
-
 def test_waiting_for_a_vehicle_that_is_not_awake_yet_is_no_fault(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
     for k in range(100):
@@ -487,50 +470,6 @@ def test_what_is_still_published_is_of_the_quality_that_is_told_of_it(make_datab
         assert decoded(database, "PairOut", answer.data)["Motor"] == motor_a
 
 
-def test_a_new_temperature_makes_the_last_value_anew_with_the_voltage_of_its_frame(make_database: MakeDatabase) -> None:
-    layout = SMALL_LAYOUT.replace(
-        'voltage = "Net.Voltage" }',
-        'voltage = "Net.Voltage", corrected = "PairOut.Power", timeout_s = 60.0 }',
-    ).replace("branch = [", 'temperature = "heat"\nbranch = [', 1)
-    layout += '[[input]]\nname = "heat"\nsignal = "Net.Heat"\n'
-    dbc = SMALL_DBC.replace(
-        ' SG_ Voltage : 0|16@1+ (0.01,0) [0|650] "V" Node\n',
-        ' SG_ Voltage : 0|16@1+ (0.01,0) [0|650] "V" Node\n SG_ Heat : 16|8@1+ (1,-40) [-40|210] "degC" Node\n',
-    ).replace("258 Net: 2", "258 Net: 3")
-    dbc = dbc.replace(
-        ' SG_ Quality : 32|2@1+ (1,0) [0|3] "" Node\n',
-        ' SG_ Quality : 32|2@1+ (1,0) [0|3] "" Node\n SG_ Power : 34|16@1+ (1,0) [0|60000] "W" Node\n',
-    )
-    database = make_database(layout, dbc + 'VAL_ 512 Power 65535 "SNA";\n')
-    parameters = parameters_for(database, battery=(0.0, 0.0), heater=(0.0, 10.0))
-    model = TemperatureDrift(drift_per_k=0.01, reference_c=25.0)
-    bent = {**parameters.branches, "heater": replace(parameters.branches["heater"], sensor_model=model)}
-    corrector = wire(database, InForce(parameters=replace(parameters, branches=bent)), start_s=0.0)
-    pair = Frame(PAIR, database.message("Pair").encode({"Battery": 0.0, "Motor": 0.0}))
-
-    def power_w() -> float:
-        (answer,) = answers(corrector, pair, 0.0)
-        return float(decoded(database, "PairOut", answer.data)["Power"])
-
-    def net(voltage_code: int, celsius: float) -> None:
-        data = voltage_code.to_bytes(2, "little") + bytes([int(celsius) + 40])
-        answers(corrector, Frame(NET, data), 0.0)
-
-    answers(corrector, Frame(HEATER, database.message("Heater").encode({"Power": 3000.0})), 0.0)
-    assert power_w() == 3000.0, "passed through: no temperature"
-    net(65535, 25.0)
-    assert power_w() == 65535.0, "no value without a voltage"
-    net(30000, 25.0)
-    assert power_w() == 65535.0, "a voltage alone changes nothing before the next power"
-    net(20000, 0.0)
-    assert power_w() == round((3000.0 + 10.0 * 200.0) / 0.75)
-    net(20000, 25.0)
-    assert power_w() == 5000.0
-    answers(corrector, Frame(HEATER, bytes(1)), 0.0)
-    net(20000, 0.0)
-    assert power_w() == 65535.0, "of a frame that was cut off nothing is made"
-
-
 def test_shadow_mode_computes_and_changes_nothing(database: VehicleDatabase) -> None:
     parameters = parameters_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
     corrector = wire(database, InForce(parameters=parameters), start_s=0.0, shadow=True)
@@ -602,6 +541,24 @@ def test_a_power_counts_in_the_sum_as_power_over_voltage(make_database: MakeData
     assert sums_at(corrector, 0.1) == pytest.approx((50.0 - 40.0 - 10.0, 50.0 - 40.0 - 8.0))
     answers(corrector, heater, 0.7)
     assert corrector.branches[2].currents_at(0.7) is None, "a voltage 0.7 s old is not divided by"
+
+
+def test_a_power_is_divided_by_the_voltage_of_its_own_instant(make_database: MakeDatabase) -> None:
+    database = make_database()
+    corrector = corrector_for(database, heater=(0.0, 0.0))
+    answers(corrector, Frame(HEATER, database.message("Heater").encode({"Power": 4000})), 0.0)
+    for now_s, volts in ((0.0, 400.0), (0.2, 500.0)):
+        answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": volts})), now_s)
+    assert corrector.branches[2].currents_at(0.1) == pytest.approx((-10.0, -10.0))
+
+
+def test_a_frame_cut_off_before_the_voltage_leaves_it_as_it_was(make_database: MakeDatabase) -> None:
+    database = make_database()
+    corrector = corrector_for(database, heater=(0.25, 0.0))
+    answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": 400.0})), 0.0)
+    answers(corrector, Frame(NET, bytes(1)), 0.1)
+    answers(corrector, Frame(HEATER, database.message("Heater").encode({"Power": 4000})), 0.1)
+    assert sums_at(corrector, 0.1) == pytest.approx((-10.0, -8.0))
 
 
 def test_a_voltage_near_zero_is_not_divided_by(make_database: MakeDatabase) -> None:

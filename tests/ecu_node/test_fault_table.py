@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
-from msgspec.structs import replace
 
 from ecu_node.corrector import Corrector
 from ecu_node.counters import Counters
@@ -13,10 +12,8 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode
 from ecu_node.in_force import InForce
-from ecu_node.sensor_models import TemperatureDrift
-from ecu_node.status import Quality, Reason, State
 from ecu_node.wiring import wire
-from tests.ecu_node.vehicles import Frame, answers, decoded, parameters_for, passed_on, protected
+from tests.ecu_node.vehicles import Frame, answers, parameters_for, passed_on, protected
 
 TABLE = Path(__file__).parents[2] / "docs" / "fault_table.md"
 TESTS = Path(__file__).parents[1]
@@ -67,23 +64,6 @@ def test_a_frame_with_a_wrong_crc_is_as_if_it_had_not_come(database: VehicleData
     found, counters = used(database, mode, [first, damaged, second, third, b""])
     assert found == [True, False, True, True, False]
     assert (counters.corrupt, counters.gaps, counters.repeated) == (2, 0, 0)
-
-
-def test_without_the_temperature_a_branch_is_passed_through_and_the_status_says_so(database: VehicleDatabase) -> None:
-    parameters = parameters_for(database, battery=(0.1, 0.0), motor=(0.0, 0.0))
-    model = TemperatureDrift(drift_per_k=0.005, reference_c=20.0)
-    bent = {**parameters.branches, "battery": replace(parameters.branches["battery"], sensor_model=model)}
-    corrector = wire(database, InForce(parameters=replace(parameters, branches=bent)), start_s=0.0)
-    found = []
-    for counter, temperature in enumerate((20.0, 215.0, 20.0)):  # 215: the code that says that there is none
-        data = protected(database, "HV_Battery", counter, BatteryCurrent=110.0, JunctionBoxTemperature=temperature)
-        (answer,) = answers(corrector, Frame(BATTERY, data), 0.02 * counter)
-        answers(corrector, Frame(MOTOR, protected(database, "HV_Motor", counter)), 0.02 * counter)
-        corrector.look(0.02 * counter)
-        values = decoded(database, "HV_BatteryCorrected", answer.data)
-        found.append((values["BatteryCurrentCorrected"], values["BatteryCurrentQuality"], corrector.state()))
-    corrected = (100.0, Quality.CORRECTED, (State.CORRECTING, Reason.NONE))
-    assert found == [corrected, (110.0, Quality.PASSED_THROUGH, (State.CORRECTING, Reason.INPUT_MISSING)), corrected]
 
 
 def test_every_row_names_tests_and_every_test_exists() -> None:

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import pytest
 from e2e.p01 import e2e_p01_check
-from msgspec.structs import replace
 
 from ecu_node.corrector import Corrector
 from ecu_node.database import VehicleDatabase
@@ -12,7 +11,6 @@ from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode, transmitted
 from ecu_node.in_force import InForce
-from ecu_node.sensor_models import TemperatureDrift
 from ecu_node.status import Reason, State
 from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, Frame, decoded, parameters_for, passed_on, protected
@@ -230,21 +228,6 @@ def test_a_frame_too_short_for_one_signal_keeps_it_out(make_database: MakeDataba
     corrector = gateway_for(database, battery=(0.5, 0.0), motor=(0.5, 0.0))
     assert passed_on(corrector, Frame(PAIR, b"\x01\x2c\x01"), 0.0) == b"\x00\xc8\x01"
     assert passed_on(corrector, Frame(PAIR, b"\x01"), 0.0) == b"\x01"
-
-
-def test_a_temperature_changes_the_correction_at_once(database: VehicleDatabase) -> None:
-    parameters = parameters_for(database, motor=(0.0, 0.0), battery=(0.1, 0.0))
-    model = TemperatureDrift(drift_per_k=0.005, reference_c=20.0)
-    bent = {**parameters.branches, "battery": replace(parameters.branches["battery"], sensor_model=model)}
-    in_force = InForce(parameters=replace(parameters, branches=bent))
-    corrector = wire(database, in_force, start_s=0.0, mode=Mode.GATEWAY)
-    found = []
-    for counter, temperature in enumerate((20.0, 20.0, 40.0, 60.0, 215.0, 20.0)):
-        frame = battery(database, counter, 110.0, JunctionBoxTemperature=temperature)
-        out = passed_on(corrector, frame, 0.0)
-        assert out is not None
-        found.append(decoded(database, "HV_Battery", out)["BatteryCurrent"])
-    assert found == pytest.approx([100.0, 100.0, 110 / 1.2, 110 / 1.3, 110.0, 100.0], abs=0.0101)
 
 
 def test_a_gateway_sends_nothing_in_its_own_name_but_the_status(database: VehicleDatabase) -> None:

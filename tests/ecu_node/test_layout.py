@@ -24,6 +24,17 @@ def test_the_projects_own_layout_is_read() -> None:
     assert layout.digest == file_digest(LAYOUT)
 
 
+def test_the_projects_own_layout_names_its_temperature() -> None:
+    assert read_layout(LAYOUT).temperature == "junction_box_temperature"
+
+
+def test_a_temperature_that_is_no_input_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "layout.toml"
+    path.write_text(LAYOUT.read_text().replace('temperature = "junction_box_temperature"', 'temperature = "oil"'))
+    with pytest.raises(LayoutError, match=r"layout\.toml: temperature: 'oil' is no \[\[input\]\]; declare the signal"):
+        read_layout(path)
+
+
 def test_a_power_branch_is_named_by_its_power(make_database: MakeDatabase) -> None:
     layout = make_database().layout
     assert layout.find_branch("heater").source == "Heater.Power"

@@ -22,6 +22,7 @@ from ecu_node.parameter_fit import check_fit
 from ecu_node.parameters import (
     MAX_FILE_BYTES,
     BranchParameters,
+    Finding,
     HardwareFault,
     JunctionResidual,
     Verdict,
@@ -103,6 +104,7 @@ def test_what_the_schema_refuses_is_not_written(database: VehicleDatabase, tmp_p
     assert (tmp_path / "p.json").read_text() == "older"
 
 
+FINDING = {"branch": "battery", "cause": "inverted", "probability": 0.99, "text": "battery: its sign is turned."}
 CHANGES: dict[str, Change] = {
     "nothing": lambda d: None,
     "unknown key": lambda d: d.update(extra=1),
@@ -133,6 +135,14 @@ CHANGES: dict[str, Change] = {
     "digest too short": lambda d: d["dbc"].update(sha256="ab"),
     "digest with more behind": lambda d: d["dbc"].update(sha256="a" * 64 + "b"),
     "fleet size 0": lambda d: d["provenance"].update(fleet_size=0),
+    "a sensor model of null": lambda d: d["branches"]["battery"].update(sensor_model=None),
+    "a sensor model": lambda d: d["branches"]["battery"].update(sensor_model={"kind": "temperature"}),
+    "a finding": lambda d: d.update(findings=[FINDING]),
+    "a finding without its branch": lambda d: d.update(findings=[{**FINDING, "branch": None}]),
+    "a finding without its cause": lambda d: d.update(findings=[{**FINDING, "cause": ""}]),
+    "a finding of many words": lambda d: d.update(findings=[{**FINDING, "text": "x" * 501}]),
+    "a finding beyond certainty": lambda d: d.update(findings=[{**FINDING, "probability": 1.1}]),
+    "65 findings": lambda d: d.update(findings=65 * [FINDING]),
 }
 
 
@@ -362,6 +372,35 @@ def test_a_file_of_the_largest_size_is_read(database: VehicleDatabase, tmp_path:
     parameters = parameters_for(database, battery=(0.1, -2.5))
     (tmp_path / "p.json").write_bytes(msgspec.json.encode(parameters).ljust(MAX_FILE_BYTES))
     assert read_parameters(tmp_path / "p.json") == parameters
+
+
+def test_findings_are_read_back(database: VehicleDatabase, tmp_path: Path) -> None:
+    findings = [Finding(**FINDING), Finding(cause="unknown load", probability=0.9, text="5 A that no sensor sees.")]  # type: ignore[arg-type]
+    parameters = replace(parameters_for(database, battery=(0.1, 1.0)), findings=findings)
+    write_parameters(parameters, tmp_path / "p.json")
+    assert read_parameters(tmp_path / "p.json") == parameters
+
+
+def test_a_file_of_version_1_0_without_sensor_models_is_read(database: VehicleDatabase, tmp_path: Path) -> None:
+    document = as_document(parameters_for(database, battery=(0.1, 1.0)))
+    assert "sensor_model" not in document["branches"]["battery"]
+    document["branches"]["battery"]["sensor_model"] = None
+    del document["findings"]
+    (tmp_path / "p.json").write_text(json.dumps(document))
+    check_fit(read_parameters(tmp_path / "p.json"), database, None)
+
+
+def test_a_file_of_version_1_0_with_a_sensor_model_is_refused(database: VehicleDatabase, tmp_path: Path) -> None:
+    document = as_document(parameters_for(database, battery=(0.1, 1.0), motor=(0.1, 1.0)))
+    model = {"kind": "gain by sign", "drift_positive": 0.1, "drift_negative": 0.0, "difference_sd": None}
+    document["branches"]["motor"]["sensor_model"] = model
+    (tmp_path / "p.json").write_text(json.dumps(document))
+    words = (
+        r"p\.json: not a parameter file: 'branches', 'motor', 'sensor_model': null is expected, found a table: sensors "
+        r"that are not linear are not corrected any more; .* write it anew with 'calibrator calibrate'$"
+    )
+    with pytest.raises(UnfitError, match=words):
+        read_parameters(tmp_path / "p.json")
 
 
 def test_a_file_must_say_of_each_branch_whether_it_is_applied(database: VehicleDatabase, tmp_path: Path) -> None:

@@ -13,8 +13,7 @@ needs_programs = pytest.mark.skipif(
 
 @needs_programs
 def test_size_and_instructions_are_those_of_a_small_function() -> None:
-    found = {(row.name.split("(")[1].split(")")[0], row.name.split(", ")[-1]): row for row in rows(200)}
-    assert {kind for kind, _ in found} == {"linear", "gain by sign", "temperature"}
-    assert all(10 < row.value < 200 for (_, what), row in found.items() if what == "per frame")
-    assert found["linear", "size"].value < 2_000
-    assert found["temperature", "size"].value > 241 * 32, "a row for each code of the temperature"
+    found = [(row.name.split(", ")[-1], row.value) for row in rows(200)]
+    assert [what for what, _ in found] == ["size", "per frame"] * 2
+    assert all(10 < value < 200 for what, value in found if what == "per frame")
+    assert all(100 < value < 2_000 for what, value in found if what == "size")

@@ -28,11 +28,11 @@ def test_no_module_is_in_two_groups() -> None:
 
 
 def test_functions_that_are_compiled_are_plain_python_in_the_copy(tmp_path: Path) -> None:
-    source = mutants.ROOT / "calibrator" / "posterior" / "decision.py"
-    mutants.copy_changed(source, tmp_path / "decision.py")
+    source = mutants.ROOT / "calibrator" / "estimator" / "posterior.py"
+    mutants.copy_changed(source, tmp_path / "posterior.py")
     assert "\n@inner\ndef " in source.read_text()
-    assert "\n@cache\ndef " in (tmp_path / "decision.py").read_text()
-    assert "\n@inner\n" not in (tmp_path / "decision.py").read_text()
+    assert "\n@cache\ndef " in (tmp_path / "posterior.py").read_text()
+    assert "\n@inner\n" not in (tmp_path / "posterior.py").read_text()
 
 
 def test_a_group_that_is_not_there_is_named_with_those_that_are() -> None:

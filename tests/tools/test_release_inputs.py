@@ -102,7 +102,7 @@ def test_every_step_names_files_of_this_checkout() -> None:
     assert len({step.name for step in wanted}) == len(wanted)
     files = {step.name: {path.relative_to(ROOT) for path in files_that_run(ROOT, step.runs)} for step in wanted}
     assert all(any(path.parts[0] in {"calibrator", "ecu_node"} for path in found) for found in files.values())
-    assert Path("calibrator/posterior/decision.py") in files["experiment real"]
+    assert Path("calibrator/estimator/decision.py") in files["experiment real"]
     assert Path("calibrator/report/page.py") not in files["experiment real"]
     assert Path("tests/tools/test_release_inputs.py") in files["tests"]
 

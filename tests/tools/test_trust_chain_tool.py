@@ -33,7 +33,7 @@ def test_no_vehicle_of_a_fleet_is_made_worse(tmp_path: Path) -> None:
     assert counts["made_worse"] == 0
     assert counts["error_median_published_a"] < 0.2 * counts["error_median_measured_a"]
     for kind in ("signs_turned", "of_another_vehicle"):
-        assert counts[f"wrong_sets_on_trial_{kind}"] > 8
+        assert counts[f"wrong_sets_on_trial_{kind}"] >= 8
         assert counts[f"of_these_passed_{kind}"] < 0.2 * counts[f"wrong_sets_on_trial_{kind}"]
 
 

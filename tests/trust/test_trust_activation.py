@@ -12,7 +12,6 @@ from msgspec.structs import replace
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UnfitError, UserError
 from ecu_node.parameters import FileReference, VehicleParameters
-from ecu_node.sensor_models import GainBySign, SensorModel, TemperatureDrift
 from ecu_node.status import Reason
 from ecu_node.trust.activation import accept, conclude, examine
 from ecu_node.trust.audit import AuditEntry, broken_line
@@ -196,46 +195,6 @@ def test_a_large_step_needs_the_signers_word(
     far = parameters_for(database, battery=(0.3, 2.0))
     activate(state, signers.parameters(far, 6, allow_large_step=True), database)
     assert read_state(state).slots["b"].sequence == 6
-
-
-@pytest.mark.parametrize(
-    ("too_far", "near"),
-    [
-        (
-            [
-                TemperatureDrift(drift_per_k=0.005, reference_c=25.0),
-                TemperatureDrift(drift_per_k=-0.005, reference_c=25.0),
-                TemperatureDrift(drift_per_k=0.001, reference_c=400.0),
-                TemperatureDrift(drift_per_k=0.9, reference_c=1e308),
-            ],
-            TemperatureDrift(drift_per_k=0.001, reference_c=25.0),
-        ),
-        (
-            [GainBySign(drift_positive=0.3, drift_negative=0.05), GainBySign(drift_positive=0.05, drift_negative=-0.3)],
-            GainBySign(drift_positive=0.06, drift_negative=0.04),
-        ),
-    ],
-    ids=["with temperature", "by sign"],
-)
-def test_a_sensor_model_is_no_way_around_the_largest_step(
-    state: Path,
-    signers: Signers,
-    parameters: VehicleParameters,
-    database: VehicleDatabase,
-    too_far: list[SensorModel],
-    near: SensorModel,
-) -> None:
-    activate(state, signers.parameters(parameters, 5), database)
-    battery = parameters.branches["battery"]
-
-    def with_model(model: SensorModel) -> VehicleParameters:
-        return replace(parameters, branches={**parameters.branches, "battery": replace(battery, sensor_model=model)})
-
-    for model in too_far:
-        with pytest.raises(UnfitError, match=r"branch battery: differs from the set in force by .* in drift"):
-            take(state, signers.parameters(with_model(model), 6), database)
-    activate(state, signers.parameters(with_model(near), 6), database)
-    assert read_state(state).in_force == "b"
 
 
 def test_names_from_a_file_stay_within_one_line(

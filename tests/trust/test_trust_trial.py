@@ -15,7 +15,6 @@ from ecu_node.frames import FrameKey
 from ecu_node.guard import Mode
 from ecu_node.layout import read_layout
 from ecu_node.parameters import JunctionResidual, VehicleParameters
-from ecu_node.sensor_models import TemperatureDrift
 from ecu_node.status import Reason, State
 from ecu_node.trust.activation import accept
 from ecu_node.trust.parameter_store import ParameterStore
@@ -48,11 +47,10 @@ class Drive:
         load_a: float = 0.0,
         drift: float = DRIFT,
         offset_a: float = OFFSET_A,
-        celsius: float = 0.0,
         contactor: int = 0,
     ) -> None:
         """Drive; a load that nobody measures takes its share from the battery."""
-        others = {"JunctionBoxTemperature": celsius, "ContactorState": contactor}
+        others = {"ContactorState": contactor}
         for _ in range(round(duration_s / PERIOD_S)):
             k = next(self._steps)
             now_s = PERIOD_S * k
@@ -183,20 +181,6 @@ def test_a_set_that_does_not_say_what_it_changes_may_leave_anything(
     drive = Drive(state, database)
     drive.go_on(330.0, load_a=-0.5)
     assert any("number 5 has passed its trial" in line for line in drive.said)
-
-
-def test_a_trial_waits_for_the_temperature_that_a_set_needs(
-    state: Path, signers: Signers, database: VehicleDatabase
-) -> None:
-    found = right(database)
-    model = TemperatureDrift(drift_per_k=0.0001, reference_c=0.0)
-    battery = replace(found.branches["battery"], sensor_model=model)
-    put_on_trial(state, signers, replace(found, branches={**found.branches, "battery": battery}), database, 5)
-    drive = Drive(state, database)
-    drive.go_on(330.0, celsius=215.0)
-    assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
-    drive.go_on(330.0, celsius=0.0)
-    assert drive.told == (State.CORRECTING, Reason.NONE)
 
 
 def test_a_trial_waits_while_a_current_is_not_measured(

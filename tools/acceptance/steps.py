@@ -13,13 +13,13 @@ CODE = ("calibrator", "ecu_node", "dbc")
 EVERYTHING = (".",)
 TOOLS = {"PYTHONPATH": "tools"}
 PAPER = ("classifier", "snr", "sparsity", "statespace", "asymmetry")
-RECORDED = ("real", "delay", "data", "phase")
+RECORDED = ("real", "delay", "data", "phase", "attacks", "coverage")
 """Experiments on drives that all vehicles share, and on recorded trips."""
 BENCHES = {
     "identification": ("tools/bench/identification.py", "dbc"),
     "posterior": ("tools/bench/posterior.py", "dbc"),
     "ingest": ("tools/bench/ingest.py", "dbc"),
-    "fleet run": ("tools/bench/fleet_run.py", "calibrator/calibration", "dbc"),
+    "fleet run": ("tools/bench/fleet_run.py", "calibrator/estimator", "dbc"),
     "node": (
         *(f"tools/bench/node{part}.py" for part in ("", "_child", "_peer", "_socketcan")),
         "tools/with_vcan",
@@ -151,6 +151,6 @@ def _trials() -> Iterator[Step]:
     yield Step(
         name="million",
         command=(PYTHON, "-m", "bench.fleet_run"),
-        runs=("tools/bench/fleet_run.py", "calibrator/calibration", "dbc"),
+        runs=("tools/bench/fleet_run.py", "calibrator/estimator", "dbc"),
         environment=SINGLE,
     )

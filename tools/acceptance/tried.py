@@ -13,7 +13,7 @@ __all__ = ["chain_promises", "coverage_promises", "fuzz_promises", "promises_of_
 TESTED = {
     "SocketCAN kernel: canplayer, node, candump; bit-exact, others untouched, sum falls tenfold": ("vcan",),
     "Tesla log: sum of 4.1 A +- 1.2 A": ("real.test_tesla_model3",),
-    "real trips: import, delays, sensors": ("real.test_i3_import", "real.test_delays_i3", "real.test_sensor_models_i3"),
+    "real trips: import, delays": ("real.test_i3_import", "real.test_delays_i3"),
     "from log to Kirchhoff plot in at most 5 commands; inverted sign, factor 1000, 200 ms found": (
         "real.test_first_minutes",
     ),

@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from random import Random
 
@@ -26,7 +26,6 @@ from calibrator.export.checked import Checked, read_checked
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters, write_parameters
-from ecu_node.sensor_models import GainBySign, SensorModel, TemperatureDrift
 
 __all__ = ["PROGRAMS", "rows"]
 
@@ -34,11 +33,6 @@ PROGRAMS = (COMPILER, "size", "valgrind")
 FRAMES = 10_000
 
 _LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
-_MODELS: Mapping[str, SensorModel | None] = {
-    "linear": None,
-    "gain by sign": GainBySign(drift_positive=0.03, drift_negative=-0.02),
-    "temperature": TemperatureDrift(drift_per_k=0.0005, reference_c=25.0),
-}
 
 
 def main() -> None:
@@ -61,25 +55,25 @@ def rows(frames: int) -> list[Row]:
     Returns
     -------
     list of Row
-        Code and constants [byte] and instructions per frame, for each kind of sensor.
+        Code and constants [byte] and instructions per frame, for each of two optimisations.
     """
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
-        return [row for kind, model in _MODELS.items() for row in _rows(kind, model, Path(name), frames)]
+        return list(_rows(Path(name), frames))
 
 
-def _rows(kind: str, model: SensorModel | None, folder: Path, frames: int) -> Iterator[Row]:
-    checked = _checked(model, folder)
+def _rows(folder: Path, frames: int) -> Iterator[Row]:
+    checked = _checked(folder)
     for flag in ("-Os", "-O2"):
         export = compile_export(checked, folder, flags=(flag,))
-        what = f"C99, five branches, two corrected ({kind}), {COMPILER} {flag}"
+        what = f"C99, five branches, two corrected, {COMPILER} {flag}"
         yield Row(name=f"{what}, size", value=_size(export), unit="byte")
         yield Row(name=f"{what}, per frame", value=_instructions(export, folder, frames) / frames, unit="instructions")
 
 
-def _checked(model: SensorModel | None, folder: Path) -> Checked:
+def _checked(folder: Path) -> Checked:
     database = read_database(read_layout(_LAYOUT))
     branches = {
-        "battery": BranchParameters(drift=0.02, offset_a=3.0, apply=True, sensor_model=model),
+        "battery": BranchParameters(drift=0.02, offset_a=3.0, apply=True),
         "motor": BranchParameters(drift=-0.03, offset_a=1.0, apply=True),
     }
     write_parameters(true_parameters(database, branches), folder / "bench.json")

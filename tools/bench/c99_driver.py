@@ -13,7 +13,7 @@ from struct import Struct
 from cantools.database.can import Message
 
 from calibrator.export.c99 import c99_files
-from calibrator.export.c_model import CInput, CProgram, c_program
+from calibrator.export.c_model import CProgram, c_program
 from calibrator.export.checked import Checked
 
 __all__ = ["COMPILER", "FLAGS", "NO_CODE", "CompiledExport", "Frame", "compile_export"]
@@ -29,8 +29,8 @@ Frame = tuple[str, bytes]
 _MOST_BYTES = 64
 _FRAME = Struct(f"<BB{_MOST_BYTES}s")
 """Message or flag "changed", length, payload."""
-_CODES, _RESULT = Struct("=4q"), Struct("=q")
-"""Branch, code, voltage code, temperature code; corrected code."""
+_CODES, _RESULT = Struct("=3q"), Struct("=q")
+"""Branch, code, voltage code; corrected code."""
 
 _MAIN = """\
 #include "hv_correction.h"
@@ -60,7 +60,7 @@ static int64_t one_code(const int64_t *given)
 int main(int count, char **arguments)
 {{
     uint8_t frame[66];
-    int64_t given[4];
+    int64_t given[3];
 
     if (count > 1 && strcmp(arguments[1], "codes") == 0) {{
         while (fread(given, sizeof given, 1, stdin) == 1) {{
@@ -120,8 +120,8 @@ class CompiledExport:
         numbers = {message.name: number for number, message in enumerate(self.messages)}
         return b"".join(_FRAME.pack(numbers[name], len(payload), payload) for name, payload in frames)
 
-    def codes(self, branch: str, codes: Sequence[tuple[int, int, int]]) -> list[int]:
-        """Correct codes of a branch, each with those of voltage and temperature (:data:`NO_CODE`: none)."""
+    def codes(self, branch: str, codes: Sequence[tuple[int, int]]) -> list[int]:
+        """Correct codes of a branch, each with that of the voltage (:data:`NO_CODE`: none)."""
         number = [item.name for item in self.program.branches].index(branch)
         found = self.run(b"".join(_CODES.pack(number, *item) for item in codes), "codes")
         return [code for (code,) in _RESULT.iter_unpack(found)]
@@ -194,10 +194,5 @@ def _message_cases(program: CProgram) -> Iterator[str]:
 
 def _branch_cases(program: CProgram) -> Iterator[str]:
     for number, branch in enumerate(program.branches):
-        arguments = ["given[1]", *_given(branch.voltage, 2), *_given(branch.temperature, 3)]
         yield f"    case {number}:"
-        yield f"        return hv_correct_{branch.name}({', '.join(arguments)});"
-
-
-def _given(item: CInput | None, number: int) -> list[str]:
-    return [] if item is None else [f"given[{number}]"]
+        yield f"        return hv_correct_{branch.name}(given[1]{'' if branch.voltage is None else ', given[2]'});"

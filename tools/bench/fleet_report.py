@@ -14,12 +14,16 @@ from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.support.wait import WebDriverWait
 
 from bench.row import Row
-from calibrator.evidence.vehicle_evidence import VehicleEvidence, evidence_names
+from calibrator.estimator.results import (
+    RunRecord,
+    encode_chunk,
+    join_rows,
+    write_parameter_files,
+    write_run,
+)
+from calibrator.estimator.rows import evidence_names
+from calibrator.estimator.vehicle_evidence import VehicleEvidence
 from calibrator.report.write import ReportOptions, fleet_report
-from calibrator.results.chunk import encode_chunk
-from calibrator.results.parameter_parts import write_parameter_files
-from calibrator.results.rows import join_rows
-from calibrator.results.run_record import RunRecord, write_run
 from calibrator.summaries.filter_bank import plain_bank
 from calibrator.summaries.unity import UNITY_FILE, UnityWindow
 from ecu_node.parameters import (

@@ -1,6 +1,6 @@
 """Identify one vehicle from its drive, filters and moments included, beside two subspace packages on the same data.
 
-Vehicles, drives and noise are those of :mod:`calibrator.artificial.dynamic_vehicles`: 12,000 samples, three inputs,
+Vehicles, drives and noise are those of :mod:`bench.dynamic_vehicles`: 12,000 samples, three inputs,
 four branches, order 6, poles within 15 % of the fleet's. The bank is chosen from other vehicles of the fleet, once. The
 slope error is that of the simulated current on a common unity drive over the true, noise-free one, |slope - 1|; the
 simulation is compared with it too. One thread.
@@ -19,12 +19,11 @@ from nfoursid.nfoursid import NFourSID
 from sippy_unipi import system_identification
 from threadpoolctl import threadpool_limits
 
-from calibrator.artificial.dynamic_vehicles import PERIOD_S, DynamicVehicle, drive_inputs, recorded
+from bench.dynamic_vehicles import PERIOD_S, DynamicVehicle, drive_inputs, recorded
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
-from calibrator.identification.pooled_bank import pooled_bank
-from calibrator.identification.read_out import fit_read_outs, state_space_model
-from calibrator.identification.state_space import StateSpaceModel, simulation_snr_db
+from calibrator.estimator.filter_bank_choice import choose_filter_bank, fit_read_outs, state_space_model
+from calibrator.estimator.state_space import StateSpaceModel, simulation_snr_db
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.summariser import summarise
 
@@ -95,7 +94,7 @@ def main() -> None:
 
 def _fleet(snr_db: float, count: int) -> tuple[FilterBank, list[DynamicVehicle]]:
     pool = [[recorded(number, snr_db=snr_db).samples] for number in POOL]
-    return pooled_bank(pool, period_s=PERIOD_S), [recorded(number, snr_db=snr_db) for number in range(count)]
+    return choose_filter_bank(pool, period_s=PERIOD_S), [recorded(number, snr_db=snr_db) for number in range(count)]
 
 
 def _measure(identify: Identify, vehicles: Sequence[DynamicVehicle], repetitions: int) -> _Result:

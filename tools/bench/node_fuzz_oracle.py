@@ -15,7 +15,6 @@ from bench.node_fuzz_protection import CheckState
 from bench.node_fuzz_vehicles import FuzzBranch, FuzzMessage, FuzzSignal, FuzzVehicle, zero_code
 from ecu_node.database import VehicleDatabase
 from ecu_node.guard import Mode
-from ecu_node.sensor_models import GainBySign, TemperatureDrift
 from ecu_node.status import Quality
 
 __all__ = ["FuzzFrame", "Oracle"]
@@ -103,8 +102,8 @@ def _ends(signal: FuzzSignal) -> tuple[int, int]:
 class _Branch:
     """One branch in one mode: its last code, and what must come of it."""
 
-    def __init__(self, branch: FuzzBranch, mode: Mode, limit: float) -> None:
-        self.branch, self._mode, self._limit = branch, mode, Fraction(str(limit))
+    def __init__(self, branch: FuzzBranch, mode: Mode) -> None:
+        self.branch, self._mode = branch, mode
         self.worth = _worth(branch.source)
         selector = branch.message.multiplexer if branch.source.above is not None else None
         self.least_size = max(branch.source.end, selector.end if selector is not None else 0)
@@ -112,11 +111,10 @@ class _Branch:
         self._target = branch.target[1] if overlay and branch.target is not None else branch.source
         self._out, self._ends = _worth(self._target), _ends(self._target)
         self._volts = _worth(branch.voltage[1]) if branch.voltage is not None else None
-        self._lines: dict[tuple[Fraction, Fraction], _Line] = {}
-        applied = branch.known and branch.apply
-        fault = (branch.drift, branch.offset_a, branch.model) != (0.0, 0.0, None)
-        self._corrects = applied and fault
-        self._seen, self._spoilt, self._code = False, False, 0
+        self._corrects = branch.known and branch.apply and (branch.drift, branch.offset_a) != (0.0, 0.0)
+        fault = (branch.drift, branch.offset_a) if self._corrects else (0.0, 0.0)
+        self._line = self._exact_line(*(Fraction(str(number)) for number in fault))
+        self._seen = False
         self._outcomes = [_Outcome(None, Quality.NOT_AVAILABLE)]
 
     @property
@@ -138,67 +136,32 @@ class _Branch:
 
     def spoil(self) -> None:
         """A frame came that must not be used."""
-        self._spoilt, self._outcomes = True, [_Outcome(None, Quality.INVALID)]
+        self._outcomes = [_Outcome(None, Quality.INVALID)]
 
-    def drift(self, code: int, voltage: int | None, temperature: Fraction | None) -> Fraction | None:
-        """Drift that holds [1]; None: nothing is corrected."""
-        model = self.branch.model
-        if not self._corrects:
-            return None
-        if isinstance(model, TemperatureDrift):
-            if temperature is None:
-                return None
-            hot = Fraction(str(self.branch.drift)) + Fraction(str(model.drift_per_k)) * (
-                temperature - Fraction(str(model.reference_c))
-            )
-            return hot if abs(hot) <= self._limit else None
-        if isinstance(model, GainBySign):
-            volts = Fraction(1)
-            if self._volts is not None:
-                volts = self._volts.scale * (voltage or 0) + self._volts.offset
-            value = self.branch.sign * (self.worth.scale * code + self.worth.offset)
-            into = value - Fraction(str(self.branch.offset_a)) * volts >= 0
-            return Fraction(str(model.drift_positive if into else model.drift_negative))
-        return Fraction(str(self.branch.drift))
-
-    def take(self, code: int, voltage: int | None, temperature: Fraction | None) -> None:
+    def take(self, code: int, voltage: int | None) -> None:
         """Take the code of an intact frame."""
-        self._seen, self._spoilt, self._code = True, False, code
-        self._outcomes = [self._outcome(code, voltage, temperature)]
+        self._seen, self._outcomes = True, [self._outcome(code, voltage)]
 
-    def at_temperature(self, voltage: int | None, temperature: Fraction | None) -> None:
-        """The temperature changed: what the last code is worth is made anew."""
-        if self._seen and not self._spoilt and self._corrects and isinstance(self.branch.model, TemperatureDrift):
-            self._outcomes = [self._outcome(self._code, voltage, temperature)]
-
-    def _outcome(self, code: int, voltage: int | None, temperature: Fraction | None) -> _Outcome:
+    def _outcome(self, code: int, voltage: int | None) -> _Outcome:
         if not self.worth.is_value(code):
             return _Outcome(None, Quality.NOT_AVAILABLE if code in self.worth.named else Quality.INVALID)
-        drift = self.drift(code, voltage, temperature)
-        if drift is not None and self._volts is not None and self.branch.offset_a != 0.0 and voltage is None:
+        if self._corrects and self._volts is not None and self.branch.offset_a != 0.0 and voltage is None:
             return _Outcome(None, Quality.NOT_AVAILABLE)
-        if drift is None:
-            if self._target is self.branch.source:
-                return _Outcome((code, code), Quality.PASSED_THROUGH)
-            line = self._line(Fraction(0), Fraction(0))
-            return _Outcome(line.allowed(code, voltage or 0, self._ends), Quality.PASSED_THROUGH)
-        line = self._line(drift, Fraction(str(self.branch.offset_a)))
-        return _Outcome(line.allowed(code, voltage or 0, self._ends), Quality.CORRECTED)
+        if not self._corrects and self._target is self.branch.source:
+            return _Outcome((code, code), Quality.PASSED_THROUGH)
+        quality = Quality.CORRECTED if self._corrects else Quality.PASSED_THROUGH
+        return _Outcome(self._line.allowed(code, voltage or 0, self._ends), quality)
 
-    def _line(self, drift: Fraction, offset_a: Fraction) -> _Line:
-        found = self._lines.get((drift, offset_a))
-        if found is None:
-            gain = 1 / (1 + drift) / self._out.scale
-            own = self.branch.sign * offset_a
-            of_voltage, at_zero = (Fraction(0), own)
-            if self._volts is not None:
-                of_voltage, at_zero = -own * self._volts.scale * gain, own * self._volts.offset
-            constant = (self.worth.offset - at_zero) * gain - self._out.offset / self._out.scale
-            of_code = self.worth.scale * gain
-            common = lcm(of_code.denominator, of_voltage.denominator, constant.denominator)
-            found = _Line(int(of_code * common), int(of_voltage * common), int(constant * common), common)
-            self._lines[drift, offset_a] = found
-        return found
+    def _exact_line(self, drift: Fraction, offset_a: Fraction) -> _Line:
+        gain = 1 / (1 + drift) / self._out.scale
+        own = self.branch.sign * offset_a
+        of_voltage, at_zero = (Fraction(0), own)
+        if self._volts is not None:
+            of_voltage, at_zero = -own * self._volts.scale * gain, own * self._volts.offset
+        constant = (self.worth.offset - at_zero) * gain - self._out.offset / self._out.scale
+        of_code = self.worth.scale * gain
+        common = lcm(of_code.denominator, of_voltage.denominator, constant.denominator)
+        return _Line(int(of_code * common), int(of_voltage * common), int(constant * common), common)
 
 
 class _Source:
@@ -239,11 +202,11 @@ class Oracle:
     def __init__(self, vehicle: FuzzVehicle, database: VehicleDatabase, mode: Mode) -> None:
         self._vehicle, self._gateway = vehicle, mode is Mode.GATEWAY
         self._passes_invalid = vehicle.on_bad_frame == "invalid"
-        self._branches = [_Branch(branch, mode, vehicle.drift_limit) for branch in vehicle.branches]
+        self._branches = [_Branch(branch, mode) for branch in vehicle.branches]
         read = [branch.message.name for branch in vehicle.branches]
         auxiliaries = [branch.voltage for branch in vehicle.branches if branch.voltage is not None]
         self._voltage = auxiliaries[0] if auxiliaries else None
-        read += [item[0].name for item in (self._voltage, vehicle.temperature) if item is not None]
+        read += [] if self._voltage is None else [self._voltage[0].name]
         self._sources = {
             message.key: _Source(message, database.message(message.name))
             for message in vehicle.sources
@@ -252,7 +215,6 @@ class Oracle:
         self._targets = {message.name: (message, database.message(message.name)) for message in vehicle.targets}
         self._counters = dict.fromkeys(self._targets, -1)
         self._voltage_code: int | None = None
-        self._temperature: Fraction | None = None
 
     def problem(self, frame: FuzzFrame, sent: Sequence[FuzzFrame]) -> str | None:
         """Take a frame and what the node sent for it.
@@ -278,7 +240,7 @@ class Oracle:
         found = source.state.take(frame.data)
         codes = source.codes(frame.data)
         if found == "usable":
-            self._take_auxiliaries(source, codes)
+            self._take_voltage(source, codes)
         if found == "usable" or (self._gateway and self._passes_invalid and found == "out of order"):
             self._take_branches(source, codes, len(frame.data))
             return self._rewritten(source, codes, frame, sent) if self._gateway else self._answered(source, sent)
@@ -294,19 +256,11 @@ class Oracle:
     def _own(self, source: _Source) -> list[_Branch]:
         return [branch for branch in self._branches if branch.branch.message is source.message]
 
-    def _take_auxiliaries(self, source: _Source, codes: dict[str, int]) -> None:
-        """Take voltage and temperature; they come before the branches of the same frame."""
+    def _take_voltage(self, source: _Source, codes: dict[str, int]) -> None:
+        """Take the voltage; it comes before the branches of the same frame."""
         if self._voltage is not None and self._voltage[0] is source.message and self._voltage[1].name in codes:
             code = codes[self._voltage[1].name]
             self._voltage_code = code if _worth(self._voltage[1]).is_value(code) else None
-        heat = self._vehicle.temperature
-        if heat is not None and heat[0] is source.message and heat[1].name in codes:
-            worth, code = _worth(heat[1]), codes[heat[1].name]
-            before, self._temperature = self._temperature, worth.scale * code + worth.offset
-            if not worth.is_value(code):
-                self._temperature = None
-            for branch in self._branches if self._temperature != before else ():
-                branch.at_temperature(self._voltage_code, self._temperature)
 
     def _take_branches(self, source: _Source, codes: dict[str, int], size: int) -> None:
         """Take the branches; one whose bits are beyond the end has no value."""
@@ -314,7 +268,7 @@ class Oracle:
             if size < branch.least_size:
                 branch.spoil()
             elif branch.branch.source.name in codes:
-                branch.take(codes[branch.branch.source.name], self._voltage_code, self._temperature)
+                branch.take(codes[branch.branch.source.name], self._voltage_code)
 
     def _rewritten(
         self, source: _Source, codes: dict[str, int], frame: FuzzFrame, sent: Sequence[FuzzFrame]

@@ -1,8 +1,8 @@
 """Random vehicles for the node's fuzz test: DBC, layout and parameters with all that the node knows, drawn from a seed.
 
 Signals of 1 to 64 bits in both byte orders and on any bit, multiplexed or not, with negative factors, ranges and named
-codes; powers with their voltage; sensors with a gain by sign or by temperature; every profile of protection; messages
-of 1 to 64 bytes with 11 and 29 bits of identifier.
+codes; powers with their voltage; every profile of protection; messages of 1 to 64 bytes with 11 and 29 bits of
+identifier.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,6 @@ from bench.true_parameters import true_parameters
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters, VehicleParameters
-from ecu_node.sensor_models import GainBySign, SensorModel, TemperatureDrift
 
 __all__ = ["FuzzBranch", "FuzzMessage", "FuzzSignal", "FuzzVehicle", "draw_vehicle"]
 
@@ -228,7 +227,6 @@ class FuzzBranch:
     apply: bool = True
     drift: float = 0.0
     offset_a: float = 0.0
-    model: SensorModel | None = None
 
 
 @dataclass(kw_only=True)
@@ -238,7 +236,6 @@ class FuzzVehicle:
     sources: list[FuzzMessage]
     targets: list[FuzzMessage]
     branches: list[FuzzBranch]
-    temperature: tuple[FuzzMessage, FuzzSignal] | None
     on_bad_frame: str
     drift_limit: float = 0.4
 
@@ -263,13 +260,8 @@ class FuzzVehicle:
             f'schema = 1\nname = "fuzz"\ndbc = "fuzz.dbc"\nfull_scale_a = {_FULL_SCALE_A}',
             f'max_age_s = {_FOREVER_S}\non_bad_frame = "{self.on_bad_frame}"',
         ]
-        if self.temperature is not None:
-            lines.append('temperature = "heat"')
         lines.append(f"watch = {{ window_s = 3600.0, margin_a = {_FOREVER_S} }}")
         lines.append(f"limits = {{ drift = {self.drift_limit}, offset_a = {_OFFSET_LIMIT_A} }}")
-        if self.temperature is not None:
-            message, signal = self.temperature
-            lines.append(f'[[input]]\nname = "heat"\nsignal = "{message.name}.{signal.name}"')
         for branch in self.branches:
             kind = "signal" if branch.voltage is None else "power"
             lines.append(f'[[branch]]\nname = "{branch.name}"\nsign = {branch.sign}\ntimeout_s = {_FOREVER_S}')
@@ -292,12 +284,7 @@ class FuzzVehicle:
         known = [item for item in self.branches if item.known]
         return true_parameters(
             database,
-            {
-                item.name: BranchParameters(
-                    drift=item.drift, offset_a=item.offset_a, apply=item.apply, sensor_model=item.model
-                )
-                for item in known
-            },
+            {item.name: BranchParameters(drift=item.drift, offset_a=item.offset_a, apply=item.apply) for item in known},
         )
 
 
@@ -316,10 +303,9 @@ def _draw(rng: Random) -> FuzzVehicle:
         sources=sources,
         targets=[_draw_message(rng, f"Out{k}", keys, least_size=8) for k in range(rng.randint(1, 3))],
         branches=[],
-        temperature=_draw_auxiliary(rng, sources, "Heat", "degC", ("1", "0.5")) if rng.random() < 0.3 else None,
         on_bad_frame=rng.choice(("hold", "invalid")),
     )
-    net = _draw_auxiliary(rng, sources, "Net", "V", ("0.01", "0.5", "-0.1")) if rng.random() < 0.5 else None
+    net = _draw_voltage(rng, sources) if rng.random() < 0.5 else None
     for number in range(rng.randint(2, 6)):
         message = rng.choice(sources)
         length = rng.choice(_LENGTHS)
@@ -331,7 +317,7 @@ def _draw(rng: Random) -> FuzzVehicle:
             branch.voltage = net
         _draw_codes(rng, source, ("W", "kW") if branch.voltage is not None else ("A", "mA", ""))
         _draw_names(rng, source)
-        _draw_fault(rng, branch, has_temperature=vehicle.temperature is not None)
+        _draw_fault(rng, branch)
         branch.target = _draw_target(rng, branch, vehicle.targets) if rng.random() < 0.9 else None
         vehicle.branches.append(branch)
     if all(branch.target is None for branch in vehicle.branches):
@@ -347,8 +333,7 @@ def _draw(rng: Random) -> FuzzVehicle:
 def _used(vehicle: FuzzVehicle) -> list[FuzzMessage]:
     found = [branch.message for branch in vehicle.branches]
     found += [branch.voltage[0] for branch in vehicle.branches if branch.voltage is not None]
-    found += [branch.target[0] for branch in vehicle.branches if branch.target is not None]
-    return [*found, *([vehicle.temperature[0]] if vehicle.temperature is not None else [])]
+    return found + [branch.target[0] for branch in vehicle.branches if branch.target is not None]
 
 
 def _draw_message(rng: Random, name: str, keys: set[tuple[int, bool]], least_size: int = 1) -> FuzzMessage:
@@ -371,15 +356,12 @@ def _draw_message(rng: Random, name: str, keys: set[tuple[int, bool]], least_siz
     return message
 
 
-def _draw_auxiliary(
-    rng: Random, sources: Sequence[FuzzMessage], name: str, unit: str, scales: Sequence[str]
-) -> tuple[FuzzMessage, FuzzSignal] | None:
+def _draw_voltage(rng: Random, sources: Sequence[FuzzMessage]) -> tuple[FuzzMessage, FuzzSignal] | None:
     message = rng.choice(sources)
-    signal = message.draw_signal(rng, name, rng.choice((6, 8, 12)), multiplexed=rng.random() < 0.5)
+    signal = message.draw_signal(rng, "Net", rng.choice((6, 8, 12)), multiplexed=rng.random() < 0.5)
     if signal is None:
         return None
-    signal.unit, signal.scale, signal.signed = unit, rng.choice(scales), rng.random() < 0.3
-    signal.offset = "-40" if unit == "degC" else "0"
+    signal.unit, signal.scale, signal.signed = "V", rng.choice(("0.01", "0.5", "-0.1")), rng.random() < 0.3
     _draw_names(rng, signal)
     signal.unnamed = []  # that is for branches
     return message, signal
@@ -418,16 +400,10 @@ def zero_code(signal: FuzzSignal) -> int:
     return min(max(code.numerator // code.denominator, lowest), highest)
 
 
-def _draw_fault(rng: Random, branch: FuzzBranch, *, has_temperature: bool) -> None:
+def _draw_fault(rng: Random, branch: FuzzBranch) -> None:
     branch.known, branch.apply = rng.random() < 0.95, rng.random() < 0.9
     branch.drift = rng.choice((0.0, 0.02, round(rng.uniform(-0.4, 0.4), 4)))
     branch.offset_a = rng.choice((0.0, 3.0, round(rng.uniform(-50.0, 50.0), 3)))
-    chance = rng.random()
-    if chance < 0.15:
-        gains = [round(rng.uniform(-0.3, 0.3), 3) for _ in range(2)]
-        branch.model = GainBySign(drift_positive=gains[0], drift_negative=gains[1])
-    elif chance < 0.5 and has_temperature:
-        branch.model = TemperatureDrift(drift_per_k=round(rng.uniform(-0.01, 0.01), 5), reference_c=25.0)
 
 
 def _draw_target(

@@ -6,7 +6,7 @@ known hyper-parameters, estimated from the same fleet before: explanations, esti
 measured in seconds of processor time on one thread, the best of some runs.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import process_time
 
@@ -16,12 +16,9 @@ from threadpoolctl import threadpool_limits
 from bench.row import Row
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
-from calibrator.evidence.rows import UNKNOWN_VARIANCE, FleetRows, constant_design, relative_design
-from calibrator.posterior.decision import best_estimate, harm_probability
-from calibrator.posterior.estimate import Moments, estimate_fleet
-from calibrator.posterior.hyperparameters import Hyperparameters, estimate_hyperparameters
-from calibrator.posterior.spread_starts import initial_spreads
-from calibrator.posterior.states import enumerate_states
+from calibrator.estimator.fleet_estimate import estimate_rows
+from calibrator.estimator.learning import Law, learn_laws
+from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows, constant_design, relative_design
 from calibrator.published.basis_pursuit import BasisPursuit
 from calibrator.published.enumeration import l1_optimum
 
@@ -86,7 +83,7 @@ def _rows(*, quick: bool) -> Iterator[Row]:
 
 @dataclass(frozen=True)
 class _Fleet:
-    rows: FleetRows
+    rows: EvidenceRows
     sparsity: float
 
 
@@ -138,25 +135,19 @@ def _slopes_and_intercepts(fleet: _Fleet) -> tuple[Array, Array]:
 
 
 def _posterior_s(fleet: _Fleet) -> float:
-    """Time per vehicle. [s]"""
-    learnt = estimate_hyperparameters(fleet.rows, initial_spreads(fleet.rows)[:1])
-    return _best_s(lambda: _decide(fleet.rows, learnt)) / len(fleet.rows)
+    """Time per vehicle, once the laws of the fleet are known. [s]"""
+    laws = learn_laws(fleet.rows, feed=0)
+    return _best_s(lambda: _estimate(fleet.rows, laws)) / len(fleet.rows)
 
 
-def _decide(rows: FleetRows, learnt: Hyperparameters) -> None:
-    states = enumerate_states(rows, learnt.prior, learnt.spread)
-    state, _ = best_estimate(states, least=(learnt.prior.relative.low, learnt.prior.constant.low))
-    chosen = (np.arange(len(rows)), state)
-    shape = (len(rows), 2, rows.branches)
-    mean, square = np.full(shape, MEAN), np.full(shape, MEAN_SQUARE)
-    harm_probability(states, states.drift[chosen], states.offset[chosen], mean=mean, mean_square=square)
+def _estimate(rows: EvidenceRows, laws: Sequence[Law]) -> None:
+    mean, square = np.full((len(rows), rows.branches), MEAN), np.full((len(rows), rows.branches), MEAN_SQUARE)
+    estimate_rows(rows, laws, feed=0, mean=mean, mean_square=square, usual=np.stack([mean[0], square[0]]))
 
 
 def _fleet_s(fleet: _Fleet) -> float:
     """Time of the whole fleet. [s]"""
-    shape = (len(fleet.rows), fleet.rows.branches)
-    moments = Moments(mean_a=np.full(shape, MEAN), mean_square_a2=np.full(shape, MEAN_SQUARE))
-    return _best_s(lambda: estimate_fleet(fleet.rows, moments, full_scale_a=1.0))
+    return _best_s(lambda: _estimate(fleet.rows, learn_laws(fleet.rows, feed=0)))
 
 
 def _simulated(branches: int, vehicles: int, sparsity: float) -> _Fleet:
@@ -176,7 +167,8 @@ def _simulated(branches: int, vehicles: int, sparsity: float) -> _Fleet:
     first[:, 2 * K - 1 :], second[:, K + 1 :] = 0.0, 0.0
     second *= np.concatenate([factor, factor[:, :1], factor], axis=1)
     covariance = np.tile(np.diag(sd**2), (vehicles, 1, 1))
-    return _Fleet(FleetRows(relative=first, constant=second, covariance=covariance), sparsity)
+    rows = EvidenceRows(relative=first, constant=second, covariance=covariance, means=np.zeros((vehicles, 2, K)))
+    return _Fleet(rows, sparsity)
 
 
 def main() -> None:

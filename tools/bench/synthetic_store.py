@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from calibrator.artificial.random_fleet import draw_faults
-from calibrator.calibration.in_order import Workers
 from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
+from calibrator.estimator.workers import Workers
 from calibrator.experiments.recorded_fleet import builtin_fleet
 from calibrator.experiments.recorded_trial import RecordedCase, record_vehicles
 from calibrator.faults import Faults

@@ -10,7 +10,6 @@ from msgspec.structs import replace
 
 from chain.fleet import ChainFleet
 from chain.node_drive import BranchTrace, NodeDrive, drive_through
-from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.guard import Mode
 from ecu_node.in_force import InForce, sensor_fault
@@ -167,8 +166,7 @@ def drive_vehicle(
         measured_a=max((after[branch].measured_a for branch in corrected if passed), default=0.0),
         published_a=max((after[branch].published_a for branch in corrected if passed), default=0.0),
         wrong={
-            kind: WrongSet(passed=trial.passed, worse=_is_worse(sets[kind], database, traces))
-            for kind, trial in trials.items()
+            kind: WrongSet(passed=trial.passed, worse=_is_worse(sets[kind], traces)) for kind, trial in trials.items()
         },
     )
 
@@ -198,10 +196,10 @@ def _turned(parameters: VehicleParameters) -> VehicleParameters:
     return replace(parameters, branches={name: turned(branch) for name, branch in parameters.branches.items()})
 
 
-def _is_worse(parameters: VehicleParameters, database: VehicleDatabase, traces: Mapping[str, BranchTrace]) -> bool:
+def _is_worse(parameters: VehicleParameters, traces: Mapping[str, BranchTrace]) -> bool:
     """Whether a set would make a branch worse."""
     for name, trace in traces.items():
-        fault = sensor_fault(database, InForce(parameters=parameters), name)
+        fault = sensor_fault(InForce(parameters=parameters), name)
         if not fault.applied:
             continue
         published_a = (trace.measured_a - fault.offset_a) / (1.0 + fault.drift)

@@ -1,5 +1,6 @@
 import json
 import platform
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,20 +8,26 @@ import pytest
 from rich.console import Console
 
 from calibrator.errors import FleetError
+from calibrator.experiments.baselines import BASELINES
 from calibrator.experiments.calibration_experiment import ALL, calibration_experiment
-from calibrator.experiments.delay_experiment import LEFT_IN, delay_experiment
+from calibrator.experiments.command import ExperimentName
+from calibrator.experiments.delay_experiment import delay_experiment
 from calibrator.experiments.judging import Effort
-from calibrator.experiments.methods import CEILING, PERFECT, POSTERIOR
+from calibrator.experiments.methods import CEILING, LEFT_IN, PERFECT, POSTERIOR
 from calibrator.experiments.paper_experiments import classifier_experiment, snr_experiment
-from calibrator.experiments.recorded_experiments import data_experiment, phase_experiment, real_experiment
+from calibrator.experiments.recorded_experiments import (
+    attacks_experiment,
+    coverage_experiment,
+    data_experiment,
+    phase_experiment,
+    real_experiment,
+)
 from calibrator.experiments.recorded_fleet import RecordedFleet
 from calibrator.experiments.recorded_trial import RecordedCase
-from calibrator.experiments.records import read_results, write_result
 from calibrator.experiments.result import ExperimentResult, Figure, decode_result
-from calibrator.experiments.runner import EXPERIMENTS, RunOptions, run_experiments
+from calibrator.experiments.runner import EXPERIMENTS, RunOptions, read_results, run_experiments, write_result
 from calibrator.experiments.table import DETAILS, caption, headline, result_markdown, result_table
 from calibrator.experiments.trial import FleetLaw
-from calibrator.options import ExperimentName
 from ecu_node import __version__
 from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, smooth_drive
 
@@ -77,7 +84,7 @@ def test_console_table_fits_80_columns(fleet: RecordedFleet) -> None:
 def test_page_holds_all_figures_of_all_methods(snr: ExperimentResult) -> None:
     page = result_markdown(snr)
     tenths = {b.low for row in snr.rows for b in row.bins}
-    assert page.count("\n| ") == 2 + 2 + 2 + len(snr.rows) + 2 + len(tenths)
+    assert page.count("\n| ") == 2 + 2 + (2 + 2) + 2 + len(snr.rows) + 2 + len(tenths)
     assert "(0.91)" in page
     assert "harmed" in page
 
@@ -92,7 +99,7 @@ def test_captions_explain_the_columns_that_are_there_and_no_others(snr: Experime
     assert "in some branch (deployed)" in page
     assert "the figures above" not in page
     pooled = result_markdown(calibration_experiment([snr]))
-    assert "within 10 %: the default (posterior). Of the default: mean confidence, share of vehicles above" in pooled
+    assert "within 10 %: the default (posterior). Of the default: mean confidence, of the vehicles above 0.95" in pooled
     assert "count once in 'all together'" in pooled
     for absent in ("paper", "published", "f2", "hardware", "(deployed)", "(harmed)", "25 %"):
         assert absent not in pooled.partition("Settings:")[0]
@@ -105,7 +112,7 @@ def test_captions_name_every_column(snr: ExperimentResult) -> None:
     result = replace(snr, rows=tuple(replace(row, figures=figures) for row in (*snr.rows, *more)))
     text = caption([result])
     columns = ("law known", "delays left in")
-    sure = ("mean confidence", "above 0.95", "their mean confidence", "of them that is recovered")
+    sure = ("mean confidence", "above 0.95 those not recovered, and how many they expect")
     for words in (*columns, *sure, "ECE", "by chance", "(deployed)", "(harmed)", "error of the estimated delays"):
         assert words in text
     details = result_markdown(result).partition("Of each method: ")[2].partition("\n")[0]
@@ -265,10 +272,43 @@ def test_experiments_on_recorded_trips_write_their_pictures(fleet: RecordedFleet
     for result in results:
         write_result(tmp_path / "results", result, tuple(EXPERIMENTS))
         ceiling = (CEILING.name,) if result.name == "real" else ()
-        assert result.methods == (PERFECT.name, POSTERIOR.name, *ceiling)
+        more = tuple(method.name for method in BASELINES) if result.name == "real" else ()
+        assert result.methods == (PERFECT.name, *more, POSTERIOR.name, *ceiling)
         assert (tmp_path / "results" / f"{result.name}.png").is_file()
-    same = [result.rows[1].figures["recovery_rate"] for result in results[:2]]
+    same = [
+        result.row(x=80.0, series=series, method=POSTERIOR.name).figures["recovery_rate"]
+        for result, series in zip(results, ("K=2, 5-25 %", "5-25"), strict=False)
+    ]
     assert same[0] == same[1]
+
+
+def test_attacks_are_counted_with_bounds_and_drawn(fleet: RecordedFleet, tmp_path: Path) -> None:
+    worlds = ("load 5 A in 30%", "second variant x1.10 in 50%")
+    more = replace(fleet, trips=fleet.trips + small_fleet(trips=12, samples=1800).trips[6:])
+    result = attacks_experiment(fleet=more, worlds=worlds, branches=(2,), effort=ONCE)
+    write_result(tmp_path / "results", result, tuple(EXPERIMENTS))
+    header, rows = headline(result)
+    assert header[:4] == ["world", "K", POSTERIOR.name, "corrected"]
+    assert {"worst [A]", "named", "misnamed"} < set(header)
+    assert [row[0] for row in rows] == list(worlds)
+    assert re.search(r"\d of \d+, at most 0\.\d+\)", (tmp_path / "results" / "attacks.md").read_text())
+    assert (tmp_path / "results" / "attacks.png").is_file()
+
+
+def test_coverage_has_the_settings_of_real_and_the_own_prior(fleet: RecordedFleet, tmp_path: Path) -> None:
+    cases = (RecordedCase(), RecordedCase(balanced=False))
+    few = coverage_experiment(fleet=fleet, cases=cases[:1], effort=ONCE)  # so few that nothing is deployed
+    write_result(tmp_path / "results", few, tuple(EXPERIMENTS))
+    result = coverage_experiment(fleet=small_fleet(samples=1800), cases=cases, effort=ONCE)
+    scores = ("gain_beyond_3", "offset_beyond_3")
+    assert [row.series for row in result.rows] == ["K=2, 5-25 %", "K=2, 5-25 %, any vehicle", "K=2, own prior"]
+    assert all(
+        sum(row.pit) == sum(row.figures[name].of or 0 for name in scores if name in row.figures) for row in result.rows
+    )
+    write_result(tmp_path / "results", result, tuple(EXPERIMENTS))
+    page = (tmp_path / "results" / "coverage.md").read_text()
+    assert "by tenths of their probability integral transform" in page
+    assert (tmp_path / "results" / "coverage.png").is_file()
 
 
 def test_delay_experiment_shows_the_default_with_and_without_compensation(fleet: RecordedFleet) -> None:

@@ -62,8 +62,8 @@ def printed(result: ExperimentResult) -> str:
 def test_own_methods_alone_are_named_beside_the_paper() -> None:
     result = run(Own(), Own("other"))
     header, rows = headline(result)
-    assert header == ["sparsity S [%]", "paper", "own", "other"]
-    assert rows[0][:2] == ["60", "0.91"]
+    assert header == ["reading of S", "sparsity S [%]", "paper", "own", "other"]
+    assert [row[:3] for row in rows] == [["", "60", "0.91"], ["3 of 6", "60", "0.91"]]
     for text in (printed(result), result_markdown(result)):
         names = "own (a method of one's own) and other (a method of one's own)."
         assert f"within 10 %: the paper's best printed figure, {names}" in text
@@ -72,7 +72,7 @@ def test_own_methods_alone_are_named_beside_the_paper() -> None:
 
 
 def test_best_figure_of_the_paper_does_not_depend_on_the_methods() -> None:
-    best = {methods: headline(run(*methods))[1][0][1] for methods in ((PERFECT,), (Own(), PERFECT), (Own(),))}
+    best = {methods: headline(run(*methods))[1][0][2] for methods in ((PERFECT,), (Own(), PERFECT), (Own(),))}
     assert set(best.values()) == {"0.91"}
 
 

@@ -15,7 +15,6 @@ from ecu_node.guard import Mode, key_of
 from ecu_node.in_force import InForce
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters, VehicleParameters, write_parameters
-from ecu_node.sensor_models import SensorModel
 from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
 
@@ -28,12 +27,6 @@ def checked_with(database: VehicleDatabase, parameters: VehicleParameters, folde
     """Parameters written to a file and read as the export reads them."""
     write_parameters(parameters, folder / "v1.json")
     return read_checked(folder / "v1.json", database, None)
-
-
-def with_branch(parameters: VehicleParameters, name: str, model: SensorModel | None = None) -> VehicleParameters:
-    """The same parameters, with a sensor model for one of the branches."""
-    found = replace(parameters.branches[name], sensor_model=model)
-    return replace(parameters, branches={**parameters.branches, name: found})
 
 
 def held_back(parameters: VehicleParameters, name: str) -> VehicleParameters:
@@ -96,5 +89,4 @@ __all__ = [
     "needs_compiler",
     "parameters_for",
     "unprotected",
-    "with_branch",
 ]

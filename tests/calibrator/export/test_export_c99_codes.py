@@ -11,12 +11,10 @@ from msgspec.structs import replace
 from bench.c99_driver import COMPILER, FLAGS, NO_CODE
 from calibrator.errors import ExportError
 from calibrator.export.c99 import HEADER, SOURCE, c99_files
-from calibrator.export.c_model import CBranch, SignRule
+from calibrator.export.c_model import CBranch
 from ecu_node.codes import Codes
-from ecu_node.correction import IntegerPlan
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, ParameterError
-from ecu_node.sensor_models import GainBySign, TemperatureDrift
 from tests.calibrator.export.exports import (
     MakeDatabase,
     checked_with,
@@ -24,7 +22,6 @@ from tests.calibrator.export.exports import (
     held_back,
     needs_compiler,
     parameters_for,
-    with_branch,
 )
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT
 
@@ -35,17 +32,13 @@ EXTREMES = (-(1 << 63), -(1 << 63) + 1, -(1 << 32), -1, 0, 1, (1 << 31) - 1, (1 
 
 
 def by_the_plan(branch: CBranch, code: int, voltage_code: int) -> int:
-    """What the node writes for a code, where the plan does not depend on a temperature."""
-    if not branch.plans or not branch.codes.is_value(code):
+    """What the node writes for a code."""
+    plan, voltage = branch.plan, branch.voltage
+    if plan is None or not branch.codes.is_value(code):
         return code
-    if branch.needs_voltage and not (branch.voltage is not None and branch.voltage.codes.is_value(voltage_code)):
-        return code
-    chosen = branch.plans[0]
-    if isinstance(branch.rule, SignRule):
-        rule = branch.rule
-        chosen = branch.plans[code * rule.of_code + voltage_code * rule.of_voltage + rule.constant < 0]
-    assert isinstance(chosen, IntegerPlan)
-    return chosen.apply(code, voltage_code if branch.needs_voltage else 0)
+    if not plan.needs_voltage:
+        return plan.apply(code)
+    return plan.apply(code, voltage_code) if voltage is not None and voltage.codes.is_value(voltage_code) else code
 
 
 def width(codes: Codes) -> range:
@@ -58,7 +51,7 @@ def test_all_codes_of_every_branch_are_those_of_its_plan(tmp_path: Path, databas
     export = compiled(database, parameters, tmp_path)
     for branch in export.program.branches:
         codes = width(branch.codes)
-        found = export.codes(branch.name, [(code, NO_CODE, NO_CODE) for code in codes])
+        found = export.codes(branch.name, [(code, NO_CODE) for code in codes])
         assert found == [by_the_plan(branch, code, NO_CODE) for code in codes]
         assert (found == list(codes)) == (branch.name == "motor_rear")
 
@@ -67,11 +60,10 @@ def test_all_codes_of_every_branch_are_those_of_its_plan(tmp_path: Path, databas
 def test_a_power_takes_every_voltage(make_database: MakeDatabase, tmp_path: Path) -> None:
     database, rng = make_database(), Random(1)
     parameters = parameters_for(database, **SMALL_FAULTS)
-    parameters = with_branch(parameters, "heater", GainBySign(drift_positive=0.02, drift_negative=-0.03))
     export = compiled(database, parameters, tmp_path)
     heater = export.program.branches[2]
     pairs = [(rng.randrange(1 << 16), rng.randrange(1 << 16)) for _ in range(50_000)]
-    found = export.codes("heater", [(*pair, NO_CODE) for pair in pairs])
+    found = export.codes("heater", pairs)
     assert found == [by_the_plan(heater, *pair) for pair in pairs]
 
 
@@ -79,16 +71,12 @@ def test_a_power_takes_every_voltage(make_database: MakeDatabase, tmp_path: Path
 def test_no_code_is_undefined_behaviour(make_database: MakeDatabase, tmp_path: Path) -> None:
     wide = SMALL_DBC.replace("7|16@0- (0.1,0) [-3000|3000]", "7|32@0- (0.001,0) [0|0]").replace("23|16@0-", "39|16@0-")
     database = make_database(dbc=wide.replace("VAL_ 256 Battery -32768", f"VAL_ 256 Battery {-1 << 31}"))
-    parameters = with_branch(
-        parameters_for(database, **SMALL_FAULTS), "motor", GainBySign(drift_positive=0.02, drift_negative=-0.03)
-    )
-    export = compiled(database, parameters, tmp_path, flags=UNDEFINED_IS_FATAL)
+    export = compiled(database, parameters_for(database, **SMALL_FAULTS), tmp_path, flags=UNDEFINED_IS_FATAL)
     for branch in export.program.branches:
         whole = width(branch.codes)
         codes = (*whole[:: max(1, len(whole) >> 12)], *EXTREMES)
-        given = [(code, voltage, NO_CODE) for code in codes for voltage in EXTREMES]
-        found = export.codes(branch.name, given)
-        assert found == [by_the_plan(branch, code, voltage) for code, voltage, _ in given]
+        given = [(code, voltage) for code in codes for voltage in EXTREMES]
+        assert export.codes(branch.name, given) == [by_the_plan(branch, *pair) for pair in given]
     rng = Random(2)
     assert len(export.frames([("Pair", rng.randbytes(8)) for _ in range(10_000)])) == 10_000
 
@@ -161,28 +149,6 @@ def test_a_signal_too_wide_is_refused_by_name(make_database: MakeDatabase, tmp_p
     assert "hv_correct_battery(int64_t code)" in c99_files(passing)[SOURCE], (
         "nothing is computed of what passes through"
     )
-
-
-def test_a_temperature_of_many_codes_is_refused_by_name(tmp_path: Path, make_database: MakeDatabase) -> None:
-    layout = SMALL_LAYOUT + '\n[[input]]\nname = "heat"\nsignal = "Net.Heat"\n'
-    layout = layout.replace("full_scale_a", 'temperature = "heat"\nfull_scale_a')
-    dbc = SMALL_DBC.replace("Net: 2 Node\n", 'Net: 4 Node\n SG_ Heat : 16|16@1+ (0.01,-40) [0|0] "degC" Node\n')
-    database = make_database(layout, dbc)
-    model = TemperatureDrift(drift_per_k=0.001, reference_c=25.0)
-    checked = checked_with(database, with_branch(parameters_for(database, **SMALL_FAULTS), "motor", model), tmp_path)
-    with pytest.raises(ExportError, match=r"branch motor: its temperature signal Heat has 65536 codes .* at most 1024"):
-        c99_files(checked)
-
-
-def test_a_sign_that_takes_too_many_bits_is_refused(make_database: MakeDatabase, tmp_path: Path) -> None:
-    database = make_database()
-    parameters = parameters_for(database, heater=(0.0, 1.2345678901234567))
-    model = GainBySign(drift_positive=0.02, drift_negative=-0.03)
-    checked = checked_with(database, with_branch(parameters, "heater", model), tmp_path)
-    with pytest.raises(
-        ExportError, match=r"branch heater: the sign of its current, .*; write its offset with fewer digits"
-    ):
-        c99_files(checked)
 
 
 def test_what_the_gateway_refuses_is_refused(make_database: MakeDatabase, tmp_path: Path) -> None:

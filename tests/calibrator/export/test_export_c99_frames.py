@@ -3,14 +3,11 @@
 from pathlib import Path
 from random import Random
 
-import pytest
-
 from bench.c99_driver import CompiledExport
 from bench.node_fuzz_vehicles import FuzzVehicle, draw_vehicle
 from calibrator.errors import ExportError
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
-from ecu_node.sensor_models import GainBySign, TemperatureDrift
 from tests.calibrator.export.exports import (
     MakeDatabase,
     assert_same,
@@ -21,7 +18,6 @@ from tests.calibrator.export.exports import (
     needs_compiler,
     parameters_for,
     unprotected,
-    with_branch,
 )
 from tests.ecu_node.vehicles import SMALL_DBC, decoded, protected
 
@@ -85,35 +81,9 @@ def _values(database: VehicleDatabase, payload: bytes) -> dict[str, float]:
     return {name: value for name, value in found.items() if name not in {"Crc", "AliveCounter"}}
 
 
-def test_each_sign_has_its_gain(tmp_path: Path) -> None:
-    database = unprotected(tmp_path)
-    parameters = demo_parameters(database)
-    for name in ("battery", "motor"):
-        parameters = with_branch(parameters, name, GainBySign(drift_positive=0.08, drift_negative=-0.045))
-    frames = [
-        (name, b"\0\0" + code.to_bytes(2, "little") + bytes(4))
-        for name in ("HV_Battery", "HV_Motor")
-        for code in range(1 << 16)
-    ]
-    assert_same(compiled(database, parameters, tmp_path), frames)
-
-
-def test_each_temperature_has_its_gain(tmp_path: Path) -> None:
-    database, rng = unprotected(tmp_path), Random(3)
-    parameters = demo_parameters(database)
-    for name in ("battery", "motor"):
-        parameters = with_branch(parameters, name, TemperatureDrift(drift_per_k=0.0041, reference_c=25.0))
-    frames = random_frames(rng, ("HV_Battery", "HV_Motor"), 50_000)
-    assert assert_same(compiled(database, parameters, tmp_path), frames) > 10_000
-
-
-@pytest.mark.parametrize("model", [None, GainBySign(drift_positive=0.08, drift_negative=-0.045)])
-def test_a_power_is_corrected_with_its_voltage(
-    make_database: MakeDatabase, tmp_path: Path, model: GainBySign | None
-) -> None:
+def test_a_power_is_corrected_with_its_voltage(make_database: MakeDatabase, tmp_path: Path) -> None:
     database, rng = make_database(), Random(4)
     parameters = parameters_for(database, battery=(0.05, 2.3), motor=(-0.031, 1.0), heater=(0.04, -2.0))
-    parameters = with_branch(parameters, "heater", model)
     frames = [
         rng.choice(
             [("Heater", rng.randbytes(4)), ("Net", rng.randbytes(2)), ("Net", b"\x40"), ("Pair", rng.randbytes(8))]

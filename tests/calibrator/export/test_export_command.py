@@ -19,8 +19,7 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError, UserError
 from ecu_node.layout import file_digest
 from ecu_node.parameters import encode_parameters, write_parameters
-from ecu_node.sensor_models import TemperatureDrift
-from tests.calibrator.export.exports import MakeDatabase, parameters_for, with_branch
+from tests.calibrator.export.exports import MakeDatabase, parameters_for
 from tests.ecu_node.vehicles import LAYOUT
 
 NAMES = {"dcm": ["v1.dcm"], "cdfx": ["v1.cdfx"], "csv": ["v1.csv"], "c99": ["hv_correction.c", "hv_correction.h"]}
@@ -150,15 +149,3 @@ def test_names_that_are_no_text_are_written_escaped(database: VehicleDatabase, t
         check=False,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, f"{tmp_path}/o\\udcff.csv\n", "")
-
-
-def test_what_is_not_corrected_is_told(make_database: MakeDatabase, tmp_path: Path) -> None:
-    database = make_database()
-    model = TemperatureDrift(drift_per_k=0.001, reference_c=25.0)
-    parameters = with_branch(parameters_for(database, battery=(0.05, 2.3)), "battery", model)
-    write_parameters(parameters, tmp_path / "v1.json")
-    run = export(tmp_path / "v1.json", "--format", "csv", "--output", tmp_path / "out.csv", layout=database.layout.path)
-    assert run.exit_code == 0
-    assert run.stderr.startswith(
-        "notice: v1.json: branch battery is passed through: its fault depends on the temperature"
-    )

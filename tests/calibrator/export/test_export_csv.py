@@ -9,8 +9,7 @@ from msgspec.structs import replace
 from calibrator.errors import ExportError
 from calibrator.export.csv_table import COLUMNS, csv_text
 from ecu_node.database import VehicleDatabase
-from ecu_node.sensor_models import TemperatureDrift
-from tests.calibrator.export.exports import checked_with, held_back, parameters_for, with_branch
+from tests.calibrator.export.exports import checked_with, held_back, parameters_for
 
 
 def rows(text: str) -> list[dict[str, str]]:
@@ -28,13 +27,12 @@ def test_each_branch_is_a_row_with_what_was_found(database: VehicleDatabase, tmp
         "offset_a": "-1.5",
         "applied": "true",
     }
-    assert [motor[name] for name in ("drift", "drift_sd", "offset_sd_a", "applied", "held_back", "sensor_model")] == [
+    assert [motor[name] for name in ("drift", "drift_sd", "offset_sd_a", "applied", "held_back")] == [
         "0.2",
         "0.01",
         "",
         "false",
         "harm limit",
-        "linear",
     ]
 
 
@@ -67,11 +65,3 @@ def test_where_it_comes_from_stands_in_every_row(database: VehicleDatabase, tmp_
     checked = checked_with(database, parameters_for(database, battery=(0.05, -1.5), motor=(0.0, 0.0)), tmp_path)
     for row in rows(csv_text([checked])):
         assert {name: row[name] for name in checked.provenance} == checked.provenance
-
-
-def test_a_sensor_that_is_not_linear_has_its_columns(database: VehicleDatabase, tmp_path: Path) -> None:
-    model = TemperatureDrift(drift_per_k=0.001, reference_c=25.0)
-    parameters = with_branch(parameters_for(database, battery=(0.05, -1.5)), "battery", model)
-    (row,) = rows(csv_text([checked_with(database, parameters, tmp_path)]))
-    found = [row[name] for name in ("sensor_model", "drift_per_k", "reference_c", "drift_positive")]
-    assert found == ["temperature", "0.001", "25.0", ""]

@@ -12,8 +12,7 @@ from calibrator.errors import ExportError
 from calibrator.export.dcm import dcm_text
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
-from ecu_node.sensor_models import GainBySign, TemperatureDrift
-from tests.calibrator.export.exports import MakeDatabase, checked_with, held_back, parameters_for, with_branch
+from tests.calibrator.export.exports import checked_with, held_back, parameters_for
 
 FAULTS = {"battery": (0.05, 2.3), "motor": (-1.23456789012345e-05, -1e-7)}
 
@@ -69,17 +68,6 @@ def test_units_functions_and_limits_are_read_back(database: VehicleDatabase, tmp
     assert (function.name, function.version) == ("HV_current_correction", "300")
 
 
-def test_sensors_that_are_not_linear_have_their_own_numbers(database: VehicleDatabase, tmp_path: Path) -> None:
-    parameters = with_branch(
-        parameters_for(database, **FAULTS), "battery", GainBySign(drift_positive=0.02, drift_negative=-0.01)
-    )
-    parameters = with_branch(parameters, "motor", TemperatureDrift(drift_per_k=0.001, reference_c=25.0))
-    found = values(read_back(database, parameters, tmp_path))
-    assert (found["HV.battery.drift_positive"], found["HV.battery.drift_negative"]) == (0.02, -0.01)
-    assert "HV.battery.drift" not in found, "one drift would be wrong for either sign"
-    assert (found["HV.motor.drift_per_k"], found["HV.motor.drift_reference"]) == (0.001, 25.0)
-
-
 def test_the_reader_understands_every_line_but_those_of_texts(
     database: VehicleDatabase, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -102,13 +90,3 @@ def test_texts_that_dcm_cannot_hold_are_refused(vehicle: str, database: VehicleD
     checked = checked_with(database, replace(parameters_for(database, **FAULTS), vehicle=vehicle), tmp_path)
     with pytest.raises(ExportError, match=r"^v1\.json: vehicle '.*' has a quotation mark, a backslash or a control"):
         dcm_text(checked)
-
-
-def test_a_fault_that_needs_an_unknown_temperature_corrects_nothing(
-    make_database: MakeDatabase, tmp_path: Path
-) -> None:
-    database = make_database()
-    model = TemperatureDrift(drift_per_k=0.001, reference_c=25.0)
-    parameters = with_branch(parameters_for(database, battery=(0.05, 2.3)), "battery", model)
-    found = values(read_back(database, parameters, tmp_path))
-    assert (found["HV.battery.applied"], found["HV.battery.drift"], found["HV.battery.offset"]) == (0, 0.0, 0.0)

@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from calibrator.evidence.vehicle_evidence import VehicleEvidence, evidence_names
-from calibrator.results.chunk import encode_chunk
-from calibrator.results.parameter_parts import write_parameter_files
-from calibrator.results.rows import join_rows
-from calibrator.results.run_record import RunRecord, write_run
+from calibrator.estimator.results import RunRecord, encode_chunk, join_rows, write_parameter_files, write_run
+from calibrator.estimator.rows import evidence_names
+from calibrator.estimator.vehicle_evidence import VehicleEvidence
 from calibrator.summaries.filter_bank import plain_bank
 from calibrator.summaries.unity import UNITY_FILE, UnityWindow
 from ecu_node.database import VehicleDatabase

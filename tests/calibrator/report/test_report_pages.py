@@ -11,14 +11,13 @@ import pytest
 from msgspec.structs import replace
 
 from calibrator.errors import FleetError
+from calibrator.estimator.results import read_run, written_of
 from calibrator.report import page as page_module
 from calibrator.report.traces import unity_traces
 from calibrator.report.window import ideal_window, read_unity
 from calibrator.report.write import ReportOptions, fleet_report, vehicle_report
-from calibrator.results.run_record import read_run
-from calibrator.results.vehicle import written_of
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import decode_parameters
+from ecu_node.parameters import Finding, decode_parameters
 from tests.calibrator.report.results_at_hand import (
     EVIL,
     WINDOW,
@@ -184,6 +183,27 @@ def test_the_vehicle_page_tells_its_parameters_evidence_and_currents(result: Pat
     assert "intercept battery" in page
     assert "<script" not in page
     assert report.parameters.vehicle == "V4"
+
+
+def test_the_vehicle_page_lists_findings_for_the_workshop(tmp_path: Path, database: VehicleDatabase) -> None:
+    vehicles = six_vehicles(database)
+    findings = [
+        Finding(branch="motor", cause="inverted", probability=0.993, text="motor: its sign is turned."),
+        Finding(cause="load", probability=0.9, text="5 A flow where <no> sensor is."),
+    ]
+    vehicles[4] = replace(
+        vehicles[4],
+        branches={**vehicles[4].branches, "motor": sensor(0.45, 0.0, held_back="does not fit")},
+        findings=findings,
+    )
+    result = write_result(tmp_path / "r", vehicles)
+    text = visible(vehicle_report(result, "V5")[0])
+    assert "For the workshop" in text
+    assert "motor inverted 99.3 % motor: its sign is turned." in text
+    assert "vehicle load 90.0 % 5 A flow where <no> sensor is." in text
+    assert "passes through: does not fit" in text
+    assert "does not fit" in visible(fleet_report(result, PLAIN)[0])
+    assert "For the workshop" not in visible(vehicle_report(result, "V1")[0])
 
 
 def test_without_deviations_no_margin_is_told(tmp_path: Path, database: VehicleDatabase) -> None:

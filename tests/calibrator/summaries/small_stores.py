@@ -19,7 +19,7 @@ from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.summaries.zero_current import ZeroCurrent
 from ecu_node.database import VehicleDatabase
-from tests.calibrator.evidence.simulated_drives import PERIOD_S, Conditions, summaries_of
+from tests.calibrator.estimator.simulated_drives import PERIOD_S, Conditions, summaries_of
 
 BRANCHES = ("battery", "motor")
 EQUIPMENT = Equipment(

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
-from calibrator.evidence.fleet_moments import stack_summaries
+from calibrator.estimator.moments import stack_summaries
 from calibrator.summaries.filter_bank import FilterBank, low_passes
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
 from calibrator.summaries.summariser import Summariser, summarise
-from tests.calibrator.evidence.simulated_drives import PERIOD_S, Conditions, drive_of, no_faults, samples_of
+from tests.calibrator.estimator.simulated_drives import PERIOD_S, Conditions, drive_of, no_faults, samples_of
 
 
 def a_drive(seed: int, samples: int = 300, noise_a: float = 0.3) -> Samples:
@@ -29,6 +29,10 @@ def assert_same(first: DriveSummary, second: DriveSummary) -> None:
     np.testing.assert_allclose(first.moments, second.moments, rtol=1e-12, atol=1e-9)
     np.testing.assert_allclose(first.noise_a2, second.noise_a2, rtol=1e-12)
     assert (first.branches, first.period_s, first.bank) == (second.branches, second.period_s, second.bank)
+    assert first.fit is not None
+    assert second.fit is not None
+    for name in ("levels", "fast_a2", "spikes", "temperature_c", "starts"):
+        np.testing.assert_allclose(getattr(first.fit, name), getattr(second.fit, name), rtol=1e-9, atol=1e-7)
 
 
 def test_moments_are_those_of_the_samples() -> None:
@@ -51,17 +55,13 @@ def test_summaries_of_drives_add_up() -> None:
 
 def test_the_sum_of_summaries_is_the_summary_of_the_drives_together() -> None:
     first, second = a_drive(2), a_drive(3, samples=170)
-    extra = [drive.inputs[:, :2] ** 2 for drive in (first, second)]
-    together = summarise([first, second], period_s=PERIOD_S, bank=a_bank(3.0, 8.0), extra=extra)
+    warm_c = [20.0 + 0.01 * drive.time_s for drive in (first, second)]
+    together = summarise([first, second], period_s=PERIOD_S, bank=a_bank(3.0, 8.0), temperatures_c=warm_c)
     alone = [
-        summarise([drive], period_s=PERIOD_S, bank=a_bank(3.0, 8.0), extra=[more])
-        for drive, more in zip((first, second), extra, strict=True)
+        summarise([drive], period_s=PERIOD_S, bank=a_bank(3.0, 8.0), temperatures_c=[warm])
+        for drive, warm in zip((first, second), warm_c, strict=True)
     ]
-    total = alone[0] + alone[1]
-    assert_same(total, together)
-    assert total.extra is not None
-    assert together.extra is not None
-    np.testing.assert_allclose(total.extra, together.extra, rtol=1e-12)
+    assert_same(alone[0] + alone[1], together)
 
 
 def test_what_was_summarised_differently_does_not_add_up() -> None:

@@ -21,9 +21,9 @@ from calibrator.summaries.identity import SCHEMA_VERSION, read_identity, write_i
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import Record, joined_records
 from calibrator.summaries.store import SummaryStore
-from calibrator.summaries.table import MOST_BLOCKS, SCHEMA
+from calibrator.summaries.table import FIT_COLUMNS, MOST_BLOCKS, SCHEMA
 from ecu_node.database import VehicleDatabase
-from tests.calibrator.evidence.simulated_drives import Conditions, no_faults, summaries_of
+from tests.calibrator.estimator.simulated_drives import Conditions, no_faults, summaries_of
 from tests.calibrator.summaries.small_stores import identity_of, random_faults, record_of, small_store
 
 VEHICLES = 40
@@ -53,6 +53,8 @@ def test_what_is_read_is_what_was_written(store: SummaryStore) -> None:
         assert found is not None
         np.testing.assert_allclose(found.summary.moments, expected.summary.moments, rtol=1e-15)
         np.testing.assert_array_equal(found.summary.noise_a2, expected.summary.noise_a2)
+        for column in FIT_COLUMNS:
+            np.testing.assert_array_equal(getattr(found.summary.fit, column), getattr(expected.summary.fit, column))
         assert found.delays.by_branch() == expected.delays.by_branch()
         np.testing.assert_array_equal(found.zero_current.offset_a, expected.zero_current.offset_a)
         assert (found.drives, found.recorded) == (expected.drives, expected.recorded)
@@ -158,12 +160,16 @@ def own_store(store: SummaryStore, tmp_path: Path) -> SummaryStore:
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"moments": None}, "its summary is damaged: moments and noise_a2 do not fit the other columns; summarise"),
-        ({"moments": [1.0] * 29}, "its summary is damaged: moments and noise_a2"),
-        ({"noise_a2": []}, "its summary is damaged: moments and noise_a2"),
+        ({"moments": None}, "its summary is damaged: moments, noise_a2 and fit sums do not fit the other columns"),
+        ({"moments": [1.0] * 29}, "its summary is damaged: moments, noise_a2 and fit sums"),
+        ({"noise_a2": []}, "its summary is damaged: moments, noise_a2 and fit sums"),
         ({"noise_a2": [math.nan] * 120}, "its summary holds impossible numbers"),
         ({"noise_a2": [None] * 120}, "its summary holds impossible numbers"),
         ({"moments": [-1.0] * 60 * 21}, "its summary holds impossible numbers"),
+        ({"levels": [1.0]}, "its summary is damaged: moments, noise_a2 and fit sums"),
+        ({"spikes": None}, "its summary is damaged: moments, noise_a2 and fit sums"),
+        ({"spikes": [-1.0] * 240}, "its summary holds impossible numbers"),
+        ({"temperature_c": [math.inf] * 60}, "its summary holds impossible numbers"),
         ({"duration_s": None}, "its summary is damaged: duration_s"),
         ({"duration_s": math.inf}, "its summary holds impossible numbers"),
         ({"delay_reference": "bogus"}, "its summary is damaged: delay_reference"),

@@ -1,0 +1,710 @@
+"""Does the best explanation fit? For each vehicle: what no gain error and no offset of any sensor can explain.
+
+The junction law is regressed once more on the vehicle's own data, with a column or a split for each cause that is not
+linear: by level of a current, by time, by temperature. What is left then tells of noise and of loads that switch. The
+fleet says how much of each is usual; the junction says that something is wrong, the fleet model which sensor it is.
+Equations: (M22) to (M25) of docs/method.md, section "Does the best explanation fit?".
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import t as student_t
+
+from calibrator.drive import Array
+from calibrator.summaries.moments import DriveSummary
+from ecu_node.parameters import Finding
+
+__all__ = ["CAUSES", "Misfits", "UsualMisfits", "check_fit", "learn_usual_misfits", "measure_misfits"]
+
+PRIOR = 0.01
+"""Probability of each cause in a vehicle, before anything is seen. [1]"""
+LEAST_PROBABILITY = 0.5
+"""From which on a cause is a finding. [1]"""
+NAMED = 0.9
+"""Probability from which on one sensor is named. [1]"""
+TAIL = 12.0
+"""Degrees of freedom of Student's t, as which the vehicles of a fleet differ: heavier than normal. [1]"""
+LEAST_MISFIT = 1e-5
+"""Usual misfit of a fleet, at least, in fractions of full scale: less harms no correction. [1]"""
+LARGEST_MISFIT = 0.2
+"""In fractions of full scale; before anything is seen, a misfit's size is log-uniform up to it. [1]"""
+EXPLAINED = 0.7
+"""Share of the unusual residual that a cause explains, at least, if what is left of it is large still. [1]"""
+LEAST_NOISE_SPREAD = 0.2
+"""Of the logarithm of the mean square residual of healthy vehicles, at least. [1]"""
+NOISE_RANGE = 9.0
+"""Of the same logarithm, over which it is uniform where there is noise. [1]"""
+FEWEST = 30
+"""Samples beyond a bend, for it to be looked for. [1]"""
+CLIPPED = 0.55
+"""Share of the gain that is lost beyond a bend, from which on the sensor counts as clipped. [1]"""
+CHANCE = 0.3
+"""Correlation by chance between the fleet model and its errors in one vehicle. [1]"""
+GAIN_SD, DEAD_SD = 0.3, 0.04
+"""How far gains of running sensors are from 1 or -1, and of dead ones from 0. [1]"""
+MOVING = 0.02
+"""Least standard deviation of a current whose level counts, in fractions of full scale: of others it is noise. [1]"""
+NEAR_ZERO = 0.07
+"""Bends below this are two gains by sign whose zero is not known better, in fractions of full scale. [1]"""
+SPIKE_RATE = 5e-4
+"""Usual share of spikes among the samples, at least. [1]"""
+NOISE_RATE = 0.015
+"""Share of spikes in both directions from which on they are bursts of noise. [1]"""
+ONE_SIDED = 0.1
+"""Share of spikes in the rarer direction up to which they count as one-sided. [1]"""
+WARMING_K = 2.0
+"""Standard deviation of the temperature in a drive, for its effect to be looked for. [K]"""
+RIDGE = 1e-10
+"""On normalised moments: a branch that stands still gets no gain. [1]"""
+TINY = 1e-12
+"""Instead of zero in denominators."""
+ALONE = 1e-6
+"""Least share of a column that gains and offsets do not explain. [1]"""
+MAD_TO_SD = 1.4826
+"""Of the normal distribution."""
+WHITE_GAIN = 1.5
+"""Variance of the second difference of white noise of variance 1."""
+MOST_NOISE = 0.9
+"""Largest share of a current's variance that is taken for noise. [1]"""
+SHARE_SD = 0.15
+"""How well a misfit is found again in the branch that has it, where its model is exact. [1]"""
+
+BENDS_A: Array = np.array(
+    [10.0, 15, 20, 25, 30, 37, 45, 55, 65, 77, 90, 105, 120, 140, 160, 185, 210, 245, 280, 325, 370, 430, 500]
+)
+"""Currents at which a gain may change, two per level; below, noise sorts samples into levels. [A]"""
+CAUSES = ("quadratic", "cubic", "sign", "bend", "step", "ramp", "temperature")
+"""Causes that are columns or splits of the junction law; a bend is a clipped or a saturating sensor."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Misfits:
+    """What each cause explains of the junction law of N vehicles with K branches.
+
+    Attributes
+    ----------
+    misfit_a : ndarray of shape (N, C)
+        Root mean square of what each of :data:`CAUSES` explains beyond gains and offsets. [A]
+    fit : ndarray of shape (N, C)
+        Logarithm of its likelihood over that of linear sensors, less what its parameters cost.
+    size, place : ndarray of shape (N, C)
+        Of causes by level: error at full scale, or change of the gain [1]. Where it is: level at which a bend begins
+        [A], share of the time before a step [1], standard deviation of a temperature [K].
+    level_branch : ndarray of int of shape (N, C)
+        Branch by whose level it is; -1 for causes by time.
+    branch_fit : ndarray of shape (N, C, K)
+        Logarithm of the likelihood that the sensor of branch k has it, by the fleet model.
+    residual_a2 : ndarray of shape (N, C + 1)
+        Mean square of what each cause, or none (last), leaves of the junction law. [A^2]
+    fast_a2 : ndarray of shape (N,)
+        White part of it. [A^2]
+    slope, slope_sd, mean_a : ndarray of shape (N, K)
+        Of each measured current over the fleet model, and its mean. [1], [A]
+    moves_a, model_error_a : ndarray of shape (N, K)
+        Standard deviation of the fleet model, and of each measured current about it. [A]
+    noise_share : ndarray of shape (N, K)
+        Share of each sensor in the fast part of the residual. [1]
+    spikes : ndarray of shape (N, K, 2)
+        Share of samples that are upward and downward spikes. [1]
+    samples : ndarray of shape (N,)
+        Number of samples.
+    """
+
+    misfit_a: Array
+    fit: Array
+    size: Array
+    place: Array
+    level_branch: NDArray[np.int64]
+    branch_fit: Array
+    residual_a2: Array
+    fast_a2: Array
+    slope: Array
+    slope_sd: Array
+    mean_a: Array
+    moves_a: Array
+    model_error_a: Array
+    noise_share: Array
+    spikes: Array
+    samples: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class UsualMisfits:
+    """How vehicles of a fleet usually differ from linear sensors: the null of every check.
+
+    Attributes
+    ----------
+    misfit_a : ndarray of shape (C,)
+        Scale of the misfit of each cause. [A]
+    residual_a2, fast_a2 : float
+        Mean square residual of the junction law, and its white part. [A^2]
+    residual_spread : float
+        Of the logarithm of the first. [1]
+    slope_spread, model_error_a : ndarray of shape (K,)
+        Robust standard deviation of slopes over the fleet model [1], and of currents about it [A].
+    spike_rate : float
+        Share of spikes. [1]
+    """
+
+    misfit_a: Array
+    residual_a2: float
+    fast_a2: float
+    residual_spread: float
+    slope_spread: Array
+    model_error_a: Array
+    spike_rate: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Residual:
+    """Residual r = y - g^T z of the junction law of N vehicles: y the branch that moves most, z the others and 1.
+
+    Attributes
+    ----------
+    blocks : ndarray of shape (B, p, p)
+        Moments of (inputs, measured currents, 1) of all blocks.
+    first, vehicle : ndarray of int of shape (N,), (B,)
+        First block of each vehicle, vehicle of each block.
+    y, z : int, ndarray of int of shape (K,)
+        Columns of the law.
+    law : ndarray of shape (N, K)
+        g: gain ratios and constant [A].
+    of_z : ndarray of shape (B, p, K)
+        Moments of all columns with z.
+    with_z : ndarray of shape (B, K)
+        Sums of z r, without the product of the noise of z with itself.
+    square_a2, samples : ndarray of shape (N,)
+        Sum of r^2 [A^2], number of samples.
+    n_eff : ndarray of shape (N,)
+        Samples that do not repeat each other.
+    """
+
+    blocks: Array
+    first: NDArray[np.int64]
+    vehicle: NDArray[np.int64]
+    y: int
+    z: NDArray[np.int64]
+    law: Array
+    of_z: Array
+    with_z: Array
+    square_a2: Array
+    samples: Array
+    n_eff: Array
+
+    def total(self, values: Array) -> Array:
+        return np.asarray(np.add.reduceat(values, self.first, axis=0))
+
+    def likelihood(self, explained: Array, parameters: float) -> Array:
+        """Logarithm of the likelihood ratio with noise of unknown size, less what parameters cost (BIC)."""
+        left = np.maximum(1.0 - explained / self.square_a2, RIDGE)
+        return np.asarray(-0.5 * self.n_eff * np.log(left) - 0.5 * parameters * np.log(self.n_eff))
+
+
+def measure_misfits(summaries: Sequence[DriveSummary], read_out: Array, *, full_scale_a: float) -> Misfits:
+    """Measure what each cause explains in each vehicle.
+
+    Parameters
+    ----------
+    summaries : sequence of N DriveSummary
+        With fit sums.
+    read_out : ndarray of shape (M + 1, K)
+        Of the fleet model, its branches in the order of the summaries. [A]
+    full_scale_a : float
+        Full scale of the junction. [A]
+
+    Returns
+    -------
+    Misfits
+        Of the N vehicles.
+    """
+    counts = np.array([len(summary.moments) for summary in summaries])
+    first, vehicle = np.cumsum(counts) - counts, np.repeat(np.arange(len(counts)), counts)
+    blocks = np.concatenate([summary.moments for summary in summaries])
+    fits = [summary.fit for summary in summaries if summary.fit is not None]
+    fast = np.stack([fit.fast_a2.sum(axis=0) for fit in fits])
+    residual, weights = _junction_residual(blocks, first, vehicle, fast)
+    total, samples = residual.total(blocks), residual.samples
+    K = fast.shape[1]
+    M = blocks.shape[1] - K - 1
+    slope, slope_sd, zero_a, variance, moves_a, error_a = _over_fleet_model(residual, total, read_out)
+    levels = np.stack([fit.levels for fit in fits])
+    middle = np.concatenate([np.cumsum(n := s.moments[:, -1, -1]) - n / 2.0 for s in summaries])
+    warm_c = np.concatenate([fit.temperature_c for fit in fits])
+    found = [
+        *_by_level(residual, total, levels, zero_a=zero_a, weights=weights, full_scale_a=full_scale_a),
+        _step(residual, total),
+        _drifting(residual, total, middle / samples[vehicle], least=0.0),
+        _drifting(residual, total, warm_c, least=WARMING_K),
+    ]
+    explained, fit, size, place, level_branch, pattern, square = (
+        np.stack(part, axis=1) for part in zip(*found, strict=True)
+    )
+    unit = np.sqrt((weights**2).mean(axis=1))  # gain errors of the branches do not scale the residual
+    white = np.einsum("nk,nkl,nl->n", weights, fast, weights)
+    left = np.maximum(residual.square_a2[:, None] - np.column_stack([explained, np.zeros(len(counts))]), 0.0)
+    return Misfits(
+        misfit_a=np.sqrt(explained / samples[:, None]) / unit[:, None],
+        fit=fit,
+        size=size,
+        place=place,
+        level_branch=level_branch.astype(np.int64),
+        branch_fit=_whose(total, read_out, variance=variance, weights=weights, pattern=pattern, square=square),
+        residual_a2=left / (samples * unit**2)[:, None],
+        fast_a2=white / (WHITE_GAIN * samples * unit**2),
+        slope=slope,
+        slope_sd=slope_sd,
+        mean_a=total[:, -1, M:-1] / samples[:, None],
+        moves_a=moves_a,
+        model_error_a=error_a,
+        noise_share=weights * np.einsum("nkl,nl->nk", fast, weights) / np.maximum(white, TINY)[:, None],
+        spikes=np.stack([fit.spikes.sum(axis=0) for fit in fits]) / samples[:, None, None],
+        samples=samples,
+    )
+
+
+def _solve(gram: Array, right: Array) -> Array:
+    """Solutions of normal equations, (..., q) of (..., q, q) and (..., q)."""
+    scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=-2, axis2=-1), TINY))
+    normal = gram / scale[..., :, None] / scale[..., None, :] + RIDGE * np.eye(gram.shape[-1])
+    return np.asarray(np.linalg.solve(normal, (right / scale)[..., None])[..., 0] / scale)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray(np.sum(a * b, axis=-1))
+
+
+def _junction_residual(
+    blocks: Array, first: NDArray[np.int64], vehicle: NDArray[np.int64], fast: Array
+) -> tuple[_Residual, Array]:
+    """Junction law of each vehicle, and the weight of each branch in it, shape (N, K).
+
+    The noise of z draws g towards zero. White noise n_k makes fast changes that the junction law does not balance: with
+    the residual's fast part q = sum w_l q_l, E[q_k q] = 1.5 n_k w_k. It is taken out of the moments.
+    """
+    total = np.add.reduceat(blocks, first, axis=0)
+    N, K = fast.shape[:2]
+    M, samples = blocks.shape[1] - K - 1, total[:, -1, -1]
+    spread = (
+        np.diagonal(total, axis1=1, axis2=2)[:, M:-1] / samples[:, None] - (total[:, -1, M:-1] / samples[:, None]) ** 2
+    )
+    y = M + int(np.argmax(np.median(spread, axis=0)))
+    z = np.array([i for i in range(M, M + K + 1) if i != y])
+    noise, weights = np.zeros((N, K)), np.zeros((N, K))
+    weights[:, y - M] = 1.0
+    for _ in range(3):
+        clean = total[:, z[:, None], z].copy()
+        clean[:, range(K), range(K)] -= samples[:, None] * noise
+        law = _solve(clean, total[:, z, y])
+        weights[:, z[:-1] - M] = -law[:, :-1]
+        unbalanced = np.einsum("nkl,nl->nk", fast, weights)[:, z[:-1] - M] / -np.where(law[:, :-1], law[:, :-1], 1.0)
+        most = MOST_NOISE * spread[:, z[:-1] - M]
+        noise[:, :-1] = np.clip(unbalanced / (WHITE_GAIN * samples[:, None]), 0.0, most)
+    own, of_z = blocks[:, -1, -1, None], blocks[:, :, z]
+    with_z = (
+        blocks[:, z, y] - np.einsum("bij,bj->bi", blocks[:, z[:, None], z], law[vehicle]) + own * (noise * law)[vehicle]
+    )
+    turned = np.concatenate([np.ones((N, 1)), -law], axis=1)
+    columns = np.array([y, *z])
+    small = blocks[:, columns[:, None], columns]
+    scores = np.einsum("bij,bj->bi", small, turned[vehicle])
+    squares = np.add.reduceat(_dot(scores, turned[vehicle]), first)
+    # Neighbouring samples repeat each other where blocks' sums of r scatter more than white noise's would.
+    scatter = np.add.reduceat(scores[:, -1] ** 2 / own[:, 0], first) / np.bincount(vehicle)
+    repeated = max(float(np.median(scatter / np.maximum(squares / samples, TINY))), 1.0)
+    residual = _Residual(
+        blocks=blocks,
+        first=first,
+        vehicle=vehicle,
+        y=y,
+        z=z,
+        law=law,
+        of_z=of_z,
+        with_z=with_z,
+        square_a2=np.maximum(squares, TINY),
+        samples=samples,
+        n_eff=samples / repeated,
+    )
+    return residual, weights
+
+
+def _over_fleet_model(residual: _Residual, total: Array, read_out: Array) -> tuple[Array, ...]:
+    """Regress each measured current on the fleet model.
+
+    Returns
+    -------
+    slope, slope_sd, zero_a, variance, moves_a, error_a : ndarray of shape (N, K)
+        Slope and its standard deviation [1], reading where the model has no current [A], variance of the residual [A^2]
+        times the number of neighbouring samples that repeat each other, standard deviations of the model and of the
+        residual [A].
+    """
+    M, K = len(read_out) - 1, read_out.shape[1]
+    u = np.array([*range(M), M + K])
+    blocks, results = residual.blocks, []
+    for k in range(K):
+        basis = np.column_stack([read_out[:, k], np.eye(M + 1)[-1]])
+        gram, right = basis.T @ total[:, u[:, None], u] @ basis, total[:, u, M + k] @ basis
+        fitted = _solve(gram, right)
+        left = np.maximum(total[:, M + k, M + k] - _dot(fitted, right), TINY) / residual.samples
+        scores = blocks[:, u, M + k] @ basis
+        scores -= np.einsum("bij,bj->bi", basis.T @ blocks[:, u[:, None], u] @ basis, fitted[residual.vehicle])
+        first_row = _solve(gram, np.broadcast_to([1.0, 0.0], right.shape))
+        sd = np.sqrt(residual.total(_dot(scores, first_row[residual.vehicle]) ** 2))
+        repeated = max(float(np.median(sd**2 / np.maximum(left * first_row[:, 0], TINY))), 1.0)
+        moves = np.sqrt(np.maximum(gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2, 0.0)) / residual.samples
+        results.append((fitted[:, 0], sd, fitted[:, 1], repeated * left, moves, np.sqrt(left)))
+    return tuple(np.stack(part, axis=1) for part in zip(*results, strict=True))
+
+
+_Cause = tuple[Array, Array, Array, Array, Array, Array, Array]
+"""Of one cause: sum of squares explained, fit, size, place, branch of the level, each (N,); products of the misfit with
+all columns (N, p) and with itself (N,)."""
+
+
+def _by_level(
+    residual: _Residual, total: Array, levels: Array, *, zero_a: Array, weights: Array, full_scale_a: float
+) -> list[_Cause]:
+    """Quadratic, cubic, two gains by sign, a bend: a column that depends on the level of one of the currents."""
+    (N, K, _, wide), z = levels.shape, residual.z
+    M = wide - K - 2
+    count = levels[..., M + K]
+    x = np.stack([levels[:, k, :, M + k] for k in range(K)], axis=1) / np.maximum(count, 1.0)
+    from_zero = x - zero_a[:, :, None]
+    above, below = (np.stack([np.maximum(sign * x - bend, 0.0) for bend in BENDS_A], axis=2) for sign in (1.0, -1.0))
+    shapes = {
+        "quadratic": (from_zero**2 / full_scale_a)[:, :, None],
+        "cubic": (from_zero**3 / full_scale_a**2)[:, :, None],
+        "sign": np.maximum(from_zero, 0.0)[:, :, None],
+        "bend": np.concatenate([above, -below, above - below], axis=2),
+    }
+    rms = np.sqrt(
+        np.maximum(
+            np.diagonal(total, axis1=1, axis2=2) / residual.samples[:, None]
+            - (total[:, -1] / residual.samples[:, None]) ** 2,
+            0.0,
+        )
+    )
+    moving = rms[:, M : M + K, None] > MOVING * full_scale_a
+    gram, found = total[:, z[:, None], z], []
+    for cause, h in shapes.items():  # h: (N, K, S, L), constant within a level
+        products = np.einsum("nksl,nkli->nksi", h, levels[..., :-1])
+        square = np.einsum("nksl,nkl->nks", h**2, count)
+        alone = square - _dot(_solve(gram[:, None, None], products[..., z]), products[..., z])
+        with_r = products[..., residual.y] - np.einsum("nksi,ni->nks", products[..., z], residual.law)
+        beyond = np.einsum("nksl,nkl->nks", h != 0.0, count)
+        usable = moving & (alone > ALONE * square) & (beyond >= FEWEST)
+        size = np.where(usable, with_r, 0.0) / np.where(usable, alone, 1.0)
+        explained = (size * with_r).reshape(N, -1)
+        best = explained.argmax(axis=1)
+        at = (np.arange(N), *np.unravel_index(best, size.shape[1:]))
+        place = BENDS_A[at[2] % len(BENDS_A)] if cause == "bend" else np.zeros(N)
+        found.append(
+            (
+                explained.max(axis=1),
+                residual.likelihood(explained.max(axis=1), 2.0 if cause == "bend" else 1.0),
+                size[at] / np.where(weights[at[:2]], weights[at[:2]], 1.0),
+                place,
+                at[1],
+                products[at] * size[at][:, None],
+                square[at] * size[at] ** 2,
+            )
+        )
+    return found
+
+
+def _step(residual: _Residual, total: Array) -> _Cause:
+    """Another law from some block on; the block in which it changes has one of its own."""
+    z, vehicle, q = residual.z, residual.vehicle, len(residual.z)
+    gram = residual.of_z[:, z]
+    grams, rights = np.cumsum(gram, axis=0), np.cumsum(residual.with_z, axis=0)
+    before = grams - gram - (grams - gram)[residual.first][vehicle]
+    before_r = rights - residual.with_z - (rights - residual.with_z)[residual.first][vehicle]
+    after = total[:, z[:, None], z][vehicle] - before - gram
+    after_r = residual.total(residual.with_z)[vehicle] - before_r - residual.with_z
+    parts = ((before, before_r), (gram, residual.with_z), (after, after_r))
+    laws = [_solve(part, right) for part, right in parts]
+    number = np.arange(len(vehicle)) - residual.first[vehicle]
+    inside = (number >= 2) & (number <= np.bincount(vehicle)[vehicle] - 3)
+    explained = np.where(inside, sum(_dot(law, right) for law, (_, right) in zip(laws, parts, strict=True)), 0.0)
+    ends = np.append(residual.first[1:], len(vehicle))
+    best = np.array([a + np.argmax(explained[a:b]) for a, b in zip(residual.first, ends, strict=True)])
+    change = laws[2][best] - laws[0][best]
+    late = residual.total(residual.of_z * (np.arange(len(vehicle)) > best[vehicle])[:, None, None])
+    return (
+        np.maximum(explained[best], 0.0),
+        residual.likelihood(np.maximum(explained[best], 0.0), q + 2.0),
+        np.zeros(len(best)),
+        (before[best, -1, -1] + 0.5 * gram[best, -1, -1]) / residual.samples,
+        np.full(len(best), -1),
+        np.einsum("nij,nj->ni", late, change),
+        np.einsum("ni,nij,nj->n", change, late[:, z], change),
+    )
+
+
+def _drifting(residual: _Residual, total: Array, course: Array, *, least: float) -> _Cause:
+    """A law that changes in proportion to a course (B,), as time or temperature; where it is not known it is NaN."""
+    z, q, own = residual.z, len(residual.z), residual.blocks[:, -1, -1]
+    known = np.isfinite(course)
+    course = np.where(known, course, 0.0)
+    course = course - (residual.total(course * own) / residual.samples)[residual.vehicle]
+    deviation = np.sqrt(residual.total(course**2 * own) / residual.samples)
+    usable = (deviation > least) & (residual.total(known * 1.0) == np.bincount(residual.vehicle))
+    first = residual.total(course[:, None, None] * residual.of_z)
+    second = residual.total(course[:, None, None] ** 2 * residual.of_z[:, z])
+    moments = [[total[:, z[:, None], z], first[:, z]], [first[:, z], second]]
+    gram = np.concatenate([np.concatenate(row, axis=2) for row in moments], axis=1)
+    right = np.concatenate([residual.total(residual.with_z), residual.total(course[:, None] * residual.with_z)], axis=1)
+    fitted = _solve(gram, right)
+    explained = np.where(usable, np.maximum(_dot(fitted, right), 0.0), 0.0)
+    change = np.where(usable[:, None], fitted[:, q:], 0.0)
+    return (
+        explained,
+        residual.likelihood(explained, float(q)),
+        np.zeros(len(change)),
+        deviation,
+        np.full(len(change), -1),
+        np.einsum("nij,nj->ni", first, change),
+        np.einsum("ni,nij,nj->n", change, second, change),
+    )
+
+
+def _whose(total: Array, read_out: Array, *, variance: Array, weights: Array, pattern: Array, square: Array) -> Array:
+    """Logarithm of the likelihood that each branch's sensor makes the misfit of each cause, shape (N, C, K).
+
+    The misfit is regressed out of each branch's residual over the fleet model: where it is this branch's, all of it is
+    found there, and nothing in the others.
+    """
+    M, K = len(read_out) - 1, read_out.shape[1]
+    u = np.array([*range(M), M + K])
+    share, sd = np.zeros((*square.shape, K)), np.zeros((*square.shape, K))
+    for k in range(K):
+        basis = np.column_stack([read_out[:, k], np.eye(M + 1)[-1]])
+        gram, cross = (basis.T @ total[:, u[:, None], u] @ basis)[:, None], pattern[..., u] @ basis
+        base = _solve(gram, cross)
+        alone = np.maximum(square - _dot(base, cross), TINY)
+        seen = pattern[..., M + k] - _dot(base, (total[:, u, M + k] @ basis)[:, None])
+        share[..., k] = weights[:, None, k] * seen / alone
+        sd[..., k] = np.hypot(np.abs(weights[:, None, k]) * np.sqrt(variance[:, None, k] / alone), SHARE_SD)
+    off = [np.sum(((share - np.eye(K)[k]) / sd) ** 2, axis=-1) for k in range(K)]
+    return np.asarray(-0.5 * (K - 1) / K * np.stack(off, axis=-1))  # the shares of all branches add up to one
+
+
+def learn_usual_misfits(
+    summaries: Sequence[DriveSummary], read_out: Array, *, full_scale_a: float
+) -> UsualMisfits | None:
+    """Learn from a fleet how vehicles usually differ from linear sensors.
+
+    Parameters
+    ----------
+    summaries : sequence of DriveSummary
+        Of the vehicles to learn from, most of them without such faults.
+    read_out : ndarray of shape (M + 1, K)
+        Of the fleet model, its branches in the order of the summaries. [A]
+    full_scale_a : float
+        Full scale of the junction. [A]
+
+    Returns
+    -------
+    UsualMisfits or None
+        Medians: a fault in less than half of the vehicles does not move them far. None if no vehicle has fit sums.
+    """
+    known = [summary for summary in summaries if summary.fit is not None]
+    if not known:
+        return None
+    misfits = measure_misfits(known, read_out, full_scale_a=full_scale_a)
+    left = np.log(np.maximum(misfits.residual_a2[:, -1], TINY))
+    centre = np.median(left)
+    return UsualMisfits(
+        # The size of a misfit has half of a symmetric distribution, whose median is 0.67 standard deviations.
+        misfit_a=np.maximum(MAD_TO_SD * np.median(misfits.misfit_a, axis=0), LEAST_MISFIT * full_scale_a),
+        residual_a2=float(np.exp(centre)),
+        fast_a2=float(np.median(misfits.fast_a2)),
+        residual_spread=max(MAD_TO_SD * float(np.median(np.abs(left - centre))), LEAST_NOISE_SPREAD),
+        slope_spread=MAD_TO_SD * np.median(np.abs(misfits.slope - np.median(misfits.slope, axis=0)), axis=0),
+        model_error_a=np.median(misfits.model_error_a, axis=0),
+        spike_rate=max(float(np.median(misfits.spikes.sum(axis=2))), SPIKE_RATE),
+    )
+
+
+def check_fit(
+    summaries: Sequence[DriveSummary],
+    read_out: Array,
+    usual: UsualMisfits | None,
+    *,
+    full_scale_a: float,
+    branches: Sequence[str],
+) -> list[tuple[Finding, ...]]:
+    """Find what linear sensors do not explain, in each vehicle by itself.
+
+    Parameters
+    ----------
+    summaries : sequence of N DriveSummary
+        Of the vehicles; one without fit sums has no findings.
+    read_out : ndarray of shape (M + 1, K)
+        Of the fleet model, its branches in the order of the summaries. [A]
+    usual : UsualMisfits or None
+        Of the fleet; None: nothing is found.
+    full_scale_a : float
+        Full scale of the junction. [A]
+    branches : sequence of str
+        Names of the K branches.
+
+    Returns
+    -------
+    list of N tuples of Finding
+        By falling probability; causes are ``inverted``, ``dead``, ``clipped``, ``saturating``, ``quadratic``,
+        ``cubic``, ``sign``, ``step``, ``ramp``, ``temperature``, ``spikes``, ``outliers``, ``noise`` and ``switching``.
+        No branch is named where the evidence does not say which sensor it is, or it is none.
+    """
+    found: list[tuple[Finding, ...]] = [()] * len(summaries)
+    places = [j for j, summary in enumerate(summaries) if summary.fit is not None]
+    if usual is None or not places:
+        return found
+    misfits = measure_misfits([summaries[j] for j in places], read_out, full_scale_a=full_scale_a)
+    # Where there is more noise than usual, larger misfits come by chance.
+    noisier = np.sqrt(np.maximum(misfits.residual_a2[:, :-1] / usual.residual_a2, 1.0))
+    shape = _probability(misfits.misfit_a, usual.misfit_a * noisier, LARGEST_MISFIT * full_scale_a)
+    above = np.log(np.maximum(misfits.residual_a2, TINY) / usual.residual_a2) / usual.residual_spread
+    factor = usual.residual_spread / (NOISE_RANGE * np.maximum(student_t.pdf(above, TAIL), TINY))
+    unusual = np.where(above > 0.0, _posterior(PRIOR * factor), 0.0)
+    inverted, dead = _of_slopes(misfits, usual)
+    for i, j in enumerate(places):
+        vehicle = _Vehicle(misfits, usual, i, tuple(branches), NEAR_ZERO * full_scale_a)
+        mine = vehicle.of_slopes(inverted[i], dead[i])
+        if not any(each.cause == "dead" for each in mine):  # without its current the junction law tells nothing
+            mine += vehicle.of_law(shape[i], unusual[i])
+            clipped = {each.branch for each in mine if each.cause == "clipped"}
+            # Beyond the range of a clipped sensor the peaks of the other branches look like spikes.
+            mine += [each for each in vehicle.of_spikes() if not clipped or each.branch in clipped]
+        found[j] = tuple(sorted(mine, key=lambda each: -each.probability))
+    return found
+
+
+def _posterior(odds: ArrayLike) -> Array:
+    return 1.0 - (1.0 - PRIOR) / (1.0 - PRIOR + np.asarray(odds, np.float64))
+
+
+def _probability(misfit_a: Array, usual_a: Array, largest_a: float) -> Array:
+    """Probability of a misfit of this size: log-uniform against half a Student's t of the usual size."""
+    z = np.maximum(misfit_a / usual_a, 1.0)
+    alternative = 1.0 / (z * np.log(np.maximum(largest_a / usual_a, np.e)))
+    return _posterior(PRIOR * alternative / np.maximum(2.0 * student_t.pdf(z, TAIL), 1e-300))
+
+
+def _of_slopes(misfits: Misfits, usual: UsualMisfits) -> tuple[Array, Array]:
+    """Probabilities that each sensor is inverted, and that it is dead, shape (N, K)."""
+
+    def density(about: float, sd: Array) -> Array:
+        return np.asarray(np.exp(-0.5 * ((misfits.slope - about) / sd) ** 2) / sd)
+
+    # What the model misses may follow it by chance, and hides it where the current hardly moves.
+    chance = CHANCE * usual.model_error_a / np.maximum(misfits.moves_a, TINY)
+    sd = np.hypot(misfits.slope_sd, np.minimum(chance, 100.0))
+    wide = np.hypot(np.hypot(GAIN_SD, usual.slope_spread), sd)
+    inverted, dead = PRIOR * density(-1.0, wide), PRIOR * density(0.0, np.hypot(DEAD_SD, sd))
+    whole = (1.0 - PRIOR) * density(1.0, wide) + inverted + dead + TINY
+    return inverted / whole, dead / whole
+
+
+def _finding(branch: str | None, cause: str, probability: float, text: str) -> Finding:
+    # Rounded, as vehicles that are checked together change the last digits.
+    return Finding(branch=branch, cause=cause, probability=min(round(float(probability), 4), 1.0), text=text)
+
+
+def _who(name: str | None) -> str:
+    return f"sensor {name}" if name is not None else "one of the sensors, it is not known which"
+
+
+@dataclass(frozen=True)
+class _Vehicle:
+    """Vehicle j of some misfits; its methods word what is found in it."""
+
+    misfits: Misfits
+    usual: UsualMisfits
+    j: int
+    branches: tuple[str, ...]
+    near_zero_a: float
+
+    def of_slopes(self, inverted: Array, dead: Array) -> list[Finding]:
+        """Sensors that are inverted or dead, by their slope over the fleet model."""
+        found, misfits, j = [], self.misfits, self.j
+        for k, name in enumerate(self.branches):
+            if inverted[k] >= LEAST_PROBABILITY:
+                text = (
+                    f"sensor {name} reads with the wrong sign, {misfits.slope[j, k]:+.2f} A per ampere of the fleet's; "
+                )
+                found.append(
+                    _finding(name, "inverted", inverted[k], f"{text}turn it round, or correct its signal's sign")
+                )
+            if dead[k] >= LEAST_PROBABILITY:
+                text = f"sensor {name} does not follow the current, it stays near {misfits.mean_a[j, k]:.1f} A; "
+                found.append(_finding(name, "dead", dead[k], f"{text}check it, its plug and its supply"))
+        return found
+
+    def of_law(self, shape: Array, unusual: Array) -> list[Finding]:
+        """The cause that explains most of the junction law's residual; noise and switched loads by what is left."""
+        misfits, usual, j = self.misfits, self.usual, self.j
+        c = int(misfits.fit[j].argmax())
+        share = 1.0 / np.exp(np.minimum(misfits.fit[j] - misfits.fit[j, c], 0.0)).sum()
+        probability = float(shape[c] * share) if misfits.fit[j, c] > 0.0 else 0.0
+        at = c if probability >= LEAST_PROBABILITY else -1
+        found, left = [], misfits.residual_a2[j]
+        excess, fast = left[at] - usual.residual_a2, misfits.fast_a2[j] - usual.fast_a2
+        if unusual[at] >= LEAST_PROBABILITY and fast > 0.5 * excess:
+            k = int(misfits.noise_share[j].argmax())
+            name = self.branches[k] if misfits.noise_share[j, k] >= NAMED else None
+            rms_a, usual_a = np.sqrt(misfits.fast_a2[j]), np.sqrt(usual.fast_a2)
+            text = f"{_who(name)}: noise of {rms_a:.1f} A RMS, usual are {usual_a:.1f} A; check its shield and its plug"
+            found.append(_finding(name, "noise", unusual[at], text))
+        elif unusual[at] >= LEAST_PROBABILITY and (
+            at < 0 or left[-1] - left[c] < EXPLAINED * (left[-1] - usual.residual_a2)
+        ):
+            rms_a, usual_a = np.sqrt(left[-1]), np.sqrt(usual.residual_a2)
+            text = f"the sum of the currents wanders by {rms_a:.1f} A RMS, usual are {usual_a:.1f} A; look for a load "
+            text += "without a sensor that is switched on and off, or a loose contact"
+            return [_finding(None, "switching", unusual[at], text)]
+        return [*found, self._worded(c, probability)] if at >= 0 else found
+
+    def _worded(self, c: int, probability: float) -> Finding:
+        """One of :data:`CAUSES`, with its sensor and figures."""
+        misfits, j, cause = self.misfits, self.j, CAUSES[c]
+        weight = np.exp(misfits.branch_fit[j, c] - misfits.branch_fit[j, c].max())
+        k = int(weight.argmax())
+        name = self.branches[k] if weight[k] >= NAMED * weight.sum() else None
+        size, place, level = misfits.size[j, c], misfits.place[j, c], misfits.level_branch[j, c]
+        percent, rms_a = f"{100.0 * abs(size):.0f} %", misfits.misfit_a[j, c]
+        if cause in {"bend", "sign"}:
+            cause = "clipped" if abs(size) >= CLIPPED else "sign" if place <= self.near_zero_a else "saturating"
+        text = {
+            "quadratic": f"its error grows with the square of the current, {percent} at full scale",
+            "cubic": f"its error grows with the cube of the current, {percent} at full scale",
+            "sign": f"its gain differs by {percent} with the sign of the current, or a load without a sensor takes "
+            f"{50.0 * abs(size):.0f} % of |{self.branches[level]}|",
+            "clipped": f"it shows no more than about {place:.0f} A" if place else "it shows currents of one sign only",
+            "saturating": f"its gain changes by {percent} beyond about {place:.0f} A",
+            "step": f"its gain or offset changed after {100.0 * place:.0f} % of the recordings",
+            "ramp": "its gain or offset drifts with time",
+            "temperature": f"its gain or offset drifts with temperature (standard deviation {place:.0f} K)",
+        }[cause]
+        text = f"{_who(name)}: {text}; this makes {rms_a:.1f} A RMS; check the sensor against a reference"
+        return _finding(name, cause, probability, text)
+
+    def of_spikes(self) -> list[Finding]:
+        """Sensors with many spikes."""
+        found, n = [], self.misfits.samples[self.j]
+        for name, (up, down) in zip(self.branches, self.misfits.spikes[self.j], strict=True):
+            rate, usual = float(up + down), self.usual.spike_rate
+            if rate <= usual:
+                continue
+            # Poisson counts at this rate against the fleet's, less what the unknown rate costs.
+            likelihood = n * (rate * (np.log(rate / usual) - 1.0) + usual) - 0.5 * np.log(rate * n)
+            one_sided = min(up, down) <= ONE_SIDED * rate
+            cause = "spikes" if one_sided else "noise" if rate > NOISE_RATE else "outliers"
+            text = (
+                f"sensor {name}: spikes{' to one side' if one_sided else ''} in {100.0 * rate:.2f} % of the samples, "
+            )
+            text += "which are left out; check its plug and its shield"
+            found.append(_finding(name, cause, float(_posterior(PRIOR * np.exp(min(likelihood, 500.0)))), text))
+        return [each for each in found if each.probability >= LEAST_PROBABILITY]

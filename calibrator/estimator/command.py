@@ -1,0 +1,216 @@
+"""``calibrator calibrate`` and ``calibrator params``: a fleet's parameter files."""
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calibrator.files.folders import require_possible_folder
+from calibrator.files.layout_files import vehicle_database
+from calibrator.options import Classifier, Method
+from calibrator.processes.interrupts import importing
+from calibrator.processes.reading import TIME_LIMIT_S
+from calibrator.terminal.options import (
+    BranchesOption,
+    FleetOrSummariesArgument,
+    JsonOption,
+    LayoutOption,
+    MagnitudeOption,
+    SeedOption,
+    SparsityOption,
+    SymmetricOption,
+    TimeLimitOption,
+    WorkersOption,
+    given_options,
+    number_option,
+)
+from calibrator.terminal.text import counted, dumps, print_report, told_once
+from ecu_node.failures import INTERNAL_ERROR, say_error
+from ecu_node.standard_output import write_output
+from ecu_node.user_files import write_atomically
+
+if TYPE_CHECKING:
+    from calibrator.fleet_truth import FleetTruth
+
+__all__ = ["calibrate", "params"]
+
+OWN_OPTIONS = {
+    Method.POSTERIOR: ("harm_limit", "trusted", "readings", "expected_faults", "scheduler", "since"),
+    Method.PUBLISHED: ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity", "seed"),
+}
+"""What only one method heeds."""
+SCHEDULER = re.compile(r"(tcp|tls)://([^\s/?#@:\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})")
+MAX_PORT = 65_535
+MOST_NAMED = 5
+"""Internal errors that are named one by one."""
+
+
+def _scheduler(value: str | None) -> str | None:
+    if value is None:
+        return None
+    found = SCHEDULER.fullmatch(value)
+    if found is None or not 1 <= int(found["port"]) <= MAX_PORT:
+        raise typer.BadParameter(
+            f"{value!r}: expected the address of a Dask scheduler, tcp://HOST:PORT or tls://HOST:PORT, port 1 to "
+            f"{MAX_PORT}"
+        )
+    return value
+
+
+def calibrate(
+    context: typer.Context,
+    fleet: FleetOrSummariesArgument,
+    layout: LayoutOption,
+    out: Annotated[Path, typer.Option("--out", help="Folder of the result, new or empty.")],
+    method: Annotated[Method, typer.Option("--method", help="Estimator.")] = Method.POSTERIOR,
+    harm_limit: Annotated[
+        float, number_option("--harm-limit", 0, 1, "Correct a branch if harm is less probable (posterior)")
+    ] = 0.001,
+    trusted: Annotated[
+        list[str] | None,
+        typer.Option("--trusted", help="Vehicles with bench-checked sensors; three carry the reference (posterior)."),
+    ] = None,
+    readings: Annotated[
+        Path | None,
+        typer.Option(
+            "--readings",
+            help="Bench readings: CSV with columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a "
+            "(posterior).",
+        ),
+    ] = None,
+    expected_faults: Annotated[
+        float | None,
+        number_option("--expected-faults", 0, 1, "Share of vehicles with a sensor fault, if known (posterior)"),
+    ] = None,
+    classifier: Annotated[
+        Classifier, typer.Option("--classifier", help="Tells hardware faults (published).")
+    ] = Classifier.TREE,
+    truth: Annotated[Path | None, typer.Option("--truth", help="truth.json, for the perfect classifier.")] = None,
+    sparsity: SparsityOption = 80.0,
+    magnitude: MagnitudeOption = (0.05, 0.25),
+    symmetric: SymmetricOption = False,
+    branches: BranchesOption = None,
+    hold_out: Annotated[
+        list[str] | None,
+        typer.Option("--hold-out", help="Vehicles to calibrate, but to learn nothing from for others."),
+    ] = None,
+    unity: Annotated[
+        str | None, typer.Option("--unity", help="Vehicle whose held-out data is the unity drive (published).")
+    ] = None,
+    seed: SeedOption = 0,
+    workers: WorkersOption = 2,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            "--scheduler",
+            metavar="URL",
+            callback=_scheduler,
+            help="Dask scheduler, tcp://HOST:PORT, instead of processes.",
+        ),
+    ] = None,
+    since: Annotated[
+        Path | None,
+        typer.Option("--since", help="Earlier result: vehicles without new drives keep its parameters (posterior)."),
+    ] = None,
+    time_limit: TimeLimitOption = TIME_LIMIT_S,
+    json: JsonOption = False,
+) -> None:
+    """Estimate the sensor faults of every vehicle and write its parameter file.
+
+    The default method, posterior, says how sure it is and corrects a branch only if that hardly harms. The options
+    classifier, truth, sparsity, magnitude, symmetric, unity and seed are for the published method, which is kept as a
+    reference: its classifier 'tree' is trained on an artificial fleet of this --sparsity, --magnitude and --seed.
+    """
+    with importing():
+        from calibrator.estimator.results import internal_errors
+        from calibrator.estimator.run import calibrate_fleet
+        from calibrator.estimator.settings import CalibrationSettings
+        from calibrator.estimator.workers import Workers
+
+    _require_truth_where_used(classifier, truth, method)
+    for other, names in OWN_OPTIONS.items():
+        given = given_options(context, names)
+        if other is not method and given:  # without a word, it would be ignored
+            raise typer.BadParameter(
+                f"belongs to --method {other.value}, not {method.value}; leave it out or change the method",
+                param_hint=given[0],
+            )
+    settings = CalibrationSettings(
+        method=method,
+        harm_limit=harm_limit,
+        trusted=_named(trusted),
+        readings=readings,
+        expected_faults=expected_faults,
+        classifier=classifier,
+        truth=_truth_of(Path(fleet), truth) if truth is not None else None,
+        sparsity=sparsity,
+        magnitude=magnitude,
+        symmetric=symmetric,
+        branches=tuple(branches.split(",")) if branches else None,
+        hold_out=_named(hold_out),
+        unity=unity,
+        seed=seed,
+        time_limit_s=time_limit,
+    )
+    where = Workers(processes=workers, scheduler=scheduler)
+    report = calibrate_fleet(fleet, vehicle_database(layout), out, settings, workers=where, since=since)
+    print_report(report, json=json)
+    if failed := internal_errors(out):
+        lines = "; ".join(told_once(failed.items())[:MOST_NAMED])
+        say_error(f"calibrator: internal error in {counted(len(failed), 'vehicle')}, which are left out: {lines}")
+        raise typer.Exit(INTERNAL_ERROR)
+
+
+def params(
+    result: Annotated[Path, typer.Argument(help="Folder that 'calibrator calibrate' wrote.")],
+    vehicles: Annotated[list[str], typer.Argument(help="Vehicles.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for VEHICLE.json; files of that name are replaced.")],
+    json: JsonOption = False,
+) -> None:
+    """Write the parameter files of some vehicles, of a fleet too large for a file each in one folder."""
+    with importing():
+        from calibrator.estimator.results import written_of
+
+    texts = {vehicle: written_of(result, vehicle).text for vehicle in vehicles}
+    require_possible_folder(out)
+    out.mkdir(parents=True, exist_ok=True)
+    files = {vehicle: str(out / f"{vehicle}.json") for vehicle in texts}
+    for vehicle, text in texts.items():
+        write_atomically(Path(files[vehicle]), text)
+    write_output(dumps({"files": files}) if json else "\n".join(files.values()))
+
+
+def _named(values: list[str] | None) -> frozenset[str]:
+    """Vehicles of an option that is given several times, or once with commas; no name has a comma."""
+    return frozenset(name.strip() for value in values or () for name in value.split(","))
+
+
+def _require_truth_where_used(classifier: Classifier, truth: Path | None, method: Method) -> None:
+    """Refuse a truth that nothing uses, and the perfect classifier without one."""
+    if (classifier is Classifier.PERFECT) == (truth is not None):
+        return
+    with_method = "" if method is Method.PUBLISHED else "--method published "
+    if truth is not None:
+        raise typer.BadParameter(
+            f"used by the perfect classifier alone, not by {classifier.value}; "
+            f"add {with_method}--classifier perfect, or leave it out",
+            param_hint="--truth",
+        )
+    raise typer.BadParameter(
+        f"perfect is told the truth; add {with_method}--truth FILE, the truth.json of this artificial fleet",
+        param_hint="--classifier",
+    )
+
+
+def _truth_of(fleet: Path, path: Path) -> "FleetTruth":
+    """The truth, if it is that of the fleet's vehicles."""
+    from calibrator.drives.fleet_id import require_same_fleet
+    from calibrator.fleet_truth import faults_of, read_truth
+    from calibrator.sources.fleet_source import find_fleet
+
+    truth = read_truth(path)
+    source = find_fleet(fleet)
+    require_same_fleet(source.fleet_ids, truth.fleet_id, drives=fleet, truth=path)
+    faults_of(truth, list(source.vehicles))
+    return truth

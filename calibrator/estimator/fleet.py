@@ -1,0 +1,605 @@
+"""The calibrator in Python: a junction, a fleet of recordings, and :class:`FleetCalibrator`, which learns from them.
+
+What it learned stands in attributes that end in ``_``, as in scikit-learn. It goes the way of ``calibrator calibrate``:
+drives are summarised into a store, of which a run makes a result folder (:mod:`calibrator.estimator.run`); data frames
+become drives first (:mod:`calibrator.estimator.frames`). Imports that take time stand in functions.
+"""
+
+import hashlib
+import html
+import inspect
+import math
+import shutil
+import warnings
+import weakref
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass, field, replace
+from numbers import Real
+from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
+from typing import TYPE_CHECKING, Any
+
+from calibrator.errors import ContradictionError, FleetError
+from ecu_node.layout import Branch, Input, Layout
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from calibrator.drive import Drive
+    from calibrator.estimator.results import CalibrationReport
+    from calibrator.estimator.settings import CalibrationSettings
+    from ecu_node.database import VehicleDatabase
+    from ecu_node.parameters import VehicleParameters
+
+__all__ = ["Fleet", "FleetCalibrator", "Junction", "Log", "Vehicle", "read_log"]
+
+MOST_BRANCHES = 16
+MOST_MISSED, LEAST_AGE_S = 2.5, 0.5
+"""Rows of a data frame farther apart than so many periods, and than this, leave a gap. [1], [s]"""
+NODE_FILES = "params"
+NAMES = {
+    "drift": "gain_error",
+    "drift_sd": "gain_error_sd",
+    "applied": "corrected",
+    "held_back": "reason_not_corrected",
+}
+"""Columns of ``results.parquet`` that the door names otherwise: a drift is a change over time to most."""
+COLUMNS = (
+    "vehicle",
+    "branch",
+    "gain_error",
+    "gain_error_sd",
+    "offset_a",
+    "offset_sd_a",
+    "fault_probability",
+    "harm_probability",
+    "corrected",
+    "reason_not_corrected",
+    "verdict",
+    "confidence",
+    "hardware_probability",
+)
+"""Of ``parameters_``."""
+NO_NODE_FILES = (
+    "no parameter files for the node are written: they belong to a layout; make the junction by Junction.from_layout"
+)
+
+
+@dataclass(frozen=True)
+class Junction:
+    """Where the high-voltage currents of a vehicle meet; the sum of the K branch currents is 0 A (Kirchhoff).
+
+    Parameters
+    ----------
+    branches : sequence of str
+        Names of the K branches, two or more.
+    full_scale_a : float
+        Nominal maximum current; offsets are compared in fractions of it. [A]
+
+    Examples
+    --------
+    >>> Junction(branches=["battery", "motor", "heater"], full_scale_a=400.0).branches
+    ('battery', 'motor', 'heater')
+    """
+
+    branches: Sequence[str]
+    full_scale_a: float
+    database: "VehicleDatabase | None" = field(default=None, repr=False, compare=False)
+    """Layout and DBC, set by :meth:`from_layout`."""
+
+    def __post_init__(self) -> None:
+        names = [] if isinstance(self.branches, str) else list(self.branches)
+        if not all(isinstance(name, str) and name.strip() for name in names) or len(set(names)) < len(names):
+            raise FleetError(f"branches {names}: expected different names, such as ['battery', 'motor']")
+        if not 2 <= len(names) <= MOST_BRANCHES:
+            raise FleetError(
+                f"branches {self.branches!r}: a junction has 2 to {MOST_BRANCHES} branches, in a list; name all "
+                f"currents that are measured, as nothing tells what a single sensor does wrong"
+            )
+        scale_a: Any = self.full_scale_a
+        if not (isinstance(scale_a, Real) and math.isfinite(scale_a) and float(scale_a) > 0.0):
+            raise FleetError(f"full_scale_a {scale_a!r}: expected the nominal maximum current in A, such as 400.0")
+        object.__setattr__(self, "branches", tuple(names))
+
+    @classmethod
+    def from_layout(cls, path: str | Path, *, branches: Sequence[str] | None = None) -> "Junction":
+        """Junction of a layout (TOML), with its limits and derived inputs, and the DBC that the node needs.
+
+        Parameters
+        ----------
+        path : str or Path
+            The layout.
+        branches : sequence of str or None
+            Those of its branches that the vehicles have; None: all.
+
+        Returns
+        -------
+        Junction
+            For :meth:`Fleet.from_frames`.
+
+        Raises
+        ------
+        LayoutError, DatabaseError
+            If layout or DBC cannot be used, or the layout has no such branch.
+        """
+        from calibrator.files.layout_files import vehicle_database
+
+        database = vehicle_database(Path(path))
+        layout = database.layout
+        for name in branches or ():
+            layout.find_branch(name)
+        chosen = layout.branch_names if branches is None else branches
+        return cls(branches=chosen, full_scale_a=layout.full_scale_a, database=database)
+
+    @property
+    def layout(self) -> Layout | None:
+        """The layout; None if there is none."""
+        return None if self.database is None else self.database.layout
+
+    def as_database(self, inputs: Sequence[str], period_s: float) -> "VehicleDatabase":
+        """Layout and DBC; without a layout one that stands for data frames, whose signals are on no bus."""
+        if self.database is not None:
+            return self.database
+        from cantools.database.can import Database
+
+        from ecu_node.database import VehicleDatabase
+
+        age_s = max(MOST_MISSED * period_s, LEAST_AGE_S)
+        layout = Layout(
+            schema=1,
+            name="frames",
+            dbc="none",
+            full_scale_a=float(self.full_scale_a),
+            branch=[Branch(name=name, sign=1, timeout_s=age_s) for name in self.branches],
+            input=[Input(name=name, signal=f"frame.{name}") for name in inputs],
+            model_inputs=list(inputs),
+            period_s=period_s,
+            max_age_s=age_s,
+            path=Path("the junction"),
+            digest=hashlib.sha256(repr(self).encode()).hexdigest(),
+        )
+        return VehicleDatabase(layout=layout, database=Database(), digest=hashlib.sha256(b"").hexdigest())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fleet:
+    """Recordings of identical vehicles; made by :meth:`from_frames` or :meth:`from_folder`.
+
+    Attributes
+    ----------
+    place : str
+        Path or URL of the drives, or of a store of their summaries.
+    database : VehicleDatabase
+        Layout and DBC, or what stands for them.
+    has_layout : bool
+        Whether there is a layout, as the node needs one.
+    in_memory : bool
+        Whether it was made of data frames; the place is removed with the fleet then.
+    """
+
+    place: str
+    database: "VehicleDatabase" = field(repr=False)
+    has_layout: bool
+    in_memory: bool = False
+
+    @classmethod
+    def from_folder(cls, path: str | Path, layout: str | Path) -> "Fleet":
+        """Fleet of recorded drives, as ``calibrator calibrate`` takes it; none of them is read yet.
+
+        Parameters
+        ----------
+        path : str or Path
+            Drive store, folder with a folder of logs per vehicle, or summaries (path or URL).
+        layout : str or Path
+            Layout (TOML) that says what the signals mean.
+
+        Returns
+        -------
+        Fleet
+            For :meth:`FleetCalibrator.fit`.
+
+        Raises
+        ------
+        UserError
+            If there is no such place, or the layout cannot be used.
+        """
+        from calibrator.estimator.run import require_fleet
+        from calibrator.files.layout_files import vehicle_database
+        from calibrator.files.storage import open_storage
+
+        database, storage = vehicle_database(Path(layout)), open_storage(path)
+        require_fleet(storage, path, database)
+        return cls(place=storage.url, database=database, has_layout=True)
+
+    @classmethod
+    def from_frames(
+        cls,
+        frames: "Mapping[str, pd.DataFrame | Sequence[pd.DataFrame]]",
+        junction: Junction,
+        *,
+        inputs: Sequence[str] | None = None,
+    ) -> "Fleet":
+        """Fleet of data frames.
+
+        Parameters
+        ----------
+        frames : mapping of str to DataFrame, or to a sequence of them
+            Drives by vehicle. Index: seconds, or a DatetimeIndex, rising. Columns: every branch of the junction,
+            positive into it [A], and the inputs; NaN where a sample is bad.
+        junction : Junction
+            Says which columns are branches. One made by :meth:`Junction.from_layout` also has derived inputs.
+        inputs : sequence of str or None
+            Columns that the currents depend on (speed, torque, demands of auxiliaries ...). None: those of the layout,
+            or all columns that are no branches, which all vehicles must have.
+
+        Returns
+        -------
+        Fleet
+            For :meth:`FleetCalibrator.fit`, which leaves out vehicles whose drives are too short.
+
+        Raises
+        ------
+        FleetError, DriveError
+            If the frames are no recordings of such a fleet; the message names vehicle and column.
+        """
+        from calibrator.estimator.frames import summarise_frames
+
+        with ExitStack() as stack:
+            folder = mkdtemp(prefix="calibrator-")
+            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            database = summarise_frames(Path(folder), frames, junction, inputs=inputs)
+            fleet = cls(place=folder, database=database, has_layout=junction.layout is not None, in_memory=True)
+            weakref.finalize(fleet, stack.pop_all().close)  # the summaries go with the fleet
+        return fleet
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vehicle:
+    """What was found for one vehicle.
+
+    Attributes
+    ----------
+    parameters : VehicleParameters
+        Content of its parameter file.
+    """
+
+    parameters: "VehicleParameters"
+
+    def correct(self, frame: "pd.DataFrame") -> "pd.DataFrame":
+        """Correct the currents of a recording of this vehicle: i = (i_m - o) / (1 + d) on its corrected branches.
+
+        Parameters
+        ----------
+        frame : DataFrame
+            Columns of the corrected branches, positive into the junction [A]; others may be there.
+
+        Returns
+        -------
+        DataFrame
+            The same with these branches corrected, everything else as it is.
+
+        Raises
+        ------
+        DriveError
+            If a corrected branch is missing or holds no numbers.
+        """
+        from calibrator.estimator.frames import column_values, require_columns
+
+        where = f"vehicle {self.parameters.vehicle}"
+        corrected = {name: branch for name, branch in self.parameters.branches.items() if branch.apply}
+        require_columns(frame, list(corrected), where)
+        currents = {name: column_values(frame, name, where) for name in corrected}
+        return frame.assign(
+            **{name: (i_m - corrected[name].offset_a) / (1.0 + corrected[name].drift) for name, i_m in currents.items()}
+        )
+
+    def explain(self) -> str:
+        """What was found for each sensor and why, other explanations, findings, and what would decide."""
+        from calibrator.estimator.vehicle_report import explained
+
+        return explained(self.parameters)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(self.explain())}</pre>"
+
+
+class FleetCalibrator:
+    """Learns from a fleet of identical vehicles what each one's current sensors do wrong.
+
+    Parameters
+    ----------
+    harm_limit : float
+        A branch is corrected if the correction does harm with a probability below this. [1]
+    trusted : collection of str
+        Vehicles with bench-checked sensors; three or more carry the reference.
+    readings : path or DataFrame or None
+        Bench readings of single sensors: columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a.
+    hold_out : collection of str
+        Vehicles to calibrate, but to learn nothing from for others.
+    expected_faults : float or None
+        Share of vehicles with a sensor fault, if it is known. [1]
+    workers : int
+        Number of processes; the result does not depend on it.
+    scheduler : str or None
+        Address of a Dask scheduler that is used instead.
+    verbose : bool
+        Whether progress is shown on standard error.
+
+    Attributes
+    ----------
+    parameters_ : DataFrame
+        One row per vehicle and branch: ``vehicle``, ``branch``, ``gain_error`` and ``gain_error_sd`` [1], ``offset_a``
+        and ``offset_sd_a`` [A], ``fault_probability``, ``harm_probability``, ``corrected``, ``reason_not_corrected``,
+        and of the vehicle ``verdict``, ``confidence``, ``hardware_probability``.
+    vehicles_ : dict of str to Vehicle
+        By name: corrects recordings, explains what was found.
+    left_out_ : dict of str to str
+        Vehicles that could not be calibrated, and why.
+    notices_ : list of str
+        What to know of the fleet as a whole.
+
+    Examples
+    --------
+    >>> FleetCalibrator(harm_limit=0.01)
+    FleetCalibrator(harm_limit=0.01)
+    """
+
+    parameters_: "pd.DataFrame"
+    vehicles_: dict[str, Vehicle]
+    left_out_: dict[str, str]
+    notices_: list[str]
+
+    def __init__(
+        self,
+        *,
+        harm_limit: float = 0.001,
+        trusted: Collection[str] = (),
+        readings: "str | Path | pd.DataFrame | None" = None,
+        hold_out: Collection[str] = (),
+        expected_faults: float | None = None,
+        workers: int = 2,
+        scheduler: str | None = None,
+        verbose: bool = False,
+    ) -> None:
+        self.harm_limit = harm_limit
+        self.trusted = trusted
+        self.readings = readings
+        self.hold_out = hold_out
+        self.expected_faults = expected_faults
+        self.workers = workers
+        self.scheduler = scheduler
+        self.verbose = verbose
+
+    # scikit-learn's BaseEstimator does the next three as well, but takes more than a second to import
+
+    def get_params(self, deep: bool = True) -> dict[str, Any]:  # noqa: ARG002 (scikit-learn's signature)
+        """Parameters of the constructor by name."""
+        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
+
+    def set_params(self, **parameters: Any) -> "FleetCalibrator":
+        """Set parameters of the constructor, and return the calibrator."""
+        for name, value in parameters.items():
+            if name not in self.get_params():
+                raise ContradictionError(f"no parameter {name!r}; there are {', '.join(self.get_params())}")
+            setattr(self, name, value)
+        return self
+
+    def __repr__(self) -> str:
+        defaults = {name: item.default for name, item in inspect.signature(type(self)).parameters.items()}
+        changed = (
+            f"{name}={value!r}" for name, value in self.get_params().items() if repr(value) != repr(defaults[name])
+        )
+        return f"{type(self).__name__}({', '.join(changed)})"
+
+    def fit(self, fleet: Fleet, y: None = None) -> "FleetCalibrator":  # noqa: ARG002 (scikit-learn's signature)
+        """Learn from a fleet, and estimate the sensor faults of every vehicle.
+
+        Parameters
+        ----------
+        fleet : Fleet
+            Recordings of two vehicles or more.
+        y : None
+            Not used.
+
+        Returns
+        -------
+        FleetCalibrator
+            This one.
+
+        Raises
+        ------
+        UserError
+            If the fleet as a whole cannot be calibrated, or a parameter makes no sense.
+        """
+        from calibrator.estimator.run import calibrate_fleet
+        from calibrator.estimator.workers import Workers
+        from calibrator.terminal.progress import no_progress
+
+        if not isinstance(fleet, Fleet):
+            raise FleetError(f"{type(fleet).__name__} given; expected a Fleet: Fleet.from_frames or Fleet.from_folder")
+        with TemporaryDirectory(prefix="calibrator-") as folder, nullcontext() if self.verbose else no_progress():
+            settings, out = self._settings(Path(folder)), Path(folder) / "result"
+            # frames are so few that another process takes longer to start than they take here
+            workers = Workers(processes=1 if fleet.in_memory else self.workers, scheduler=self.scheduler)
+            report = calibrate_fleet(fleet.place, fleet.database, out, settings, workers=workers)
+            self._keep(out, report, has_layout=fleet.has_layout)
+        return self
+
+    def _settings(self, folder: Path) -> "CalibrationSettings":
+        """Parameters of the constructor as the command takes them; ContradictionError if one makes no sense."""
+        from calibrator.estimator.settings import CalibrationSettings
+
+        for name, low, high in (("harm_limit", 0, 1), ("expected_faults", 0, 1), ("workers", 1, 256)):
+            value = getattr(self, name)
+            if name == "expected_faults" and value is None:
+                continue
+            if not (isinstance(value, Real) and low <= float(value) <= high):
+                raise ContradictionError(f"{name} is {value!r}; expected a number from {low} to {high}")
+        trusted, hold_out = (
+            frozenset([names] if isinstance(names, str) else names) for names in (self.trusted, self.hold_out)
+        )
+        readings = self.readings
+        if readings is not None and not isinstance(readings, (str, Path)):
+            readings.to_csv(folder / "readings.csv", index=False)
+            readings = folder / "readings.csv"
+        return CalibrationSettings(
+            harm_limit=self.harm_limit,
+            readings=None if readings is None else Path(readings),
+            expected_faults=self.expected_faults,
+            trusted=trusted,
+            hold_out=hold_out,
+        )
+
+    def _keep(self, out: Path, report: "CalibrationReport", *, has_layout: bool) -> None:
+        """Take over what stands in a result folder."""
+        import pandas as pd
+
+        from calibrator.estimator.results import internal_errors, read_part
+        from calibrator.terminal.text import told_once
+        from ecu_node.parameters import decode_parameters
+
+        paths = [path for path in sorted(out.rglob("*")) if path.is_file()]
+        self._files = {
+            str(path.relative_to(out)): path.read_bytes()
+            for path in paths
+            if has_layout or path.parent.name != NODE_FILES
+        }
+        self._report, self._has_layout = replace(report, result=""), has_layout
+        written = {
+            name: item for path in paths if path.parent.name == "parameters" for name, item in read_part(path).items()
+        }
+        self.vehicles_ = {
+            name: Vehicle(parameters=decode_parameters(written[name].text, f"parameters of {name}"))
+            for name in sorted(written)
+        }
+        rows = pd.read_parquet(out / "results.parquet")
+        left_out = rows[rows["branch"].isna()]
+        self.left_out_ = dict(zip(left_out["vehicle"], left_out["reason"], strict=True))
+        self.parameters_ = rows[rows["branch"].notna()].rename(columns=NAMES)[list(COLUMNS)].reset_index(drop=True)
+        self.parameters_["corrected"] = self.parameters_["corrected"].astype(bool)
+        self.notices_ = list(report.run.notices)
+        if failed := internal_errors(out):
+            warnings.warn(
+                f"internal error, left out: {'; '.join(told_once(failed.items()))}", RuntimeWarning, stacklevel=3
+            )
+
+    def _require_fitted(self) -> None:
+        if not hasattr(self, "parameters_"):
+            raise FleetError("this FleetCalibrator has learned nothing yet; call fit(fleet) first")
+
+    def summary(self) -> str:
+        """What was found, as ``calibrator calibrate`` prints it."""
+        self._require_fitted()
+        return self._report.as_text()
+
+    def _repr_html_(self) -> str:
+        if not hasattr(self, "parameters_"):
+            return f"<pre>{html.escape(repr(self))}</pre>"
+        table: str = self.parameters_.to_html(index=False, max_rows=60, float_format="{:.4g}".format)
+        return f"<pre>{html.escape(self.summary())}</pre>{table}"
+
+    def write(self, folder: str | Path) -> Path:
+        """Write the result folder, the same that ``calibrator calibrate`` writes.
+
+        Without a layout (data frames of a bare junction) it has no parameter files for the node; a warning says so.
+
+        Parameters
+        ----------
+        folder : str or Path
+            New or empty folder; it appears only when it is complete.
+
+        Returns
+        -------
+        Path
+            The folder.
+
+        Raises
+        ------
+        FleetError
+            If nothing was learned yet, or the folder is not empty or cannot be made.
+        """
+        from calibrator.files.folders import whole_folder
+
+        self._require_fitted()
+        with whole_folder(Path(folder)) as partial:
+            for name, content in self._files.items():
+                (partial / name).parent.mkdir(parents=True, exist_ok=True)
+                (partial / name).write_bytes(content)
+        if not self._has_layout:
+            warnings.warn(NO_NODE_FILES, stacklevel=2)
+        return Path(folder)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Log:
+    """One log of a vehicle, as its layout reads it.
+
+    Attributes
+    ----------
+    drive : Drive
+        Every signal at its own instants: ``drive.branches`` and ``drive.inputs`` by name.
+    layout : Layout
+        Of the log.
+    """
+
+    drive: "Drive"
+    layout: Layout
+
+    def to_frame(self) -> "pd.DataFrame":
+        """All signals on one time base, as :meth:`Fleet.from_frames` takes them.
+
+        Returns
+        -------
+        DataFrame
+            Index: seconds since the start of the log, the period of the layout apart. Columns: branches [A], positive
+            into the junction, inputs, and derived inputs; NaN where any of them is missing.
+
+        Raises
+        ------
+        DriveError
+            If the signals have no instant in common.
+        """
+        import pandas as pd
+
+        from calibrator.drives.align import align, choose_inputs
+
+        branches = [name for name, channel in self.drive.branches.items() if channel.good.any()]
+        recorded = [name for name, channel in self.drive.inputs.items() if channel.good.any()]
+        derived = choose_inputs(self.layout, recorded, names=[item.name for item in self.layout.derived])[0]
+        samples = align(self.drive, self.layout, branches, inputs=[*recorded, *derived])
+        columns = dict(zip(samples.branch_names, samples.currents_a.T, strict=True))
+        columns |= dict(zip(samples.input_names, samples.inputs.T, strict=True))
+        return pd.DataFrame(columns, index=pd.Index(samples.time_s, name="time_s"))
+
+    def __repr__(self) -> str:
+        channels = ", ".join([*self.drive.branches, *self.drive.inputs])
+        return f"Log({self.drive.vehicle} {self.drive.name}, {self.drive.duration_s:.0f} s: {channels})"
+
+
+def read_log(path: str | Path, layout: str | Path) -> Log:
+    """Read one CAN log (candump, BLF, ASC, TRC, MF4).
+
+    Parameters
+    ----------
+    path : str or Path
+        The log; its folder is the vehicle's name.
+    layout : str or Path
+        Layout (TOML) that says what the signals mean.
+
+    Returns
+    -------
+    Log
+        With ``to_frame()``.
+
+    Raises
+    ------
+    LogError, LayoutError, DatabaseError
+        If the log, the layout or its DBC cannot be used.
+    """
+    from calibrator.files.layout_files import vehicle_database
+    from calibrator.recordings.readers import read_drive
+
+    database, log = vehicle_database(Path(layout)), Path(path)
+    drive = read_drive(log, database, vehicle=log.absolute().parent.name, name=log.name.partition(".")[0])
+    return Log(drive=drive, layout=database.layout)

@@ -1,0 +1,776 @@
+"""Estimate the sensor faults of a fleet: learn what its vehicles have in common, then each vehicle by itself.
+
+    summaries -> fleet model, evidence rows (learn_fleet) -> laws of the fleet -> FleetReference
+    summaries of any vehicles + FleetReference (estimate_vehicles) -> explanations -> decision, checks -> FleetEstimate
+
+What is said of a vehicle does not depend on which others are estimated with it.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrator.drive import Array, Mask
+from calibrator.errors import FleetError
+from calibrator.estimator.checks import UsualMisfits, check_fit, learn_usual_misfits
+from calibrator.estimator.clusters import densest_clusters
+from calibrator.estimator.decision import Explained, Points, best_estimate, harm_probability, points_of
+from calibrator.estimator.fleet_model import FleetModel, fit_fleet_model
+from calibrator.estimator.learning import DOUBT, Law, centre_rows, explain, learn_laws, weigh_law
+from calibrator.estimator.moments import FleetMoments, stack_summaries
+from calibrator.estimator.prior import Prior
+from calibrator.estimator.readings import FEWEST_TRUSTED, Readings, untrusted_vehicles, with_readings
+from calibrator.estimator.rows import EvidenceRows, collect_rows, evidence_names
+from calibrator.estimator.vehicle_evidence import VehicleEvidence, reported_evidence
+from calibrator.summaries.moments import DriveSummary
+from ecu_node.layout import UnmeasuredLoad
+from ecu_node.parameters import Explanation, Finding
+
+__all__ = [
+    "HARM_LIMIT",
+    "FleetEstimate",
+    "FleetReference",
+    "RowsEstimate",
+    "estimate_rows",
+    "estimate_vehicles",
+    "learn_fleet",
+]
+
+HARM_LIMIT = 0.001
+"""Default probability of making a branch worse up to which it is corrected. [1]"""
+CONFIDENT, SUSPECTED = 0.95, 0.5
+"""Confidence from which on a vehicle counts as sound, and probability from which on hardware is suspected. [1]"""
+FEWEST_VEHICLES = 5
+"""Of a fleet that is compared with itself: in a smaller one it is not clear who differs from whom."""
+MOST_GAIN_SD = 0.1
+"""Standard deviation from which on a gain is not known: smaller than the faults that matter. [1]"""
+LEAST_EXPLANATION = 1e-5
+"""Probability of an explanation that is reported. [1]"""
+CENTRAL = 0.6827
+"""Share of a normal distribution within one standard deviation. [1]"""
+LEFT_OUT_CAUSES = ("spikes", "outliers")
+"""Findings whose samples are not in the sums: the other branches of the vehicle are not concerned."""
+VARIANT_SHARE, VARIANT_SPREAD, FEWEST_VARIANT = 0.15, 0.012, 4
+"""Share of the fleet, half width of the hardware drift, and number of vehicles of a variant. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowsEstimate:
+    """What the evidence rows of N vehicles with K branches say, branches in the order of the rows.
+
+    Attributes
+    ----------
+    drift, offset, drift_sd, offset_sd : ndarray of shape (N, K)
+        Sensor faults, offsets in fractions of full scale, and their standard deviations. [1]
+    hardware_drift, hardware_probability, confidence : ndarray of shape (N,)
+        Of a hardware fault; posterior probability that the estimate is recovered. [1]
+    hardware_offset : ndarray of shape (N, K)
+        In fractions of full scale. [1]
+    fault_probability, harm_probability : ndarray of shape (N, K)
+        That the sensor is faulty; that correction makes the branch worse. [1]
+    identifiable : ndarray of bool of shape (N, K)
+        Whether some row shows the gain.
+    load_probability, load : ndarray of shape (N,)
+        That a load without a sensor is carried by the feeding branch in this vehicle alone, and its expected size, in
+        fractions of full scale. [1]
+    group_probability : ndarray of shape (N, g)
+        That the vehicle is one of each group that shares a constant of the feeding branch. [1]
+    explanations : list of N lists of (float, ndarray of shape (4, K))
+        Probability; hardware drift (first column), hardware offsets, drifts and offsets; by falling probability.
+    points : list of N Points
+        The posterior.
+    """
+
+    drift: Array
+    offset: Array
+    drift_sd: Array
+    offset_sd: Array
+    hardware_drift: Array
+    hardware_offset: Array
+    hardware_probability: Array
+    confidence: Array
+    fault_probability: Array
+    harm_probability: Array
+    identifiable: Mask
+    load_probability: Array
+    load: Array
+    group_probability: Array
+    explanations: list[list[tuple[float, Array]]]
+    points: list[Points]
+
+
+def estimate_rows(
+    rows: EvidenceRows, laws: Sequence[Law], *, feed: int, mean: Array, mean_square: Array, usual: Array
+) -> RowsEstimate:
+    """Estimate N vehicles from their evidence rows.
+
+    Parameters
+    ----------
+    rows : EvidenceRows
+        Of the vehicles.
+    laws : sequence of Law
+        That explain their fleet.
+    feed : int
+        Branch that carries loads without a sensor.
+    mean, mean_square : ndarray of shape (N, K)
+        Moments of the measured currents, in fractions of full scale and their squares.
+    usual : ndarray of shape (2, K)
+        The same moments of the fleet's usual drive.
+
+    Returns
+    -------
+    RowsEstimate
+        In the order of the rows.
+    """
+    N, K = mean.shape
+    explained = []
+    for law in laws:
+        draws = explain(rows, law, feed=feed)
+        explained.append(Explained(law.probability, draws, weigh_law(draws, law), law.prior.group_centre))
+    smallest = np.array([laws[0].prior.gain.smallest, laws[0].prior.offset.smallest])
+    estimate, sd, confidence, harm = np.zeros((N, 2 * K)), np.zeros((N, 2 * K)), np.zeros(N), np.zeros((N, K))
+    fault, hardware, points, explanations = np.zeros((N, K)), np.zeros(N), [], []
+    for j in range(N):
+        found = points_of(explained, j)
+        estimate[j], confidence[j] = best_estimate(found, smallest)
+        drift, offset = estimate[j, :K], estimate[j, K:]
+        own = (mean[j] - offset) / (1.0 + drift)
+        own_square = np.maximum((mean_square[j] - 2.0 * offset * mean[j] + offset**2) / (1.0 + drift) ** 2, own**2)
+        harm[j] = harm_probability(
+            found, estimate[j], np.stack([own, usual[0]]), np.stack([own_square, np.maximum(usual[1], usual[0] ** 2)])
+        )
+        sd[j] = _central_sd(found, estimate[j])
+        faulty = found.faults != 0.0
+        fault[j] = np.minimum(found.weight @ (faulty[:, :K] | faulty[:, K:]), 1.0)
+        points.append(found)
+        explanations.append(_explanations(explained, found, j))
+        hardware[j] = sum(share for share, values in explanations[j] if values[:2].any())
+    first = np.array([_nearest(each, estimate[j]) for j, each in enumerate(explanations)])
+    return RowsEstimate(
+        drift=estimate[:, :K],
+        offset=estimate[:, K:],
+        drift_sd=sd[:, :K],
+        offset_sd=sd[:, K:],
+        hardware_drift=first[:, 0, 0],
+        hardware_offset=first[:, 1],
+        hardware_probability=np.minimum(hardware, 1.0),
+        confidence=confidence,
+        fault_probability=fault,
+        harm_probability=harm,
+        identifiable=_identifiable(rows),
+        **_unmeasured(explained),
+        explanations=explanations,
+        points=points,
+    )
+
+
+def _unmeasured(laws: Sequence[Explained]) -> dict[str, Array]:
+    """Loads without a sensor, and groups, over all laws; these share their groups."""
+    own, size, groups = [], [], []
+    for law in laws:
+        P = law.draws.values.shape[3]
+        alone = law.weight[..., 0] * law.draws.fits.support[:, :, None, P - 1]
+        own.append(law.probability * _total(alone))
+        size.append(law.probability * _total(alone * law.draws.values[..., P - 1]))
+        groups.append(law.probability * _total(law.weight[..., 1:]))
+    most = max(group.shape[1] for group in groups)
+    load = np.sum(own, axis=0)
+    return {
+        "load_probability": load,
+        "load": np.sum(size, axis=0) / np.maximum(load, 1e-300),
+        "group_probability": np.sum([np.pad(group, [(0, 0), (0, most - group.shape[1])]) for group in groups], axis=0),
+    }
+
+
+def _total(values: Array) -> Array:
+    """Sum over draws (N, Q, M, ...), one after the other: the same however many explanations other vehicles have."""
+    N, Q, M = values.shape[:3]
+    return np.asarray(np.cumsum(values.reshape(N, Q * M, *values.shape[3:]), axis=1)[:, -1])
+
+
+def _central_sd(points: Points, estimate: Array) -> Array:
+    """Distance from the estimate within which 68 % of the posterior lies, shape (2K,)."""
+    sd, total = np.zeros(len(estimate)), points.weight.sum()
+    exactly = points.weight @ (points.faults == estimate)
+    for i in np.flatnonzero(exactly < CENTRAL * total):
+        away = np.abs(points.faults[:, i] - estimate[i])
+        order = np.argsort(away, kind="stable")
+        inside = np.cumsum(points.weight[order])
+        sd[i] = away[order[min(int(np.searchsorted(inside, CENTRAL * inside[-1])), len(order) - 1)]]
+    return sd
+
+
+def _explanations(laws: Sequence[Explained], points: Points, j: int) -> list[tuple[float, Array]]:
+    """Supports of a vehicle with the signs of their parameters, over all laws; each with its mean parameters."""
+    K = points.faults.shape[1] // 2
+    share = np.bincount(points.explanation, points.weight)
+    order = np.argsort(-share, kind="stable")
+    order = order[share[order] >= LEAST_EXPLANATION]
+    theta = np.array([laws[points.law[i]].draws.fits.theta[j, points.fit[i]] for i in order.tolist()])
+    values = np.zeros((len(order), 4, K))
+    values[:, 0, 0] = np.expm1(theta[:, 0])
+    values[:, 1, :-1] = theta[:, K + 1 : 2 * K]
+    values[:, 1, -1] = -theta[:, K + 1 : 2 * K].sum(axis=1)
+    for i in range(2 * K):
+        total = np.bincount(points.explanation, points.weight * points.faults[:, i])
+        values[:, 2 + i // K, i % K] = total[order] / share[order]
+    signs = np.sign(np.where(np.abs(values) < 1e-9, 0.0, values))
+    found: dict[bytes, tuple[float, Array]] = {}
+    for each, sign, part in zip(values, signs, share[order].tolist(), strict=True):
+        before, kept = found.get(sign.tobytes(), (0.0, each))
+        found[sign.tobytes()] = (before + part, kept)
+    return sorted(found.values(), key=lambda item: -item[0])
+
+
+def _nearest(explanations: list[tuple[float, Array]], estimate: Array) -> Array:
+    """Parameters of the most probable explanation with sensor faults like the estimate's."""
+    K = len(estimate) // 2
+    apart = [float(np.abs(np.concatenate(values[2:]) - estimate).max()) for _, values in explanations]
+    near = [i for i, distance in enumerate(apart) if distance < 0.1 * np.abs(estimate).max() + DOUBT]
+    return explanations[near[0]][1] if near else np.zeros((4, K))
+
+
+def _identifiable(rows: EvidenceRows) -> Mask:
+    """Branches whose gain some row shows better than :data:`MOST_GAIN_SD`: slope, gain ratio, or a bench reading."""
+    K = rows.branches
+    sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
+    best = np.minimum(sd[:, :K], sd[:, 2 * K - 1 : 3 * K - 1])
+    best[:, 1:] = np.minimum(best[:, 1:], sd[:, K : 2 * K - 1])
+    return np.asarray(best < MOST_GAIN_SD)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetReference:
+    """What a fleet says of every vehicle of its kind.
+
+    Attributes
+    ----------
+    branches : tuple of str
+        Names of the K branches, in the vehicles' own order.
+    order : tuple of int
+        Branches as they are worked with, the most moving first: position of each in their own order.
+    feed : int
+        Place in that order of the branch that feeds the others, and any load without a sensor.
+    model : FleetModel
+        Ideal currents over the inputs, branches in the order worked with.
+    usual_correlation : ndarray of shape (3K, 3K)
+        Of the evidence rows. [1]
+    laws : tuple of Law
+        Of the faults.
+    usual : ndarray of shape (2, K)
+        Mean and mean square of the measured currents on the fleet's usual drive, over full scale.
+    misfits : UsualMisfits or None
+        How vehicles usually differ from linear sensors.
+    full_scale_a : float
+        Full scale of the junction. [A]
+    load : UnmeasuredLoad or None
+        Load that no branch measures, if it is known.
+    vehicles : int
+        Number of vehicles learnt from, or trusted ones that carry the reference, whichever is more to be relied on.
+    agreeing : tuple of float
+        Per branch in their own order: share of the vehicles whose slopes agree. [1]
+    variants : tuple of float
+        Logarithms of the factors on all currents of two variants of the vehicle; empty if there is only one. [1]
+    notices : tuple of str
+        What the user should know of the fleet.
+    distrusted : mapping of int to str
+        Vehicles called trusted that contradict it, by position among those learnt from, and how.
+    differing : tuple of int
+        Trusted vehicles that differ as by a hardware fault, and do not carry the reference.
+    """
+
+    branches: tuple[str, ...]
+    order: tuple[int, ...]
+    feed: int
+    model: FleetModel
+    usual_correlation: Array
+    laws: tuple[Law, ...]
+    usual: Array
+    misfits: UsualMisfits | None
+    full_scale_a: float
+    load: UnmeasuredLoad | None
+    vehicles: int
+    agreeing: tuple[float, ...]
+    variants: tuple[float, ...] = ()
+    notices: tuple[str, ...] = ()
+    distrusted: Mapping[int, str] = field(default_factory=dict)
+    differing: tuple[int, ...] = ()
+
+    @property
+    def expected_a(self) -> float:
+        """Mean junction sum that right sensors show: the load that none of them sees. [A]"""
+        law, K = self.laws[0], len(self.branches)
+        return float((law.spread.mean[4 * K - 1] - law.spread.shared[:K].sum()) * self.full_scale_a)
+
+    @property
+    def read_out(self) -> Array:
+        """Read-outs of the fleet model (M + 1, K), branches in their own order. [A]"""
+        return self.model.read_out[:, np.argsort(self.order)]
+
+    def details(self) -> dict[str, object]:
+        """What the run records of it."""
+        ordered, law = [self.branches[k] for k in self.order], self.laws[0]
+        prior, spread = law.prior, np.sqrt(np.diag(law.spread.covariance))
+        return {
+            "reference": {
+                "agreeing_share": dict(zip(self.branches, self.agreeing, strict=True)),
+                "unmeasured_a": self.expected_a,
+                "read_out": {name: self.model.read_out[:, k].tolist() for k, name in enumerate(ordered)},
+            },
+            "evidence": evidence_names(ordered),
+            "hyperparameters": {
+                "hardware_share": float(prior.counts[1:].sum()),
+                "drift_magnitude": [prior.gain.low, prior.gain.high],
+                "offset_magnitude": [prior.offset.low, prior.offset.high],
+                "model_spread": dict(zip(ordered, spread[: len(ordered)].tolist(), strict=True)),
+                "log_evidence": law.log_evidence,
+                "laws": [law.probability for law in self.laws],
+            },
+        }
+
+    def rows_of(
+        self, summaries: Sequence[DriveSummary], readings: Readings | None, trusted: Mask
+    ) -> tuple[EvidenceRows, FleetMoments]:
+        """Evidence of some vehicles, with what is known of single sensors and of loads without one."""
+        fleet = stack_summaries(summaries, self.order)
+        rows, _ = collect_rows(
+            fleet, self.model, full_scale_a=self.full_scale_a, usual_correlation=self.usual_correlation
+        )
+        known = _with_knowledge(
+            rows, readings, trusted, order=self.order, full_scale_a=self.full_scale_a, load=self.load
+        )
+        return known, fleet
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetEstimate:
+    """Estimate of N vehicles with K branches in their own order; NaN where a probability is not known.
+
+    Attributes
+    ----------
+    drift, offset_a, drift_sd, offset_sd_a : ndarray of shape (N, K)
+        Sensor faults and their standard deviations. [1], [A]
+    fault_probability, harm_probability : ndarray of shape (N, K)
+        That the sensor is faulty; that its correction makes it worse. [1]
+    identifiable, corrected : ndarray of bool of shape (N, K)
+        Whether the branch moved enough for its gain to be known; whether the node is to correct it.
+    held_back : ndarray of str of shape (N, K)
+        Why a fault that was found is not corrected; empty where it is, or where none was found.
+    hardware_drift, hardware_probability, confidence : ndarray of shape (N,)
+        Of a hardware fault; probability that the estimate is recovered: within 10 % of the truth. [1]
+    hardware_offset_a : ndarray of shape (N, K)
+        Of a hardware fault. [A]
+    verdicts : sequence of N str
+        Of each vehicle.
+    explanations : sequence of N sequences of Explanation
+        By falling probability, at least one.
+    findings : sequence of N sequences of Finding
+        What no explanation fits.
+    evidence : sequence of N VehicleEvidence
+        For the pages of a report; may be empty.
+    points : sequence of N Points
+        The posterior; branches in the order ``order``, offsets in fractions of full scale.
+    order : tuple of int
+        Branches of the points: position of each in their own order.
+    full_scale_a : float
+        Full scale of the junction. [A]
+    """
+
+    drift: Array
+    offset_a: Array
+    drift_sd: Array
+    offset_sd_a: Array
+    fault_probability: Array
+    harm_probability: Array
+    identifiable: Mask
+    corrected: Mask
+    held_back: NDArray[np.str_]
+    hardware_drift: Array
+    hardware_offset_a: Array
+    hardware_probability: Array
+    confidence: Array
+    verdicts: Sequence[str]
+    explanations: Sequence[Sequence[Explanation]]
+    findings: Sequence[Sequence[Finding]]
+    evidence: Sequence[VehicleEvidence] = ()
+    points: Sequence[Points] = ()
+    order: tuple[int, ...] = ()
+    full_scale_a: float = 1.0
+
+    def pit(self, drift: Array, offset_a: Array) -> tuple[Array, Array]:
+        """Probability integral transform of the truth: share of the posterior below it, each of shape (N, K).
+
+        Half of what lies exactly at the truth (a sensor without fault) counts as below.
+        """
+        place, N, K = np.argsort(self.order), *drift.shape
+        truth = np.concatenate([drift[:, list(self.order)], offset_a[:, list(self.order)] / self.full_scale_a], axis=1)
+        below = np.zeros((N, 2 * K))
+        for j, points in enumerate(self.points):
+            less, same = points.faults < truth[j] - 1e-9, np.abs(points.faults - truth[j]) <= 1e-9
+            below[j] = points.weight @ (less + 0.5 * same)
+        return below[:, :K][:, place], below[:, K:][:, place]
+
+
+def learn_fleet(
+    summaries: Sequence[DriveSummary],
+    *,
+    full_scale_a: float,
+    branches: Sequence[str],
+    readings: Readings | None = None,
+    trusted: Mask | None = None,
+    load: UnmeasuredLoad | None = None,
+    expected_faults: float | None = None,
+    known: Prior | None = None,
+) -> FleetReference:
+    """Learn what vehicles without faults are like, and which faults there are.
+
+    Parameters
+    ----------
+    summaries : sequence of DriveSummary
+        Of N vehicles, with the same inputs and branches.
+    full_scale_a : float
+        Full scale of the junction. [A]
+    branches : sequence of str
+        Names of the K branches.
+    readings : Readings or None
+        Direct readings of single sensors.
+    trusted : ndarray of bool of shape (N,) or None
+        Vehicles whose sensors were found faultless on a bench; at least three carry the reference. Those that break
+        the junction law are not trusted, those that differ from the others do not carry.
+    load : UnmeasuredLoad or None
+        Load that no branch measures, if it is known; None: estimated from the fleet.
+    expected_faults : float or None
+        Share of vehicles with a sensor fault, if it is known. [1]
+    known : Prior or None
+        Prior of the faults, if it is known.
+
+    Returns
+    -------
+    FleetReference
+        For these and other vehicles of the fleet.
+
+    Raises
+    ------
+    FleetError
+        If there is no vehicle.
+    """
+    if not summaries:
+        raise FleetError("no vehicle to learn the fleet's reference from")
+    plain = stack_summaries(summaries)
+    order = tuple(np.argsort(-np.median(plain.variance_a2, axis=0), kind="stable").tolist())
+    fleet = stack_summaries(summaries, order)
+    feed = int(np.argmax(np.median(fleet.mean_a, axis=0)))
+    model = fit_fleet_model(fleet)
+    measured, usual_correlation = collect_rows(fleet, model, full_scale_a=full_scale_a)
+    ordered = [branches[k] for k in order]
+    carriers = np.zeros(len(fleet), bool) if trusted is None else trusted.copy()
+    distrusted = untrusted_vehicles(measured, carriers, ordered, full_scale_a=full_scale_a, load=load)
+    carriers[list(distrusted)] = False
+    rows = _with_knowledge(measured, readings, carriers, order=order, full_scale_a=full_scale_a, load=load)
+
+    def learn(carrying: Mask) -> list[Law]:
+        return learn_laws(
+            rows,
+            feed=feed,
+            fixed=_carried_centre(rows, carrying),
+            load=None if load is None else load.mean_a / full_scale_a,
+            known=known,
+            expected_faults=expected_faults,
+        )
+
+    laws = learn(carriers)
+    mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
+    usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
+    differing = np.zeros_like(carriers)
+    if np.count_nonzero(carriers) >= FEWEST_TRUSTED:
+        found = estimate_rows(
+            rows.take(carriers), laws, feed=feed, mean=mean[carriers], mean_square=square[carriers], usual=usual
+        )
+        differing[carriers] = found.hardware_probability > SUSPECTED
+        laws = learn(carriers & ~differing) if differing.any() else laws
+    carried = np.count_nonzero(carriers & ~differing) >= FEWEST_TRUSTED
+    everyone = estimate_rows(rows, laws, feed=feed, mean=mean, mean_square=square, usual=usual)
+    place = np.argsort(order)
+    own_read_out = model.read_out[:, place]
+    reference = FleetReference(
+        branches=tuple(branches),
+        order=order,
+        feed=feed,
+        model=model,
+        usual_correlation=usual_correlation,
+        laws=tuple(laws),
+        usual=usual,
+        misfits=learn_usual_misfits(summaries, own_read_out, full_scale_a=full_scale_a),
+        full_scale_a=full_scale_a,
+        load=load,
+        vehicles=max(len(fleet), FEWEST_VEHICLES) if carried else len(fleet),
+        agreeing=tuple(_agreeing(rows, int(p)) for p in place),
+        variants=_variants(everyone),
+        distrusted=distrusted,
+        differing=tuple(np.flatnonzero(differing).tolist()),
+    )
+    return FleetReference(**{**vars(reference), "notices": tuple(_notices(reference))})
+
+
+def _with_knowledge(
+    rows: EvidenceRows,
+    readings: Readings | None,
+    trusted: Mask,
+    *,
+    order: Sequence[int],
+    full_scale_a: float,
+    load: UnmeasuredLoad | None,
+) -> EvidenceRows:
+    """Evidence with what is known of single sensors and of loads without one."""
+    N, K = len(rows), rows.branches
+    known = Readings.none(N, K) if readings is None else readings
+    known = known.merged(Readings.of_trusted(trusted, K, full_scale_a)).take_branches(order)
+    if load is not None:
+        rows = rows.with_load_spread(load.sd_a / full_scale_a)
+    return with_readings(rows, known, full_scale_a=full_scale_a)
+
+
+def _carried_centre(rows: EvidenceRows, carriers: Mask) -> Array:
+    """Centre (5K,) of the rows that enough trusted vehicles show; NaN in the others."""
+    fixed = np.full(rows.values.shape[1], np.nan)
+    if np.count_nonzero(carriers) >= FEWEST_TRUSTED:
+        for row in np.flatnonzero(centre_rows(rows.branches)):
+            shown = carriers & rows.known[:, row]
+            if np.count_nonzero(shown) >= FEWEST_TRUSTED:
+                fixed[row] = np.median(rows.values[shown, row])
+    return fixed
+
+
+def _agreeing(rows: EvidenceRows, branch: int) -> float:
+    """Share of the vehicles whose slopes of a branch agree."""
+    known = rows.known[:, branch]
+    if not known.any():
+        return 0.0
+    sd = np.sqrt(rows.covariance[known, branch, branch])
+    return densest_clusters(rows.relative[known, branch], sd, widest=1.0)[0].share
+
+
+def _variants(found: RowsEstimate) -> tuple[float, ...]:
+    """Two variants of the vehicle: groups in each of which a hardware drift is the same, as logarithms."""
+    eta = np.log1p(found.hardware_drift)
+    near = np.abs(eta[:, None] - eta[None, :]) < VARIANT_SPREAD
+    centres: list[float] = []
+    left = np.ones(len(eta), bool)
+    for _ in range(2):
+        count = np.where(left, (near & left).sum(axis=1), 0)
+        best = int(np.argmax(count))
+        if count[best] < max(FEWEST_VARIANT, VARIANT_SHARE * len(eta)):
+            return ()
+        centres.append(float(np.median(eta[near[best] & left])))
+        left &= np.abs(eta - centres[-1]) > 2.0 * VARIANT_SPREAD
+    return tuple(sorted(centres))
+
+
+def _notices(reference: FleetReference) -> list[str]:
+    """What may be wrong about the fleet as a whole, one line each."""
+    scale_a, ordered = reference.full_scale_a, [reference.branches[k] for k in reference.order]
+    K, feed = len(ordered), ordered[reference.feed]
+    notices = []
+    if reference.vehicles < FEWEST_VEHICLES:
+        notices.append(
+            f"{reference.vehicles} vehicles are few for a fleet that is compared with itself: nothing is corrected; at "
+            f"least {FEWEST_VEHICLES} are needed, or {FEWEST_TRUSTED} bench-checked vehicles (--trusted)"
+        )
+    best = reference.laws[0]
+    constant = best.spread.mean[4 * K - 1]
+    if reference.load is None and abs(constant) > DOUBT:
+        notices.append(
+            f"the currents of most vehicles sum to {constant * scale_a:+.1f} A: "
+            + _causes(reference.laws, lambda law: law.spread.shared[:K], ordered)
+        )
+    for share, centre in zip(best.prior.group_share, best.prior.group_centre, strict=True):
+        sensor = sum(law.probability for law in reference.laws if law.spread.shared[-1])
+        notices.append(
+            f"about {share:.0%} of the vehicles share {centre * scale_a:+.1f} A in branch {feed} beside the others: a "
+            f"load without a sensor ({1.0 - sensor:.0%}), or an offset of a batch of sensors ({sensor:.0%})"
+        )
+    gains = sum(law.probability for law in reference.laws if law.spread.shared[K : 2 * K].any())
+    if gains > DOUBT:
+        size = next(law.spread.shared[K : 2 * K] for law in reference.laws if law.spread.shared[K : 2 * K].any())
+        notices.append(
+            f"most vehicles break the junction law by {np.abs(size).max():.1%}: a gain error that a batch of sensors "
+            f"shares ({gains:.0%}), in branch "
+            + " or ".join(
+                name for k, name in enumerate(ordered) if any(law.spread.shared[K + k] != 0.0 for law in reference.laws)
+            )
+        )
+    if reference.variants:
+        notices.append(
+            f"the currents of some vehicles are all larger by {np.expm1(np.ptp(reference.variants)):.1%} than those of "
+            f"others: two variants of the vehicle? calibrate them apart"
+        )
+    return notices
+
+
+def _causes(laws: Sequence[Law], shared: Callable[[Law], Array], branches: Sequence[str]) -> str:
+    """Causes of what most vehicles share, with their probabilities."""
+    share = {"a load without a sensor": 0.0}
+    for law in laws:
+        offsets = shared(law)
+        cause = "a load without a sensor"
+        if np.abs(offsets).max() > DOUBT:
+            cause = f"an offset that the sensors of branch {branches[int(np.argmax(np.abs(offsets)))]} share"
+        share[cause] = share.get(cause, 0.0) + law.probability
+    said = sorted(((p, cause) for cause, p in share.items() if p > 0.005), reverse=True)
+    return " or ".join(f"{cause} ({p:.0%})" for p, cause in said) + "; declare the load if it is known"
+
+
+def estimate_vehicles(
+    summaries: Sequence[DriveSummary],
+    reference: FleetReference,
+    *,
+    readings: Readings | None = None,
+    trusted: Mask | None = None,
+    harm_limit: float = HARM_LIMIT,
+    limits: tuple[float, float] | None = None,
+) -> FleetEstimate:
+    """Estimate vehicles, each by itself.
+
+    Parameters
+    ----------
+    summaries : sequence of DriveSummary
+        Of N vehicles.
+    reference : FleetReference
+        Of their fleet.
+    readings : Readings or None
+        Direct readings of their sensors.
+    trusted : ndarray of bool of shape (N,) or None
+        Vehicles that are trusted and do not break the junction law.
+    harm_limit : float
+        Largest probability of harm with which a branch is corrected. [1]
+    limits : tuple of float or None
+        Largest drift [1] and offset [A] that are corrected; None: any.
+
+    Returns
+    -------
+    FleetEstimate
+        In the order of the summaries.
+    """
+    scale_a, names, place = reference.full_scale_a, reference.branches, np.argsort(reference.order)
+    trusted = np.zeros(len(summaries), bool) if trusted is None else trusted
+    rows, fleet = reference.rows_of(summaries, readings, trusted)
+    found = estimate_rows(
+        rows,
+        reference.laws,
+        feed=reference.feed,
+        mean=fleet.mean_a / scale_a,
+        mean_square=fleet.mean_square_a2 / scale_a**2,
+        usual=reference.usual,
+    )
+    findings = check_fit(summaries, reference.read_out, reference.misfits, full_scale_a=scale_a, branches=list(names))
+    shared = _shared_findings(found, reference)
+    drift, offset_a = found.drift[:, place], found.offset[:, place] * scale_a
+    faulty = (drift != 0.0) | (offset_a != 0.0)
+    harm, identifiable = found.harm_probability[:, place], found.identifiable[:, place]
+    drift_limit, offset_limit_a = (np.inf, np.inf) if limits is None else limits
+    reasons = {  # the last that applies is told
+        "beyond the limits": (np.abs(drift) > drift_limit) | (np.abs(offset_a) > offset_limit_a),
+        "harm limit": ~(harm < harm_limit),
+        "moved too little": ~identifiable,
+        "reference in doubt": np.full(faulty.shape, reference.vehicles < FEWEST_VEHICLES) & ~trusted[:, None],
+        "does not fit": np.array([_unfit(each, names) for each in findings]).reshape(faulty.shape),
+    }
+    held_back = np.full(faulty.shape, "", f"<U{max(map(len, reasons))}")
+    for reason, applies in reasons.items():
+        held_back[faulty & applies] = reason
+    corrected = faulty & (held_back == "")
+    verdicts = [
+        "corrected"
+        if corrected[j].any()
+        else "no sensor fault"
+        if not faulty[j].any() and found.confidence[j] >= CONFIDENT and not findings[j]
+        else "cannot tell"
+        for j in range(len(summaries))
+    ]
+    law = reference.laws[0]
+    evidence = reported_evidence(
+        rows,
+        centre=law.spread.mean,
+        covariance=rows.dispersed(law.spread.dispersion)[0] + law.spread.covariance,
+        drift=found.drift,
+        offset_a=found.offset * scale_a,
+        hardware_drift=found.hardware_drift,
+        hardware_offset_a=found.hardware_offset * scale_a,
+        full_scale_a=scale_a,
+    )
+    ordered = [names[k] for k in reference.order]
+    return FleetEstimate(
+        drift=drift,
+        offset_a=offset_a,
+        drift_sd=found.drift_sd[:, place],
+        offset_sd_a=found.offset_sd[:, place] * scale_a,
+        fault_probability=found.fault_probability[:, place],
+        harm_probability=harm,
+        identifiable=identifiable,
+        corrected=corrected,
+        held_back=held_back,
+        hardware_drift=found.hardware_drift,
+        hardware_offset_a=found.hardware_offset[:, place] * scale_a,
+        hardware_probability=found.hardware_probability,
+        confidence=found.confidence,
+        verdicts=verdicts,
+        explanations=[
+            [_explanation(share, values, ordered, scale_a) for share, values in each] for each in found.explanations
+        ],
+        findings=[(*each, *others) for each, others in zip(findings, shared, strict=True)],
+        evidence=evidence,
+        points=found.points,
+        order=reference.order,
+        full_scale_a=scale_a,
+    )
+
+
+def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[list[Finding]]:
+    """Loads without a sensor, batches and variants, of each vehicle: explained, and nothing of them is corrected."""
+    scale_a, feed = reference.full_scale_a, reference.branches[reference.order[reference.feed]]
+    sensor = sum(law.probability for law in reference.laws if law.spread.shared[-1])
+    cause, rival = ("batch", "load") if sensor > SUSPECTED else ("load", "batch")
+    what = {"load": "a load without a sensor", "batch": "an offset of a batch of sensors"}
+    findings: list[list[Finding]] = [[] for _ in found.load_probability]
+    for j, mine in enumerate(findings):
+        for g in np.flatnonzero(found.group_probability[j] > SUSPECTED):
+            size_a = reference.laws[0].prior.group_centre[g] * scale_a
+            text = f"{size_a:+.1f} A in branch {feed} as in other vehicles: {what[cause]}, or {what[rival]}"
+            mine.append(_finding(feed, cause, found.group_probability[j, g], text))
+        if found.load_probability[j] > SUSPECTED:
+            text = f"a load without a sensor of {found.load[j] * scale_a:.1f} A, or an offset of the {feed} sensor"
+            mine.append(_finding(feed, "load", found.load_probability[j], text))
+    for j, mine in enumerate(findings):
+        eta = [(p, float(np.log1p(values[0, 0]))) for p, values in found.explanations[j]]
+        of = [sum(p for p, each in eta if abs(each - centre) < VARIANT_SPREAD) for centre in reference.variants]
+        if sum(of) > SUSPECTED:
+            size = f"{np.expm1(np.ptp(reference.variants)):.1%}"
+            than = "larger" if of[1] > of[0] else "smaller"
+            text = f"all its currents are {than} by {size} than those of some other vehicles: one of two variants?"
+            mine.append(_finding(None, "variant", sum(of), text))
+    return findings
+
+
+def _finding(branch: str | None, cause: str, probability: float, text: str) -> Finding:
+    return Finding(branch=branch, cause=cause, probability=float(min(probability, 1.0)), text=text)
+
+
+def _unfit(findings: Sequence[Finding], branches: Sequence[str]) -> list[bool]:
+    """Branches that a finding concerns: all, as they share the junction law, unless its samples are left out."""
+    everywhere = any(each.cause not in LEFT_OUT_CAUSES or each.branch is None for each in findings)
+    return [everywhere or any(each.branch == name for each in findings) for name in branches]
+
+
+def _explanation(share: float, values: Array, branches: Sequence[str], full_scale_a: float) -> Explanation:
+    def nonzero(row: Array, unit: float) -> dict[str, float]:
+        return {name: float(value * unit) for name, value in zip(branches, row, strict=True) if abs(value) > 1e-9}
+
+    return Explanation(
+        probability=min(share, 1.0),
+        drift=nonzero(values[2], 1.0),
+        offset_a=nonzero(values[3], full_scale_a),
+        hardware_drift=float(values[0, 0]),
+        hardware_offset_a=nonzero(values[1], full_scale_a),
+    )

@@ -1,0 +1,286 @@
+"""Data frames of a fleet become drives, and the drives a store of summaries, as that of ``calibrator summarise``.
+
+Whatever cannot be a recording of such a fleet is refused, with the vehicle and the column: nothing is guessed.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from calibrator.drive import Array, Channel, Drive
+from calibrator.drives.align import base_inputs, choose_inputs
+from calibrator.drives.plain_names import require_plain_name
+from calibrator.errors import DriveError, FleetError
+from calibrator.files.storage import open_storage
+from calibrator.sources.fleet_source import Equipment
+from calibrator.summaries.identity import store_identity, write_identity
+from calibrator.summaries.record import Record
+from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.vehicle_summary import summarise_drives
+from calibrator.terminal.text import few
+from ecu_node.database import VehicleDatabase
+
+if TYPE_CHECKING:
+    from calibrator.estimator.fleet import Junction
+
+__all__ = ["column_values", "require_columns", "summarise_frames"]
+
+FINEST_PERIOD_S, COARSEST_PERIOD_S = 0.1, 5.0
+"""Time base of data frames without a layout: that of logs, or slower; still several rows per block of 30 s. [s]"""
+LEAST_OF_SCALE, MOST_OF_SCALE = 0.002, 10.0
+"""Of full scale: currents that never reach the former, or go beyond the latter, are in another unit. [1]"""
+OTHER_UNIT = 100.0
+"""Largest current of the median vehicle over that of this one, from which on the latter is in another unit. [1]"""
+
+
+def summarise_frames(
+    folder: Path, frames: Mapping[str, Any], junction: "Junction", *, inputs: Sequence[str] | None
+) -> VehicleDatabase:
+    """Make a store of summaries of data frames.
+
+    Parameters
+    ----------
+    folder : Path
+        Empty folder for the store.
+    frames, junction, inputs
+        As for :meth:`calibrator.Fleet.from_frames`.
+
+    Returns
+    -------
+    VehicleDatabase
+        Layout of the store.
+
+    Raises
+    ------
+    FleetError, DriveError
+        If the frames are no recordings of such a fleet.
+    """
+    vehicles = _vehicles(frames)
+    labelled = [
+        (f"vehicle {vehicle}, frame {number}", frame)
+        for vehicle, drives in vehicles.items()
+        for number, frame in enumerate(drives, start=1)
+    ]
+    chosen = _chosen_inputs(labelled, junction, inputs)
+    times = {where: _seconds(frame, where) for where, frame in labelled}
+    database = junction.as_database(chosen, _period_s(times, junction))
+    columns = (*junction.branches, *sorted(base_inputs(database.layout, chosen)))
+    drives = _drives(vehicles, times, junction.branches, columns)
+    _require_amperes(drives, junction)
+
+    equipment = Equipment(branches=tuple(junction.branches), inputs=chosen, fleet_inputs=chosen, notices=())
+    identity = store_identity(equipment, database, vehicles=len(drives), fleet="frames", fleet_ids=frozenset())
+    store = SummaryStore(storage=open_storage(folder), identity=identity)
+    write_identity(store.storage, identity)
+    for bucket, names in store.by_bucket(drives).items():
+        store.write(bucket, {name: [_record(drives[name], store, database)] for name in names})
+    return database
+
+
+def _vehicles(frames: Mapping[str, Any]) -> dict[str, list[pd.DataFrame]]:
+    """Frames by vehicle, at least two vehicles with at least one frame each."""
+    if not isinstance(frames, Mapping) or not frames:
+        raise FleetError(f"{type(frames).__name__} without vehicles: expected data frames by vehicle, {{'V1': frame}}")
+    found: dict[str, list[pd.DataFrame]] = {}
+    for key, given in frames.items():
+        vehicle, drives = str(key), [given] if isinstance(given, pd.DataFrame) else given
+        require_plain_name(vehicle, "vehicle")
+        if vehicle in found:
+            raise FleetError(f"vehicle {vehicle} is there twice; give all of its frames as one list")
+        if not isinstance(drives, Sequence) or not all(isinstance(frame, pd.DataFrame) for frame in drives):
+            raise FleetError(f"vehicle {vehicle}: {type(given).__name__} given; expected a DataFrame or a list of them")
+        if not drives:
+            raise FleetError(f"vehicle {vehicle}: no frame in its list; leave the vehicle out")
+        found[vehicle] = list(drives)
+    if len(found) < 2:
+        raise FleetError(f"a single vehicle, {vehicle}: at least 2 are needed, as each is compared with its fleet")
+    return found
+
+
+def _chosen_inputs(
+    labelled: Sequence[tuple[str, pd.DataFrame]], junction: "Junction", inputs: Sequence[str] | None
+) -> tuple[str, ...]:
+    """Names of the inputs; every frame has the columns that it takes."""
+    branches = list(junction.branches)
+    if isinstance(inputs, str):
+        raise FleetError(f"inputs {inputs!r}: expected a list of column names, [{inputs!r}]")
+    both = sorted(set(inputs or ()) & set(branches))
+    if both:
+        raise FleetError(f"inputs {few(both)}: a branch of the junction cannot be an input of its model")
+    if junction.layout is not None:
+        common = set.intersection(*(set(frame.columns) for _, frame in labelled))
+        known = {item.name for item in junction.layout.input} | {item.name for item in junction.layout.derived}
+        unknown = sorted(set(inputs or ()) - known)
+        if unknown:
+            raise FleetError(f"inputs {few(unknown)}: not in the layout; it has {few(sorted(known))}")
+        fleet_inputs = junction.layout.fleet_inputs or junction.layout.model_inputs
+        chosen = tuple(inputs) if inputs is not None else choose_inputs(junction.layout, common, names=fleet_inputs)[0]
+        needed = [*branches, *sorted(base_inputs(junction.layout, chosen))]
+    else:
+        (first, frame), *others = labelled
+        chosen = tuple(str(name) for name in frame.columns if name not in branches) if inputs is None else tuple(inputs)
+        needed = [*branches, *chosen]
+        for where, other in others if inputs is None else ():
+            if more := sorted(str(name) for name in set(other.columns) - set(needed)):
+                raise FleetError(
+                    f"{where}: column {few(more)}, which {first} has not; all vehicles need the same columns, or name "
+                    f"those to use with inputs=[...]"
+                )
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise FleetError(
+            f"inputs {few(chosen) or 'none'}: expected one or more different columns that the currents depend on, such "
+            f"as speed, torque, or the demands of heater and air conditioning"
+        )
+    for where, frame in labelled:
+        require_columns(frame, needed, where)
+    return chosen
+
+
+def require_columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> None:
+    """Refuse a frame that lacks columns."""
+    if not isinstance(frame, pd.DataFrame):
+        raise DriveError(f"{where}: {type(frame).__name__} given; expected a DataFrame")
+    if missing := [name for name in names if name not in frame.columns]:
+        there = few([str(name) for name in frame.columns])
+        raise DriveError(f"{where}: no column {few(missing)}; it has {there or 'none'}")
+
+
+def _seconds(frame: pd.DataFrame, where: str) -> Array:
+    """Instants of a frame from 0, rising. [s]"""
+    index = frame.index
+    if isinstance(index, pd.RangeIndex) or not (
+        isinstance(index, (pd.DatetimeIndex, pd.TimedeltaIndex))
+        or (pd.api.types.is_numeric_dtype(index) and not pd.api.types.is_bool_dtype(index))
+    ):
+        what = "counts rows" if isinstance(index, pd.RangeIndex) else f"is of {index.dtype}"
+        raise DriveError(
+            f"{where}: its index {what}; expected the time: seconds, or a DatetimeIndex; use frame.set_index(...)"
+        )
+    if len(index) < 2:
+        raise DriveError(f"{where}: {len(index)} rows; leave the frame out")
+    if isinstance(index, (pd.DatetimeIndex, pd.TimedeltaIndex)):
+        time_s = np.asarray((index - index[0]).total_seconds(), np.float64)
+    else:
+        time_s = index.to_numpy(np.float64)
+    if not np.isfinite(time_s).all():
+        raise DriveError(f"{where}: {int((~np.isfinite(time_s)).sum())} rows without a time; remove them")
+    step_s = np.diff(time_s)
+    if not (step_s > 0.0).all():
+        row = int(np.argmin(step_s > 0.0))
+        what = "time twice" if step_s[row] == 0.0 else "time runs back"
+        raise DriveError(
+            f"{where}: {what} at row {row + 1} ({index[row]} -> {index[row + 1]}); expected rising times: sort by "
+            f"time, one row each, or give drives as frames of their own"
+        )
+    return np.asarray(time_s - time_s[0])
+
+
+def _period_s(times: Mapping[str, Array], junction: "Junction") -> float:
+    """Time base of the fleet: that of the layout, or of the rows."""
+    row_s = float(np.median([np.median(np.diff(time_s)) for time_s in times.values()]))
+    if junction.layout is not None:
+        shortest_s = min(junction.layout.max_age_s, *(branch.timeout_s for branch in junction.layout.branch))
+        if row_s > shortest_s:
+            raise FleetError(
+                f"rows are {row_s:.3g} s apart, and in {junction.layout.path.name} a value is stale after "
+                f"{shortest_s:g} s; give the signals as recorded, or Junction(branches=..., full_scale_a=...)"
+            )
+        return junction.layout.period_s
+    if row_s > COARSEST_PERIOD_S:
+        raise FleetError(
+            f"rows are {row_s:.3g} s apart, expected {COARSEST_PERIOD_S:g} s at most; if the index is not in seconds, "
+            f"convert it"
+        )
+    return max(round(row_s, 6), FINEST_PERIOD_S)
+
+
+def column_values(frame: pd.DataFrame, name: str, where: str) -> Array:
+    """Values of a column as floating-point numbers, NaN where there is none; DriveError if it has no numbers."""
+    column = frame[name]
+    if isinstance(column, pd.DataFrame):
+        raise DriveError(f"{where}: column {name} is there twice")
+    if not pd.api.types.is_any_real_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
+        raise DriveError(
+            f"{where}: column {name} is of {column.dtype}; expected numbers, with NaN where a sample is bad: "
+            f"pandas.to_numeric converts"
+        )
+    return np.asarray(column.to_numpy(np.float64, na_value=np.nan))
+
+
+def _drives(
+    vehicles: Mapping[str, Sequence[pd.DataFrame]],
+    times: Mapping[str, Array],
+    branches: Sequence[str],
+    columns: Sequence[str],
+) -> dict[str, list[Drive]]:
+    """Drives by vehicle; a frame that two vehicles have, or one has twice, is refused."""
+    found: dict[str, list[Drive]] = {}
+    seen: dict[bytes, str] = {}
+    for vehicle, frames in vehicles.items():
+        found[vehicle] = []
+        for number, frame in enumerate(frames, start=1):
+            where = f"vehicle {vehicle}, frame {number}"
+            channels = {
+                name: _channel(times[where], column_values(frame, name, where), name, where) for name in columns
+            }
+            content = b"".join(part.tobytes() for item in channels.values() for part in (item.time_s, item.value))
+            digest = hashlib.blake2b(content).digest()
+            if digest in seen:
+                raise FleetError(f"{where}: the same as {seen[digest]}; give each recording once")
+            seen[digest] = where
+            drive = Drive(
+                vehicle=vehicle,
+                name=f"frame {number}",
+                branches={name: channels[name] for name in branches},
+                inputs={name: item for name, item in channels.items() if name not in branches},
+            )
+            found[vehicle].append(drive)
+    return found
+
+
+def _channel(time_s: Array, value: Array, name: str, where: str) -> Channel:
+    good = np.isfinite(value)
+    if not good.any():
+        raise DriveError(f"{where}: column {name} has no number at all; leave the frame or the column out")
+    return Channel(time_s=time_s, value=value, good=good)
+
+
+def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: "Junction") -> None:
+    """Refuse branches that stand still, and values that cannot be amperes."""
+    branches, scale_a = list(junction.branches), float(junction.full_scale_a)
+    largest = np.zeros((len(drives), len(branches)))
+    for j, (vehicle, parts) in enumerate(drives.items()):
+        for k, name in enumerate(branches):
+            values = np.concatenate([part.branches[name].value[part.branches[name].good] for part in parts])
+            largest[j, k] = np.abs(values).max()
+            if not np.ptp(values):
+                raise DriveError(
+                    f"vehicle {vehicle}: branch {name} is {values[0]:g} A throughout: stuck, or not connected; leave "
+                    f"the vehicle out, or the branch if the junction has none"
+                )
+    small = largest < LEAST_OF_SCALE * scale_a
+    strange = small & (small.all(axis=0) | small.all(axis=1, keepdims=True))
+    strange |= small & (np.median(largest, axis=0) > OTHER_UNIT * largest)
+    strange |= largest > MOST_OF_SCALE * scale_a
+    if strange.any():
+        j, k = (int(place[0]) for place in np.nonzero(strange))
+        unit = "kA: multiply by 1000" if small[j, k] else "mA: divide by 1000"
+        raise DriveError(
+            f"vehicle {list(drives)[j]}: the largest {branches[k]} current is {largest[j, k]:.3g} A, full scale being "
+            f"{scale_a:g} A; expected amperes; perhaps it is in {unit}, or full_scale_a is wrong"
+        )
+
+
+def _record(drives: Sequence[Drive], store: SummaryStore, database: VehicleDatabase) -> Record:
+    """Summary of a vehicle's drives, or why they cannot be used."""
+    names = tuple(drive.name for drive in drives)
+    sources = ("",) * len(names)
+    try:
+        found = summarise_drives(drives, store.identity.equipment, database, bank=store.identity.bank)
+    except DriveError as error:
+        return Record(vehicle=drives[0].vehicle, drives=names, sources=sources, found=None, problem=str(error))
+    return Record(vehicle=drives[0].vehicle, drives=names, sources=sources, found=found)

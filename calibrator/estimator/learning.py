@@ -1,0 +1,557 @@
+"""What a fleet says of its faults, and of vehicles without faults: the laws that explain it, with their probabilities.
+
+A law is a prior of the faults and a model spread, by expectation maximisation on the fleet's own evidence (M14):
+
+    expectation    explanations of each vehicle under the present law, weighed
+    maximisation   numbers and sizes of faults, groups of vehicles that share a constant, centre and covariance of what
+                   vehicles without faults differ by
+
+The likelihood has several maxima, as a cluster of faulty vehicles can stand for the reference. So it is climbed from
+clusters of the evidence, and all laws that explain the fleet about as well are kept. What a whole fleet shares in the
+junction's constant may be a load without a sensor or an offset of the sensors of a branch: each is a law of its own.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from calibrator.drive import Array, Mask
+from calibrator.estimator.clusters import densest_clusters
+from calibrator.estimator.explanations import Fits, evidence_of, fit_explanations, row_residuals
+from calibrator.estimator.posterior import GAIN, OFFSET, Draws, draw_explanations, size_evidence, weigh
+from calibrator.estimator.prior import (
+    LARGEST_SHARED,
+    TAIL_DENSITY,
+    TAIL_RANGE,
+    Prior,
+    Slab,
+    first_prior,
+    sparse_counts,
+    uniform_density,
+    with_slabs,
+)
+from calibrator.estimator.rows import EvidenceRows, constant_design, relative_design
+
+__all__ = ["DOUBT", "Law", "Spread", "centre_rows", "explain", "learn_laws", "weigh_law"]
+
+MOST_LEARNT = 200
+"""Vehicles that a law is learnt from; more change it less than the faults themselves. [1]"""
+START_ROUNDS, ROUNDS, PRIOR_STEPS = 2, 5, 6
+"""Rounds of each start, of the best ones after that, and steps of the prior in each round."""
+KEPT_STARTS = 2
+"""Starts that are climbed to their end."""
+SAME_DENSITY = 0.2
+"""Logarithm of densities of sizes up to which two priors count as one."""
+KEPT_LOG_ODDS = 7.0
+"""Logarithm of the odds against the best law up to which another one is kept."""
+DOUBT = 0.001
+"""Shared constant below which it does not matter what makes it, in fractions of full scale. [1]"""
+SPREAD_VEHICLES = 5.0
+"""Weight of the guessed model spread, in vehicles."""
+SPREAD_OVER_SAMPLING = 2.0
+"""Guess of the model spread over the usual sampling deviation: a model errs alike over a whole drive. [1]"""
+MOST_LOAD_SPREAD = 0.005
+"""Of loads without a sensor over vehicles before anything is known, in fractions of full scale: some A. [1]"""
+LEAST_SPREAD = (1e-5, 1e-6)
+"""Least model spread of relative and constant rows: far below any sensor's resolution. [1]"""
+FIRST_DISPERSION = 4.0
+"""Where the variance of intercepts over what their blocks show starts: it falls fast. [1]"""
+TAIL_DEGREES = 8.0
+"""Degrees of freedom of Student's t with which a vehicle that fits badly counts less for the model spread. [1]"""
+COUNT_VEHICLES = 2.5
+"""Weight of the law of sparse faults against the fleet's own numbers of faults, in vehicles."""
+USED_FITS = 16
+"""Explanations of each vehicle that the model spread is learnt from, the most probable ones."""
+MISFIT_SD = 4.0
+"""Standard deviations of chi square from which on a vehicle's evidence is widened. [1]"""
+LEAST_GROUP, MOST_GROUPS, GROUP_GAIN = 2.0, 2, 5.0
+"""Vehicles of a group, number of groups, and what one must gain in log evidence: three vehicles that agree do."""
+LEAST_SHARED_GAIN = (0.3, 0.004)
+"""Share of the vehicles that agree, and size of a gain error from which on their sensors may share it. [1]"""
+COARSE_LOW, COARSE_HIGH = np.geomspace(0.003, 0.4, 14), np.geomspace(0.015, 1.2, 14)
+"""Bounds of sizes that are tried first: drifts [1], offsets in fractions of full scale."""
+FINE = 1.06 ** np.arange(-8, 9)
+"""Bounds that are tried about the best ones so far, relative to them. [1]"""
+TAILS = (0.001, 0.003, 0.01, 0.03, 0.1)
+"""Shares of faults beyond the bounds that are tried. [1]"""
+SIZE_STARTS = ((0.004, 1.0), (0.03, 0.4), (0.1, 0.2))
+"""Bounds from which the prior is climbed again: small faults that combine can stand for large ones that do not."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """What vehicles without any fault differ by in the rows of the evidence: the model spread.
+
+    Attributes
+    ----------
+    mean : ndarray of shape (5K,)
+        Centre of the fleet in each row: what is left of the error of the reference, and the mean unmeasured load. [1]
+    covariance : ndarray of shape (5K, 5K)
+        Over vehicles. [1]
+    dispersion : ndarray of shape (K,)
+        Variance of each intercept over what its blocks show, at least 1: a model errs alike for longer than a block.
+    shared : ndarray of shape (2K + 1,)
+        See :class:`calibrator.estimator.explanations.Evidence`.
+    """
+
+    mean: Array
+    covariance: Array
+    dispersion: Array
+    shared: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Law:
+    """One law that explains a fleet.
+
+    Attributes
+    ----------
+    probability : float
+        Of this law, over all that are kept.
+    spread : Spread
+        Of vehicles without faults.
+    priors : tuple of (float, Prior)
+        Priors of the faults that explain the fleet about as well, with their probabilities; the first is the best.
+    log_evidence : float
+        Of the vehicles that it was learnt from.
+    """
+
+    probability: float = 1.0
+    spread: Spread
+    priors: tuple[tuple[float, Prior], ...]
+    log_evidence: float = field(default=-np.inf)
+
+    @property
+    def prior(self) -> Prior:
+        """The best prior."""
+        return self.priors[0][1]
+
+
+def centre_rows(branches: int) -> Mask:
+    """Rows whose centre the fleet shows, shape (5K,): slopes, intercepts, junction constant; ratios have none."""
+    free = np.zeros(5 * branches, bool)
+    free[:branches] = free[3 * branches - 1 : 4 * branches] = True
+    return free
+
+
+def learn_laws(
+    rows: EvidenceRows,
+    *,
+    feed: int,
+    fixed: Array | None = None,
+    load: float | None = None,
+    known: Prior | None = None,
+    expected_faults: float | None = None,
+) -> list[Law]:
+    """Learn the laws that explain a fleet.
+
+    Parameters
+    ----------
+    rows : EvidenceRows
+        Of N vehicles.
+    feed : int
+        Branch that carries loads without a sensor.
+    fixed : ndarray of shape (5K,) or None
+        Centre of rows that trusted vehicles carry; NaN in the others. None: the fleet carries all. [1]
+    load : float or None
+        Load that no branch measures, in fractions of full scale, if it is known. [1]
+    known : Prior or None
+        Prior of the faults, if it is known.
+    expected_faults : float or None
+        Share of vehicles with a sensor fault, if it is known. [1]
+
+    Returns
+    -------
+    list of Law
+        By falling probability.
+    """
+    fixed = np.full(rows.values.shape[1], np.nan) if fixed is None else fixed.copy()
+    if load is not None:
+        fixed[4 * rows.branches - 1] = load
+    order = np.lexsort(rows.values.T[::-1])  # the same whatever the order of the vehicles
+    some = order[np.linspace(0, len(rows) - 1, min(len(rows), MOST_LEARNT)).astype(np.int64)]
+    learner = _Learner(rows.take(np.sort(some)), feed, fixed, known, expected_faults)
+    climbed = [learner.climb(learner.start(centre), START_ROUNDS) for centre in learner.centres()]
+    climbed = sorted(climbed, key=lambda law: -law.log_evidence)[:KEPT_STARTS]
+    best = max((learner.climb(law, ROUNDS, begun=True) for law in climbed), key=lambda law: law.log_evidence)
+    laws = learner.variants(best)
+    return [learner.with_modes(law) for law in sorted(laws, key=lambda law: -law.probability)]
+
+
+def explain(rows: EvidenceRows, law: Law, *, feed: int) -> Draws:
+    """Explain vehicles under the best prior and the model spread of a law; their draws are not weighed yet.
+
+    A vehicle that even its best explanation leaves too much of has a wider covariance, in proportion to its chi square
+    (Birge ratio): something about it is not in the model, and nothing about it is known as well as it seems.
+    """
+    prior, spread = law.prior, law.spread
+    n_h, n_s = np.indices(prior.counts.shape)
+    rough = prior.log_supports + 0.5 * (n_h + n_s)  # a slab is about that much denser than the wide Gaussian
+    log_load = float(np.log(prior.load_share + prior.group_share.sum())) + 2.0
+    covariance = rows.dispersed(spread.dispersion)[0] + spread.covariance
+
+    def fitted(chosen: EvidenceRows, covariance: Array) -> tuple[Fits, Draws]:
+        evidence = evidence_of(
+            chosen.values, covariance, chosen.means, centre=spread.mean, shared=spread.shared, feed=feed
+        )
+        fits = fit_explanations(evidence, rough, log_load)
+        return fits, draw_explanations(fits, evidence)
+
+    fits, draws = fitted(rows, covariance)
+    score = fits.log_evidence + rough[fits.hardware, fits.sensor] + log_load * fits.support[:, :, -1]
+    best = np.argmax(np.where(np.arange(score.shape[1]) < fits.number[:, None], score, -np.inf), axis=1)
+    picked = (np.arange(len(rows)), best)
+    free = np.maximum(rows.known.sum(axis=1) - fits.support[picked].sum(axis=1), 1.0)
+    bad = fits.chi2[picked] > free + MISFIT_SD * np.sqrt(2.0 * free)
+    if not bad.any():
+        return draws
+    wider = (fits.chi2[picked] / free)[:, None, None]
+    return fitted(rows, np.where(bad[:, None, None], wider, 1.0) * covariance)[1]
+
+
+def weigh_law(draws: Draws, law: Law) -> Array:
+    """Weights of draws averaged over the priors of a law; see :func:`calibrator.estimator.posterior.weigh`."""
+    return np.asarray(sum(share * weigh(draws, prior)[0] for share, prior in law.priors))
+
+
+class _Learner:
+    """Expectation maximisation on the evidence of one fleet."""
+
+    def __init__(
+        self, rows: EvidenceRows, feed: int, fixed: Array, known: Prior | None, expected_faults: float | None
+    ) -> None:
+        K = rows.branches
+        self.rows, self.feed, self.fixed, self.known = rows, feed, fixed, known
+        self.expected_faults = expected_faults
+        self.free = centre_rows(K) & np.isnan(fixed)
+        self.least = np.diag(np.repeat(LEAST_SPREAD, [3 * K - 1, 2 * K + 1]) ** 2)
+        self.guess = self._guessed_spread()
+        self.design = np.zeros((5 * K, 3 * K + 1))
+        self.design[: 3 * K - 1, : K + 1] = relative_design(K)
+        self.design[3 * K - 1 :, K + 1 : 3 * K] = constant_design(K)
+        self.design[[3 * K - 1 + feed, 4 * K - 1], 3 * K] = 1.0
+
+    def _guessed_spread(self) -> Array:
+        """A multiple of the usual sampling covariance, in rows that the fleet model or the junction law makes."""
+        rows, K = self.rows, self.rows.branches
+        variance = np.diagonal(rows.covariance, axis1=1, axis2=2).copy()
+        variance[:, 3 * K - 1 : 4 * K - 1] = np.diagonal(rows.intercept_covariance(), axis1=1, axis2=2)
+        guess = np.zeros(5 * K)
+        for row in [*range(2 * K - 1), *range(3 * K - 1, 4 * K)]:
+            known = rows.known[:, row]
+            guess[row] = np.median(variance[known, row]) if known.any() else 1.0
+        return np.diag(SPREAD_OVER_SAMPLING**2 * guess)
+
+    def centres(self) -> list[Array]:
+        """Where to start: what vehicles agree on row by row, with each zero that the feeding branch may have.
+
+        Intercepts of a vehicle without faults add up to its junction constant, as do those of a centre.
+        """
+        rows, K = self.rows, self.rows.branches
+        sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
+
+        def clusters(row: int, farthest: float = np.inf) -> list[float]:
+            known = rows.known[:, row]
+            found = densest_clusters(rows.values[known, row], sd[known, row], most=2, farthest=farthest)
+            return [cluster.centre for cluster in found] or [0.0]
+
+        centre, junction, intercept = np.zeros(5 * K), 4 * K - 1, 3 * K - 1 + self.feed
+        for row in np.flatnonzero(centre_rows(K)):
+            centre[row] = clusters(int(row))[0]
+        others = centre[3 * K - 1 : junction].sum() - centre[intercept]
+        by_feed = [zero + others for zero in clusters(intercept, LARGEST_SHARED)]
+        found: list[Array] = []
+        for constant in (*clusters(junction, LARGEST_SHARED), 0.0, *by_feed):  # the junction shows it most exactly
+            start = centre.copy()
+            start[intercept], start[junction] = constant - others, constant
+            start = np.where(np.isnan(self.fixed), start, self.fixed)
+            if not any(np.abs(start - other).max() < DOUBT for other in found):
+                found.append(start)
+        return found
+
+    def start(self, centre: Array) -> Law:
+        """Law before anything is known but a centre."""
+        rows, K = self.rows, self.rows.branches
+        covariance, junction = self.guess + self.least, 4 * K - 1
+        clusters = densest_clusters(
+            rows.values[:, junction], np.sqrt(rows.covariance[:, junction, junction]), farthest=LARGEST_SHARED
+        )
+        if clusters:  # loads without a sensor differ between vehicles
+            covariance[junction, junction] += min(clusters[0].spread, MOST_LOAD_SPREAD) ** 2
+        spread = Spread(
+            mean=centre,
+            covariance=covariance,
+            dispersion=np.full(K, FIRST_DISPERSION),
+            shared=np.zeros(2 * K + 1),
+        )
+        return Law(spread=spread, priors=((1.0, self.known or first_prior(K)),))
+
+    def climb(self, law: Law, rounds: int, *, begun: bool = False) -> Law:
+        """Some rounds of expectation and maximisation; the best law that was met."""
+        best = replace(law, log_evidence=-np.inf)
+        for n in range(rounds):
+            draws = explain(self.rows, law, feed=self.feed)
+            prior = self._next_prior(draws, law.prior, coarse=not begun, grouping=begun or n > 0)
+            weight, log_evidence = weigh(draws, prior)
+            met = Law(spread=law.spread, priors=((1.0, prior),), log_evidence=float(log_evidence.sum()))
+            centred = met.prior.group_share.max(initial=0.0) <= 1.0 - met.prior.group_share.sum()
+            if met.log_evidence > best.log_evidence and (centred or met.spread.shared.any()):
+                best = met
+            law = self._recentred(replace(met, spread=self._next_spread(draws, weight, law.spread)))
+        return best if best.log_evidence > -np.inf else law
+
+    def _recentred(self, law: Law) -> Law:
+        """The law about the largest group, if it is not the vehicles of no group that are most."""
+        prior, spread, K = law.prior, law.spread, self.rows.branches
+        shares = prior.group_share
+        if not shares.size or shares.max() <= 1.0 - shares.sum() or spread.shared.any() or not self.free[4 * K - 1]:
+            return law
+        mean = spread.mean.copy()
+        mean[[3 * K - 1 + self.feed, 4 * K - 1]] += prior.group_centre[int(np.argmax(shares))]
+        alone = replace(prior, group_share=np.zeros(0), group_centre=np.zeros(0), group_sd=np.zeros(0))
+        return replace(law, spread=replace(spread, mean=mean), priors=((1.0, alone),), log_evidence=-np.inf)
+
+    def variants(self, best: Law) -> list[Law]:
+        """The same law with each cause of what vehicles share: loads, offsets or gains of the sensors of a branch."""
+        K, prior = self.rows.branches, best.prior
+        found = [
+            (plausible, replace(best, spread=replace(best.spread, shared=shared)))
+            for plausible, shared in self._shared_constants(float(best.spread.mean[4 * K - 1]), prior)
+        ]
+        slopes = self.centres()[0][:K]  # as most vehicles show them: with what their sensors share
+        for shared in self._shared_gains():
+            mean = best.spread.mean.copy()
+            mean[:K] = np.where(self.free[:K], slopes - shared[K : 2 * K], mean[:K])
+            fresh = replace(self.start(mean), spread=replace(best.spread, mean=mean, shared=shared))
+            found.append((0.0, self.climb(fresh, START_ROUNDS)))
+        if len(found) > 1:
+            found = [(plausible, self.climb(law, START_ROUNDS, begun=True)) for plausible, law in found]
+        evidence = np.array([law.log_evidence for _, law in found])
+        of_gains = np.array([law.spread.shared[K : 2 * K].any() for _, law in found])
+        if self.free[:K].all() and of_gains.any():
+            # Which branch it is shows in the noise of the constants alone, seen through the gain: that is no evidence.
+            evidence[of_gains] = evidence[of_gains].max()
+        log_odds = evidence + [plausible for plausible, _ in found]
+        odds = np.where(log_odds > log_odds.max() - KEPT_LOG_ODDS, np.exp(log_odds - log_odds.max()), 0.0)
+        kept = zip((odds / odds.sum()).tolist(), found, strict=True)
+        return [replace(law, probability=share) for share, (_, law) in kept if share]
+
+    def _shared_constants(self, c0: float, prior: Prior) -> list[tuple[float, Array]]:
+        """What vehicles may share in the junction's constant, and how plausible it is, as a logarithm."""
+        K = self.rows.branches
+        found: list[tuple[float, Array]] = []
+        for of_sensor in (False, True) if len(prior.group_centre) else (False,):
+            offsets = [(0.0, self.feed)]
+            if abs(c0) > DOUBT and np.isnan(self.fixed[4 * K - 1]):
+                offsets += [(c0, k) for k in range(K)]
+            if of_sensor:
+                others = [-float(centre) for centre in prior.group_centre]
+                offsets += [(z, self.feed) for z in others if all(abs(z - known) > DOUBT for known, _ in offsets)]
+            for offset, k in offsets:
+                shared: Array = np.zeros(2 * K + 1)
+                shared[k], shared[-1] = offset, of_sensor
+                plausible = _log_plausible(c0, offset, prior, of_sensor=of_sensor) - np.log(K if offset else 1)
+                found.append((float(plausible), shared))
+        return found
+
+    def _shared_gains(self) -> list[Array]:
+        """Gains that the sensors of a branch may share: most vehicles break the junction law alike."""
+        rows, K = self.rows, self.rows.branches
+        off = np.zeros(K)
+        for k in range(1, K):
+            known = rows.known[:, K + k - 1]
+            value, sd = rows.relative[known, K + k - 1], np.sqrt(rows.covariance[known, K + k - 1, K + k - 1])
+            clusters = densest_clusters(value, sd)
+            if clusters and clusters[0].share > LEAST_SHARED_GAIN[0] and abs(clusters[0].centre) > LEAST_SHARED_GAIN[1]:
+                off[k] = clusters[0].centre
+        if not off.any():
+            return []
+        # lambda_1 - lambda_k is off: by the sensors of the first branch if all are alike, else by those of branch k
+        of_first: Array = np.zeros(2 * K + 1)
+        of_others: Array = np.zeros(2 * K + 1)
+        of_first[K] = off[1:].mean()
+        of_others[K : 2 * K] = -off
+        alike = np.ptp(off[1:]) < LEAST_SHARED_GAIN[1]
+        return [of_first] * bool(alike) + [of_others] * bool(K == 2 or not alike)
+
+    def with_modes(self, law: Law) -> Law:
+        """The same law with all priors that explain the fleet about as well; several starts, one set of draws."""
+        if self.known is not None:
+            return law
+        draws = explain(self.rows, law, feed=self.feed)
+        found: list[tuple[float, Prior]] = []
+        for bounds in (None, *SIZE_STARTS):
+            prior = law.prior
+            if bounds is not None:
+                slab = Slab(low=bounds[0], high=bounds[1], tail=0.03)
+                prior = with_slabs(prior, slab, slab)
+            for n in range(3):
+                prior = self._next_prior(draws, prior, coarse=bounds is not None and not n, grouping=False)
+            found.append((float(weigh(draws, prior)[1].sum()), prior))
+        found.sort(key=lambda item: -item[0])
+        odds: list[tuple[float, Prior]] = []
+        for value, prior in found:
+            same = (np.abs(prior.log_density - other.log_density).max() < SAME_DENSITY for _, other in odds)
+            if value > found[0][0] - 0.5 * KEPT_LOG_ODDS and not any(same):
+                odds.append((float(np.exp(value - found[0][0])), prior))
+        total = sum(share for share, _ in odds)
+        return replace(law, priors=tuple((share / total, prior) for share, prior in odds))
+
+    def _next_prior(self, draws: Draws, prior: Prior, *, coarse: bool, grouping: bool) -> Prior:
+        if self.known is not None:
+            return self.known
+        for _ in range(PRIOR_STEPS):
+            prior = self._next_shares(draws, prior)
+        prior = _next_sizes(draws, prior, coarse=coarse)
+        if grouping and len(prior.group_share) < MOST_GROUPS:
+            prior = self._with_group(draws, prior)
+        return prior
+
+    def _next_shares(self, draws: Draws, prior: Prior) -> Prior:
+        """Numbers of faults, loads and groups from the weights of the draws."""
+        weight, _ = weigh(draws, prior)
+        N, K = len(weight), prior.branches
+        of_fit = weight.sum(axis=(2, 3))
+        tally = np.zeros(prior.counts.shape)
+        np.add.at(tally, (draws.fits.hardware, draws.fits.sensor), of_fit)
+        counts = (tally + COUNT_VEHICLES * sparse_counts(tally)) / (N + COUNT_VEHICLES)
+        if self.expected_faults is not None:
+            sound, faulty = counts[:, :1], counts[:, 1:]
+            expected = self.expected_faults
+            counts = np.concatenate([(1.0 - expected) * sound / sound.sum(), expected * faulty / faulty.sum()], axis=1)
+        loaded = draws.fits.support[:, :, 3 * K]
+        share, centre, sd = prior.group_share.copy(), prior.group_centre.copy(), prior.group_sd.copy()
+        for g in range(len(share)):
+            share[g] = (weight[..., 1 + g].sum() + 0.02) / (N + 1.0)
+            w = (weight[..., 1 + g] * loaded[:, :, None]).ravel()
+            if w.sum() > 0.5:
+                x = draws.values[..., 3 * K].ravel()
+                centre[g] = w @ x / w.sum()
+                sd[g] = np.sqrt((w @ (x - centre[g]) ** 2 + 2.0 * DOUBT**2) / (w.sum() + 2.0))
+        return replace(
+            prior,
+            counts=counts,
+            load_share=float((weight[..., 0][loaded].sum() + 0.02) / (N + 2.0)),
+            group_share=share,
+            group_centre=centre,
+            group_sd=np.maximum(sd, 0.7 * DOUBT),
+        )
+
+    def _with_group(self, draws: Draws, prior: Prior) -> Prior:
+        """The prior with one group more, if vehicles that share a constant of the feeding branch make it likelier."""
+        K, N, fits = prior.branches, len(draws.values), draws.fits
+        weight = weigh(draws, prior)[0][..., 0].sum(axis=2)
+        found = []
+        for column in (2 * K + self.feed, 3 * K):
+            on = fits.support[:, :, column] & (weight > 0.05)
+            sd = np.sqrt((fits.root[:, :, column] ** 2).sum(axis=2))
+            found.append(np.stack([fits.theta[:, :, column][on], sd[on], weight[on]]))
+        value, sd, share = np.concatenate(found, axis=1)
+        near = (np.abs(value) > 4.0 * DOUBT) & (np.abs(value) < LARGEST_SHARED) & (sd < 10.0 * DOUBT)
+        value, sd, share = value[near], sd[near], share[near]
+        width = np.hypot(sd, DOUBT)
+        vehicles = np.exp(-0.5 * ((value[:, None] - value) / width) ** 2) @ share
+        for centre in prior.group_centre:
+            vehicles[np.abs(value - centre) < 4.0 * DOUBT] = 0.0
+        if not vehicles.size or vehicles.max() < LEAST_GROUP:
+            return prior
+        first = int(np.argmax(vehicles))
+        grouped = replace(
+            prior,
+            group_share=np.append(prior.group_share, min(vehicles[first] / N, 0.7)),
+            group_centre=np.append(prior.group_centre, value[first]),
+            group_sd=np.append(prior.group_sd, 1.5 * DOUBT),
+        )
+        for _ in range(PRIOR_STEPS):
+            prior, grouped = self._next_shares(draws, prior), self._next_shares(draws, grouped)
+        gain = float(weigh(draws, grouped)[1].sum() - weigh(draws, prior)[1].sum())
+        return grouped if gain > GROUP_GAIN else prior
+
+    def _next_spread(self, draws: Draws, weight: Array, spread: Spread) -> Spread:
+        """Centre, covariance and dispersion of what the explanations leave of the rows."""
+        rows, K, N = self.rows, self.rows.branches, len(self.rows)
+        of_fit = weight.sum(axis=(2, 3))
+        top = np.argsort(-of_fit, axis=1, kind="stable")[:, :USED_FITS]
+        share = np.take_along_axis(of_fit, top, axis=1)
+        share /= share.sum(axis=1, keepdims=True)
+        theta = np.take_along_axis(draws.fits.theta, top[:, :, None], axis=1)
+        root = np.take_along_axis(draws.fits.root, top[:, :, None, None], axis=1)
+        whole, added = rows.dispersed(spread.dispersion)
+        evidence = evidence_of(
+            rows.values,
+            whole + spread.covariance,
+            rows.means,
+            centre=spread.mean,
+            shared=spread.shared,
+            feed=self.feed,
+        )
+        left = row_residuals(evidence, theta)
+        chi2 = np.einsum("nqa,nab,nqb->nq", left, evidence.precision, left) / (2 * K + 2)
+        counted = share * (1.0 + TAIL_DEGREES) / (1.0 + TAIL_DEGREES * np.maximum(chi2, 1.0))
+
+        def expected(prior_covariance: Array, gain: Array) -> tuple[Array, Array]:
+            """Mean (N, Q, r) and covariance (N, Q, r, r) of a part of the error that has this prior and gain."""
+            shown = (gain @ self.design)[:, None] @ root  # what the fitted parameters hide of it
+            return np.einsum("nab,nqb->nqa", gain, left), prior_covariance + shown @ np.swapaxes(shown, 2, 3)
+
+        V, P = spread.covariance, evidence.precision
+        mean, covariance = expected((V - V @ P @ V)[:, None], V @ P)
+        shift = np.where(self.free, np.einsum("nq,nqa->a", counted, mean) / counted.sum(), 0.0)
+        apart = mean - shift
+        scatter = np.einsum("nq,nqa,nqb->ab", counted, apart, apart) + np.einsum("nq,nqab->ab", share, covariance)
+        b = slice(3 * K - 1, 4 * K - 1)
+        gain = added @ P[:, b]
+        error, doubt = expected((added - gain[:, :, b] @ added)[:, None], gain)
+        stated = np.diagonal(rows.intercept_covariance(), axis1=1, axis2=2)[:, None]
+        more = (error**2 + np.diagonal(doubt, axis1=2, axis2=3)) / stated
+        guessed = SPREAD_VEHICLES / (SPREAD_VEHICLES + N)
+        return Spread(
+            mean=spread.mean + shift,
+            covariance=(1.0 - guessed) * scatter / N + guessed * self.guess + self.least,
+            dispersion=1.0 + (np.einsum("nq,nqk->k", counted, more) + SPREAD_VEHICLES) / (N + SPREAD_VEHICLES),
+            shared=spread.shared,
+        )
+
+
+def _next_sizes(draws: Draws, prior: Prior, *, coarse: bool) -> Prior:
+    """Bounds and tail of the sizes of drifts and of offsets, each averaged over what the fleet leaves open."""
+    slabs = [prior.gain, prior.offset]
+    for kind in (GAIN, OFFSET):
+        best, odds = slabs[kind], {}
+        for again in (False, True):
+            for name in ("high", "low", "tail"):
+                grid: Sequence[float] | Array = TAILS
+                if name != "tail":
+                    first = COARSE_LOW if name == "low" else COARSE_HIGH
+                    grid = first if coarse and not again else getattr(best, name) * FINE
+                tried = [replace(best, **{name: float(value)}, density=np.zeros(0)) for value in grid]
+                tried = [slab for slab in tried if slab.high > 1.2 * slab.low and slab.low > TAIL_RANGE[0]]
+                evidence = size_evidence(draws, prior, kind, np.stack([slab.density for slab in tried]))
+                best = tried[int(np.argmax(evidence))]
+                weight = np.exp(evidence - evidence.max())
+                odds[name] = [(getattr(slab, name), w) for slab, w in zip(tried, weight / weight.sum(), strict=True)]
+        pairs = np.array([(low, high, a * b) for low, a in odds["low"] for high, b in odds["high"] if high > 1.2 * low])
+        uniform = uniform_density(pairs[:, 0], pairs[:, 1]) @ pairs[:, 2] / pairs[:, 2].sum()
+        tail = sum(value * w for value, w in odds["tail"])
+        slabs[kind] = replace(best, density=(1.0 - tail) * uniform + tail * TAIL_DENSITY)
+        prior = with_slabs(prior, slabs[GAIN], slabs[OFFSET])
+    return prior
+
+
+def _log_plausible(c0: float, offset: float, prior: Prior, *, of_sensor: bool) -> float:
+    """Prior of a cause of what vehicles share, as a logarithm.
+
+    An offset that most sensors share is rarer than one of a few; a load takes current; and currents that sum to zero
+    although both a load and an offset are there would do so by chance.
+    """
+    levels = c0 + np.append(0.0, prior.group_centre)  # what the currents of the vehicles of each group sum to
+    shares = np.append(1.0 - prior.group_share.sum(), prior.group_share)
+    sensors = offset + np.append(0.0, prior.group_centre if of_sensor else 0.0 * prior.group_centre)
+    loads, affected = levels - sensors, np.abs(sensors) > DOUBT
+    value = 3.0 * np.log(max(1.0 - shares[affected].sum(), 0.3))
+    if (loads < -DOUBT).any() or (loads > LARGEST_SHARED).any():
+        value -= 7.0
+    if (affected & (np.abs(levels) < DOUBT)).any():
+        value -= 4.0
+    return float(value)

@@ -1,0 +1,185 @@
+"""Prior of the faults of a fleet: how many a vehicle has, how large they are, and what several vehicles share.
+
+Sizes are uniform between two bounds (a slab), with a log-uniform tail far below and above them, so that no size is
+impossible. Numbers of faults follow the law of sparse faults (20) of [1]_: n of the 3K parameters are not zero, and in
+some vehicles none of the hardware (M13). Bounds, tail and numbers are learned: :mod:`calibrator.estimator.learning`.
+
+.. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
+"""
+
+from dataclasses import dataclass, field
+from math import comb
+
+import numpy as np
+
+from calibrator.drive import Array
+
+__all__ = ["GRID", "LARGEST_SHARED", "Prior", "Slab", "first_prior", "known_prior", "sparse_counts", "with_slabs"]
+
+GRID: Array = np.geomspace(1e-4, 4.0, 500)
+"""Magnitudes at which densities are tabulated: drifts [1], offsets and loads in fractions of full scale."""
+TAIL_RANGE = (0.002, 1.5)
+"""Of the log-uniform tail: from the resolution of sensors to what no layout would correct. [1]"""
+LOAD_RANGE = (0.002, 0.04)
+"""Of a load without a sensor, in fractions of full scale: from the resolution of the junction's sum to some kW. [1]"""
+LARGEST_SHARED = 0.08
+"""Largest offset or load that vehicles share, in fractions of full scale: larger ones stop a vehicle. [1]"""
+EDGE = 0.03
+"""Relative width of the edges of a slab, so that its evidence is smooth in its bounds. [1]"""
+GUESSED_LOAD_SHARE = 0.01
+"""Share of vehicles with a load without a sensor of their own, before anything is known. [1]"""
+GUESS_WEIGHT = 2.0
+"""Weight of the guessed law of the number of faults, in vehicles."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slab:
+    """Density of the size of faults.
+
+    Attributes
+    ----------
+    low, high : float
+        Most probable bounds: drifts [1], offsets in fractions of full scale.
+    tail : float
+        Share of faults outside. [1]
+    density : ndarray of shape (G,)
+        At :data:`GRID`; may be averaged over what the fleet leaves open of bounds and tail.
+    """
+
+    low: float
+    high: float
+    tail: float
+    density: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not self.density.size:
+            uniform = uniform_density(np.array([self.low]), np.array([self.high]))[:, 0]
+            object.__setattr__(self, "density", (1.0 - self.tail) * uniform + self.tail * TAIL_DENSITY)
+
+    @property
+    def smallest(self) -> float:
+        """Size below which 3 % of the faults are."""
+        return float(np.interp(0.03, np.cumsum(self.density * np.gradient(GRID)), GRID))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prior:
+    """How faults are distributed over a fleet with K branches.
+
+    Attributes
+    ----------
+    counts : ndarray of shape (K + 1, 2K + 1)
+        Probability of so many hardware (rows) and sensor faults (columns); all supports with the same numbers are
+        equally likely.
+    gain, offset : Slab
+        Sizes of drifts, and of offsets.
+    load_share : float
+        Share of vehicles that have a load without a sensor of their own; its size is log-uniform. [1]
+    group_share, group_centre, group_sd : ndarray of shape (g,)
+        Groups of vehicles that share a constant of the feeding branch, a load or an offset of its sensor: share of
+        the fleet [1], centre and standard deviation in fractions of full scale.
+    """
+
+    counts: Array
+    gain: Slab
+    offset: Slab
+    load_share: float = GUESSED_LOAD_SHARE
+    group_share: Array = field(default_factory=lambda: np.zeros(0))
+    group_centre: Array = field(default_factory=lambda: np.zeros(0))
+    group_sd: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def branches(self) -> int:
+        """Number of branches K."""
+        return len(self.counts) - 1
+
+    @property
+    def log_density(self) -> Array:
+        """Logarithm of the density of drifts, offsets and loads at :data:`GRID`, shape (3, G)."""
+        return np.log(np.stack([self.gain.density, self.offset.density, LOAD_DENSITY]))
+
+    @property
+    def log_supports(self) -> Array:
+        """Logarithm of the probability of one support, by its numbers of faults, shape (K + 1, 2K + 1)."""
+        K = self.branches
+        ways = np.outer([comb(K, h) for h in range(K + 1)], [comb(2 * K, s) for s in range(2 * K + 1)])
+        return np.asarray(np.log(np.maximum(self.counts / ways, 1e-300)))
+
+
+def uniform_density(low: Array, high: Array) -> Array:
+    """Densities of magnitudes between bounds with soft edges, shape (G, S) of two arrays (S,)."""
+    x = np.log(GRID)[:, None]
+    rise, fall = np.clip((x - np.log(low)) / EDGE, -50.0, 50.0), np.clip((x - np.log(high)) / EDGE, -50.0, 50.0)
+    density = 1.0 / (1.0 + np.exp(-rise)) / (1.0 + np.exp(fall))
+    return np.asarray(density / np.trapezoid(density, GRID, axis=0))
+
+
+def _log_uniform(low: float, high: float) -> Array:
+    density = np.where((low < GRID) & (high > GRID), 1.0 / GRID, 1e-6)
+    return np.asarray(density / np.trapezoid(density, GRID))
+
+
+TAIL_DENSITY, LOAD_DENSITY = _log_uniform(*TAIL_RANGE), _log_uniform(*LOAD_RANGE)
+
+
+def first_prior(branches: int) -> Prior:
+    """Prior before anything is known of a fleet: few faults, of any size."""
+    n = np.arange(3 * branches + 1)
+    total = np.array([comb(3 * branches, i) for i in n]) * 0.2**n * 0.8 ** (3 * branches - n)
+    counts = np.einsum("n,znhs->hs", total, _laws(branches)) / 2.0
+    slab = Slab(low=0.01, high=0.6, tail=0.03)
+    return Prior(counts=counts, gain=slab, offset=slab)
+
+
+def known_prior(counts: Array, magnitude: tuple[float, float]) -> Prior:
+    """Prior of a fleet whose faults were drawn in a known way: numbers (K + 1, 2K + 1), and bounds of all sizes."""
+    slab = Slab(low=magnitude[0], high=magnitude[1], tail=1e-6)
+    return Prior(counts=counts + 1e-9, gain=slab, offset=slab, load_share=1e-9)
+
+
+def with_slabs(prior: Prior, gain: Slab, offset: Slab) -> Prior:
+    """The same prior with other sizes of faults."""
+    return Prior(**{**vars(prior), "gain": gain, "offset": offset})
+
+
+def _laws(K: int) -> Array:
+    """Probability of (n_h, n_s) if n parameters are not zero, shape (2, 3K + 1, K + 1, 2K + 1).
+
+    First of any vehicle, all supports of n parameters being equally likely; then of one whose hardware ones are zero.
+    """
+    laws = np.zeros((2, 3 * K + 1, K + 1, 2 * K + 1))
+    for h in range(K + 1):
+        for s in range(2 * K + 1):
+            laws[0, h + s, h, s] = comb(K, h) * comb(2 * K, s) / comb(3 * K, h + s)
+    laws[1, :, 0] = laws[0].sum(axis=1)
+    return laws
+
+
+def sparse_counts(tally: Array) -> Array:
+    """Most probable law of sparse faults for a fleet.
+
+    Parameters
+    ----------
+    tally : ndarray of shape (K + 1, 2K + 1)
+        Expected number of vehicles with so many hardware and sensor faults.
+
+    Returns
+    -------
+    ndarray of shape (K + 1, 2K + 1)
+        Law with a free distribution of the number n of faults about a binomial, and a share of vehicles without
+        hardware faults; by expectation maximisation.
+    """
+    K, N = len(tally) - 1, float(tally.sum())
+    laws, n = _laws(K), np.arange(3 * K + 1)
+    ways = np.array([comb(3 * K, i) for i in n])
+    total, sound, each = np.full(3 * K + 1, 1.0 / (3 * K + 1)), 0.5, 0.25
+    for _ in range(30):
+        joint = np.array([1.0 - sound, sound])[:, None, None, None] * total[:, None, None] * laws
+        share = joint / np.maximum(joint.sum(axis=(0, 1)), 1e-300) * tally
+        guess = ways * each**n * (1.0 - each) ** (3 * K - n)
+        total = (share.sum(axis=(0, 2, 3)) + GUESS_WEIGHT * guess) / (N + GUESS_WEIGHT)
+        sound = (share[1].sum() + 0.5) / (N + 1.0)
+        each = (N * float(total @ n) + 0.5 * K) / (3.0 * K * N + 2.0 * K)
+    return np.asarray(np.array([1.0 - sound, sound]) @ np.einsum("n,znhs->zhs", total, laws).reshape(2, -1)).reshape(
+        tally.shape
+    )

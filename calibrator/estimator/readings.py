@@ -1,0 +1,483 @@
+"""Direct readings of single sensors: bench checks, zero-current windows, trusted vehicles.
+
+A zero-current window (contactors open) shows the offset itself; a bench check shows gain error (drift) and offset; the
+sensors of a trusted vehicle were all found faultless. Each is one more Gaussian row of the evidence. The bench table is
+a CSV file with one line per sensor that was checked: columns ``vehicle, branch`` and ``drift, drift_sd`` or ``offset_a,
+offset_sd_a`` or both pairs; a pair of empty cells was not read. measured = (1 + drift) * true + offset.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from calibrator.drive import Array, Mask
+from calibrator.errors import FleetError
+from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows
+from calibrator.faults import Index
+from calibrator.summaries.vehicle_summary import VehicleSummary
+from calibrator.summaries.zero_current import weighted_mean
+from calibrator.terminal.text import few
+from ecu_node.layout import UnmeasuredLoad
+
+__all__ = [
+    "FEWEST_TRUSTED",
+    "TRUSTED_DRIFT_SD",
+    "TRUSTED_OFFSET_SD",
+    "BenchReading",
+    "BenchTable",
+    "Readings",
+    "check_bench_table",
+    "contradicted_readings",
+    "merge_readings",
+    "read_bench_table",
+    "trust_notices",
+    "untrusted_vehicles",
+    "with_readings",
+]
+
+TRUSTED_DRIFT_SD = 0.002
+"""Accuracy of a bench check of the gain, as of a laboratory shunt. [1]"""
+TRUSTED_OFFSET_SD = 0.0005
+"""The same of the zero, in fractions of full scale. [1]"""
+FEWEST_TRUSTED = 3
+"""Trusted vehicles from which on they carry the reference."""
+CONTRADICTION = 4.0
+"""Standard deviations from which on two readings of one sensor contradict each other. [1]"""
+LEAST_PROBABILITY = 1e-4
+"""Of the explanations near a bench reading: below, the drives contradict it. [1]"""
+LEAST_GAIN, LEAST_OFFSET = 0.003, 0.001
+"""What else than its sensors may bend a gain ratio or move the constant: the latter in fractions of full scale. [1]"""
+MOST_LOAD = 0.015
+"""Largest load without a sensor that is taken for granted, over full scale. [1]"""
+
+PAIRS = (("drift", "drift_sd"), ("offset_a", "offset_sd_a"))
+COLUMNS = ("vehicle", "branch", *PAIRS[0], *PAIRS[1])
+LEAST_SD = 1e-5
+"""Least standard deviation of a reading: no bench is sharper; of offsets over full scale. [1]"""
+LARGEST = 0.9
+"""Largest fault that a sensor of a running vehicle is read with; a drift of 2 is 2 %, wrongly typed. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Readings:
+    """Readings of N vehicles with K branches; NaN where there is none.
+
+    Attributes
+    ----------
+    drift, drift_sd : ndarray of shape (N, K)
+        Drift as read, above -1, and its standard deviation, positive. [1]
+    offset_a, offset_sd_a : ndarray of shape (N, K)
+        Offset as read and its standard deviation, positive. [A]
+    """
+
+    drift: Array
+    drift_sd: Array
+    offset_a: Array
+    offset_sd_a: Array
+
+    @classmethod
+    def none(cls, vehicles: int, branches: int) -> "Readings":
+        """No readings at all."""
+        nothing = np.full((vehicles, branches), np.nan)
+        return cls(drift=nothing, drift_sd=nothing, offset_a=nothing, offset_sd_a=nothing)
+
+    @classmethod
+    def of_trusted(cls, trusted: Mask, branches: int, full_scale_a: float) -> "Readings":
+        """Readings of zero for all K sensors of the trusted of N vehicles, none for the others; full scale in A."""
+        zero = np.where(trusted[:, None], 0.0, np.nan) * np.ones(branches)
+        offset_sd_a = zero + TRUSTED_OFFSET_SD * full_scale_a
+        return cls(drift=zero, drift_sd=zero + TRUSTED_DRIFT_SD, offset_a=zero, offset_sd_a=offset_sd_a)
+
+    @classmethod
+    def of_bench(cls, bench: "BenchTable", vehicles: Sequence[str], branches: Sequence[str]) -> "Readings":
+        """Readings of a bench table for N vehicles and K branches, by their names."""
+        unread = (math.nan,) * 4
+        values = [[bench.get((vehicle, branch), unread)[:4] for branch in branches] for vehicle in vehicles]
+        drift, drift_sd, offset_a, offset_sd_a = np.moveaxis(np.array(values), 2, 0)
+        return cls(drift=drift, drift_sd=drift_sd, offset_a=offset_a, offset_sd_a=offset_sd_a)
+
+    def merged(self, other: "Readings") -> "Readings":
+        """Both together: of a sensor that was read twice the mean, weighted by precision."""
+        drift, drift_sd = weighted_mean((self.drift, self.drift_sd), (other.drift, other.drift_sd))
+        offset_a, offset_sd_a = weighted_mean((self.offset_a, self.offset_sd_a), (other.offset_a, other.offset_sd_a))
+        return Readings(drift=drift, drift_sd=drift_sd, offset_a=offset_a, offset_sd_a=offset_sd_a)
+
+    def take(self, index: Index) -> "Readings":
+        """Return the readings of some of the vehicles."""
+        return Readings(**{name: values[index] for name, values in vars(self).items()})
+
+    def take_branches(self, order: Sequence[int]) -> "Readings":
+        """Return the same readings with the branches in another order."""
+        return Readings(**{name: values[:, list(order)] for name, values in vars(self).items()})
+
+
+def with_readings(rows: EvidenceRows, readings: Readings, *, full_scale_a: float) -> EvidenceRows:
+    """Put direct readings into the evidence.
+
+    Parameters
+    ----------
+    rows : EvidenceRows
+        Of N vehicles.
+    readings : Readings
+        Of the same vehicles and branches.
+    full_scale_a : float
+        Full scale of the junction. [A]
+
+    Returns
+    -------
+    EvidenceRows
+        The same with the rows of the readings filled in.
+    """
+    K = rows.branches
+    relative, constant, covariance = rows.relative.copy(), rows.constant.copy(), rows.covariance.copy()
+    log_sd = readings.drift_sd / (1.0 + readings.drift)
+    for values, value, sd, first in (
+        (relative[:, 2 * K - 1 :], np.log1p(readings.drift), log_sd, 2 * K - 1),
+        (constant[:, K + 1 :], readings.offset_a / full_scale_a, readings.offset_sd_a / full_scale_a, 4 * K),
+    ):
+        known, row = np.isfinite(value) & np.isfinite(sd), np.arange(first, first + K)
+        values[:] = np.where(known, value, 0.0)
+        covariance[:, row, row] = np.where(known, sd**2, UNKNOWN_VARIANCE)
+    return replace(rows, relative=relative, constant=constant, covariance=covariance)
+
+
+class BenchReading(NamedTuple):
+    """What a bench showed of one sensor; NaN where it was not read. [1], [A]"""
+
+    drift: float
+    drift_sd: float
+    offset_a: float
+    offset_sd_a: float
+    place: str
+    """File and line, for messages."""
+
+
+BenchTable = Mapping[tuple[str, str], BenchReading]
+"""Bench readings by vehicle and branch."""
+
+
+def read_bench_table(path: Path, branches: Collection[str], *, full_scale_a: float) -> BenchTable:
+    """Read a table of bench readings.
+
+    Parameters
+    ----------
+    path : Path
+        CSV file with a header.
+    branches : collection of str
+        Names of the K branches.
+    full_scale_a : float
+        Full scale of the junction. [A]
+
+    Returns
+    -------
+    mapping
+        The readings by vehicle and branch; the vehicles are not yet known to exist, see :func:`check_bench_table`.
+
+    Raises
+    ------
+    FleetError
+        Naming file, line, what was expected.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise FleetError(f"{path}: cannot read the bench readings: {error.strerror}; give a CSV table") from None
+    except UnicodeDecodeError:
+        raise FleetError(f"{path}: not a table of bench readings: the file is not UTF-8 text") from None
+    lines = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+    bench: dict[tuple[str, str], BenchReading] = {}
+    try:
+        header = [cell.strip() for cell in next(lines, [])]
+        complete = {"vehicle", "branch"} <= set(header) <= set(COLUMNS) and len(set(header)) == len(header)
+        if not complete or not any(set(pair) <= set(header) for pair in PAIRS):
+            raise FleetError(
+                f"{path}: line 1: columns {', '.join(header) or 'none'}; expected each of {', '.join(COLUMNS)} once, "
+                f"one pair of the last four may be left out"
+            )
+        for cells in filter(any, lines):
+            place = f"{path}: line {lines.line_num}"
+            if len(cells) > len(header):
+                raise FleetError(f"{place}: {len(cells)} cells, and the header has {len(header)} columns")
+            row = dict.fromkeys(COLUMNS, "") | dict(zip(header, map(str.strip, cells), strict=False))
+            vehicle, branch = row["vehicle"], row["branch"]
+            if branch not in branches:
+                raise FleetError(f"{place}: no branch {branch!r} in this fleet; known are {few(sorted(branches))}")
+            if (vehicle, branch) in bench:
+                raise FleetError(f"{place}: the {branch} sensor of {vehicle} stands there twice; give it one line")
+            bench[vehicle, branch] = _reading(row, place, full_scale_a)
+    except csv.Error as error:
+        raise FleetError(f"{path}: line {lines.line_num}: not a table of bench readings: {error}") from None
+    if not bench:
+        raise FleetError(f"{path}: no reading below the header; leave --readings out if there is none")
+    return bench
+
+
+def _reading(row: Mapping[str, str], place: str, full_scale_a: float) -> BenchReading:
+    """Numbers of one line, each pair NaN where both cells are empty."""
+    numbers = dict.fromkeys(COLUMNS[2:], math.nan)
+    for pair in (pair for pair in PAIRS if any(row[name] for name in pair)):
+        for name in pair:
+            with suppress(ValueError):
+                numbers[name] = float(row[name])
+            if not math.isfinite(numbers[name]):
+                expected = f"a number, and {pair[0]} together with {pair[1]}"
+                raise FleetError(f"{place}: {name} is {row[name]!r}; expected {expected}")
+    if all(map(math.isnan, numbers.values())):
+        raise FleetError(f"{place}: nothing was read; give drift and drift_sd, or offset_a and offset_sd_a")
+    for name, low, high, what in (
+        ("drift", 0.0, LARGEST, "a relative gain error; 2 % is 0.02"),
+        ("drift_sd", LEAST_SD, LARGEST, "a standard deviation; 0.1 % is 0.001"),
+        ("offset_a", 0.0, LARGEST * full_scale_a, "in A"),
+        ("offset_sd_a", LEAST_SD * full_scale_a, LARGEST * full_scale_a, "in A"),
+    ):
+        size, value = ("a number", numbers[name]) if "sd" in name else ("a magnitude", abs(numbers[name]))
+        if value < low or value > high:  # NaN, which was not read, is neither
+            raise FleetError(f"{place}: {name} is {row[name]}; expected {size} from {low:g} to {high:g}: {what}")
+    return BenchReading(**numbers, place=place)
+
+
+def check_bench_table(
+    bench: BenchTable,
+    vehicles: Collection[str],
+    *,
+    left_out: Mapping[str, str],
+    trusted: Collection[str],
+    full_scale_a: float,
+) -> None:
+    """Refuse bench readings of vehicles that do not exist, or that contradict the trust in a vehicle.
+
+    Parameters
+    ----------
+    bench : mapping
+        From :func:`read_bench_table`.
+    vehicles : collection of str
+        Vehicles that can be used.
+    left_out : mapping of str to str
+        Vehicles that have no usable drive, and why.
+    trusted : collection of str
+        Vehicles whose sensors are said to be faultless.
+    full_scale_a : float
+        Full scale of the junction. [A]
+
+    Raises
+    ------
+    FleetError
+        Naming file and line of the reading.
+    """
+    for (vehicle, branch), (drift, drift_sd, offset_a, offset_sd_a, place) in bench.items():
+        if vehicle not in vehicles:
+            if vehicle in left_out:
+                raise FleetError(f"{place}: vehicle {vehicle!r} is left out: {left_out[vehicle]}")
+            raise FleetError(f"{place}: no vehicle {vehicle!r} in this fleet; known are {few(sorted(vehicles))}")
+        if vehicle in trusted and (
+            abs(drift) > CONTRADICTION * np.hypot(drift_sd, TRUSTED_DRIFT_SD)
+            or abs(offset_a) > CONTRADICTION * np.hypot(offset_sd_a, TRUSTED_OFFSET_SD * full_scale_a)
+        ):
+            raise FleetError(
+                f"{place}: the {branch} sensor of {vehicle} was read as faulty, and {vehicle} is trusted; a trusted "
+                f"vehicle is one whose sensors were all found faultless"
+            )
+
+
+def merge_readings(
+    vehicles: Sequence[VehicleSummary], bench: BenchTable, branches: Sequence[str]
+) -> tuple[Readings, list[str]]:
+    """Merge what the sensors showed on a bench with what they showed in zero-current windows.
+
+    Parameters
+    ----------
+    vehicles : sequence of VehicleSummary
+        N vehicles.
+    bench : mapping
+        Bench readings.
+    branches : sequence of str
+        Names of the K branches.
+
+    Returns
+    -------
+    readings : Readings
+        Both together; neither where they contradict each other.
+    notices : list of str
+        Where they do, and readings that could not be used.
+    """
+    names = [vehicle.vehicle for vehicle in vehicles]
+    offset_a = np.stack([vehicle.zero_current.offset_a for vehicle in vehicles])
+    sd_a = np.stack([vehicle.zero_current.sd_a for vehicle in vehicles])
+    read = Readings.of_bench(bench, names, branches)
+    apart = np.abs(offset_a - read.offset_a) > CONTRADICTION * np.hypot(sd_a, read.offset_sd_a)
+    notices = [
+        f"vehicle {names[j]}: its {branches[k]} sensor was read as {read.offset_a[j, k]:+.1f} A on the bench, and "
+        f"showed {offset_a[j, k]:+.1f} A with open contactors: neither is used; check it again"
+        for j, k in np.argwhere(apart).tolist()
+    ]
+    unused = sorted({vehicle for vehicle, _ in bench} - set(names))
+    if unused:
+        notices.append(f"bench readings of vehicles that are left out are not used: {', '.join(unused)}")
+    windows = replace(Readings.none(*offset_a.shape), offset_a=offset_a, offset_sd_a=sd_a)
+    merged = windows.merged(read)
+    return replace(
+        merged,
+        offset_a=np.where(apart, np.nan, merged.offset_a),
+        offset_sd_a=np.where(apart, np.nan, merged.offset_sd_a),
+    ), notices
+
+
+def contradicted_readings(
+    bench: BenchTable,
+    vehicles: Sequence[str],
+    branches: Sequence[str],
+    *,
+    weight: Array,
+    drift: Array,
+    drift_sd: Array,
+    offset_a: Array,
+    offset_sd_a: Array,
+) -> dict[tuple[str, str], str]:
+    """Find bench readings that a vehicle's drives contradict: those of another vehicle, or a slip.
+
+    Parameters
+    ----------
+    bench : mapping
+        The readings.
+    vehicles, branches : sequence of str
+        Names of the N vehicles and K branches.
+    weight : ndarray of shape (N, S)
+        Probabilities of the explanations of each vehicle, found without these readings. [1]
+    drift, drift_sd, offset_a, offset_sd_a : ndarray of shape (N, S, K)
+        Their sensor faults and standard deviations. [1], [A]
+
+    Returns
+    -------
+    dict of (str, str) to str
+        What to say of each such sensor.
+    """
+    found = {}
+    for (vehicle, branch), read in bench.items():
+        if vehicle not in vehicles:
+            continue
+        j, k = vehicles.index(vehicle), branches.index(branch)
+        drift_apart = np.abs(read.drift - drift[j, :, k]) / np.hypot(read.drift_sd, drift_sd[j, :, k])
+        offset_apart = np.abs(read.offset_a - offset_a[j, :, k]) / np.hypot(read.offset_sd_a, offset_sd_a[j, :, k])
+        far = (drift_apart > CONTRADICTION) | (offset_apart > CONTRADICTION)  # what was not read is not far
+        if weight[j] @ ~far < LEAST_PROBABILITY:
+            found[vehicle, branch] = (
+                f"vehicle {vehicle}: the bench reading of its {branch} sensor is not what its drives show, and is not "
+                f"used; check it again, and whether it is of this vehicle"
+            )
+    return found
+
+
+def untrusted_vehicles(
+    rows: EvidenceRows,
+    trusted: Mask,
+    branches: Sequence[str],
+    *,
+    full_scale_a: float,
+    load: UnmeasuredLoad | None = None,
+) -> dict[int, str]:
+    """Find trusted vehicles whose measured currents break the junction law: some sensor of theirs is faulty.
+
+    Other vehicles are no measure: where most of a fleet share an offset, the trusted ones are those that differ.
+
+    Parameters
+    ----------
+    rows : EvidenceRows
+        Evidence of N vehicles, without readings.
+    trusted : ndarray of bool of shape (N,)
+        Which are trusted.
+    branches : sequence of str
+        Names of the K branches in the order of the rows.
+    full_scale_a : float
+        Full scale of the junction. [A]
+    load : UnmeasuredLoad or None
+        Load that no branch measures; None: any that such a load can be, so that an offset as small is not found.
+
+    Returns
+    -------
+    dict of int to str
+        How each such vehicle breaks it, by position.
+    """
+    K = rows.branches
+    sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
+    ratio, constant = rows.relative[:, K : 2 * K - 1], rows.constant[:, K]
+    accuracy = np.sqrt(2.0 * TRUSTED_DRIFT_SD**2 + LEAST_GAIN**2)
+    gain_off = np.abs(ratio) > CONTRADICTION * np.hypot(sd[:, K : 2 * K - 1], accuracy)
+    lowest, highest, spread = 0.0, MOST_LOAD, 0.0
+    why = "no load without a sensor explains"
+    if load is not None:
+        lowest = highest = load.mean_a / full_scale_a
+        spread = load.sd_a / full_scale_a
+        why = f"the declared load of {load.mean_a:g} A does not explain"
+    accuracy = np.sqrt(K * TRUSTED_OFFSET_SD**2 + spread**2 + LEAST_OFFSET**2)
+    away = np.maximum(lowest - constant, constant - highest)
+    constant_off = away > CONTRADICTION * np.hypot(sd[:, 4 * K - 1], accuracy)
+    found = {}
+    for j in np.flatnonzero(trusted & (gain_off.any(axis=1) | constant_off)).tolist():
+        if gain_off[j].any():
+            k = int(np.argmax(np.where(gain_off[j], np.abs(ratio[j]), 0.0)))
+            found[j] = f"the gains of its sensors {branches[k + 1]} and {branches[0]} differ by {ratio[j, k]:+.1%}"
+        else:
+            found[j] = f"its currents sum to {constant[j] * full_scale_a:+.1f} A on average, which {why}"
+    return found
+
+
+def trust_notices(
+    vehicles: Sequence[VehicleSummary],
+    trusted: Mask,
+    branches: Sequence[str],
+    *,
+    untrusted: Mapping[int, str],
+    differing: Collection[int],
+    full_scale_a: float,
+) -> list[str]:
+    """Say which trusted vehicles contradict the trust in them, or are too few to carry the reference.
+
+    Parameters
+    ----------
+    vehicles : sequence of VehicleSummary
+        N vehicles.
+    trusted : ndarray of bool of shape (N,)
+        Which are called trusted.
+    branches : sequence of str
+        Names of the K branches in the order of the summaries.
+    untrusted : mapping of int to str
+        From :func:`untrusted_vehicles`.
+    differing : collection of int
+        Trusted vehicles that differ as by a hardware fault, by position.
+    full_scale_a : float
+        Full scale of the junction. [A]
+
+    Returns
+    -------
+    list of str
+        Notices.
+    """
+    notices = []
+    carriers = int(np.count_nonzero(trusted)) - len(untrusted) - len(differing)
+    if trusted.any() and carriers < FEWEST_TRUSTED:
+        notices.append(
+            f"only {carriers} of the trusted vehicles can carry the reference, {FEWEST_TRUSTED} are needed: it is the "
+            f"fleet's"
+        )
+    notices += [f"vehicle {vehicles[j].vehicle} is not trusted: {why}; check it again" for j, why in untrusted.items()]
+    notices += [
+        f"trusted vehicle {vehicles[j].vehicle} does not carry the reference: it differs from the other trusted ones "
+        f"as by a hardware fault"
+        for j in differing
+    ]
+    for vehicle in (vehicles[j] for j in np.flatnonzero(trusted).tolist()):
+        offset_a, sd_a = vehicle.zero_current.offset_a, vehicle.zero_current.sd_a
+        surprising = np.abs(offset_a) > CONTRADICTION * np.hypot(sd_a, TRUSTED_OFFSET_SD * full_scale_a)
+        notices += [
+            f"trusted vehicle {vehicle.vehicle}: its {branches[k]} sensor showed {offset_a[k]:+.1f} A with open "
+            f"contactors; it was taken for faultless: check it again, or do not trust it"
+            for k in np.flatnonzero(surprising).tolist()
+        ]
+    return notices

@@ -1,0 +1,639 @@
+"""Result of a calibration: a folder, written once and read by the commands that come after.
+
+``run.json`` says how it was made (:class:`RunRecord`). ``results.parquet`` has one row per vehicle and branch, and one
+without branch for each vehicle that was left out. ``parameters/NNNNN.parquet`` has the texts of the parameter files by
+bucket of the vehicle; for up to :data:`MOST_FILES` vehicles each is also a file ``params/VEHICLE.json``, as a folder of
+a million files is of no use.
+"""
+
+import io
+import shutil
+import traceback
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from calibrator.drive import Array, Mask
+from calibrator.errors import FleetError
+from calibrator.estimator.vehicle_evidence import VehicleEvidence
+from calibrator.summaries.buckets import bucket_of
+from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
+from ecu_node.errors import ParameterError
+from ecu_node.parameters import VehicleParameters, encode_parameters
+from ecu_node.user_files import write_atomically
+
+__all__ = [
+    "MOST_FILES",
+    "PARTS",
+    "SCHEMA",
+    "CalibrationReport",
+    "ChunkResult",
+    "Counts",
+    "RunRecord",
+    "Written",
+    "count_rows",
+    "deployed_rms_a",
+    "encode_chunk",
+    "internal_error",
+    "internal_errors",
+    "join_rows",
+    "left_out_of",
+    "read_part",
+    "read_results",
+    "read_run",
+    "report_of",
+    "write_parameter_files",
+    "write_run",
+    "written_of",
+]
+
+MOST_FILES = 10_000
+"""Vehicles whose parameters are files of their own in one folder."""
+MOST_SORTED = 100_000
+"""Rows of results that are put in the order of the vehicles."""
+MOST_NAMED = 1000
+"""Vehicles that a report names one by one; all of them stand in ``results.parquet``."""
+CONFIDENT = 0.95
+"""Confidence below which a report adds it to what is corrected. [1]"""
+PARTS, FILES, ROWS = "parameters", "params", "results.parquet"
+LEFT_OUT = "left out"
+"""Stands for the verdict of a vehicle, or of a file of unclear vehicle, that has no parameters."""
+INTERNAL_ERROR = "internal error: "
+"""Begins the reason of a vehicle that an error of the program itself left out."""
+REMEDY = "name a folder that 'calibrator calibrate --out' wrote"
+
+_UNITS = {
+    "drift": "1",
+    "offset_a": "A",
+    "drift_sd": "1",
+    "offset_sd_a": "A",
+    "delay_s": "s",
+    "applied": None,
+    "held_back": "",
+    "confidence": "1",
+    "fault_probability": "1",
+    "harm_probability": "1",
+    "hardware_fault": None,
+    "hardware_probability": "1",
+    "hardware_drift": "1",
+    "hardware_offset_a": "A",
+    "junction_rms_measured_a": "A",
+    "junction_rms_corrected_a": "A",
+    "duration_s": "s",
+    "reason": "",
+    "moved": "",
+}
+"""Columns after vehicle, branch and verdict: numbers with their unit, texts (empty), and flags (None)."""
+SCHEMA = pa.schema(
+    [
+        pa.field("vehicle", pa.string(), nullable=False),
+        pa.field("branch", pa.string()),
+        pa.field("verdict", pa.string(), nullable=False),
+        *(
+            pa.field(name, pa.float64(), metadata={"unit": unit})
+            if unit
+            else pa.field(name, pa.bool_() if unit is None else pa.string())
+            for name, unit in _UNITS.items()
+        ),
+    ]
+)
+"""Of ``results.parquet``."""
+PARAMETERS_SCHEMA = pa.schema(
+    [
+        pa.field("vehicle", pa.string(), nullable=False),
+        pa.field("drives", pa.string(), nullable=False, metadata={"meaning": "digest of the drives' files"}),
+        pa.field("parameters", pa.string(), nullable=False, metadata={"meaning": "text of the parameter file"}),
+        pa.field("evidence_value", pa.list_(pa.float32()), metadata={"meaning": "rows named in run.json"}),
+        pa.field("evidence_sd", pa.list_(pa.float32()), metadata={"meaning": "standard deviation of the same"}),
+        pa.field("evidence_explained", pa.list_(pa.float32()), metadata={"meaning": "what the estimate makes of it"}),
+    ]
+)
+"""Of the parts with the parameter files."""
+
+
+class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """How a result was made."""
+
+    tool: str
+    method: str
+    fleet: str
+    fleet_ids: list[str] = []
+    """Artificial fleets that the drives come from; empty if they are recorded."""
+    layout: str
+    branches: list[str]
+    model_inputs: list[str]
+    settings: dict[str, Any]
+    """What the user chose: hold-out and trusted vehicles, harm limit, or the published method's classifier."""
+    created: str
+    details: dict[str, Any]
+    """What the method says of its run: unity drive and simulation SNR, or reference, delays and hyper-parameters."""
+    vehicles: int
+    buckets: int = 0
+    """Files that the parameters are spread over by the hash of the vehicle; 0: all are in the first."""
+    left_out: dict[str, str]
+    """Why vehicles have no parameters; of many the first ones."""
+    left_out_count: int = 0
+    full_scale_a: float = 0.0
+    """Of the junction; 0: not known. [A]"""
+    layout_sha256: str = ""
+    dbc_sha256: str = ""
+    notices: list[str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Written:
+    """Parameters of one vehicle as they were written.
+
+    Attributes
+    ----------
+    drives : str
+        Digest of the drives' files; empty if it is not known.
+    text : bytes
+        Of the parameter file.
+    evidence : VehicleEvidence or None
+        What they were found from; None if it was not kept.
+    """
+
+    drives: str
+    text: bytes
+    evidence: VehicleEvidence | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChunkResult:
+    """Result of some vehicles of a fleet: their rows of ``results.parquet``, and their parameters, as files."""
+
+    rows: bytes
+    parameters: bytes
+
+
+def encode_chunk(
+    parameters: Sequence[VehicleParameters],
+    left_out: Mapping[str, str],
+    *,
+    moved: Mapping[tuple[str, str], str] | None = None,
+    drives: Mapping[str, str] | None = None,
+    evidence: Mapping[str, VehicleEvidence] | None = None,
+) -> ChunkResult:
+    """Write down the result of some vehicles, in the order of their names.
+
+    Parameters
+    ----------
+    parameters : sequence of VehicleParameters
+        One per calibrated vehicle; one whose parameters cannot be written is left out.
+    left_out : mapping of str to str
+        Why the other vehicles have none.
+    moved : mapping of (str, str) to str, or None
+        What has moved since an earlier result, by vehicle and branch.
+    drives : mapping of str to str, or None
+        Digest of the drives' files by vehicle.
+    evidence : mapping of str to VehicleEvidence, or None
+        What the parameters were found from, by vehicle.
+
+    Returns
+    -------
+    ChunkResult
+        As files.
+    """
+    rows: list[dict[str, Any]] = []
+    texts: list[dict[str, Any]] = []
+    reasons = dict(left_out)
+    for item in sorted(parameters, key=lambda item: item.vehicle):
+        name = item.vehicle
+        try:
+            text = encode_parameters(item, f"parameters of {name}").decode()
+        except ParameterError as error:
+            reasons[name] = f"{error}; look at its recordings"
+            continue
+        told = (evidence or {}).get(name)
+        columns = {} if told is None else {f"evidence_{column}": values for column, values in vars(told).items()}
+        texts.append({"vehicle": name, "drives": (drives or {}).get(name, ""), "parameters": text, **columns})
+        rows += [{**row, "moved": (moved or {}).get((name, row["branch"]))} for row in _rows_of(item)]
+    rows += _left_out_rows(reasons)
+    return ChunkResult(rows=_parquet(rows, SCHEMA), parameters=_parquet(texts, PARAMETERS_SCHEMA))
+
+
+def _rows_of(item: VehicleParameters) -> list[dict[str, Any]]:
+    """Rows of a vehicle, one per branch."""
+    vehicle = {
+        "vehicle": item.vehicle,
+        "verdict": item.verdict,
+        "confidence": item.confidence,
+        "hardware_fault": item.hardware_fault.suspected,
+        "hardware_probability": item.hardware_fault.probability,
+        "hardware_drift": item.hardware_fault.drift,
+        "junction_rms_measured_a": item.junction_residual.measured_a,
+        "junction_rms_corrected_a": item.junction_residual.corrected_a,
+        "duration_s": item.provenance.duration_s,
+        "reason": item.deciding_evidence or None,
+    }
+    same = ("drift", "offset_a", "drift_sd", "offset_sd_a", "delay_s", "held_back", "fault_probability")
+    return [
+        {
+            **vehicle,
+            "branch": name,
+            **{column: getattr(branch, column) for column in (*same, "harm_probability")},
+            "applied": branch.apply,
+            "hardware_offset_a": item.hardware_fault.offset_a.get(name, 0.0),
+        }
+        for name, branch in item.branches.items()
+    ]
+
+
+def _left_out_rows(left_out: Mapping[str, str]) -> list[dict[str, Any]]:
+    return [{"vehicle": vehicle, "verdict": LEFT_OUT, "reason": left_out[vehicle]} for vehicle in sorted(left_out)]
+
+
+def _parquet(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes:
+    buffer = io.BytesIO()
+    pq.write_table(pa.Table.from_pylist(rows, schema=schema), buffer, compression="zstd")
+    return buffer.getvalue()
+
+
+def join_rows(folder: Path, parts: Sequence[Path], left_out: Mapping[str, str]) -> int:
+    """Join the rows of all chunks to ``results.parquet``; up to :data:`MOST_SORTED` rows in order of the vehicles.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the result; it must exist.
+    parts : sequence of Path
+        Files with the rows of each chunk.
+    left_out : mapping of str to str
+        Vehicles, or files of unclear vehicle, that are in no chunk, and why.
+
+    Returns
+    -------
+    int
+        Number of vehicles that have parameters.
+    """
+    path, calibrated, rows, others = folder / ROWS, 0, 0, dict(left_out)
+    with pq.ParquetWriter(path, SCHEMA, compression="zstd") as writer:
+        for part in parts:
+            found = pq.read_table(part, schema=SCHEMA, use_threads=False)
+            calibrated += len(pc.unique(found.filter(pc.field("branch").is_valid())["vehicle"]))
+            rows += found.num_rows
+            for name in others.keys() & set(found["vehicle"].to_pylist()):
+                del others[name]
+            writer.write_table(found)
+        writer.write_table(pa.Table.from_pylist(_left_out_rows(others), schema=SCHEMA))
+    if rows <= MOST_SORTED:
+        found = pq.read_table(path, schema=SCHEMA, use_threads=False).to_pylist()
+        found.sort(key=lambda row: (row["verdict"] == LEFT_OUT, row["vehicle"]))  # stable: branches keep their order
+        path.write_bytes(_parquet(found, SCHEMA))
+    return calibrated
+
+
+def write_parameter_files(folder: Path, parts: Mapping[int, Path], *, vehicles: int) -> str:
+    """Write the parameter files of a result.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the result; it must exist.
+    parts : mapping of int to Path
+        Files with the parameters of each chunk, by its number.
+    vehicles : int
+        How many there are in all.
+
+    Returns
+    -------
+    str
+        Where they are for the user, within the folder.
+    """
+    (folder / PARTS).mkdir()
+    for number, part in parts.items():
+        shutil.copyfile(part, _part(folder, number))
+    if vehicles > MOST_FILES:
+        return PARTS
+    (folder / FILES).mkdir()
+    for part in parts.values():
+        for vehicle, written in read_part(part).items():
+            write_atomically(folder / FILES / f"{vehicle}.json", written.text)
+    return FILES
+
+
+def _part(result: Path, number: int) -> Path:
+    return result / PARTS / f"{number:05d}.parquet"
+
+
+def read_part(path: Path) -> dict[str, Written]:
+    """Parameters of a chunk by vehicle, from a file of a result; none if there is no such file.
+
+    Raises
+    ------
+    FleetError
+        If the file is damaged.
+    """
+    try:
+        rows = pq.ParquetFile(path).read(use_threads=False).to_pylist()
+        return {row["vehicle"]: _written(row) for row in rows}
+    except FileNotFoundError:
+        return {}
+    except (pa.ArrowException, OSError, KeyError) as error:
+        raise FleetError(f"{path}: damaged part of a result: {_first_line(error)}; calibrate again") from None
+
+
+def _written(row: Mapping[str, Any]) -> Written:
+    evidence = None
+    if row.get("evidence_value") is not None:
+        evidence = VehicleEvidence(**{name: row[f"evidence_{name}"] for name in ("value", "sd", "explained")})
+    return Written(drives=row["drives"], text=row["parameters"].encode(), evidence=evidence)
+
+
+def written_of(result: Path, vehicle: str) -> Written:
+    """Parameters of one vehicle.
+
+    Parameters
+    ----------
+    result : Path
+        Folder of a result.
+    vehicle : str
+        Name.
+
+    Returns
+    -------
+    Written
+        With the text as the node reads it.
+
+    Raises
+    ------
+    FleetError
+        If it is no result, or there are no parameters of this vehicle in it.
+    """
+    run = read_run(result)
+    found = read_part(_part(result, bucket_of(vehicle, run.buckets) if run.buckets else 0))
+    if vehicle in found:
+        return found[vehicle]
+    if not (result / PARTS).is_dir():
+        raise FleetError(f"{result / PARTS}: no such folder; give all that 'calibrator calibrate' wrote")
+    try:
+        rows = pq.ParquetFile(result / ROWS).read(columns=["vehicle", "reason"], use_threads=False)
+        reasons = rows.filter(pc.equal(rows["vehicle"], vehicle))["reason"].to_pylist()
+    except (pa.ArrowException, OSError):
+        reasons = []
+    if not reasons:
+        raise FleetError(f"{result}: no vehicle {vehicle!r} in it; {ROWS} names all that are")
+    raise FleetError(f"{result}: no parameters of vehicle {vehicle!r}, it was left out: {reasons[0]}")
+
+
+def read_results(result: Path) -> list[dict[str, Any]]:
+    """Rows of ``results.parquet`` of a result folder; FleetError if it is none."""
+    path = result / ROWS
+    try:
+        found = pq.read_table(path, use_threads=False)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise FleetError(f"{path}: not a result of 'calibrator calibrate': {_first_line(error)}; {REMEDY}") from None
+    missing = [name for name in SCHEMA.names if name not in found.column_names]
+    if missing:
+        raise FleetError(f"{path}: column {', '.join(missing)} is missing; write the result anew with this version")
+    rows: list[dict[str, Any]] = found.to_pylist()
+    return rows
+
+
+def left_out_of(result: Path) -> tuple[dict[str, str], int]:
+    """Vehicles of ``results.parquet`` that have no parameters and why, the first :data:`MOST_NAMED`; how many."""
+    found = pq.read_table(result / ROWS, columns=["vehicle", "branch", "reason"], use_threads=False)
+    found = found.filter(pc.field("branch").is_null())
+    return {row["vehicle"]: row["reason"] for row in found.slice(0, MOST_NAMED).to_pylist()}, found.num_rows
+
+
+def internal_error(error: Exception) -> str:
+    """Reason of a vehicle that an error of the program itself left out."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{INTERNAL_ERROR}{type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno}); report it"
+
+
+def internal_errors(result: Path) -> dict[str, str]:
+    """Vehicles of a result that errors of the program itself left out, and which errors."""
+    found = pq.read_table(result / ROWS, columns=["vehicle", "branch", "reason"], use_threads=False)
+    found = found.filter(pc.field("branch").is_null() & pc.starts_with(pc.field("reason"), INTERNAL_ERROR))
+    return {row["vehicle"]: row["reason"].removeprefix(INTERNAL_ERROR) for row in found.to_pylist()}
+
+
+def write_run(folder: Path, run: RunRecord) -> None:
+    """Write ``run.json``."""
+    write_atomically(folder / "run.json", msgspec.json.format(msgspec.json.encode(run), indent=2) + b"\n")
+
+
+def read_run(result: Path) -> RunRecord:
+    """``run.json`` of a result folder; FleetError if it is none."""
+    path = result / "run.json"
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=RunRecord)
+    except OSError as error:
+        raise FleetError(f"{path}: not a result of 'calibrator calibrate': {error.strerror}; {REMEDY}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise FleetError(f"{path}: not a run of 'calibrator calibrate': {error}; calibrate again") from None
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0][:120]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counts:
+    """Numbers of a result.
+
+    Attributes
+    ----------
+    verdicts : Counter of str
+        Vehicles per verdict, in the order in which verdicts first come.
+    held_back : Counter of str
+        Branches in which a fault was found that is not applied, by reason, in the same order.
+    hardware_suspected : int
+        Vehicles of which a hardware fault is suspected.
+    moved_vehicles, moved_sensors : int
+        Vehicles with sensors that have moved since an earlier result, and these sensors.
+    """
+
+    verdicts: Counter[str] = field(default_factory=Counter)
+    held_back: Counter[str] = field(default_factory=Counter)
+    hardware_suspected: int = 0
+    moved_vehicles: int = 0
+    moved_sensors: int = 0
+
+
+def count_rows(rows: pa.Table, branches: Sequence[str]) -> Counts:
+    """Count rows of ``results.parquet`` that have a branch.
+
+    Parameters
+    ----------
+    rows : pyarrow.Table
+        All rows of each of some vehicles, one per branch.
+    branches : sequence of str
+        Names of the branches; what is said of a vehicle as a whole is taken from its row of the first.
+
+    Returns
+    -------
+    Counts
+        Of these vehicles.
+    """
+    vehicles = rows.filter(pc.field("branch") == branches[0])
+    moved = rows.filter(pc.field("moved").is_valid())
+    verdicts, held_back = (
+        Counter({item["values"]: item["counts"] for item in pc.value_counts(column).to_pylist()})
+        for column in (vehicles["verdict"], rows["held_back"].drop_null())
+    )
+    return Counts(
+        verdicts=verdicts,
+        held_back=held_back,
+        hardware_suspected=vehicles.filter(pc.field("hardware_fault")).num_rows,
+        moved_vehicles=len(pc.unique(moved["vehicle"])),
+        moved_sensors=moved.num_rows,
+    )
+
+
+def deployed_rms_a(applied: Mask, *, measured_a: Array, corrected_a: Array) -> Array:
+    """Root mean square of the Kirchhoff sum with what the node applies.
+
+    Parameters
+    ----------
+    applied : ndarray of bool, shape (N, K)
+        Branches that the node corrects.
+    measured_a, corrected_a : ndarray of shape (N,)
+        The same as measured, and with what is applied. [A]
+
+    Returns
+    -------
+    ndarray of shape (N,)
+        As measured where nothing is applied. [A]
+    """
+    return np.where(applied.any(axis=1), corrected_a, measured_a)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationReport:
+    """What a calibration found, in short; of each kind at most :data:`MOST_NAMED` vehicles are named."""
+
+    result: str
+    """Folder; empty: not written."""
+    parameters: str
+    """Where in the result the parameter files are."""
+    run: RunRecord
+    verdicts: Mapping[str, int]
+    undecided: Mapping[str, str]
+    """Vehicles of which it cannot be told what is faulty, and what would decide."""
+    corrected: Mapping[str, str]
+    """Vehicles of which branches are corrected, and which."""
+    hardware_suspected: Mapping[str, str]
+    """Vehicles that are thought to differ from their fleet, and how probable that is."""
+    hardware_count: int
+    held_back: Mapping[str, int]
+    """Branches in which a fault was found that is not applied, by reason."""
+    moved: Mapping[str, str]
+    """Vehicles with sensors that have moved since an earlier result, and how."""
+    moved_count: int
+    junction_rms_measured_a: float
+    """Median over vehicles. [A]"""
+    junction_rms_deployed_a: float
+    """The same with the parameters that the node applies. [A]"""
+
+    def as_json(self) -> str:
+        """The report as JSON."""
+        return dumps(vars(self))
+
+    def as_text(self) -> str:
+        """The report for people."""
+        run, details = self.run, self.run.details
+        snr, agreeing, spread = (
+            details.get("simulation_snr_db", {}),
+            details.get("reference", {}).get("agreeing_share", {}),
+            details.get("hyperparameters", {}).get("model_spread", {}),
+        )
+        rows = [
+            ("vehicles calibrated", f"{run.vehicles}"),
+            *((f"  {verdict}", f"{count}") for verdict, count in self.verdicts.items()),
+            ("  hardware fault suspected", f"{self.hardware_count}"),
+            ("vehicles left out", f"{run.left_out_count}"),
+            *((f"faults held back, {reason}", f"{count}") for reason, count in self.held_back.items()),
+            ("junction sum RMS, median, measured [A]", f"{self.junction_rms_measured_a:.2f}"),
+            ("junction sum RMS, median, deployed [A]", f"{self.junction_rms_deployed_a:.2f}"),
+            *((f"simulation SNR, median, {name} [dB]", f"{value:.1f}") for name, value in snr.items()),
+            *((f"vehicles that agree, {name}", f"{value:.0%}") for name, value in agreeing.items()),
+            *((f"faultless vehicles differ by, {name}", f"{value:.1%}") for name, value in spread.items()),
+        ]
+        parts = [
+            table((f"method {run.method}", ""), rows),
+            "\n".join(f"notice: {notice}" for notice in run.notices),
+            reasons_text("corrected", self.corrected),
+            reasons_text("moved since the earlier result", self.moved),
+            reasons_text("hardware fault suspected", self.hardware_suspected),
+            reasons_text("cannot tell", self.undecided),
+            left_out_text(run.left_out),
+            f"parameter files: {self.result}/{self.parameters}" if self.result else "",
+        ]
+        return "\n\n".join(part for part in parts if part)
+
+
+def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> CalibrationReport:
+    """Count what stands in a result.
+
+    Parameters
+    ----------
+    result : Path
+        Folder with ``results.parquet``.
+    run : RunRecord
+        How it was made.
+    parameters : str
+        Where in the folder the parameter files are.
+    shown : Path
+        What the folder is called for the user.
+
+    Returns
+    -------
+    CalibrationReport
+        Of all its vehicles.
+    """
+    rows = pq.read_table(result / ROWS, use_threads=False).filter(pc.field("branch").is_valid())
+    vehicles, K = rows.filter(pc.field("branch") == run.branches[0]), len(run.branches)
+    applied = rows["applied"].to_numpy().reshape(-1, K)
+    measured_a, corrected_a = (vehicles[f"junction_rms_{name}_a"].to_numpy() for name in ("measured", "corrected"))
+    deployed_a = deployed_rms_a(applied, measured_a=measured_a, corrected_a=corrected_a)
+    counts = count_rows(rows, run.branches)
+    moved = _named(rows.filter(pc.field("moved").is_valid()))
+    corrected = _named(rows.filter((pc.field("verdict") == "corrected") & pc.field("applied")))
+    suspected = _named(vehicles.filter(pc.field("hardware_fault")))
+    undecided = _named(vehicles.filter(pc.field("verdict") == "cannot tell"))
+
+    def doubt(confidence: float | None) -> str:
+        unsure = confidence is not None and confidence < CONFIDENT
+        return f" (all of its faults: confidence {confidence:.2f})" if unsure else ""
+
+    def probability(value: float | None) -> str:
+        return "" if value is None else f"probability {value:.1f}"
+
+    return CalibrationReport(
+        result=str(shown),
+        parameters=parameters,
+        run=run,
+        verdicts=dict(counts.verdicts),
+        undecided={name: items[0]["reason"] or "" for name, items in undecided.items()},
+        corrected={
+            name: ", ".join(row["branch"] for row in items) + doubt(items[0]["confidence"])
+            for name, items in corrected.items()
+        },
+        hardware_suspected={name: probability(items[0]["hardware_probability"]) for name, items in suspected.items()},
+        hardware_count=counts.hardware_suspected,
+        held_back=dict(counts.held_back),
+        moved={name: "; ".join(f"{row['branch']} {row['moved']}" for row in items) for name, items in moved.items()},
+        moved_count=counts.moved_vehicles,
+        junction_rms_measured_a=float(np.median(measured_a)),
+        junction_rms_deployed_a=float(np.median(deployed_a)),
+    )
+
+
+def _named(rows: pa.Table) -> dict[str, list[dict[str, Any]]]:
+    """Rows by vehicle, of the first vehicles; those of a vehicle stand together, K at most."""
+    names = pc.unique(rows["vehicle"]).slice(0, MOST_NAMED)
+    found = rows.filter(pc.is_in(rows["vehicle"], value_set=names)).to_pylist()
+    return {name: list(group) for name, group in groupby(found, key=lambda row: str(row["vehicle"]))}

@@ -1,0 +1,144 @@
+"""How a fleet is calibrated: the user's choices, and what a method makes of a fleet."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from calibrator.errors import ContradictionError, FleetError
+from calibrator.fleet_truth import FleetTruth
+from calibrator.options import Classifier, Method
+from calibrator.processes.reading import TIME_LIMIT_S
+from calibrator.terminal.text import counted, few, few_reasons
+from ecu_node.layout import file_digest
+from ecu_node.parameters import VehicleParameters
+
+__all__ = ["HARM_LIMIT", "LEAST_VEHICLES", "CalibrationSettings", "FleetOutcome", "require_learning"]
+
+LEAST_VEHICLES = 2
+"""A single vehicle would be its own reference."""
+HARM_LIMIT = 0.001
+"""Default probability of making a branch worse up to which it is corrected. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationSettings:
+    """How a fleet is calibrated.
+
+    Attributes
+    ----------
+    method : Method
+        Estimator.
+    branches : tuple of str or None
+        Branches to use; None: those that the fleet has.
+    hold_out : frozenset of str
+        Vehicles that are calibrated, but from which nothing is learnt for the others.
+    trusted : frozenset of str
+        Vehicles whose sensors were found faultless on a bench; they carry the reference of the posterior.
+    readings : Path or None
+        Table of bench readings (CSV).
+    harm_limit : float
+        Largest posterior probability of making a branch worse with which it is corrected. [1]
+    expected_faults : float or None
+        Share of the vehicles that have a sensor fault, if it is known; None: learnt from the fleet. [1]
+    classifier : Classifier
+        Of the published method.
+    truth : FleetTruth or None
+        For the perfect classifier.
+    sparsity : float
+        Of the artificial fleet that the tree is trained on. [%]
+    magnitude : tuple of float
+        Of the same: range of drifts [1] and of offsets in fractions of full scale.
+    symmetric : bool
+        Whether the fleet is symmetric as in the paper, so that its mean has no error of its own.
+    unity : str or None
+        Vehicle whose held-out inputs are the unity drive; None: the one with the longest.
+    seed : int
+        Seed of the training fleet.
+    time_limit_s : float
+        Longest time to read one vehicle, in whatever method; one that takes longer is left out. [s]
+
+    Raises
+    ------
+    ContradictionError
+        If a vehicle is both held out and trusted.
+    """
+
+    method: Method = Method.POSTERIOR
+    branches: tuple[str, ...] | None = None
+    hold_out: frozenset[str] = field(default_factory=frozenset)
+    trusted: frozenset[str] = field(default_factory=frozenset)
+    readings: Path | None = None
+    harm_limit: float = HARM_LIMIT
+    expected_faults: float | None = None
+    classifier: Classifier = Classifier.TREE
+    truth: FleetTruth | None = None
+    sparsity: float = 80.0
+    magnitude: tuple[float, float] = (0.05, 0.25)
+    symmetric: bool = False
+    unity: str | None = None
+    seed: int = 0
+    time_limit_s: float = TIME_LIMIT_S
+
+    def __post_init__(self) -> None:
+        if both := self.hold_out & self.trusted:
+            raise ContradictionError(
+                f"vehicle {few(sorted(both))} is both held out and trusted: the reference would be learnt from it"
+            )
+
+    def record(self) -> dict[str, Any]:
+        """What the method in use heeds, for the record of a run."""
+        names = ["classifier", "sparsity", "magnitude", "symmetric", "unity", "seed"]
+        found: dict[str, Any] = {"branches": self.branches, "hold_out": sorted(self.hold_out)}
+        if self.method is Method.PUBLISHED:
+            return found | {name: getattr(self, name) for name in names}
+        return found | {
+            "harm_limit": self.harm_limit,
+            "trusted": sorted(self.trusted),
+            "readings": None if self.readings is None else [self.readings.name, file_digest(self.readings)],
+            "expected_faults": self.expected_faults,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetOutcome:
+    """What a method that needs all vehicles at once found.
+
+    Attributes
+    ----------
+    parameters : sequence of VehicleParameters
+        One per calibrated vehicle.
+    left_out : mapping of str to str
+        Why the other vehicles have none.
+    notices : tuple of str
+        What the user should know.
+    details : mapping of str to JSON values
+        For the record of the run.
+    """
+
+    parameters: Sequence[VehicleParameters]
+    left_out: Mapping[str, str]
+    notices: tuple[str, ...]
+    details: Mapping[str, Any]
+
+
+def require_learning(
+    names: Sequence[str],
+    settings: CalibrationSettings,
+    left_out: Mapping[str, str],
+    *,
+    left_out_count: int | None = None,
+) -> list[bool]:
+    """Which vehicles the fleet learns from; FleetError if they are too few.
+
+    ``left_out`` says why others cannot be used; of many the first ones, ``left_out_count`` being how many there are.
+    """
+    learning = [name not in settings.hold_out for name in names]
+    if sum(learning) < LEAST_VEHICLES:
+        reasons = few_reasons(left_out, count=left_out_count)
+        raise FleetError(
+            f"{counted(sum(learning), 'usable vehicle')} to learn from, at least {LEAST_VEHICLES} are needed, "
+            f"as every vehicle is compared with its fleet ('calibrator kirchhoff' shows the sum of one, 'ecu-node "
+            f"template' begins a parameter file by hand){reasons}"
+        )
+    return learning

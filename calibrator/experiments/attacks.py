@@ -1,0 +1,281 @@
+"""Worlds of an attack: what the estimator does not expect, put on some vehicles of a fleet of recorded trips.
+
+A world is a row of :data:`WORLDS`. It may change the truth of the vehicles that have it (what stays linear), their true
+currents (loads without a sensor), or the measured current of one of their sensors. The sensor is that of the battery or
+the motor: the other branches of a recorded trip hardly move, and there nothing of this would show. Disturbances of a
+recording (spikes, interference) are not on the drive on which corrections are judged; what a sensor or a vehicle is
+like, is: there a step or a ramp is over, and the temperature is another one.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrator.drive import Array, Mask
+from calibrator.faults import Faults
+
+__all__ = ["WORLDS", "Attack", "World", "draw_attack"]
+
+MOVING = 2
+"""Branches that move: battery and motor, the first of the layout."""
+HZ = 10.0
+"""Samples per second of recorded trips; lengths of bursts and switching loads are counted in them. [1/s]"""
+REFERENCE_C = 25.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """What a world may look at besides the currents of one vehicle.
+
+    Attributes
+    ----------
+    size : float
+        Of what it does; signed for the faults of sensors.
+    full_scale_a, peak_a : float
+        Full scale of the junction, and the sensor's largest current on the drive to learn from. [A]
+    unseen : bool
+        Whether this is the drive on which corrections are judged.
+    progress, temperature_c : ndarray of shape (T,)
+        Time since the start over the drive's length [1], 1 on the unseen drive; temperature of the sensors [degC].
+    rng : numpy.random.Generator
+        Of this vehicle and drive.
+    """
+
+    size: float
+    full_scale_a: float
+    peak_a: float
+    unseen: bool
+    progress: Array
+    temperature_c: Array
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """One world.
+
+    Attributes
+    ----------
+    share : float
+        Of the vehicles that have it. [1]
+    size : tuple of float
+        Range of its size over vehicles.
+    causes : tuple of str
+        Names under which a finding names it; empty: no cause is to be named.
+    magnitude : tuple of float or None
+        Of the faults of all vehicles, where the world is about them.
+    truth : callable or None
+        New drift, offset [A] of the affected sensor, from the old ones, the size and full scale; sensors stay linear.
+    hardware : callable or None
+        New hardware drift from the old one and the size.
+    true : callable or None
+        What it adds to the first branch (the source), shape (T,), from the true currents (T, K). [A]
+    measured : callable or None
+        New measured current of the affected sensor, shape (T,). [A]
+    battery : bool
+        Whether the sensor is always the battery's.
+    """
+
+    share: float = 0.3
+    size: tuple[float, float] = (0.0, 0.0)
+    causes: tuple[str, ...] = ()
+    magnitude: tuple[float, float] | None = None
+    truth: Callable[[Array, Array, Array, float], tuple[Array, Array]] | None = None
+    hardware: Callable[[Array, Array], Array] | None = None
+    true: Callable[[Array, Scene], Array] | None = None
+    measured: Callable[[Array, Scene], Array] | None = None
+    battery: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attack:
+    """A world drawn for N vehicles.
+
+    Attributes
+    ----------
+    world : World
+        The world.
+    has : ndarray of bool of shape (N,)
+        Vehicles that have it.
+    branch : ndarray of int of shape (N,)
+        Their affected sensor.
+    size : ndarray of shape (N,)
+        Signed size.
+    full_scale_a : float
+        Full scale of the junction. [A]
+    seed : int
+        Of this repetition.
+    """
+
+    world: World
+    has: Mask
+    branch: NDArray[np.int64]
+    size: Array
+    full_scale_a: float
+    seed: int
+
+    def truth(self, faults: Faults) -> Faults:
+        """Faults of the fleet in this world, as far as they are linear."""
+        drift, offset_a, hardware = faults.drift.copy(), faults.offset_a.copy(), faults.hardware_drift
+        j = np.flatnonzero(self.has)
+        at = (j, self.branch[j])
+        if self.world.truth is not None:
+            drift[at], offset_a[at] = self.world.truth(drift[at], offset_a[at], self.size[j], self.full_scale_a)
+        if self.world.hardware is not None:
+            hardware = np.where(self.has, self.world.hardware(hardware, self.size), hardware)
+        return replace(faults, drift=drift, offset_a=offset_a, hardware_drift=hardware)
+
+    def true_a(self, vehicle: int, i: Array, *, unseen: bool) -> Array:
+        """True currents of a vehicle in this world, shape (T, K), from those without it. [A]"""
+        if not self.has[vehicle] or self.world.true is None:
+            return i
+        load_a = self.world.true(i, self._scene(vehicle, len(i), unseen=unseen))
+        return np.column_stack([i[:, 0] + load_a, i[:, 1:]])
+
+    def measured_a(self, vehicle: int, i_m: Array, *, unseen: bool, peak_a: Array) -> Array:
+        """Measured currents of a vehicle in this world, shape (T, K), from those of linear sensors. [A]"""
+        if not self.has[vehicle] or self.world.measured is None:
+            return i_m
+        k = int(self.branch[vehicle])
+        scene = self._scene(vehicle, len(i_m), unseen=unseen, peak_a=float(peak_a[k]))
+        changed = i_m.copy()
+        changed[:, k] = self.world.measured(i_m[:, k], scene)
+        return changed
+
+    def _scene(self, vehicle: int, samples: int, *, unseen: bool, peak_a: float = 0.0) -> Scene:
+        rng = np.random.default_rng([self.seed, vehicle, int(unseen)])
+        warm = 1.0 - np.exp(-2.0 * np.linspace(0.0, 1.0, samples))
+        return Scene(
+            size=float(self.size[vehicle]),
+            full_scale_a=self.full_scale_a,
+            peak_a=peak_a,
+            unseen=unseen,
+            progress=np.ones(samples) if unseen else np.linspace(0.0, 1.0, samples),
+            temperature_c=rng.uniform(5.0, 25.0) + rng.uniform(20.0, 30.0) * warm / warm[-1],
+            rng=rng,
+        )
+
+
+def draw_attack(name: str, vehicles: int, *, full_scale_a: float, seed: int) -> Attack:
+    """Draw which vehicles of a fleet have what a world does, and how much of it.
+
+    Parameters
+    ----------
+    name : str
+        Of :data:`WORLDS`.
+    vehicles : int
+        Fleet size N.
+    full_scale_a : float
+        Full scale of the junction. [A]
+    seed : int
+        Of this repetition.
+
+    Returns
+    -------
+    Attack
+        Of the N vehicles.
+    """
+    world, rng = WORLDS[name], np.random.default_rng([seed, vehicles, *name.encode()])
+    sign = rng.choice([-1.0, 1.0], vehicles) if world.measured is not None else 1.0
+    return Attack(
+        world=world,
+        has=rng.random(vehicles) < world.share,
+        branch=np.zeros(vehicles, np.int64) if world.battery else rng.integers(0, MOVING, vehicles),
+        size=sign * rng.uniform(*world.size, vehicles),
+        full_scale_a=full_scale_a,
+        seed=seed,
+    )
+
+
+def _on_off(scene: Scene, samples: int, seconds: tuple[float, float], duty: float = 0.5) -> Array:
+    """1 and 0 by turns, for random times on, and off as long as the duty asks for; shape (T,)."""
+    lengths_s = scene.rng.uniform(*seconds, (2 * int(samples / HZ / seconds[0]) + 2,))
+    state = np.arange(len(lengths_s)) % 2 == int(scene.rng.random() < duty)
+    lengths_s[~state] *= (1.0 - duty) / duty
+    return np.repeat(state.astype(float), (lengths_s * HZ).astype(int))[:samples]
+
+
+def _batch(share: float, offset_a: float) -> World:
+    """A batch of battery sensors with one more offset."""
+    size = (offset_a, offset_a)
+    return World(share=share, size=size, causes=("batch",), battery=True, truth=lambda d, o, s, _: (d, o + s))
+
+
+def _load(
+    share: float, low: float, high: float, causes: tuple[str, ...], true: Callable[[Array, Scene], Array]
+) -> World:
+    """A load without a sensor, which the source carries."""
+    return World(share=share, size=(low, high), causes=causes, battery=True, true=true)
+
+
+def _sensor(cause: str, size: tuple[float, float], measured: Callable[[Array, Scene], Array], **more: Any) -> World:
+    """A sensor that is not linear."""
+    also = more.pop("also", ())
+    return World(size=size, causes=(cause, *also), measured=measured, **more)
+
+
+def _disturbance(cause: str, size: tuple[float, float], added: Callable[[Scene, int], Array], **more: Any) -> World:
+    """Something added to the samples of a recording alone."""
+    return _sensor(cause, size, lambda x, s: x if s.unseen else x + added(s, len(x)), **more)
+
+
+def _spikes(scene: Scene, samples: int, share: float, signs: tuple[float, ...]) -> Array:
+    height_a = scene.full_scale_a * scene.rng.uniform(0.1, 1.0, samples) * scene.rng.choice(signs, samples)
+    return np.where(scene.rng.random(samples) < share, height_a, 0.0)
+
+
+def _later_gain(d: Array, o: Array, size: Array, _: float) -> tuple[Array, Array]:
+    """What a gain that has stepped or drifted away is at the end."""
+    return (1.0 + d) * (1.0 + size) - 1.0, o * (1.0 + size)
+
+
+def _earlier(x: Array, scene: Scene, part: Array) -> Array:
+    """Current of a sensor whose gain has reached only a part of its change, from that with all of it."""
+    return x * (1.0 + scene.size * part) / (1.0 + scene.size)
+
+
+LOAD = ("load",)
+WORLDS = {
+    "faults 30-60 %": World(share=0.0, magnitude=(0.3, 0.6)),
+    **{f"battery {a:+g} A in {share:.0%}": _batch(share, a) for share in (1.0, 0.6) for a in (5.0, 12.0, 20.0, -12.0)},
+    "load 5 A in 30%": _load(0.3, 5.0, 5.0, LOAD, lambda i, s: np.full(len(i), s.size)),
+    "load 10 A in 15%": _load(0.15, 10.0, 10.0, LOAD, lambda i, s: np.full(len(i), s.size)),
+    "load 0-10 % of |motor| in 30%": _load(0.3, 0.0, 0.1, (*LOAD, "sign"), lambda i, s: s.size * np.abs(i[:, 1])),
+    "load 15 A switching in 15%": _load(
+        0.15, 15.0, 15.0, (*LOAD, "switching"), lambda i, s: s.size * _on_off(s, len(i), (20.0, 120.0))
+    ),
+    "inverted in 10%": World(share=0.1, causes=("inverted",), truth=lambda d, o, *_: (-2.0 - d, -o)),
+    "dead in 10%": World(share=0.1, causes=("dead",), truth=lambda d, o, *_: (0.0 * d - 1.0, 0.0 * o)),
+    "clipped at 40-70 %": _sensor(
+        "clipped", (0.4, 0.7), lambda x, s: np.clip(x, -abs(s.size) * s.peak_a, abs(s.size) * s.peak_a),
+        also=("saturating",),
+    ),
+    "quadratic 5-20 %": _sensor("quadratic", (0.05, 0.2), lambda x, s: x + s.size * x**2 / s.full_scale_a),
+    "cubic 5-20 %": _sensor(
+        "cubic", (0.05, 0.2), lambda x, s: x + s.size * x**3 / s.full_scale_a**2, also=("saturating",)
+    ),
+    "gain step of 15 % midway": _sensor(
+        "step", (0.15, 0.15), lambda x, s: _earlier(x, s, np.ceil(s.progress - 0.5)), truth=_later_gain
+    ),
+    "gain ramp to 15 %": _sensor(
+        "ramp", (0.15, 0.15), lambda x, s: _earlier(x, s, s.progress), truth=_later_gain, also=("temperature",)
+    ),
+    "0.1-0.3 % per K": _sensor(
+        "temperature", (0.001, 0.003), lambda x, s: x * (1.0 + s.size * (s.temperature_c - REFERENCE_C)),
+        also=("ramp",),
+    ),
+    "spikes in 0.5 %": _disturbance("spikes", (1.0, 1.0), lambda s, n: _spikes(s, n, 0.005, (1.0,))),
+    "outliers in 0.2 %": _disturbance(
+        "outliers", (1.0, 1.0), lambda s, n: _spikes(s, n, 0.002, (-1.0, 1.0)), also=("spikes",)
+    ),
+    "EMI bursts of 5-10 A": _disturbance(
+        "noise", (5.0, 10.0), lambda s, n: s.size * _on_off(s, n, (1.0, 5.0), 0.1) * s.rng.standard_normal(n)
+    ),
+    "second variant x1.10 in 50%": World(
+        share=0.5, size=(0.1, 0.1), causes=("variant",), hardware=lambda d_h, size: (1.0 + d_h) * (1.0 + size) - 1.0
+    ),
+}  # fmt: skip
+"""By the names that the table shows; shares of vehicles where they are not 30 %."""

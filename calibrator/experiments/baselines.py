@@ -1,0 +1,220 @@
+"""Baselines: what an engineer tries in an afternoon, beside the published method and the default.
+
+Best subset and LASSO [1]_ work on the evidence rows of the default, the regression on the fleet's median on its slopes
+and intercepts, total least squares [2]_ and reconciliation [3]_ on the moments of each vehicle's measured currents
+alone. Whatever they find is corrected.
+
+.. [1] H. Zou, T. Hastie, R. Tibshirani, "On the degrees of freedom of the lasso", Ann. Statist. 35 (2007).
+.. [2] S. Van Huffel, J. Vandewalle, "The Total Least Squares Problem", SIAM 1991.
+.. [3] VDI 2048 part 1, "Control and quality improvement of process data and their uncertainties", 2017.
+"""
+
+import itertools
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import median_abs_deviation
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.linear_model import LassoLarsIC
+
+from calibrator.drive import Array, Mask
+from calibrator.estimator.clusters import densest_clusters
+from calibrator.estimator.fleet_model import fit_fleet_model
+from calibrator.estimator.moments import stack_summaries
+from calibrator.estimator.rows import EvidenceRows, collect_rows, constant_design, relative_design
+from calibrator.experiments.methods import Estimate
+from calibrator.experiments.trial import CommonEvidence, Trial
+from calibrator.faults import Faults
+
+__all__ = ["BASELINES", "Baseline"]
+
+PENALTY = float(np.log(10_000.0))
+"""Of a parameter in the Bayesian information criterion: log of the samples of a quarter of an hour at 10 Hz."""
+WIDER = 3.0
+"""Variance of the rows over that of the densest cluster: the factor with which the best subset recovers most. [1]"""
+ROUNDS = 4
+"""Of least squares: the constant rows depend on the gains of the sensors, so they are solved by turns. [1]"""
+BEYOND = 3.0
+"""Robust standard deviations from the median from which on a slope or an intercept counts as faulty. [1]"""
+ACCURACY = 0.01
+"""Standard deviation that the class of a current sensor promises, in fractions of full scale. [1]"""
+LEAST_WEIGHT = 0.2
+"""Weight of a branch in the junction law below which total least squares says nothing of its gain. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Baseline:
+    """A method that corrects whatever it finds.
+
+    Attributes
+    ----------
+    name : str
+        For tables.
+    solve : callable
+        Faults of the vehicles of a trial.
+    """
+
+    name: str
+    solve: Callable[[Trial], Faults]
+
+    def estimate(self, trial: Trial) -> Estimate:
+        """Solve, and correct every sensor whose parameters are not zero."""
+        faults = self.solve(trial)
+        corrected = (faults.drift != 0.0) | (faults.offset_a != 0.0)
+        return Estimate(
+            faults=faults, hardware=faults.has_hardware_fault, corrected=corrected, confidence=None, failed=0
+        )
+
+
+def _best_subset(trial: Trial) -> Faults:
+    """The support with the least Bayesian information criterion, of all."""
+    linear = _Linear(trial)
+    P = linear.design.shape[1]
+    supports = np.array([bits for bits in itertools.product((False, True), repeat=P) if sum(bits) < P], bool)
+    fits = [linear.fit(np.tile(support, (len(linear.rows), 1))) for support in supports]
+    bic = np.stack([chi2 + PENALTY * support.sum() for support, (_, chi2) in zip(supports, fits, strict=True)])
+    best = supports[np.argmin(bic, axis=0)]
+    return linear.faults(linear.fit(best)[0])
+
+
+def _lasso(trial: Trial) -> Faults:
+    """Support of the LASSO path with the least criterion, fitted anew without shrinkage."""
+    linear = _Linear(trial)
+    y = linear.values(np.zeros((len(linear.rows), linear.design.shape[1])))
+    support = np.zeros((len(y), linear.design.shape[1]), bool)
+    for j, whiten in enumerate(linear.whiten):
+        path = LassoLarsIC(criterion="bic", fit_intercept=False, noise_variance=1.0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)  # gains are open by a common factor
+            support[j] = path.fit(whiten @ linear.design, whiten @ y[j]).coef_ != 0.0
+    return linear.faults(linear.fit(support)[0])
+
+
+def _median_regression(trial: Trial) -> Faults:
+    """Slopes and intercepts that differ from the fleet's median; all of it is the sensor's."""
+    rows, order = _evidence_rows(trial)
+    K = rows.branches
+
+    def apart(values: Array) -> Array:
+        deviation = values - np.median(values, axis=0)
+        return np.where(np.abs(deviation) > BEYOND * median_abs_deviation(values, scale="normal"), deviation, 0.0)
+
+    drift, offset = apart(np.exp(rows.relative[:, :K])), apart(rows.constant[:, :K])
+    return _sensors_alone(drift[:, np.argsort(order)], offset[:, np.argsort(order)] * trial.full_scale_a)
+
+
+def _total_least_squares(trial: Trial) -> Faults:
+    """Direction in which a vehicle's currents vary least: weights 1 / (1 + d) of the junction law, median 1."""
+    mean_a, covariance_a2 = _measured_moments(trial)
+    w = np.linalg.eigh(covariance_a2)[1][:, :, 0]
+    w = w / np.median(w, axis=1, keepdims=True)
+    w = np.where(w > LEAST_WEIGHT, w, 1.0)
+    # sum_k w_k (mean_k - o_k) = 0 leaves the offsets open: the smallest ones
+    offset_a = w * (np.sum(w * mean_a, axis=1) / np.sum(w**2, axis=1))[:, None]
+    return _sensors_alone(1.0 / w - 1.0, offset_a)
+
+
+def _reconciliation(trial: Trial) -> Faults:
+    """Measured over reconciled currents: those nearest to the measured ones that sum to zero, all as accurate."""
+    mean_a, covariance_a2 = _measured_moments(trial)
+    K = mean_a.shape[1]
+    project = np.eye(K) - 1.0 / K
+    variance_a2 = np.maximum(np.einsum("ik,nkl,il->ni", project, covariance_a2, project), 1e-12)
+    slope = np.einsum("ik,nki->ni", project, covariance_a2) / variance_a2
+    offset_a = mean_a - slope * (mean_a @ project)
+    # the global test: a sum within what the sensors promise asks for no correction
+    sum_a2 = covariance_a2.sum(axis=(1, 2)) + mean_a.sum(axis=1) ** 2
+    wrong = sum_a2 > K * (ACCURACY * trial.full_scale_a) ** 2
+    return _sensors_alone((slope - 1.0) * wrong[:, None], offset_a * wrong[:, None])
+
+
+def _sensors_alone(drift: Array, offset_a: Array) -> Faults:
+    """Faults without any of the hardware."""
+    return Faults(
+        hardware_drift=np.zeros(len(drift)), hardware_offset_a=np.zeros_like(drift), drift=drift, offset_a=offset_a
+    )
+
+
+def _measured_moments(trial: Trial) -> tuple[Array, Array]:
+    """Mean (N, K) [A] and covariance (N, K, K) [A^2] of each vehicle's measured currents."""
+    if isinstance(trial.recorded, CommonEvidence):
+        return trial.recorded.mean_a, trial.recorded.covariance_a2
+    mean_a = np.stack([summary.mean_a for summary in trial.recorded])
+    product_a2 = np.stack([summary.mean_product_a2 for summary in trial.recorded])
+    return mean_a, product_a2 - mean_a[:, :, None] * mean_a[:, None, :]
+
+
+def _evidence_rows(trial: Trial) -> tuple[EvidenceRows, NDArray[np.int64]]:
+    """Evidence rows, and the position of each of their branches in the vehicle's own order."""
+    if isinstance(trial.recorded, CommonEvidence):
+        return trial.recorded.rows, np.arange(trial.recorded.rows.branches)
+    order = np.argsort(-np.median(stack_summaries(trial.recorded).variance_a2, axis=0), kind="stable")
+    fleet = stack_summaries(trial.recorded, order.tolist())
+    rows, _ = collect_rows(fleet, fit_fleet_model(fleet), full_scale_a=trial.full_scale_a)
+    return rows, order
+
+
+class _Linear:
+    """Evidence rows as a linear model: 3K rows over eta, lambda (K), o_h (K - 1), omega (K), see docs/method.md.
+
+    The densest cluster of each row over the fleet says what vehicles without faults show, and how much they differ.
+    """
+
+    def __init__(self, trial: Trial) -> None:
+        self.rows, self.order = _evidence_rows(trial)
+        self.full_scale_a = trial.full_scale_a
+        K = self.rows.branches
+        self.design = np.zeros((3 * K, 3 * K))
+        self.design[: 2 * K - 1, : K + 1] = relative_design(K)[: 2 * K - 1]
+        self.design[2 * K - 1 :, K + 1 :] = constant_design(K)[: K + 1]
+        told = np.array([*range(2 * K - 1), *range(3 * K - 1, 4 * K)])
+        covariance = self.rows.covariance[:, told[:, None], told]
+        sd = np.sqrt(np.einsum("nii->ni", covariance))
+        raw = np.hstack([self.rows.relative[:, : 2 * K - 1], self.rows.constant[:, : K + 1]])
+        clusters = [densest_clusters(raw[:, i], sd[:, i])[0] for i in range(3 * K)]
+        self.centre = np.array([cluster.centre for cluster in clusters])
+        whole = WIDER * (covariance + np.diag([cluster.spread**2 for cluster in clusters]))
+        self.whiten = np.linalg.inv(np.linalg.cholesky(whole))
+
+    def values(self, theta: Array) -> Array:
+        """Rows (N, 3K) as they would be if the gains were those of theta (N, 3K)."""
+        K = self.rows.branches
+        relative = self.rows.relative - theta[:, : K + 1] @ relative_design(K).T
+        relative[:, : 2 * K - 1] -= self.centre[: 2 * K - 1]
+        seen = self.rows.constant_seen(np.expm1(theta[:, None, : K + 1]), relative[:, None])[:, 0, : K + 1]
+        return np.asarray(np.hstack([self.rows.relative[:, : 2 * K - 1], seen]) - self.centre)
+
+    def fit(self, support: Mask) -> tuple[Array, Array]:
+        """Parameters (N, 3K) and chi2 (N,) of least squares with a support (N, 3K) for each vehicle."""
+        theta = np.zeros(support.shape)
+        design = (self.whiten @ self.design) * support[:, None, :]
+        solve = np.linalg.pinv(design, rcond=1e-9)
+        for _ in range(ROUNDS):
+            y = np.einsum("nij,nj->ni", self.whiten, self.values(theta))
+            theta = np.clip(np.einsum("npi,ni->np", solve, y), -2.0, 2.0)
+        y = np.einsum("nij,nj->ni", self.whiten, self.values(theta))
+        return theta, np.sum((y - np.einsum("nip,np->ni", design, theta)) ** 2, axis=1)
+
+    def faults(self, theta: Array) -> Faults:
+        """Faults of parameters (N, 3K), branches in the vehicles' own order."""
+        K, own = self.rows.branches, np.argsort(self.order)
+        gain = np.exp(theta[:, 1 : K + 1])
+        hardware = np.column_stack([theta[:, K + 1 : 2 * K], -theta[:, K + 1 : 2 * K].sum(axis=1)])
+        return Faults(
+            hardware_drift=np.expm1(theta[:, 0]),
+            hardware_offset_a=hardware[:, own] * self.full_scale_a,
+            drift=gain[:, own] - 1.0,
+            offset_a=(theta[:, 2 * K :] * gain)[:, own] * self.full_scale_a,
+        )
+
+
+BASELINES = (
+    Baseline(name="best subset", solve=_best_subset),
+    Baseline(name="LASSO", solve=_lasso),
+    Baseline(name="fleet median", solve=_median_regression),
+    Baseline(name="total least squares", solve=_total_least_squares),
+    Baseline(name="VDI 2048", solve=_reconciliation),
+)

@@ -1,1 +1,0 @@
-"""State-space models of vehicles from their drives."""

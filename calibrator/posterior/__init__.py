@@ -1,1 +1,0 @@
-"""Sparse posterior over hardware and sensor faults: the default estimator."""

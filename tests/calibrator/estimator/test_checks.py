@@ -1,0 +1,165 @@
+"""What no gain error and no offset explains: found and named, and nothing else."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrator.artificial.random_fleet import draw_faults
+from calibrator.drive import Array
+from calibrator.drives.align import Samples
+from calibrator.estimator.checks import check_fit, learn_usual_misfits
+from calibrator.faults import Faults, measured_currents, true_currents
+from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.summariser import summarise
+from ecu_node.parameters import Finding
+from tests.calibrator.estimator.simulated_drives import (
+    INPUTS,
+    PERIOD_S,
+    coloured,
+    no_faults,
+    read_out_of,
+    samples_of,
+)
+
+BRANCHES = ("battery", "motor", "auxiliary")
+FULL_SCALE_A = 400.0
+SAMPLES = 3000
+HOURS = np.linspace(0.0, 1.0, SAMPLES)
+WARM_C = 10.0 + 25.0 * np.sqrt(HOURS)
+BAD = 2
+"""The vehicle whose sensor is not linear."""
+Bend = Callable[[Array, np.random.Generator], Array]
+"""What a sensor shows of the current that it should show. [A]"""
+
+CAUSES: dict[str, Bend] = {
+    "inverted": lambda x, _: -x,
+    "dead": lambda x, _: np.full(len(x), 12.0),
+    "clipped": lambda x, _: np.clip(x, -90.0, 90.0),
+    "saturating": lambda x, _: np.where(np.abs(x) > 80.0, np.sign(x) * 80.0 + 0.7 * (x - np.sign(x) * 80.0), x),
+    "quadratic": lambda x, _: x + 0.1 * x**2 / FULL_SCALE_A,
+    "cubic": lambda x, _: x + 0.2 * x**3 / FULL_SCALE_A**2,
+    "sign": lambda x, _: np.where(x > 0.0, 1.1 * x, x),
+    "step": lambda x, _: x * np.where(HOURS > 0.6, 1.15, 1.0),
+    "ramp": lambda x, _: x * (1.0 + 0.15 * HOURS),
+    "temperature": lambda x, _: x * (1.0 + 0.006 * (WARM_C - 25.0)),
+    "spikes": lambda x, rng: x + (rng.random(len(x)) < 0.008) * rng.uniform(40.0, 100.0, len(x)),
+    "outliers": lambda x, rng: x + (rng.random(len(x)) < 0.008) * rng.choice([-80.0, 80.0], len(x)),
+    "noise": lambda x, rng: x + (np.arange(len(x)) // 30 % 10 == 0) * rng.normal(0.0, 8.0, len(x)),
+}
+
+
+def a_drive(seed: int, faults: Faults, bend: Bend | None, branch: int = 0, load_a: Array | float = 0.0) -> Samples:
+    """One drive; one sensor is bent about the zero that its offset moved."""
+    rng, K = np.random.default_rng(seed), len(faults.drift)
+    u = coloured(rng, SAMPLES, INPUTS, 0.99) + np.array([0.5, 0.2, 0.0])
+    error = 1.5 * coloured(rng, SAMPLES, K, 0.99)
+    i = true_currents(u @ read_out_of(K), faults) + error - error.mean(axis=1, keepdims=True)
+    i[:, 0] += load_a
+    i_m = measured_currents(i, faults)
+    if bend is not None:
+        i_m[:, branch] = bend(i_m[:, branch] - faults.offset_a[branch], rng) + faults.offset_a[branch]
+    return samples_of(u, i_m + rng.normal(0.0, 0.3, i_m.shape))
+
+
+def a_fleet(K: int, bend: Bend | None = None, branch: int = 0, load_a: Array | float = 0.0) -> list[DriveSummary]:
+    """Nine vehicles with gain errors and offsets, of which one has a bent sensor or a load without a sensor."""
+    faults = draw_faults(
+        np.random.default_rng(K),
+        vehicles=9,
+        branches=K,
+        sparsity=80.0,
+        magnitude=(0.05, 0.25),
+        full_scale_a=FULL_SCALE_A,
+        balanced=True,
+    )
+    drives = [
+        a_drive(10 + j, faults.take(j), *((bend, branch, load_a) if j == BAD else (None,))) for j in range(len(faults))
+    ]
+    return [summarise([drive], period_s=PERIOD_S, temperatures_c=[WARM_C]) for drive in drives]
+
+
+def read_out(K: int) -> Array:
+    return np.vstack([read_out_of(K), np.zeros(K)])
+
+
+def checked(summaries: Sequence[DriveSummary], K: int) -> list[tuple[Finding, ...]]:
+    usual = learn_usual_misfits(summaries, read_out(K), full_scale_a=FULL_SCALE_A)
+    return check_fit(summaries, read_out(K), usual, full_scale_a=FULL_SCALE_A, branches=BRANCHES[:K])
+
+
+@pytest.mark.parametrize("K", [2, 3])
+@pytest.mark.parametrize("branch", [0, 1])
+@pytest.mark.parametrize("cause", CAUSES)
+def test_sensor_that_is_not_linear_is_found_and_named(cause: str, branch: int, K: int) -> None:
+    found = checked(a_fleet(K, CAUSES[cause], branch), K)
+    if (cause, branch, K) == ("clipped", 1, 3):
+        cause, branch = "switching", -1  # the level beyond which it is clipped shows in no single other current
+    probability = {each.cause: each.probability for each in found[BAD]}
+    assert probability[cause] > 0.7
+    assert {each.branch for each in found[BAD]} <= {None, *BRANCHES[branch : branch + 1]}
+    assert [j for j, mine in enumerate(found) if mine] == [BAD]
+
+
+@pytest.mark.parametrize("K", [2, 3])
+def test_switched_load_is_found_and_no_sensor_blamed(K: int) -> None:
+    on = np.repeat(np.random.default_rng(0).random(SAMPLES // 50) < 0.5, 50)
+    found = checked(a_fleet(K, load_a=15.0 * on), K)
+    assert [(each.cause, each.branch) for each in found[BAD]] == [("switching", None)]
+    assert "load without a sensor" in found[BAD][0].text
+
+
+def test_load_in_proportion_to_a_current_looks_like_two_gains() -> None:
+    faults = no_faults(9, 2)
+    drives = [a_drive(10 + j, faults.take(j), None) for j in range(9)]
+    loaded = drives[BAD].currents_a.copy()
+    loaded[:, 0] += 0.08 * np.abs(loaded[:, 1])
+    drives[BAD] = replace(drives[BAD], currents_a=loaded)
+    (finding,) = checked([summarise([drive], period_s=PERIOD_S) for drive in drives], 2)[BAD]
+    assert finding.cause == "sign"
+    assert "or a load without a sensor takes 8 % of" in finding.text
+
+
+@pytest.mark.parametrize("K", [2, 3])
+def test_gain_errors_offsets_and_a_constant_load_are_no_finding(K: int) -> None:
+    assert checked(a_fleet(K, load_a=8.0), K) == [()] * 9
+
+
+def test_misfit_that_all_vehicles_have_is_usual() -> None:
+    faults = no_faults(9, 2)
+    bent = [a_drive(j, faults.take(j), lambda x, _: x + 0.03 * x**2 / FULL_SCALE_A) for j in range(9)]
+    assert checked([summarise([drive], period_s=PERIOD_S) for drive in bent], 2) == [()] * 9
+
+
+def test_finding_does_not_depend_on_the_order_of_the_branches() -> None:
+    summaries, order = a_fleet(3, CAUSES["quadratic"], 1), [2, 0, 1]
+    (first,) = checked(summaries, 3)[BAD]
+    turned = [summary.take_branches(order) for summary in summaries]
+    usual = learn_usual_misfits(turned, read_out(3)[:, order], full_scale_a=FULL_SCALE_A)
+    names = [BRANCHES[k] for k in order]
+    (second,) = check_fit(turned, read_out(3)[:, order], usual, full_scale_a=FULL_SCALE_A, branches=names)[BAD]
+    assert (second.cause, second.branch, second.text) == (first.cause, first.branch, first.text)
+
+
+def test_vehicle_is_checked_by_itself() -> None:
+    summaries = a_fleet(2, CAUSES["step"])
+    usual = learn_usual_misfits(summaries, read_out(2), full_scale_a=FULL_SCALE_A)
+    alone = check_fit(summaries[BAD : BAD + 1], read_out(2), usual, full_scale_a=FULL_SCALE_A, branches=BRANCHES[:2])
+    assert [each.cause for each in alone[0]] == ["step"]
+
+
+def test_summaries_without_fit_sums_have_no_findings() -> None:
+    summaries = a_fleet(2, CAUSES["step"])
+    plain = [replace(summary, fit=None) for summary in summaries]
+    assert learn_usual_misfits(plain, read_out(2), full_scale_a=FULL_SCALE_A) is None
+    assert checked(plain, 2) == [()] * 9
+    mixed = [plain[0], *summaries[1:]]
+    assert [bool(mine) for mine in checked(mixed, 2)] == [j == BAD for j in range(9)]
+
+
+def test_vehicle_that_stands_still_has_no_findings() -> None:
+    summaries = a_fleet(2)
+    still = samples_of(np.zeros((SAMPLES, INPUTS)), np.zeros((SAMPLES, 2)))
+    found = checked([*summaries, summarise([still], period_s=PERIOD_S)], 2)
+    assert found == [()] * 10

@@ -1,0 +1,360 @@
+"""The calibrator in Python: from data frames, logs or summaries to parameters, and what is refused."""
+
+import importlib.util
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.base import clone
+
+import calibrator
+from calibrator import Fleet, FleetCalibrator, Junction, read_log
+from calibrator.artificial.builtin_drives import builtin_trip
+from calibrator.errors import ContradictionError, DriveError, FleetError
+from calibrator.estimator.results import read_results
+from calibrator.summaries.store import SummaryStore
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import LayoutError, UserError
+from tests.calibrator.command_here import calibrator as command
+from tests.calibrator.estimator.test_run import contents, failing_for
+from tests.calibrator.summaries.small_stores import random_faults, small_store
+
+ROOT = Path(__file__).parents[3]
+LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
+JUNCTION = Junction(branches=["battery", "motor"], full_scale_a=400.0)
+INPUTS = ["power", "heat"]
+Frames = dict[str, Any]
+
+
+def frame(seed: int, *, gain_error: float = 0.0, minutes: float = 5.0) -> pd.DataFrame:
+    """A drive with a row a second; the battery sensor has a gain error."""
+    rng, time_s = np.random.default_rng(seed), np.arange(0.0, 60.0 * minutes)
+    power = np.convolve(rng.normal(size=len(time_s) + 7), np.ones(8), "valid")
+    heat = np.repeat(rng.integers(0, 2, len(time_s) // 20 + 1), 20)[: len(time_s)].astype(float)
+    true_a = 40.0 * power + 15.0 * heat
+    noise_a = rng.normal(0.0, 0.3, (2, len(time_s)))
+    return pd.DataFrame(
+        {
+            "battery": (1.0 + gain_error) * true_a + noise_a[0],
+            "motor": -true_a + noise_a[1],
+            "power": power,
+            "heat": heat,
+        },
+        index=time_s,
+    )
+
+
+def frames(vehicles: int = 3) -> Frames:
+    return {f"V{number}": frame(number) for number in range(1, vehicles + 1)}
+
+
+@pytest.fixture(scope="module")
+def example() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("twelve_vehicles", ROOT / "examples" / "twelve_vehicles.py")
+    assert spec is not None and spec.loader is not None  # noqa: PT018
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def fitted(example: ModuleType) -> FleetCalibrator:
+    found: FleetCalibrator = example.main()
+    return found
+
+
+# What it offers
+
+
+def test_package_offers_four_names_and_imports_nothing_heavy() -> None:
+    assert sorted(calibrator.__all__) == dir(calibrator) == ["Fleet", "FleetCalibrator", "Junction", "read_log"]
+    with pytest.raises(AttributeError, match="no attribute 'fit'; it offers Fleet, FleetCalibrator"):
+        _ = calibrator.fit
+    heavy = ("numpy", "pandas", "scipy", "numba", "pyarrow", "sklearn", "cantools", "matplotlib", "typer")
+    code = f"import sys; from calibrator import *; print([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]"
+
+
+def test_twelve_vehicles_from_frames_to_parameters(fitted: FleetCalibrator, example: ModuleType) -> None:
+    found = fitted.parameters_
+    assert len(found) == 12 * 3
+    assert set(found.loc[found["corrected"], "vehicle"]) == set(example.FAULTS)
+    for vehicle, (branch, gain_error, offset_a) in example.FAULTS.items():
+        (row,) = found[(found["vehicle"] == vehicle) & found["corrected"]].to_dict("records")
+        assert row["branch"] == branch
+        assert row["gain_error"] == pytest.approx(gain_error, abs=0.002)
+        assert row["offset_a"] == pytest.approx(offset_a, abs=0.5)
+    assert fitted.left_out_ == {}
+
+
+def test_correction_gives_true_currents_on_corrected_branches_alone(
+    fitted: FleetCalibrator, example: ModuleType
+) -> None:
+    measured = example.recorded_drive("V02", np.random.default_rng(5))
+    corrected = fitted.vehicles_["V02"].correct(measured)
+    branch = fitted.vehicles_["V02"].parameters.branches["battery"]
+    expected = (measured["battery"] - branch.offset_a) / (1.0 + branch.drift)
+    pd.testing.assert_series_equal(corrected["battery"], expected)
+    pd.testing.assert_frame_equal(corrected.drop(columns="battery"), measured.drop(columns="battery"))
+    assert (corrected[["battery", "motor", "heater"]].sum(axis=1) ** 2).mean() ** 0.5 < 0.7
+    with pytest.raises(DriveError, match="vehicle V02: no column battery; it has motor"):
+        fitted.vehicles_["V02"].correct(measured.drop(columns="battery"))
+    with pytest.raises(DriveError, match="vehicle V02: column battery is of object"):
+        fitted.vehicles_["V02"].correct(measured.astype({"battery": object}))
+
+
+def test_results_are_shown_as_text_and_html(fitted: FleetCalibrator) -> None:
+    assert fitted.summary().startswith("method posterior")
+    assert "parameter files:" not in fitted.summary()
+    assert fitted.vehicles_["V02"].explain().startswith("V02: corrected (confidence ")
+    assert "<table" in fitted._repr_html_()
+    assert "V02: corrected" in fitted.vehicles_["V02"]._repr_html_()
+
+
+def test_fitted_calibrator_pickles(fitted: FleetCalibrator) -> None:
+    again = pickle.loads(pickle.dumps(fitted))
+    pd.testing.assert_frame_equal(again.parameters_, fitted.parameters_)
+    assert again.vehicles_ == fitted.vehicles_
+    assert again.summary() == fitted.summary()
+
+
+def test_constructor_only_stores_as_in_scikit_learn() -> None:
+    plain = FleetCalibrator(harm_limit=0.01, trusted=["V1"])
+    assert repr(plain) == "FleetCalibrator(harm_limit=0.01, trusted=['V1'])"
+    assert clone(plain).get_params() == plain.get_params()
+    assert plain.set_params(workers=1).workers == 1
+    with pytest.raises(ContradictionError, match="no parameter 'x'; there are harm_limit, trusted"):
+        plain.set_params(x=1)
+    with pytest.raises(FleetError, match="has learned nothing yet; call fit"):
+        plain.summary()
+    assert repr(plain) in plain._repr_html_().replace("&#x27;", "'")
+
+
+def test_results_of_frames_without_a_layout_have_no_files_for_the_node(fitted: FleetCalibrator, tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match=r"no parameter files for the node are written: .*Junction\.from_layout"):
+        out = fitted.write(tmp_path / "result")
+    assert len(read_results(out)) == 36
+    assert not (out / "params").exists()
+    with pytest.raises(FleetError, match="exists and is not empty"):
+        fitted.write(tmp_path / "result")
+
+
+# The way of the command
+
+
+def test_summaries_give_what_the_command_writes(
+    database: VehicleDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    store: SummaryStore = small_store(tmp_path / "store", database, random_faults(20))
+    bench = pd.DataFrame([("V001", "motor", 0.0, 0.001)], columns=["vehicle", "branch", "drift", "drift_sd"])
+    bench.to_csv(tmp_path / "readings.csv", index=False)
+    options = ("--workers", 1, "--hold-out", "V003,V004", "--harm-limit", 0.01, "--readings", tmp_path / "readings.csv")
+    done = command("calibrate", store.url, "--layout", LAYOUT, "--out", tmp_path / "command", *options)
+    assert done.returncode == 0, done.stderr
+    capsys.readouterr()
+    settings: dict[str, Any] = {"workers": 1, "hold_out": ["V003", "V004"], "harm_limit": 0.01, "readings": bench}
+    found = FleetCalibrator(**settings).fit(Fleet.from_folder(store.url, LAYOUT))
+    assert contents(found.write(tmp_path / "python")) == contents(tmp_path / "command")
+    assert found.summary() in done.stdout
+    assert found.notices_ == ["a notice"]
+    assert capsys.readouterr() == ("", "")
+
+
+def test_frames_of_a_layout_have_derived_inputs_limits_and_files_for_the_node(tmp_path: Path) -> None:
+    trips = [builtin_trip(np.random.default_rng(seed), duration_s=240.0, name="trip") for seed in range(3)]
+    given = {
+        f"V{n}": pd.DataFrame({**trip.currents_a, **trip.inputs}, index=trip.time_s) for n, trip in enumerate(trips)
+    }
+    junction = Junction.from_layout(LAYOUT, branches=list(trips[0].currents_a))
+    found = FleetCalibrator().fit(Fleet.from_frames(given, junction))
+    out = found.write(tmp_path / "result")
+    assert {path.stem for path in (out / "params").iterdir()} == set(given)
+    with pytest.raises(FleetError, match="inputs wind: not in the layout; it has "):
+        Fleet.from_frames(given, junction, inputs=["wind"])
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Fleet of two vehicles with a log each."""
+    out = tmp_path_factory.mktemp("simulated") / "fleet"
+    done = command(
+        *("simulate", "--vehicles", 2, "--currents", 2, "--minutes", 4, "--unseen-minutes", 1, "--seed", 5),
+        *("--layout", LAYOUT, "--out", out),
+    )
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_logs_give_what_the_command_writes(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    done = command("calibrate", logs, "--layout", LAYOUT, "--out", tmp_path / "command", "--workers", 1)
+    assert done.returncode == 0, done.stderr
+    found = FleetCalibrator(workers=1).fit(Fleet.from_folder(logs, LAYOUT))
+    assert contents(found.write(tmp_path / "python")) == contents(tmp_path / "command")
+
+
+def test_log_reads_as_a_frame_that_makes_a_fleet(logs: Path) -> None:
+    paths = sorted((logs / "logs").rglob("*.log*"))
+    log = read_log(paths[0], LAYOUT)
+    found = log.to_frame()
+    assert found.index.name == "time_s"
+    assert np.diff(found.index) == pytest.approx(0.1)
+    assert {"battery", "motor"} <= set(found)
+    assert repr(log).startswith(f"Log({paths[0].parent.name} {log.drive.name}, ")
+    two = Junction(branches=["battery", "motor"], full_scale_a=400.0)
+    recorded = {path.parent.name: read_log(path, LAYOUT).to_frame() for path in paths}
+    assert len(FleetCalibrator().fit(Fleet.from_frames(recorded, two)).vehicles_) == 2
+
+
+def test_fault_of_the_program_in_one_vehicle_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    failing_for("V2", ZeroDivisionError("by nothing"), monkeypatch)
+    with pytest.warns(RuntimeWarning, match="internal error, left out: V2: ZeroDivisionError: by nothing"):
+        found = FleetCalibrator().fit(Fleet.from_frames(frames(), JUNCTION))
+    assert sorted(found.vehicles_) == ["V1", "V3"]
+
+
+# What frames may be
+
+
+def test_time_of_day_and_seconds_are_the_same() -> None:
+    seconds = frames()
+    clock = {
+        name: each.set_index(pd.Timestamp("2026-01-01T12:00Z") + pd.to_timedelta(each.index, unit="s"))
+        for name, each in seconds.items()
+    }
+    one, other = (FleetCalibrator().fit(Fleet.from_frames(given, JUNCTION)) for given in (seconds, clock))
+    pd.testing.assert_frame_equal(one.parameters_, other.parameters_)
+
+
+def test_several_frames_and_bad_samples_are_taken_as_they_are() -> None:
+    given = {**frames(5), "V9": [frame(90, gain_error=0.1), frame(91, gain_error=0.1)]}
+    given["V9"][0].iloc[20:40, 0] = np.nan
+    given["V8"] = frame(80, minutes=1.0)
+    found = FleetCalibrator().fit(Fleet.from_frames(given, JUNCTION, inputs=INPUTS))
+    parameters = found.vehicles_["V9"].parameters
+    assert parameters.branches["battery"].drift == pytest.approx(0.1, abs=0.01)
+    assert 575.0 <= parameters.provenance.duration_s <= 582.0
+    assert parameters.provenance.drives == ["frame 1", "frame 2"]
+    assert "at least 120 s are needed" in found.left_out_["V8"]
+
+
+def changed(**changes: Callable[[pd.DataFrame], Any]) -> Callable[[], Frames]:
+    """Three vehicles, one or more of them changed."""
+    return lambda: {name: changes.get(name, lambda each: each)(each) for name, each in frames().items()}
+
+
+def scaled(column: str, factor: float) -> Callable[[pd.DataFrame], pd.DataFrame]:
+    return lambda each: each.assign(**{column: factor * each[column]})
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (dict, r"dict without vehicles: expected data frames by vehicle"),
+        (lambda: [frame(1)], r"list without vehicles: expected data frames by vehicle"),
+        (lambda: frames(1), r"a single vehicle, V1: at least 2 are needed, as each is compared with its fleet"),
+        (lambda: {1: frame(1), "1": frame(2)}, r"vehicle 1 is there twice; give all of its frames as one list"),
+        (lambda: {"a/b": frame(1), "V2": frame(2)}, r"vehicle 'a/b' cannot be used"),
+        (changed(V2=lambda _: []), r"vehicle V2: no frame in its list"),
+        (changed(V2=lambda each: each["motor"]), r"vehicle V2: Series given; expected a DataFrame or a list of them"),
+        (changed(V2=lambda _: frame(1)), r"vehicle V2, frame 1: the same as vehicle V1, frame 1"),
+        (changed(V2=lambda each: [each, each]), r"vehicle V2, frame 2: the same as vehicle V2, frame 1"),
+        (changed(V2=lambda each: each.drop(columns="motor")), r"vehicle V2, frame 1: no column motor; it has battery"),
+        (changed(V3=lambda each: each.drop(columns="heat")), r"vehicle V3, frame 1: no column heat; it has battery"),
+        (changed(V3=lambda each: each.assign(wind=1.0)), r"V3, frame 1: column wind, which vehicle V1, frame 1 has n"),
+        (changed(V2=lambda each: each.astype({"motor": str})), r"V2, frame 1: column motor is of .*expected numbers"),
+        (changed(V2=lambda each: each.assign(motor=np.nan)), r"V2, frame 1: column motor has no number at all"),
+        (changed(V2=lambda each: each.assign(motor=3.0)), r"vehicle V2: branch motor is 3 A throughout: stuck"),
+        (changed(V2=lambda each: each.iloc[::-1]), r"V2, frame 1: time runs back at row 1 \(299.0 -> 298.0\)"),
+        (
+            changed(V2=lambda each: each.set_index(each.index.where(each.index != 7.0, 6.0))),
+            r"V2, frame 1: time twice at row 7 \(6.0 -> 6.0\)",
+        ),
+        (changed(V2=lambda each: each.reset_index(drop=True)), r"V2, frame 1: its index counts rows; expected the tim"),
+        (changed(V2=lambda each: each.set_index(each.index.astype(str))), r"V2, frame 1: its index is of .*; expected"),
+        (
+            changed(V2=lambda each: each.set_index(each.index.where(each.index != 7.0))),
+            r"V2, frame 1: 1 rows without a time",
+        ),
+        (changed(V2=lambda each: each.iloc[:1]), r"V2, frame 1: 1 rows; leave the frame out"),
+        (changed(V2=scaled("motor", 1e-3)), r"V2: the largest motor current is 0.\d+ A.*perhaps it is in kA"),
+        (changed(V2=scaled("motor", 1e3)), r"V2: the largest motor current is .*perhaps it is in mA"),
+        (
+            lambda: {name: each.set_index(60.0 * each.index) for name, each in frames().items()},
+            r"rows are 60 s apart, expected 5 s at most",
+        ),
+        (
+            lambda: {name: each[["battery", "motor"]] for name, each in frames().items()},
+            r"inputs none: expected one or more",
+        ),
+    ],
+)
+def test_frames_that_are_no_recordings_of_a_fleet_are_refused_in_one_line(
+    given: Callable[[], Frames], message: str
+) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        Fleet.from_frames(given(), JUNCTION)
+    assert "\n" not in str(caught.value)
+    assert type(caught.value).__module__ == "calibrator.errors"
+
+
+@pytest.mark.parametrize(
+    ("inputs", "message"),
+    [
+        ("power", r"inputs 'power': expected a list of column names, \['power'\]"),
+        (["power", "motor"], r"inputs motor: a branch of the junction cannot be an input"),
+        (["power", "power"], r"inputs power, power: expected one or more different columns"),
+        (["power", "wind"], r"vehicle V1, frame 1: no column wind; it has battery"),
+    ],
+)
+def test_inputs_that_are_none_are_refused(inputs: Any, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        Fleet.from_frames(frames(), JUNCTION, inputs=inputs)
+
+
+@pytest.mark.parametrize(
+    ("branches", "full_scale_a", "message"),
+    [
+        (["battery"], 400.0, r"branches \['battery'\]: a junction has 2 to 16 branches"),
+        ("battery", 400.0, r"branches 'battery': a junction has 2 to 16 branches, in a list"),
+        (["battery", "battery"], 400.0, r"branches \['battery', 'battery'\]: expected different names"),
+        (["battery", "motor"], 0.0, r"full_scale_a 0.0: expected the nominal maximum current in A"),
+        (["battery", "motor"], "400 A", r"full_scale_a '400 A': expected the nominal maximum current in A"),
+    ],
+)
+def test_junction_of_one_branch_or_without_full_scale_is_refused(
+    branches: Any, full_scale_a: Any, message: str
+) -> None:
+    with pytest.raises(FleetError, match=message):
+        Junction(branches=branches, full_scale_a=full_scale_a)
+
+
+def test_wrong_places_and_parameters_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FleetError, match="no such folder, store of drives or store of summaries"):
+        Fleet.from_folder(tmp_path / "nothing", LAYOUT)
+    with pytest.raises(LayoutError, match=r"none\.toml"):
+        Junction.from_layout(tmp_path / "none.toml")
+    with pytest.raises(LayoutError, match="no branch 'turbine'; known are battery"):
+        Junction.from_layout(LAYOUT, branches=["battery", "turbine"])
+    with pytest.raises(FleetError, match=r"dict given; expected a Fleet: Fleet\.from_frames or Fleet\.from_folder"):
+        FleetCalibrator().fit(frames())  # type: ignore[arg-type]
+    fleet = Fleet.from_frames(frames(), JUNCTION)
+    wrong: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"harm_limit": 2.0}, "harm_limit is 2.0; expected a number from 0 to 1"),
+        ({"expected_faults": "half"}, "expected_faults is 'half'; expected a number from 0 to 1"),
+        ({"workers": 0}, "workers is 0; expected a number from 1 to 256"),
+        ({"trusted": ["V1"], "hold_out": "V1"}, "vehicle V1 is both held out and trusted"),
+        ({"trusted": "V9"}, "fleet frames: no usable vehicle V9 to trust"),
+    )
+    for parameters, message in wrong:
+        with pytest.raises(UserError, match=message):
+            FleetCalibrator(**parameters).fit(fleet)

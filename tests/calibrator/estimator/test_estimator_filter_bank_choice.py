@@ -1,0 +1,190 @@
+"""Read-outs on a shared filter bank against their samples, and the choice of the bank for known vehicles."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.dynamic_vehicles import INPUT_NAMES, PERIOD_S, drive_inputs, dynamic_vehicle, recorded
+from calibrator.drive import Array
+from calibrator.drives.align import Samples
+from calibrator.errors import DriveError
+from calibrator.estimator.filter_bank_choice import (
+    FIRST_HELD_OUT,
+    FOLDS,
+    LONGEST_S,
+    choose_filter_bank,
+    far_below_fleet,
+    fit_read_outs,
+    state_space_model,
+)
+from calibrator.estimator.state_space import StateSpaceModel, simulation_snr_db
+from calibrator.summaries.filter_bank import FilterBank, low_pass_bank, plain_bank
+from calibrator.summaries.moments import BLOCK_S, DriveSummary
+from calibrator.summaries.summariser import summarise
+
+BLOCK = round(BLOCK_S / PERIOD_S)
+LEAD_IN = 600
+PLAIN = plain_bank(INPUT_NAMES, period_s=PERIOD_S)
+FILTERED = low_pass_bank(INPUT_NAMES, (0.5, 3.0), period_s=PERIOD_S)
+GAINS = np.random.default_rng(0).normal(size=(4, 3))
+
+
+def bank_of(model: StateSpaceModel) -> FilterBank:
+    """The bank that has exactly the poles of a vehicle."""
+    poles = np.linalg.eigvals(model.A)
+    kept = tuple((float(pole.real), float(pole.imag)) for pole in poles if pole.imag >= 0.0)
+    return FilterBank(input_names=INPUT_NAMES, period_s=PERIOD_S, poles=kept)
+
+
+def summary_of(drive: Samples, bank: FilterBank = FILTERED) -> DriveSummary:
+    return summarise([drive], period_s=PERIOD_S, bank=bank)
+
+
+def by_samples(drive: Samples) -> tuple[Array, Array, Array]:
+    """Columns with the constant, currents, and the number of the block, of the blocks that are in the summary."""
+    columns, used = FILTERED.run(drive.inputs, drive.valid, FILTERED.start())
+    block = np.arange(len(used)) // BLOCK
+    kept = np.unique(block[used], return_counts=True)
+    good = kept[0][kept[1] >= 0.2 * BLOCK]
+    used &= np.isin(block, good)
+    number = np.searchsorted(good, block[used]).astype(float)
+    return np.column_stack([columns[used], np.ones(int(used.sum()))]), drive.currents_a[used], number
+
+
+def pool(models: list[StateSpaceModel], *, samples: int = 6000, snr_db: float = 30.0) -> list[list[Samples]]:
+    return [[recorded(j, snr_db=snr_db, samples=samples, model=model).samples] for j, model in enumerate(models)]
+
+
+def lagging_vehicle(*poles: float) -> StateSpaceModel:
+    """A vehicle with one pole, or static."""
+    n = len(poles)
+    return StateSpaceModel(
+        A=np.diag(poles),
+        B=np.array([[1.0, -0.5, 0.3]])[:n] * (1.0 - np.array(poles))[:, None],
+        C=GAINS[:, :n],
+        D=np.zeros((4, 3)) if n else GAINS,
+        x0=np.zeros(n),
+        offset_a=np.ones(4),
+        snr_db=np.zeros(4),
+    )
+
+
+def test_vehicle_whose_poles_the_bank_has_is_found() -> None:
+    vehicle = recorded(1, snr_db=200.0)
+    bank = bank_of(vehicle.model)
+    model = state_space_model(bank, fit_read_outs([summary_of(vehicle.samples, bank)]), 0)
+    # The states of the bank start at rest, and 5 % of that error remain when samples are used.
+    expected, found = (each.simulate(drive_inputs(999))[LEAD_IN:] for each in (vehicle.model, model))
+    assert simulation_snr_db(expected, found).min() > 50.0
+
+
+def test_read_outs_and_their_snr_are_those_of_least_squares_on_the_samples() -> None:
+    drives = [recorded(j, snr_db=20.0, samples=3000 + 500 * j).samples for j in range(4)]
+    found = fit_read_outs([summary_of(drive) for drive in drives])
+    for j, drive in enumerate(drives):
+        z, y, block = by_samples(drive)
+        expected = np.linalg.lstsq(z, y, rcond=None)[0]
+        np.testing.assert_allclose(found.coefficients[j], expected[:-1], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(found.offset_a[j], expected[-1], rtol=1e-6, atol=1e-6)
+        held_out = block % FOLDS == FIRST_HELD_OUT
+        fit = np.linalg.lstsq(z[~held_out], y[~held_out], rcond=None)[0]
+        np.testing.assert_allclose(found.snr_db[j], simulation_snr_db(y[held_out], z[held_out] @ fit), atol=1e-6)
+
+
+def test_units_and_zeros_of_inputs_and_currents_do_not_matter() -> None:
+    drive = recorded(4, snr_db=20.0, samples=3000).samples
+    changed = replace(drive, inputs=1e3 * drive.inputs - 50.0, currents_a=1e-2 * drive.currents_a + 3.0)
+    plain, scaled = (state_space_model(FILTERED, fit_read_outs([summary_of(each)]), 0) for each in (drive, changed))
+    unity = drive_inputs(999, samples=500)
+    expected = 1e-2 * plain.simulate(unity) + 3.0
+    np.testing.assert_allclose(scaled.simulate(1e3 * unity - 50.0), expected, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(scaled.snr_db, plain.snr_db, atol=1e-6)
+
+
+def test_inputs_and_currents_that_stand_still_get_zeros_and_no_figure() -> None:
+    drive = recorded(5, snr_db=20.0, samples=3000).samples
+    inputs, currents = drive.inputs.copy(), drive.currents_a.copy()
+    inputs[:, 1], currents[:, 2] = 7.0, -4.0
+    found = fit_read_outs([summary_of(replace(drive, inputs=inputs, currents_a=currents))])
+    np.testing.assert_array_equal(found.coefficients[0, 1::3], 0.0)
+    np.testing.assert_allclose(found.coefficients[0, :, 2], 0.0, atol=1e-9)
+    assert found.offset_a[0, 2] == pytest.approx(-4.0, abs=1e-6)
+    assert np.isnan(found.snr_db[0]).tolist() == [False, False, True, False]
+
+
+def test_two_blocks_are_fitted_and_not_judged() -> None:
+    found = fit_read_outs([summary_of(recorded(6, snr_db=20.0, samples=2 * BLOCK).samples, PLAIN)])
+    assert np.isfinite(found.coefficients).all()
+    assert np.isnan(found.snr_db).all()
+    assert not far_below_fleet(found).any()
+
+
+def test_summaries_of_different_banks_are_refused() -> None:
+    drive = recorded(7, snr_db=20.0, samples=3000).samples
+    with pytest.raises(DriveError, match="made with 2 filter banks"):
+        fit_read_outs([summary_of(drive, bank) for bank in (PLAIN, FILTERED)])
+    with pytest.raises(DriveError, match=r"do not fit the bank .*; summarise the drives with this bank"):
+        state_space_model(PLAIN, fit_read_outs([summary_of(drive)]), 0)
+
+
+@pytest.mark.parametrize(
+    ("snr_db", "median_db", "worst_db", "slope"), [(20.0, 40.0, 38.0, 3e-3), (40.0, 54.0, 45.0, 5e-4)]
+)
+def test_vehicles_whose_poles_differ_are_followed_by_the_bank_of_others(
+    snr_db: float, median_db: float, worst_db: float, slope: float
+) -> None:
+    bank = choose_filter_bank([[recorded(j, snr_db=snr_db).samples] for j in range(100, 106)], period_s=PERIOD_S)
+    vehicles = [recorded(j, snr_db=snr_db) for j in range(10)]
+    read_outs = fit_read_outs([summary_of(vehicle.samples, bank) for vehicle in vehicles])
+    unity, slopes, errors_db = drive_inputs(999), [], []
+    for j, vehicle in enumerate(vehicles):
+        models = (vehicle.model, state_space_model(bank, read_outs, j))
+        true, simulated = (model.simulate(unity)[LEAD_IN:] for model in models)
+        centred = true - true.mean(axis=0)
+        slopes.append(np.sum(centred * simulated, axis=0) / np.sum(centred**2, axis=0))
+        errors_db.append(float(simulation_snr_db(true, simulated).min()))
+    assert np.percentile(np.abs(np.concatenate(slopes) - 1.0), 95) < slope
+    assert np.median(errors_db) > median_db
+    assert min(errors_db) > worst_db
+    assert not far_below_fleet(read_outs).any()
+
+
+def test_vehicle_of_other_dynamics_is_noticed_and_no_other() -> None:
+    bank = bank_of(dynamic_vehicle(0, pole_spread=0.0))
+    models = [dynamic_vehicle(j, pole_spread=0.02) for j in range(5)] + [dynamic_vehicle(5, pole_scale=2.5)]
+    drives = [recorded(j, snr_db=30.0, model=model).samples for j, model in enumerate(models)]
+    read_outs = fit_read_outs([summary_of(drive, bank) for drive in drives])
+    assert far_below_fleet(read_outs).tolist() == [False] * 5 + [True]
+
+
+def test_vehicles_without_dynamics_get_the_plain_inputs() -> None:
+    bank = choose_filter_bank(pool([lagging_vehicle()] * 3), period_s=PERIOD_S)
+    assert (bank.poles, bank.input_names) == ((), INPUT_NAMES)
+
+
+def test_one_common_pole_is_found_through_the_noise_and_beside_an_input_that_stands_still() -> None:
+    vehicles = pool([lagging_vehicle(0.95)] * 3, snr_db=20.0)
+    bank = choose_filter_bank(vehicles, period_s=PERIOD_S)
+    ((pole, imag),) = bank.poles
+    assert pole == pytest.approx(0.95, abs=0.002)
+    assert imag == 0.0
+    assert choose_filter_bank(vehicles, period_s=PERIOD_S) == bank
+    for (drive,) in vehicles:
+        drive.inputs[:, 2] = 5.0
+    assert choose_filter_bank(vehicles, period_s=PERIOD_S).poles != ()
+
+
+def test_resonance_that_differs_between_vehicles_is_covered_from_both_sides() -> None:
+    bank = choose_filter_bank(pool([dynamic_vehicle(j) for j in range(4)]), period_s=PERIOD_S)
+    angles = np.angle(bank.complex_poles[bank.complex_poles.imag > 0.0]) / (2.0 * np.pi * PERIOD_S)
+    true = np.sqrt(1.0 - 0.35**2) * 0.5
+    assert angles.min() < true < angles.max()
+    assert bank.settling * PERIOD_S < 4.0 * LONGEST_S
+
+
+def test_drives_by_which_no_bank_can_be_judged_are_refused() -> None:
+    ((short,),) = pool([lagging_vehicle()], samples=400)
+    for drive in (short, replace(short, valid=np.zeros(400, bool))):
+        with pytest.raises(DriveError, match="none of 1 vehicles has three blocks of varied, valid samples"):
+            choose_filter_bank([[drive]], period_s=PERIOD_S)

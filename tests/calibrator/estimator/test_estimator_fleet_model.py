@@ -1,0 +1,113 @@
+"""Fleet model: read-outs, slopes and intercepts of fleets whose faults are known."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrator.artificial.random_fleet import draw_faults
+from calibrator.drive import Array
+from calibrator.estimator.fleet_model import FleetModel, fit_fleet_model, regress_on_fleet
+from calibrator.estimator.moments import stack_summaries
+from calibrator.faults import Faults, slopes_and_intercepts
+from calibrator.summaries.moments import DriveSummary
+from tests.calibrator.estimator.simulated_drives import Conditions, no_faults, read_out_of, summaries_of
+
+K = 3
+
+
+def one_sided_faults(vehicles: int, share: float) -> Faults:
+    """Sensors that read too much, all with the same sign: the mean of the fleet is far from the ideal."""
+    rng = np.random.default_rng(vehicles)
+    faulty = rng.random((2, vehicles, K)) < share
+    size = rng.uniform(0.05, 0.25, size=(2, vehicles, K)) * faulty
+    return replace(no_faults(vehicles, K), drift=size[0], offset_a=400.0 * size[1])
+
+
+def model_of(summaries: Sequence[DriveSummary]) -> FleetModel:
+    return fit_fleet_model(stack_summaries(summaries))
+
+
+def slopes_of(summaries: Sequence[DriveSummary]) -> tuple[Array, Array]:
+    fits = regress_on_fleet(stack_summaries(summaries), model_of(summaries).read_out)
+    a, b = np.stack([fit.estimate for fit in fits], axis=2).transpose(1, 0, 2)
+    return a, b
+
+
+def scaled(summary: DriveSummary, column: int, factor: float) -> DriveSummary:
+    """The same with an input or current in another unit."""
+    scale = np.ones(summary.moments.shape[1])
+    scale[column] = factor
+    return replace(summary, moments=summary.moments * np.outer(scale, scale))
+
+
+def largest_error(model: FleetModel) -> float:
+    """Of the read-outs, relative to each branch's largest."""
+    W = read_out_of(K)
+    return float(np.max(np.abs(model.read_out[:-1] - W) / np.abs(W).max(axis=0)))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_read_outs_are_those_of_faultless_vehicles_however_lopsided_the_faults(share: float) -> None:
+    model = model_of(summaries_of(one_sided_faults(40, share)))
+    assert largest_error(model) < 0.005
+    assert np.abs(model.read_out[-1]).max() < 0.5
+    np.testing.assert_allclose(model.read_out.sum(axis=1), 0.0, atol=1e-9)
+
+
+def test_faulty_majority_of_one_branch_does_not_carry_the_reference_away() -> None:
+    faults = one_sided_faults(60, 0.0)
+    drift = faults.drift.copy()
+    drift[:35, 0] = np.random.default_rng(2).uniform(0.05, 0.25, 35)
+    assert largest_error(model_of(summaries_of(replace(faults, drift=drift)))) < 0.005
+
+
+def test_slopes_and_intercepts_are_those_of_the_faults() -> None:
+    faults = draw_faults(
+        np.random.default_rng(1),
+        vehicles=40,
+        branches=K,
+        sparsity=70.0,
+        magnitude=(0.05, 0.25),
+        full_scale_a=400.0,
+        balanced=True,
+    )
+    a, b = slopes_of(summaries_of(faults, seed=1))
+    slopes, intercepts = slopes_and_intercepts(faults)
+    np.testing.assert_allclose(a, slopes, atol=0.02)
+    np.testing.assert_allclose(b, intercepts, atol=1.0)
+
+
+def test_order_of_vehicles_units_and_copies_of_inputs_do_not_matter() -> None:
+    summaries = list(summaries_of(one_sided_faults(20, 0.3)))
+    plain = model_of(summaries).read_out
+    np.testing.assert_allclose(model_of(summaries[::-1]).read_out, plain, atol=1e-6)
+    other = model_of([scaled(summary, 0, 3.6) for summary in summaries]).read_out
+    np.testing.assert_allclose(other * np.array([[3.6], [1.0], [1.0], [1.0]]), plain, atol=1e-5)
+    columns = [0, 0, *range(1, summaries[0].moments.shape[1])]
+    twice = [replace(summary, moments=summary.moments[:, columns][:, :, columns]) for summary in summaries]
+    np.testing.assert_allclose(slopes_of(twice)[0], slopes_of(summaries)[0], atol=1e-4)
+
+
+def test_branch_that_never_moves_counts_as_faultless_and_unknown() -> None:
+    summaries = summaries_of(no_faults(10, K), Conditions(noise_a=0.0))
+    summaries = [scaled(summary, summary.inputs + 2, 0.0) for summary in summaries]
+    model = model_of(summaries)
+    fit = regress_on_fleet(stack_summaries(summaries[:1]), model.read_out)[2]
+    assert np.isfinite(model.read_out).all()
+    assert fit.estimate[0, 0] == pytest.approx(1.0, abs=0.01)
+    assert fit.sd[0, 0] == pytest.approx(0.4, rel=0.05)
+
+
+def test_one_vehicle_is_its_own_fleet() -> None:
+    a, b = slopes_of(summaries_of(no_faults(1, K), Conditions(noise_a=0.0)))
+    np.testing.assert_allclose(a, 1.0, atol=1e-3)
+    np.testing.assert_allclose(b, 0.0, atol=0.1)
+
+
+def test_vehicle_with_an_input_in_another_unit_does_not_bend_the_model() -> None:
+    summaries = list(summaries_of(no_faults(20, K), seed=4))
+    plain = largest_error(model_of(summaries))
+    summaries[3] = scaled(summaries[3], 0, 1000.0)
+    assert largest_error(model_of(summaries)) < 1.5 * plain + 1e-3

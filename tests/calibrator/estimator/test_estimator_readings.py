@@ -1,0 +1,216 @@
+"""Direct readings: every slip in a table is named, contradictions are named, and nothing is averaged over them."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrator.drives.delays import BranchDelays
+from calibrator.errors import FleetError
+from calibrator.estimator.readings import (
+    BenchReading,
+    BenchTable,
+    Readings,
+    check_bench_table,
+    contradicted_readings,
+    merge_readings,
+    read_bench_table,
+    trust_notices,
+    untrusted_vehicles,
+    with_readings,
+)
+from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows
+from calibrator.summaries.vehicle_summary import VehicleSummary
+from calibrator.summaries.zero_current import ZeroCurrent
+from ecu_node.layout import UnmeasuredLoad
+from tests.calibrator.estimator.simulated_drives import no_faults, summaries_of
+
+VEHICLES, BRANCHES, FULL_SCALE_A = ("V1", "V2"), ("battery", "motor"), 400.0
+HEADER = "vehicle,branch,drift,drift_sd,offset_a,offset_sd_a"
+NAN = np.nan
+
+
+def read(folder: Path, *lines: str) -> BenchTable:
+    path = folder / "bench.csv"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8-sig")
+    return read_bench_table(path, BRANCHES, full_scale_a=FULL_SCALE_A)
+
+
+def check(bench: BenchTable, *trusted: str) -> None:
+    left_out = {"copy": "same recording as V1"}
+    check_bench_table(bench, VEHICLES, left_out=left_out, trusted=trusted, full_scale_a=FULL_SCALE_A)
+
+
+def bench_of(drift: float, drift_sd: float, offset_a: float, offset_sd_a: float, *sensor: str) -> BenchTable:
+    vehicle, branch = sensor or ("V1", "battery")
+    return {(vehicle, branch): BenchReading(drift, drift_sd, offset_a, offset_sd_a, "bench.csv: line 2")}
+
+
+def rows_of(relative: float = 0.0, constant_a: tuple[float, ...] = (0.0,)) -> EvidenceRows:
+    """Vehicles of three branches; the second gain ratio of the first is off, and junction constants are."""
+    N, K = len(constant_a), 3
+    rows = EvidenceRows(
+        relative=np.zeros((N, 3 * K - 1)),
+        constant=np.zeros((N, 2 * K + 1)),
+        covariance=np.tile(1e-6 * np.eye(5 * K), (N, 1, 1)),
+        means=np.zeros((N, 2, K)),
+    )
+    rows.relative[0, K + 1] = relative
+    rows.constant[:, K] = np.array(constant_a) / FULL_SCALE_A
+    return rows
+
+
+def vehicles_that_showed(offset_a: float, sd_a: float) -> list[VehicleSummary]:
+    """Two vehicles; the first battery sensor showed this offset with open contactors."""
+    delays = BranchDelays(branches=BRANCHES, delay_s=np.zeros(2), sd_s=np.zeros(2), known=np.ones(2, bool))
+    shown = {"V1": (offset_a, sd_a), "V2": (NAN, NAN)}
+    return [
+        VehicleSummary(
+            vehicle=name,
+            drives=("d",),
+            summary=summary,
+            delays=delays,
+            zero_current=ZeroCurrent(offset_a=np.array([shown[name][0], NAN]), sd_a=np.array([shown[name][1], NAN])),
+            recorded=frozenset(),
+        )
+        for name, summary in zip(VEHICLES, summaries_of(no_faults(2, 2)), strict=True)
+    ]
+
+
+def test_table_is_read_in_any_order_and_empty_cells_are_not_read(tmp_path: Path) -> None:
+    bench = read(tmp_path, HEADER, "V2, motor, 0.02, 0.001, , ", "", "V1,battery,,,-1.5,0.2")
+    check(bench)
+    readings = Readings.of_bench(bench, VEHICLES, BRANCHES)
+    np.testing.assert_array_equal(readings.drift, [[NAN, NAN], [NAN, 0.02]])
+    np.testing.assert_array_equal(readings.drift_sd, [[NAN, NAN], [NAN, 0.001]])
+    np.testing.assert_array_equal(readings.offset_a, [[-1.5, NAN], [NAN, NAN]])
+    np.testing.assert_array_equal(readings.take_branches([1, 0]).offset_sd_a, [[NAN, 0.2], [NAN, NAN]])
+    other = read(tmp_path, 'branch , vehicle,offset_sd_a,"offset_a"', 'motor,"V1",0.1,3')
+    assert other["V1", "motor"][2:4] == (3.0, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["vehicle;branch;drift"], r"line 1: columns vehicle;branch;drift; expected each of vehicle, branch, drift"),
+        (["vehicle,branch"], r"line 1: columns vehicle, branch; expected"),
+        ([""], r"line 1: columns none; expected"),
+        (["vehicle,branch,drift,drift_sd,drift,drift_sd"], r"line 1: columns .*; expected each of .* once"),
+        ([HEADER], r"no reading below the header; leave --readings out"),
+        ([HEADER, "V3,motor,0,0.1,,"], r"line 2: no vehicle 'V3' in this fleet; known are V1, V2"),
+        ([HEADER, "copy,motor,0.2,0.1,,"], r"line 2: vehicle 'copy' is left out: same recording as V1"),
+        ([HEADER, "V1,engine,0,0.1,,"], r"line 2: no branch 'engine' in this fleet; known are battery, motor"),
+        ([HEADER, "V1"], r"line 2: no branch '' in this fleet"),
+        ([HEADER, "V1,motor,2 %,0.1,,"], r"line 2: drift is '2 %'; expected a number"),
+        ([HEADER, "V1,motor,nan,0.1,,"], r"line 2: drift is 'nan'; expected a number"),
+        ([HEADER, "V1,motor,0.02,,,"], r"line 2: drift_sd is ''; expected a number, and drift together with drift_sd"),
+        ([HEADER, "V1,motor,,,1.0,0"], r"line 2: offset_sd_a is 0; expected a number from 0\.004 to 360: in A"),
+        ([HEADER, "V1,motor,2,0.1,,"], r"line 2: drift is 2; expected a magnitude from 0 to 0\.9: .*2 % is 0\.02"),
+        ([HEADER, "V1,motor,0.2,1,,"], r"line 2: drift_sd is 1; expected a number from 1e-05 to 0\.9"),
+        (["v" * 200_000], r"line \d: not a table of bench readings: field larger than"),
+        ([HEADER, "V1,motor,,,,"], r"line 2: nothing was read"),
+        ([HEADER, "V1,motor,0,0.1,,", "V1,motor,0,0.1,,"], r"line 3: the motor sensor of V1 stands there twice"),
+        ([HEADER, "V1,motor,0,0.1,,,,7"], r"line 2: 8 cells, and the header has 6 columns"),
+    ],
+)
+def test_slip_is_named_with_its_line(tmp_path: Path, lines: list[str], message: str) -> None:
+    with pytest.raises(FleetError, match=message):
+        check(read(tmp_path, *lines))
+
+
+def test_table_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FleetError, match=r"none\.csv: cannot read the bench readings: No such file"):
+        read_bench_table(tmp_path / "none.csv", BRANCHES, full_scale_a=FULL_SCALE_A)
+    binary = tmp_path / "binary.csv"
+    binary.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FleetError, match=r"not UTF-8 text"):
+        read_bench_table(binary, BRANCHES, full_scale_a=FULL_SCALE_A)
+
+
+@pytest.mark.parametrize("reading", [(0.05, 0.002, NAN, NAN), (NAN, NAN, 3.0, 0.2)])
+def test_trusted_vehicle_that_was_read_as_faulty_is_refused(reading: tuple[float, float, float, float]) -> None:
+    bench = bench_of(*reading)
+    with pytest.raises(FleetError, match=r"line 2: the battery sensor of V1 was read as faulty, and V1 is trusted"):
+        check(bench, "V1")
+    check(bench, "V2")
+    check(bench_of(0.001, 0.002, 0.1, 0.2), "V1")
+
+
+def test_window_and_reading_that_agree_count_together() -> None:
+    bench = {**bench_of(NAN, NAN, 5.1, 0.1), **bench_of(0.02, 0.001, NAN, NAN, "V2", "motor")}
+    readings, notices = merge_readings(vehicles_that_showed(4.9, 0.1), bench, BRANCHES)
+    assert notices == []
+    assert readings.offset_a[0, 0] == pytest.approx(5.0)
+    assert readings.offset_sd_a[0, 0] == pytest.approx(0.1 / np.sqrt(2.0))
+    assert readings.drift[1, 1] == pytest.approx(0.02)
+
+
+def test_of_window_and_reading_that_contradict_each_other_neither_is_used() -> None:
+    bench = {**bench_of(0.03, 0.001, -5.0, 0.1), **bench_of(0.02, 0.001, NAN, NAN, "gone", "motor")}
+    readings, notices = merge_readings(vehicles_that_showed(5.0, 0.1), bench, BRANCHES)
+    assert np.isnan(readings.offset_a[0, 0])
+    assert np.isnan(readings.offset_sd_a[0, 0])
+    assert readings.drift[0, 0] == pytest.approx(0.03)
+    assert notices[0].startswith("vehicle V1: its battery sensor was read as -5.0 A on the bench, and showed +5.0 A")
+    assert notices[1] == "bench readings of vehicles that are left out are not used: gone"
+
+
+def test_readings_become_rows_and_what_was_not_read_stays_unknown() -> None:
+    rows = rows_of(0.1, (1.0, 2.0))
+    trusted = Readings.of_trusted(np.array([False, True]), 3, FULL_SCALE_A)
+    one = replace(trusted, drift=trusted.drift.copy(), drift_sd=trusted.drift_sd.copy())
+    one.drift[0, 1], one.drift_sd[0, 1] = 0.25, 0.01
+    found = with_readings(rows, one, full_scale_a=FULL_SCALE_A)
+    variance = np.diagonal(found.covariance, axis1=1, axis2=2)
+    assert found.relative[0, 5:] == pytest.approx([0.0, np.log(1.25), 0.0])
+    assert variance[0, 5:8] == pytest.approx([UNKNOWN_VARIANCE, (0.01 / 1.25) ** 2, UNKNOWN_VARIANCE])
+    assert (variance[0, 12:] == UNKNOWN_VARIANCE).all()
+    assert np.sqrt(variance[1, 12:]) == pytest.approx(0.0005)
+    np.testing.assert_array_equal(found.relative[:, :5], rows.relative[:, :5])
+    np.testing.assert_array_equal(found.covariance[:, 8:12, :12], rows.covariance[:, 8:12, :12])
+
+
+def test_reading_far_from_every_explanation_contradicts_the_drives() -> None:
+    explained = {
+        "weight": np.array([[0.7, 0.3]]),
+        "drift": np.array([[[0.0, 0.0], [0.1, 0.0]]]),
+        "drift_sd": np.full((1, 2, 2), 0.002),
+        "offset_a": np.array([[[5.0, 0.0], [0.0, 0.0]]]),
+        "offset_sd_a": np.full((1, 2, 2), 0.5),
+    }
+
+    def found(drift: float, offset_a: float = NAN) -> dict[tuple[str, str], str]:
+        bench = bench_of(drift, 0.002, offset_a, 0.2 + 0.0 * offset_a)
+        return contradicted_readings(bench, ["V1"], BRANCHES, **explained)
+
+    assert found(0.1) == found(0.1, 0.5) == {}
+    assert list(found(-0.1)) == [("V1", "battery")]
+    assert "bench reading of its battery sensor is not what its drives show" in found(0.1, 5.0)["V1", "battery"]
+    assert contradicted_readings(bench_of(-0.1, 0.002, NAN, NAN), ["V2"], BRANCHES, **explained) == {}
+
+
+@pytest.mark.parametrize("others_a", [0.0, 5.0, -12.0])
+def test_trusted_vehicle_that_breaks_the_junction_law_is_found_whatever_others_have(others_a: float) -> None:
+    names = (*BRANCHES, "auxiliary")
+    rows = rows_of(0.05, (0.0, 0.0, 3.0, -9.0, others_a))
+    found = untrusted_vehicles(rows, np.arange(5) < 4, names, full_scale_a=FULL_SCALE_A)
+    assert list(found) == [0, 3]
+    assert re.match(r"the gains of its sensors auxiliary and battery differ by \+5\.0%", found[0])
+    assert found[3] == "its currents sum to -9.0 A on average, which no load without a sensor explains"
+    load = UnmeasuredLoad(mean_a=3.0, sd_a=0.1)
+    declared = untrusted_vehicles(rows, np.arange(5) < 3, names, full_scale_a=FULL_SCALE_A, load=load)
+    assert list(declared) == [0, 1]
+    assert "which the declared load of 3 A does not explain" in declared[1]
+
+
+def test_notices_name_trusted_vehicles_that_do_not_carry_the_reference() -> None:
+    vehicles, both = vehicles_that_showed(5.0, 0.1), np.ones(2, bool)
+    texts = trust_notices(vehicles, both, BRANCHES, untrusted={0: "it leaks"}, differing=[1], full_scale_a=FULL_SCALE_A)
+    assert texts[0] == "only 0 of the trusted vehicles can carry the reference, 3 are needed: it is the fleet's"
+    assert texts[1] == "vehicle V1 is not trusted: it leaks; check it again"
+    assert texts[2].startswith("trusted vehicle V2 does not carry the reference: it differs from the other trusted")
+    assert texts[3].startswith("trusted vehicle V1: its battery sensor showed +5.0 A with open contactors")
+    nothing = trust_notices(vehicles, ~both, BRANCHES, untrusted={}, differing=[], full_scale_a=FULL_SCALE_A)
+    assert nothing == []

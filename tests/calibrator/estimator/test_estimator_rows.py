@@ -1,0 +1,205 @@
+"""Evidence rows: the faults that they state are those that the vehicles have, within their covariance."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrator.artificial.random_fleet import draw_faults
+from calibrator.drive import Array
+from calibrator.errors import FleetError
+from calibrator.estimator.fleet_model import FleetModel, fit_fleet_model
+from calibrator.estimator.moments import stack_summaries
+from calibrator.estimator.rows import (
+    UNKNOWN_VARIANCE,
+    EvidenceRows,
+    collect_rows,
+    constant_design,
+    evidence_names,
+    relative_design,
+)
+from calibrator.faults import Faults
+from calibrator.summaries.moments import DriveSummary
+from tests.calibrator.estimator.simulated_drives import Conditions, no_faults, read_out_of, summaries_of
+
+K, FULL_SCALE_A = 3, 400.0
+MEASURED = [*range(2 * K - 1), *range(3 * K - 1, 4 * K)]
+"""Rows that drives show; the others are readings."""
+TRUE_MODEL = FleetModel(read_out=np.vstack([read_out_of(K), np.zeros(K)]))
+BRANCHES = pytest.mark.parametrize("branches", [2, 3, 5])
+
+
+def random_faults(seed: int, vehicles: int) -> Faults:
+    return draw_faults(
+        np.random.default_rng(seed),
+        vehicles=vehicles,
+        branches=K,
+        sparsity=70.0,
+        magnitude=(0.05, 0.25),
+        full_scale_a=FULL_SCALE_A,
+        balanced=True,
+    )
+
+
+def rows_of(
+    summaries: Sequence[DriveSummary], model: FleetModel = TRUE_MODEL, scale_a: float = FULL_SCALE_A
+) -> EvidenceRows:
+    return collect_rows(stack_summaries(summaries), model, full_scale_a=scale_a)[0]
+
+
+def errors(rows: EvidenceRows, faults: Faults) -> Array:
+    """Rows less what they are without error, as seen in true currents, shape (N, 5K)."""
+    parameters = np.column_stack([faults.hardware_drift, faults.drift])
+    omega = faults.offset_a / (1.0 + faults.drift)
+    constant = np.concatenate([faults.hardware_offset_a[:, :-1], omega], axis=1) / FULL_SCALE_A
+    relative = rows.relative - np.log1p(parameters) @ relative_design(K).T
+    seen = rows.constant_seen(parameters[:, None], relative[:, None])[:, 0]
+    return np.concatenate([relative, seen - constant @ constant_design(K).T], axis=1)
+
+
+@pytest.mark.parametrize(
+    "conditions", [Conditions(), Conditions(noise_a=1.0, memory=0.8), Conditions(model_error_a=1.0)]
+)
+def test_standardised_errors_are_standard_normal(conditions: Conditions) -> None:
+    faults = random_faults(1, 150)
+    rows = rows_of(summaries_of(faults, conditions, seed=1))
+    L = np.linalg.cholesky(rows.covariance[:, MEASURED][:, :, MEASURED])
+    z = np.linalg.solve(L, errors(rows, faults)[:, MEASURED, None])[..., 0]
+    rms = np.sqrt(np.mean(z**2, axis=0))
+    assert 0.75 < np.sqrt(np.mean(z**2)) < 1.25, rms
+    # The last, the junction constant, is the sum of the intercepts but for rounding: stated too wide, others are not.
+    assert ((rms[:-1] > 0.35) & (rms[:-1] < 1.45)).all(), rms
+    assert 0.15 < rms[-1] < 1.45, rms
+    assert (np.abs(z.mean(axis=0)) < 0.45).all(), z.mean(axis=0)
+
+
+def test_rows_are_as_right_over_the_model_learnt_from_the_fleet() -> None:
+    faults = random_faults(2, 100)
+    summaries = summaries_of(faults, seed=2)
+    error = errors(rows_of(summaries, fit_fleet_model(stack_summaries(summaries))), faults)[:, MEASURED]
+    assert np.abs(np.median(error[:, : 2 * K - 1], axis=0)).max() < 0.003
+    assert np.abs(np.median(error[:, 2 * K - 1 :], axis=0)).max() < 0.002
+    assert np.abs(error).max() < 0.05
+
+
+def test_full_scale_is_only_the_unit_of_the_constant_rows() -> None:
+    summaries = summaries_of(random_faults(3, 10), seed=3)
+    plain, half = (rows_of(summaries, scale_a=scale) for scale in (400.0, 200.0))
+    np.testing.assert_allclose(half.relative, plain.relative)
+    np.testing.assert_allclose(half.constant, 2.0 * plain.constant)
+
+
+def test_one_vehicle_with_the_fleet_s_correlation_is_as_among_the_fleet() -> None:
+    fleet = stack_summaries(summaries := summaries_of(random_faults(3, 10), seed=3))
+    rows, usual = collect_rows(fleet, TRUE_MODEL, full_scale_a=FULL_SCALE_A)
+    alone, _ = collect_rows(
+        stack_summaries(summaries[4:5]), TRUE_MODEL, full_scale_a=FULL_SCALE_A, usual_correlation=usual
+    )
+    for name, values in vars(rows.take(slice(4, 5))).items():
+        np.testing.assert_allclose(getattr(alone, name), values, rtol=1e-12, err_msg=name)
+
+
+def test_twice_the_driving_halves_the_variance() -> None:
+    once, twice = (
+        rows_of(summaries_of(no_faults(40, K), Conditions(samples=samples, noise_a=3.0))) for samples in (1800, 3600)
+    )
+    variances = [np.median(np.einsum("nrr->nr", rows.covariance)[:, MEASURED], axis=0) for rows in (once, twice)]
+    np.testing.assert_allclose(variances[1] / variances[0], 0.5, atol=0.12)
+
+
+def test_readings_and_reversed_branches_are_unknown() -> None:
+    faults = no_faults(4, K)
+    faults.drift[2, 1] = -2.0
+    rows = rows_of(summaries_of(faults))
+    assert rows.known[0].tolist() == [row in MEASURED for row in range(5 * K)]
+    assert np.flatnonzero(rows.known[0] != rows.known[2]).tolist() == [1, K]
+    assert rows.covariance[2, 1, 1] == pytest.approx(UNKNOWN_VARIANCE)
+    assert (rows.values[~rows.known] == 0.0).all()
+
+
+def test_covariances_are_positive_definite_with_few_blocks() -> None:
+    rows = rows_of(summaries_of(random_faults(5, 6), Conditions(samples=90), seed=5))
+    assert (np.linalg.eigvalsh(rows.covariance) > 0.0).all()
+
+
+@BRANCHES
+def test_designs_are_logarithms_and_true_currents_of_what_is_measured(branches: int) -> None:
+    rng = np.random.default_rng(branches)
+    d, o, o_h = rng.uniform(-0.2, 0.2, (3, branches))
+    d_h, o_h = 0.1, o_h - o_h.mean()
+    slopes, ratios = (1.0 + d) * (1.0 + d_h), (1.0 + d[0]) / (1.0 + d[1:])
+    relative = relative_design(branches) @ np.log1p(np.append(d_h, d))
+    np.testing.assert_allclose(relative, np.log(np.concatenate([slopes, ratios, 1.0 + d])), atol=1e-12)
+    b, c = (1.0 + d) * o_h + o, (1.0 + d[0]) * np.sum(o / (1.0 + d))
+    constant = constant_design(branches) @ np.append(o_h[:-1], o / (1.0 + d))
+    expected = np.concatenate([b / (1.0 + d), [c / (1.0 + d[0])], o / (1.0 + d)])
+    np.testing.assert_allclose(constant, expected, atol=1e-12)
+    assert len(evidence_names([f"{k}" for k in range(branches)])) == len(relative) + len(constant)
+
+
+@BRANCHES
+def test_constants_pivot_with_their_ratios_about_the_means(branches: int) -> None:
+    """Given the truth the constants are exact but for what is linear in the errors of slopes and gain ratios."""
+    n, rng = branches, np.random.default_rng(branches)
+    d_h, d, o, o_h, true = 0.1, *rng.uniform(-0.2, 0.2, (4, n))
+    o_h, true = o_h - o_h.mean(), true - true.mean()
+    measured = (1.0 + d) * ((1.0 + d_h) * true + o_h) + o
+    exact = relative_design(n) @ np.log1p(np.append(d_h, d))
+    expected = np.append(o_h + o / (1.0 + d), np.sum(o / (1.0 + d)))
+
+    def off(error: Array) -> Array:
+        """Constants as seen less what they are, for errors of the ratios."""
+        relative = exact + np.append(error, np.zeros(n))
+        b = measured - np.exp(relative[:n]) * true
+        c = measured[0] + np.exp(relative[n : 2 * n - 1]) @ measured[1:]
+        rows = EvidenceRows(
+            relative=relative[None],
+            constant=np.concatenate([b, [c], np.zeros(n)])[None],
+            covariance=np.eye(5 * n)[None],
+            means=np.stack([true, measured])[None],
+        )
+        seen = rows.constant_seen(np.append(d_h, d)[None, None], (relative - exact)[None, None])
+        return np.asarray(seen[0, 0, : n + 1] - expected)
+
+    np.testing.assert_allclose(off(np.zeros(2 * n - 1)), 0.0, atol=1e-12)
+    slope_error, ratio_error = rng.normal(0.0, 0.3, (2, 2 * n - 1))
+    slope_error[n:], ratio_error[:n] = 0.0, 0.0
+    # What is linear turns the intercepts by -f, and the constant by the measured currents over 1 + d, about 1 / a.
+    np.testing.assert_allclose(off(slope_error), np.append(-true * slope_error[:n], 0.0), atol=1e-12)
+    turned = np.sum(measured[1:] * np.exp(-exact[1:n]) * ratio_error[n:])
+    np.testing.assert_allclose(off(ratio_error), np.append(np.zeros(n), turned), atol=1e-12)
+
+
+def test_dispersion_widens_intercepts_at_their_means_alone_and_a_load_the_constant() -> None:
+    rows = rows_of(summaries_of(random_faults(3, 10), seed=3))
+    whole, added = rows.dispersed(np.array([4.0, 1.0, 1.0]))
+    b = slice(3 * K - 1, 4 * K - 1)
+    np.testing.assert_allclose(whole[:, b, b] - rows.covariance[:, b, b], added, atol=1e-15)
+    np.testing.assert_allclose(added[:, 0, 0], 3.0 * rows.intercept_covariance()[:, 0, 0])
+    assert not added[:, 1:].any()
+    wider = rows.with_load_spread(0.01).covariance - rows.covariance
+    np.testing.assert_allclose(wider[:, 4 * K - 1, 4 * K - 1], 1e-4)
+    assert np.count_nonzero(wider) == len(rows)
+
+
+def test_intercepts_at_the_means_do_not_depend_on_the_slopes() -> None:
+    model, own = np.array([0.3, -0.2, -0.1]), np.diag([4e-6, 9e-6, 1e-6]) + 1e-6
+    pivot, at_means = np.eye(5 * K), np.diag(np.full(5 * K, 1e-4))
+    pivot[range(3 * K - 1, 4 * K - 1), range(K)] = -model
+    at_means[3 * K - 1 : 4 * K - 1, 3 * K - 1 : 4 * K - 1] = own
+    rows = EvidenceRows(
+        relative=np.zeros((1, 3 * K - 1)),
+        constant=np.zeros((1, 2 * K + 1)),
+        covariance=(pivot @ at_means @ pivot.T)[None],
+        means=np.stack([model, np.zeros(K)])[None],
+    )
+    np.testing.assert_allclose(rows.intercept_covariance()[0], own, atol=1e-18)
+
+
+def test_rows_that_do_not_fit_or_are_not_finite_are_refused() -> None:
+    rows = rows_of(summaries_of(no_faults(2, K)))
+    with pytest.raises(FleetError, match=r"evidence of shapes \(2, 8\), \(1, 7\), .* expected relative rows of shape"):
+        replace(rows, constant=rows.constant[:1])
+    with pytest.raises(FleetError, match="evidence is not finite; leave out"):
+        replace(rows, covariance=rows.covariance + np.inf)

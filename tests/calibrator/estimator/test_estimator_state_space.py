@@ -1,0 +1,210 @@
+"""State-space models and their identification: known systems are found through noise, bad drives are refused."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from calibrator.drive import Array, Mask
+from calibrator.errors import DriveError
+from calibrator.estimator.state_space import (
+    StateSpaceModel,
+    _lagged_moments,
+    choose_order,
+    identify,
+    pooled_poles,
+    simulation_snr_db,
+)
+
+SAMPLES, INPUTS, BRANCHES = 12_000, 5, 4
+TRAIN = 9_600
+A_OF_KIND = {
+    "real poles": np.array([[0.5, 0.2], [0.0, 0.9]]),
+    "complex pair": np.array([[0.8, -0.3], [0.3, 0.8]]),
+    "no separate modes": np.array([[0.9, 1.0, 0.0], [0.0, 0.9, 1.0], [0.0, 0.0, 0.9]]),
+    "static": np.zeros((0, 0)),
+}
+
+
+def model_with(A: Array, inputs: int = INPUTS, seed: int = 0) -> StateSpaceModel:
+    rng = np.random.default_rng(seed)
+    n = len(A)
+    return StateSpaceModel(
+        A=A,
+        B=0.3 * rng.normal(size=(n, inputs)),
+        C=rng.normal(size=(BRANCHES, n)),
+        D=rng.normal(size=(BRANCHES, inputs)),
+        x0=rng.normal(size=n),
+        offset_a=np.array([5.0, -3.0, 0.0, 1.0]),
+        snr_db=np.full(BRANCHES, np.inf),
+    )
+
+
+def true_system(order: int, seed: int) -> StateSpaceModel:
+    """Oscillating modes of 0.5 to 5 s at 10 Hz with random couplings."""
+    rng = np.random.default_rng(seed)
+    A = np.zeros((order, order))
+    for k in range(0, order, 2):
+        radius, angle = rng.uniform(0.8, 0.98), rng.uniform(0.05, 0.6)
+        cos, sin = radius * np.cos(angle), radius * np.sin(angle)
+        A[k : k + 2, k : k + 2] = [[cos, -sin], [sin, cos]]
+    return model_with(A, seed=seed)
+
+
+def smooth_inputs(seed: int, samples: int = SAMPLES) -> Array:
+    noise = np.random.default_rng(seed).normal(size=(samples, INPUTS))
+    return np.asarray(3.0 * lfilter([0.1], [1.0, -0.9], noise, axis=0) + 2.0)
+
+
+def recording(order: int, snr_db: float, seed: int) -> tuple[Array, Array, Array]:
+    """Inputs, noise-free currents, and currents with white noise."""
+    truth = true_system(order, seed)
+    inputs = smooth_inputs(seed + 100)
+    clean = truth.simulate(inputs, initial_state=truth.x0)
+    noise = np.random.default_rng(seed + 200).normal(size=clean.shape)
+    return inputs, clean, clean + noise * clean.std(axis=0) * 10.0 ** (-snr_db / 20.0)
+
+
+@pytest.mark.parametrize("kind", A_OF_KIND)
+def test_simulation_follows_the_equations_and_starts_in_steady_state(kind: str) -> None:
+    model, expected = model_with(A_OF_KIND[kind], 2), []
+    inputs, x = np.random.default_rng(1).normal(size=(50, 2)), model.x0
+    for u in inputs:
+        expected.append(model.C @ x + model.D @ u + model.offset_a)
+        x = model.A @ x + model.B @ u
+    np.testing.assert_allclose(model.simulate(inputs, initial_state=model.x0), expected, atol=1e-10)
+    still = model.simulate(np.tile([1.0, -2.0], (40, 1)))
+    np.testing.assert_allclose(still, still[:1].repeat(40, axis=0), atol=1e-10)
+    assert model.simulate(np.empty((0, 2))).shape == (0, BRANCHES)
+
+
+def test_snr_is_infinite_for_an_exact_and_nan_for_a_constant_channel() -> None:
+    measured = np.column_stack([np.arange(10.0), np.full(10, 4.0), np.arange(10.0)])
+    snr_db = simulation_snr_db(measured, measured + np.array([0.0, 1.0, 0.1]))
+    assert np.isposinf(snr_db[0])
+    assert np.isnan(snr_db[1])
+    assert snr_db[2] == pytest.approx(10.0 * np.log10(8.25 / 0.01))
+
+
+def test_inputs_that_cannot_be_simulated_are_refused() -> None:
+    model, inputs = model_with(A_OF_KIND["real poles"], 2), np.zeros((5, 2))
+    with pytest.raises(DriveError, match=r"has 2 inputs, the drive to simulate has shape \(5, 3\)"):
+        model.simulate(np.zeros((5, 3)))
+    inputs[3, 1] = np.inf
+    with pytest.raises(DriveError, match="1 of 5 samples are not finite, the first is sample 3"):
+        model.simulate(inputs)
+
+
+@pytest.mark.parametrize("order", [4, 6])
+@pytest.mark.parametrize(("snr_db", "least_db", "slope"), [(20, 40, 0.006), (40, 60, 0.0006)])
+def test_known_system_is_found_through_noise(order: int, snr_db: float, least_db: float, slope: float) -> None:
+    for seed in range(3):
+        inputs, clean, noisy = recording(order, snr_db, seed)
+        model = identify(inputs[:TRAIN], noisy[:TRAIN], order=order)
+        simulated = model.simulate(inputs, initial_state=model.x0)[TRAIN:]
+        centred = clean[TRAIN:] - clean[TRAIN:].mean(axis=0)
+        slopes = np.sum(centred * simulated, axis=0) / np.sum(centred**2, axis=0)
+        assert simulation_snr_db(clean[TRAIN:], simulated).min() > least_db
+        assert np.abs(slopes - 1.0).max() < slope
+
+
+def test_noise_free_system_is_found_to_rounding() -> None:
+    inputs, clean, _ = recording(4, 20, 0)
+    model, truth = identify(inputs, clean, order=4), true_system(4, 0)
+    np.testing.assert_allclose(model.simulate(inputs, initial_state=model.x0), clean, atol=1e-5)
+    poles = [np.sort_complex(np.linalg.eigvals(each.A)) for each in (model, truth)]
+    np.testing.assert_allclose(poles[0], poles[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("order", [4, 6])
+def test_order_is_chosen_as_the_system_has_it_and_the_snr_is_that_of_the_simulation(order: int) -> None:
+    inputs, _, noisy = recording(order, 30, 2)
+    assert choose_order(inputs, noisy) == order
+    model = identify(inputs, noisy, order=order)
+    simulated = model.simulate(inputs, initial_state=model.x0)
+    np.testing.assert_allclose(model.snr_db, simulation_snr_db(noisy, simulated), atol=1e-3)
+
+
+def test_static_system_has_order_zero_and_its_gains() -> None:
+    inputs, gains = smooth_inputs(3), np.random.default_rng(3).normal(size=(BRANCHES, INPUTS))
+    noise = 0.1 * np.random.default_rng(4).normal(size=(SAMPLES, BRANCHES))
+    model = identify(inputs, inputs @ gains.T + 7.0 + noise)
+    assert model.order == 0
+    np.testing.assert_allclose(model.D, gains, atol=0.01)
+    np.testing.assert_allclose(model.offset_a, 7.0, atol=0.05)
+
+
+def test_units_and_zeros_of_inputs_and_currents_pass_through() -> None:
+    inputs, _, noisy = recording(4, 20, 5)
+    scale, shift = np.array([1.2, -1.0, 0.8, 1000.0]), np.array([30.0, 0.0, -5.0, 1.0])
+    changed_inputs = np.array([1e3, 1.0, 1e-3, 5.0, -1.0]) * inputs + 10.0
+    plain, changed = identify(inputs, noisy, order=4), identify(changed_inputs, scale * noisy + shift, order=4)
+    expected = scale * plain.simulate(inputs) + shift
+    np.testing.assert_allclose(changed.simulate(changed_inputs), expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(changed.snr_db, plain.snr_db, atol=1e-6)
+
+
+def test_constant_equal_and_hardly_moving_inputs_and_a_dead_current_do_no_harm() -> None:
+    inputs, _, noisy = recording(4, 30, 7)
+    blip = np.zeros(SAMPLES)
+    blip[0] = 1.0  # as an air conditioning that was being switched off
+    inputs = np.column_stack([inputs, inputs[:, 0], np.full(SAMPLES, 12.0), np.zeros(SAMPLES), blip])
+    model = identify(inputs, np.column_stack([noisy, np.zeros(SAMPLES)]), order=4)
+    simulated = model.simulate(inputs, initial_state=model.x0)
+    assert simulation_snr_db(noisy, simulated[:, :BRANCHES]).min() > 29.0
+    np.testing.assert_allclose(simulated[:, BRANCHES], 0.0, atol=1e-6)
+    assert np.isnan(model.snr_db[BRANCHES])
+
+
+def test_samples_outside_the_mask_are_not_used() -> None:
+    inputs, clean, noisy = recording(4, 30, 8)
+    valid = (np.arange(SAMPLES) + 100) % 1000 >= 7
+    spoilt_inputs, spoilt = np.where(valid[:, None], inputs, np.nan), np.where(valid[:, None], noisy, np.nan)
+    model = identify(spoilt_inputs, spoilt, order=4, valid=valid)
+    assert simulation_snr_db(clean, model.simulate(inputs, initial_state=model.x0)).min() > 40.0
+
+
+@pytest.mark.parametrize("growth", [1.004, 1.0])
+def test_growth_and_pure_noise_give_stable_models(growth: float) -> None:
+    inputs, noise = smooth_inputs(9, 2000), np.random.default_rng(10).normal(size=(2000, 2))
+    currents = noise if growth == 1.0 else growth ** np.arange(2000.0)[:, None] * [1.0, -1.0] + inputs[:, :2]
+    for order in (1, 2, 4, 8):
+        model = identify(inputs, currents, order=order)
+        assert np.abs(np.linalg.eigvals(model.A)).max() < 1.0
+        assert np.isfinite(model.simulate(inputs)).all()
+
+
+def test_vehicles_together_have_the_poles_of_their_system() -> None:
+    drives = []
+    for seed in range(3):
+        inputs, truth = smooth_inputs(seed, 4000), true_system(2, 0)
+        noise = np.random.default_rng(seed).normal(size=(4000, BRANCHES))
+        drives.append((inputs, truth.simulate(inputs) + 0.1 * noise, np.ones(4000, bool)))
+    (poles,) = pooled_poles(drives, [2], branches=BRANCHES)
+    true = np.linalg.eigvals(true_system(2, 0).A)
+    assert poles == pytest.approx(true[true.imag > 0.0], abs=2e-3)
+
+
+def test_drives_that_cannot_be_used_are_refused() -> None:
+    inputs, _, noisy = recording(4, 20, 0)
+    with pytest.raises(DriveError, match=r"30 valid samples are too few .* at least 360 .* longer drive"):
+        identify(inputs[:30], noisy[:30], order=4)
+    with pytest.raises(DriveError, match=r"only 0 stretches of 20 valid samples"):
+        identify(inputs, noisy, order=4, valid=np.arange(SAMPLES) % 10 != 0)
+    with pytest.raises(DriveError, match="no valid sample in the last 2400 of 12000: cannot compare orders"):
+        identify(inputs, noisy, valid=np.arange(SAMPLES) < 9000)
+    with pytest.raises(DriveError, match="do not belong together"):
+        identify(inputs[:-1], noisy, order=4)
+    noisy[1234, 2] = np.nan
+    with pytest.raises(DriveError, match=r"1 of 12000 valid samples are not finite, the first is sample 1234"):
+        identify(inputs, noisy, order=4)
+
+
+@pytest.mark.parametrize(("lags", "valid"), [(6, np.random.default_rng(0).random(200) > 0.03), (1, np.ones(200, bool))])
+def test_moments_of_lagged_data_equal_those_of_its_rows_across_gaps(lags: int, valid: Mask) -> None:
+    z = np.random.default_rng(0).normal(size=(200, 3)) + 5.0
+    z[~valid] = np.nan
+    starts = [t for t in range(len(z) - lags + 1) if valid[t : t + lags].all()]
+    rows = np.array([z[t : t + lags].ravel() for t in starts])
+    gram, count = _lagged_moments(z, lags, valid)
+    assert count == len(rows)
+    np.testing.assert_allclose(gram, (rows - rows.mean(axis=0)).T @ (rows - rows.mean(axis=0)), atol=1e-9)

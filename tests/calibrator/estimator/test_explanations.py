@@ -1,0 +1,239 @@
+"""Explanations of a vehicle: residuals follow the equations of the rows, fits those of dense linear algebra."""
+
+import numpy as np
+import pytest
+
+from calibrator.drive import Array
+from calibrator.estimator.explanations import WIDE_SD, Evidence, Fits, fit_explanations, row_residuals
+from calibrator.estimator.prior import first_prior
+from calibrator.estimator.rows import EvidenceRows
+from calibrator.faults import Faults
+from tests.calibrator.estimator.simulated_rows import (
+    Errors,
+    all_supports,
+    dense_fit,
+    parameters_of,
+    plain_evidence,
+    plain_residual,
+    random_faults,
+    rows_of,
+)
+
+BRANCHES = pytest.mark.parametrize("K", [2, 3, 4])
+LOG_LOAD = -4.0
+READ = Errors(gain_read=0.01, offset_read=0.001)
+"""Every row says something."""
+
+
+def fitted(evidence: Evidence) -> Fits:
+    K = evidence.values.shape[1] // 5
+    return fit_explanations(evidence, first_prior(K).log_supports, LOG_LOAD)
+
+
+def supports(fits: Fits, vehicle: int) -> list[tuple[int, ...]]:
+    return [tuple(np.flatnonzero(row).tolist()) for row in fits.support[vehicle, : fits.number[vehicle]]]
+
+
+def random_parameters(seed: int, shape: tuple[int, ...], K: int) -> Array:
+    return np.random.default_rng(seed).uniform(-0.3, 0.3, (*shape, 3 * K + 1))
+
+
+@BRANCHES
+def test_true_parameters_leave_nothing_of_rows_without_noise(K: int) -> None:
+    faults, load = random_faults(K, vehicles=30, branches=K, sparsity=50.0), np.linspace(0.0, 0.03, 30)
+    rows = rows_of(faults, errors=READ, noise=0.0, load=load)
+    left = row_residuals(plain_evidence(rows), parameters_of(faults, load)[:, None])
+    np.testing.assert_allclose(left, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("of_sensor", [False, True])
+@BRANCHES
+def test_what_all_sensors_share_leaves_nothing_either(K: int, of_sensor: bool) -> None:
+    """Offset and gain of every sensor of a branch beside the vehicle's own; what a group shares is offset or load."""
+    own = random_faults(K, vehicles=20, branches=K, sparsity=50.0)
+    group = np.where(np.arange(20) % 2 == 0, 0.02, 0.0)
+    shared, centre = np.zeros(2 * K + 1), np.zeros(5 * K)
+    shared[0], shared[K - 1], shared[K], shared[2 * K - 1], shared[-1] = 0.03, -0.01, 0.05, -0.04, of_sensor
+    centre[3 * K - 1 : 4 * K - 1], centre[4 * K - 1] = shared[:K], shared[:K].sum()
+    offset = own.offset_a + shared[:K]
+    offset[:, 0] += group * of_sensor
+    both = Faults(
+        hardware_drift=own.hardware_drift,
+        hardware_offset_a=own.hardware_offset_a,
+        drift=(1.0 + own.drift) * np.exp(shared[K : 2 * K]) - 1.0,
+        offset_a=offset,
+    )
+    theta = parameters_of(own, group)
+    theta[:, 2 * K : 3 * K] = own.offset_a / (1.0 + both.drift)
+    rows = rows_of(both, noise=0.0, load=0.0 if of_sensor else group)
+    left = row_residuals(plain_evidence(rows, centre=centre, shared=shared), theta[:, None])[:, 0]
+    np.testing.assert_allclose(left[rows.known], 0.0, atol=1e-12)
+
+
+@BRANCHES
+def test_residuals_are_those_of_the_equations_of_the_rows(K: int) -> None:
+    rows = rows_of(random_faults(K, vehicles=8, branches=K, sparsity=50.0), seed=K, errors=READ)
+    theta = random_parameters(K, (8, 5), K)
+    left = row_residuals(plain_evidence(rows), theta)
+    for j in range(len(rows)):
+        np.testing.assert_allclose(left[j], plain_residual(rows.take(slice(j, j + 1)), theta[j]), atol=1e-13)
+
+
+@pytest.mark.parametrize("of_sensor", [False, True])
+@BRANCHES
+def test_fits_are_stationary_and_their_covariance_that_of_the_slopes_there(K: int, of_sensor: bool) -> None:
+    """Numerical derivatives of the residuals against the design, with everything that sensors can share."""
+    rows = rows_of(random_faults(K, vehicles=6, branches=K, sparsity=60.0), seed=K, load=0.01)
+    shared = np.append(np.linspace(-0.003, 0.004, 2 * K), of_sensor)
+    evidence = plain_evidence(rows, centre=np.linspace(-0.002, 0.003, 5 * K), shared=shared)
+    fits, P, step = fitted(evidence), 3 * K + 1, 1e-6
+    for j in range(len(rows)):
+        likely = fits.log_evidence[j] > fits.log_evidence[j].max() - 8.0
+        q = int(np.argmax(fits.support[j].sum(axis=1) * likely))  # of the likely ones that with most parameters
+        on, theta, root = np.flatnonzero(fits.support[j, q]), fits.theta[j, q], fits.root[j, q]
+        around = theta + step * np.concatenate([[np.zeros(P)], np.eye(P)[on], -np.eye(P)[on]])
+        left = row_residuals(evidence, np.repeat(around[None], len(rows), axis=0))[j]
+        slopes = (left[1 + len(on) :] - left[1 : 1 + len(on)]) / (2.0 * step)
+        covariance = np.linalg.inv(slopes @ evidence.precision[j] @ slopes.T + np.eye(len(on)) / WIDE_SD**2)
+        pull = covariance @ (slopes @ evidence.precision[j] @ left[0] - theta[on] / WIDE_SD**2)
+        assert (np.abs(pull) < 1e-3 * np.sqrt(np.diag(covariance))).all()
+        np.testing.assert_allclose((root @ root.T)[np.ix_(on, on)], covariance, rtol=1e-3, atol=1e-9)
+        assert not np.delete(theta, on).any()
+        assert not np.delete(root, on, axis=0).any()
+
+
+@pytest.mark.parametrize("errors", [Errors(), Errors(slope=0.02, ratio=0.01, intercept=0.01, junction=0.01), READ])
+def test_fits_of_two_branches_are_those_of_all_supports_one_by_one(errors: Errors) -> None:
+    rows = rows_of(random_faults(4, vehicles=8, branches=2, sparsity=60.0), seed=4, errors=errors)
+    fits, log_prior = fitted(plain_evidence(rows)), first_prior(2).log_supports
+    for j in range(len(rows)):
+        dense = {on: dense_fit(rows.take(slice(j, j + 1)), on) for on in all_supports(2) if len(on) <= 6}
+        prior = {
+            on: log_prior[sum(p in {0, 3} for p in on), sum(p in {1, 2, 4, 5} for p in on)] + LOG_LOAD * (6 in on)
+            for on in dense
+        }
+        score = {on: value + prior[on] for on, (_, _, value) in dense.items()}
+        found = supports(fits, j)
+        assert len(set(found)) == len(found)
+        for q, on in enumerate(found):
+            theta, covariance, log_evidence = dense[on]
+            if log_evidence + prior[on] < max(score.values()) - 8.0:
+                continue  # has next to no weight, and need not be at its optimum
+            assert fits.log_evidence[j, q] == pytest.approx(log_evidence, abs=0.01)
+            np.testing.assert_allclose(
+                fits.theta[j, q], theta, atol=2e-3 * np.sqrt(covariance.max(initial=1e-6)) + 1e-7
+            )
+            np.testing.assert_allclose((fits.root[j, q] @ fits.root[j, q].T)[np.ix_(on, on)], covariance, rtol=0.02)
+        missed = [value for on, value in score.items() if on not in found]
+        assert np.exp(np.array(missed) - max(score.values())).sum() < 1e-3
+
+
+@BRANCHES
+def test_true_support_is_fitted_and_fits(K: int) -> None:
+    faults = random_faults(5, vehicles=40, branches=K)
+    fits, truth = fitted(plain_evidence(rows_of(faults, seed=5))), parameters_of(faults)
+    chi2, z = [], []
+    for j in range(40):
+        on = tuple(np.flatnonzero(truth[j]).tolist())
+        q = supports(fits, j).index(on)
+        chi2.append(fits.chi2[j, q])
+        L = fits.root[j, q][np.ix_(on, on)]
+        z.append(np.linalg.solve(L, (fits.theta[j, q] - truth[j])[list(on)]))
+        assert (fits.hardware[j, q], fits.sensor[j, q]) == (
+            sum(p == 0 or K < p < 2 * K for p in on),
+            sum(1 <= p <= K or 2 * K <= p < 3 * K for p in on),
+        )
+    degrees = 3 * K - np.mean([len(values) for values in z])
+    assert np.mean(chi2) == pytest.approx(degrees, abs=3.5 * np.sqrt(2.0 * degrees / 40))
+    assert np.sqrt(np.mean(np.concatenate(z) ** 2)) == pytest.approx(1.0, abs=0.25)
+
+
+@pytest.mark.parametrize("magnitude", [(0.05, 0.25), (0.3, 0.6)])
+@pytest.mark.parametrize("K", [2, 3])
+def test_support_that_holds_another_one_fits_as_well(K: int, magnitude: tuple[float, float]) -> None:
+    errors = Errors(slope=0.01, ratio=0.02, intercept=0.005, junction=0.005)
+    faults = random_faults(11, vehicles=60, branches=K, sparsity=60.0, magnitude=magnitude)
+    fits = fitted(plain_evidence(rows_of(faults, seed=11, errors=errors)))
+    misfit = fits.chi2 + np.sum((fits.theta / WIDE_SD) ** 2, axis=2)
+    for j, n in enumerate(fits.number):
+        on, log_evidence = fits.support[j, :n], fits.log_evidence[j, :n]
+        holds = (on[:, None] <= on).all(axis=2) & (log_evidence > log_evidence.max() - 8.0)
+        assert (misfit[j, :n] <= misfit[j, :n, None] + 1e-3)[holds].all()
+
+
+def test_vehicle_is_fitted_alike_alone_and_in_any_fleet() -> None:
+    rows = rows_of(random_faults(6, vehicles=300, branches=3, sparsity=60.0), seed=6)
+    together = fitted(plain_evidence(rows))
+    for j in (0, 157, 299):
+        alone = fitted(plain_evidence(rows.take(slice(j, j + 1))))
+        n = int(alone.number[0])
+        assert together.number[j] == n
+        for name, values in alone._asdict().items():
+            if name != "number":
+                np.testing.assert_array_equal(getattr(together, name)[j, :n], values[0], err_msg=name)
+
+
+def test_order_of_the_consumers_does_not_matter() -> None:
+    """But for the first branch, which the gain ratios refer to, and the last, whose hardware offset is the others'."""
+    K, order = 4, [0, 2, 1, 3]
+    faults = random_faults(7, vehicles=12, branches=K)
+    swapped = Faults(
+        hardware_drift=faults.hardware_drift,
+        hardware_offset_a=faults.hardware_offset_a[:, order],
+        drift=faults.drift[:, order],
+        offset_a=faults.offset_a[:, order],
+    )
+    currents = np.append(0.1, np.full(K - 1, -0.1 / (K - 1)))
+    plain, other = (fitted(plain_evidence(rows_of(each, noise=0.0, currents=currents))) for each in (faults, swapped))
+    place = np.array([0, *(1 + np.array(order)), *(K + 1 + np.array(order[:-1])), *(2 * K + np.array(order)), 3 * K])
+    for j in range(12):
+        value = {
+            tuple(np.flatnonzero(on[place]).tolist()): log_evidence
+            for on, log_evidence in zip(plain.support[j, : plain.number[j]], plain.log_evidence[j], strict=False)
+        }
+        found = supports(other, j)
+        best = other.log_evidence[j, : len(found)].max()
+        for on, log_evidence in zip(found, other.log_evidence[j], strict=False):
+            if log_evidence > best - 5.0:
+                assert value[on] == pytest.approx(log_evidence, abs=1e-3)
+
+
+def test_reversed_constants_have_reversed_offsets() -> None:
+    """A vehicle whose currents and offsets all have the other sign, with the same gains."""
+    rows = rows_of(random_faults(8, vehicles=15, branches=3, sparsity=60.0), seed=8)
+    turn = np.repeat([1.0, -1.0], [8, 7])
+    mirrored = EvidenceRows(
+        relative=rows.relative,
+        constant=-rows.constant,
+        covariance=rows.covariance * np.outer(turn, turn),
+        means=-rows.means,
+    )
+    plain, other = fitted(plain_evidence(rows)), fitted(plain_evidence(mirrored))
+    np.testing.assert_array_equal(other.support, plain.support)
+    np.testing.assert_allclose(other.log_evidence, plain.log_evidence, atol=1e-9)
+    np.testing.assert_allclose(other.theta, plain.theta * np.repeat([1.0, -1.0], [4, 6]), atol=1e-9)
+
+
+def test_offset_of_the_feeding_sensor_and_a_load_are_never_both_fitted() -> None:
+    faults = random_faults(9, vehicles=20, branches=3)
+    faults.offset_a[:, 0] = 0.02
+    fits = fitted(plain_evidence(rows_of(faults, seed=9, load=0.01)))
+    assert fits.support[:, :, 6].any()
+    assert fits.support[:, :, 9].any()
+    assert not (fits.support[:, :, 6] & fits.support[:, :, 9]).any()
+
+
+def test_rows_that_nothing_explains_and_rows_that_say_nothing_are_fitted_without_failing() -> None:
+    rows = rows_of(random_faults(10, vehicles=3, branches=2))
+    rows.relative[0, :2], rows.constant[1, :2] = 3.0, -40.0
+    rows.covariance[2] = 100.0 * np.eye(10)
+    fits = fitted(plain_evidence(rows))
+    assert (fits.number > 0).all()
+    for j in range(3):
+        n = fits.number[j]
+        assert np.isfinite(fits.log_evidence[j, :n]).all()
+        assert np.isfinite(fits.theta[j, :n]).all()
+        assert np.isfinite(fits.root[j, :n]).all()
+    assert () in supports(fits, 2)
+    np.testing.assert_allclose(fits.theta[2], 0.0, atol=0.05)
+    np.testing.assert_allclose(np.einsum("qpp->p", fits.root[2, : fits.number[2]] ** 2).max() > 0.1, True)

@@ -1,0 +1,135 @@
+"""From summaries to what is corrected: known truth, one vehicle at a time, limits, few vehicles, batches."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrator.artificial.random_fleet import draw_faults
+from calibrator.errors import FleetError
+from calibrator.estimator.fleet_estimate import FleetEstimate, FleetReference, estimate_vehicles, learn_fleet
+from calibrator.faults import Faults
+from calibrator.score import harmed, recovered
+from calibrator.summaries.moments import DriveSummary
+from tests.calibrator.estimator.simulated_drives import Conditions, summaries_of
+
+SCALE_A, VEHICLES, K = 400.0, 24, 2
+NAMES = ["battery", "motor"]
+
+
+def drawn(seed: int) -> Faults:
+    return draw_faults(
+        np.random.default_rng(seed),
+        vehicles=VEHICLES,
+        branches=K,
+        sparsity=80.0,
+        magnitude=(0.05, 0.25),
+        full_scale_a=SCALE_A,
+        balanced=True,
+    )
+
+
+def applied_of(found: FleetEstimate, truth: Faults) -> Faults:
+    """What is corrected with, beside the hardware of the truth."""
+    drift, offset_a = (np.where(found.corrected, values, 0.0) for values in (found.drift, found.offset_a))
+    return replace(truth, drift=drift, offset_a=offset_a)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Faults:
+    return drawn(3)
+
+
+@pytest.fixture(scope="module")
+def summaries(truth: Faults) -> list[DriveSummary]:
+    return list(summaries_of(truth, Conditions(model_error_a=0.3), seed=3))
+
+
+@pytest.fixture(scope="module")
+def reference(summaries: list[DriveSummary]) -> FleetReference:
+    return learn_fleet(summaries, full_scale_a=SCALE_A, branches=NAMES)
+
+
+def test_faults_are_recovered_and_no_correction_does_harm(
+    truth: Faults, summaries: list[DriveSummary], reference: FleetReference
+) -> None:
+    found = estimate_vehicles(summaries, reference)
+    estimate = replace(truth, drift=found.drift, offset_a=found.offset_a)
+    assert recovered(estimate, truth, full_scale_a=SCALE_A, smallest_fault=0.05).mean() > 0.9
+    applied = replace(
+        truth,
+        drift=np.where(found.corrected, found.drift, 0.0),
+        offset_a=np.where(found.corrected, found.offset_a, 0.0),
+    )
+    mean_a = np.array([summary.mean_a for summary in summaries])
+    assert not harmed(applied, truth, mean_a=mean_a, mean_square_a2=mean_a**2 + 900.0).any()
+    faulty = (truth.drift != 0.0) | (truth.offset_a != 0.0)
+    assert (found.corrected & faulty).sum() > 0.7 * faulty.sum()
+    assert not (found.corrected & ~faulty).any()
+
+
+def test_a_vehicle_is_estimated_alike_alone_and_among_others(
+    summaries: list[DriveSummary], reference: FleetReference
+) -> None:
+    together, alone = estimate_vehicles(summaries, reference), estimate_vehicles(summaries[5:6], reference)
+    for name in ("drift", "offset_a", "confidence", "harm_probability", "drift_sd"):
+        np.testing.assert_array_equal(getattr(together, name)[5], getattr(alone, name)[0])
+
+
+def test_a_reference_goes_to_other_processes(summaries: list[DriveSummary], reference: FleetReference) -> None:
+    copy = pickle.loads(pickle.dumps(reference))
+    here, there = (estimate_vehicles(summaries[:2], each) for each in (reference, copy))
+    np.testing.assert_array_equal(here.drift, there.drift)
+
+
+def test_faults_beyond_the_limits_are_found_and_not_corrected(
+    truth: Faults, summaries: list[DriveSummary], reference: FleetReference
+) -> None:
+    free, limited = (estimate_vehicles(summaries, reference, limits=limits) for limits in (None, (0.1, 1e3)))
+    beyond = free.corrected & (np.abs(free.drift) > 0.1)
+    assert beyond.any()
+    assert (limited.held_back[beyond] == "beyond the limits").all()
+    assert not limited.corrected[beyond].any()
+    np.testing.assert_array_equal(limited.drift, free.drift)
+
+
+def test_nothing_is_corrected_at_a_harm_limit_of_zero(summaries: list[DriveSummary], reference: FleetReference) -> None:
+    found = estimate_vehicles(summaries, reference, harm_limit=0.0)
+    assert not found.corrected.any()
+    assert "corrected" not in found.verdicts
+
+
+def test_few_vehicles_are_compared_and_nothing_is_corrected(summaries: list[DriveSummary]) -> None:
+    few = learn_fleet(summaries[:4], full_scale_a=SCALE_A, branches=NAMES)
+    assert any("few for a fleet" in notice for notice in few.notices)
+    assert not estimate_vehicles(summaries[:4], few).corrected.any()
+
+
+def test_an_offset_that_all_battery_sensors_share_harms_nobody_and_is_said(truth: Faults) -> None:
+    batch = replace(truth, offset_a=truth.offset_a + np.array([12.0, 0.0]))
+    summaries = list(summaries_of(batch, Conditions(model_error_a=0.3), seed=4))
+    learnt = learn_fleet(summaries, full_scale_a=SCALE_A, branches=NAMES)
+    assert any("sum to +12" in notice for notice in learnt.notices)
+    found = estimate_vehicles(summaries, learnt)
+    applied = replace(
+        batch,
+        drift=np.where(found.corrected, found.drift, 0.0),
+        offset_a=np.where(found.corrected, found.offset_a, 0.0),
+    )
+    mean_a = np.array([summary.mean_a for summary in summaries])
+    assert not harmed(applied, batch, mean_a=mean_a, mean_square_a2=mean_a**2 + 900.0).any()
+
+
+def test_pit_of_the_truth_lies_between_zero_and_one(
+    truth: Faults, summaries: list[DriveSummary], reference: FleetReference
+) -> None:
+    for pit in estimate_vehicles(summaries, reference).pit(truth.drift, truth.offset_a):
+        assert pit.shape == (VEHICLES, K)
+        assert ((pit >= 0.0) & (pit <= 1.0 + 1e-9)).all()
+        assert 0.3 < pit.mean() < 0.7
+
+
+def test_no_vehicle_is_no_fleet() -> None:
+    with pytest.raises(FleetError, match="no vehicle to learn"):
+        learn_fleet([], full_scale_a=SCALE_A, branches=NAMES)

@@ -1,0 +1,254 @@
+"""Laws that explain a fleet: its faults, its centre and its spread, and what its vehicles share."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrator.drive import Array
+from calibrator.estimator import learning
+from calibrator.estimator.learning import Law, Spread, explain, learn_laws, weigh_law
+from calibrator.estimator.posterior import weigh
+from calibrator.estimator.prior import TAIL_RANGE, Prior, first_prior, known_prior
+from calibrator.estimator.rows import EvidenceRows
+from calibrator.faults import Faults
+from tests.calibrator.estimator.simulated_drives import no_faults
+from tests.calibrator.estimator.simulated_rows import Errors, random_faults, rows_of
+
+
+def moved(rows: EvidenceRows, by: Array) -> EvidenceRows:
+    """Rows (N, 5K) that differ by so much more, known ones only."""
+    c, by = rows.relative.shape[1], by * rows.known
+    return replace(rows, relative=rows.relative + by[:, :c], constant=rows.constant + by[:, c:])
+
+
+def learned(rows: EvidenceRows, **knowledge: float) -> Law:
+    """The most probable law."""
+    laws = learn_laws(rows, feed=0, **knowledge)  # type: ignore[arg-type]
+    assert sum(law.probability for law in laws) == pytest.approx(1.0)
+    assert [law.probability for law in laws] == sorted((law.probability for law in laws), reverse=True)
+    assert all(sum(share for share, _ in law.priors) == pytest.approx(1.0) for law in laws)
+    return laws[0]
+
+
+def shared_by(laws: list[Law]) -> dict[tuple[int, ...], float]:
+    """Probabilities of what all vehicles share: places of offsets, gains and of a group's offset."""
+    found: dict[tuple[int, ...], float] = {}
+    for law in laws:
+        cause = tuple(np.flatnonzero(np.abs(law.spread.shared) > learning.DOUBT).tolist())
+        found[cause] = found.get(cause, 0.0) + law.probability
+    return found
+
+
+def same(one: Law, other: Law, rtol: float) -> None:
+    np.testing.assert_allclose(one.spread.mean, other.spread.mean, rtol=rtol, atol=1e-9)
+    np.testing.assert_allclose(one.spread.covariance, other.spread.covariance, rtol=rtol, atol=1e-12)
+    np.testing.assert_allclose(one.prior.counts, other.prior.counts, rtol=rtol, atol=1e-9)
+    np.testing.assert_allclose(one.prior.gain.density, other.prior.gain.density, rtol=rtol, atol=1e-9)
+    assert one.log_evidence == pytest.approx(other.log_evidence, rel=rtol)
+
+
+@pytest.mark.parametrize("magnitude", [(0.05, 0.25), (0.3, 0.6)])
+@pytest.mark.parametrize("K", [2, 3])
+def test_sizes_and_numbers_are_those_that_the_fleet_was_drawn_with(K: int, magnitude: tuple[float, float]) -> None:
+    faults = random_faults(1, vehicles=60, branches=K, magnitude=magnitude)
+    law = learned(rows_of(faults, seed=1))
+    for slab, values in ((law.prior.gain, faults.drift), (law.prior.offset, faults.offset_a)):
+        sizes = np.abs(values[values != 0.0])
+        assert 0.8 * magnitude[0] < slab.low < 1.05 * sizes.min()
+        assert 0.95 * sizes.max() < slab.high < 1.3 * magnitude[1]
+    assert law.prior.counts[1:].sum() == pytest.approx(faults.has_hardware_fault.mean(), abs=0.08)
+    many = np.count_nonzero(np.hstack([faults.drift, faults.offset_a]), axis=1)
+    expected = np.bincount(many, minlength=2 * K + 1) / 60.0
+    np.testing.assert_allclose(law.prior.counts.sum(axis=0), expected, atol=0.08)
+    assert not law.spread.shared.any()
+    assert np.abs(law.spread.mean).max() < 0.002
+    assert law.prior.load_share < 0.02
+
+
+def test_fleet_without_faults_has_none() -> None:
+    law = learned(rows_of(no_faults(30, 2), seed=2))
+    assert law.prior.counts[0, 0] > 0.95
+    assert not law.prior.group_share.size
+    assert np.abs(law.spread.mean).max() < 0.001
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_scatter_of_sound_vehicles_is_not_learned_as_tiny_faults(seed: int) -> None:
+    """One vehicle with a hardware fault: sizes of other faults, which nobody has, stay above every resolution."""
+    faults = no_faults(16, 2)
+    faults.hardware_drift[2] = 0.1
+    prior = learned(rows_of(faults, seed=seed)).prior
+    assert min(prior.gain.low, prior.offset.low) > TAIL_RANGE[0]
+    assert prior.counts[1:].sum() < 0.1
+
+
+def test_what_vehicles_without_faults_differ_by_is_learned() -> None:
+    K, rng = 2, np.random.default_rng(3)
+    rows = rows_of(random_faults(3, vehicles=80, branches=K), seed=3)
+    more = np.zeros((80, 5 * K))
+    more[:, [0, 3 * K - 1]] = rng.normal(0.0, [0.01, 0.004], (80, 2))
+    spread = learned(moved(rows, more)).spread
+    sd = np.sqrt(np.diag(spread.covariance))
+    assert sd[0] == pytest.approx(0.01, rel=0.35)
+    assert np.hypot(sd[3 * K - 1], 0.001 * np.sqrt(spread.dispersion[0])) == pytest.approx(0.004, rel=0.35)
+    assert sd[1] < 0.005
+    assert np.linalg.eigvalsh(spread.covariance).min() > 0.0
+
+
+def test_intercepts_that_err_more_than_their_blocks_show_are_trusted_less() -> None:
+    K = 2
+    rows = rows_of(random_faults(4, vehicles=60, branches=K), seed=4, errors=Errors(intercept=0.004))
+    stated = rows.covariance.copy()
+    at = slice(3 * K - 1, 4 * K - 1)
+    stated[:, at, at] -= np.diag([0.004**2 - 0.001**2] * K)
+    wide, plain = (learned(each).spread for each in (replace(rows, covariance=stated), rows))
+    variance = 0.001**2 * wide.dispersion + np.diag(wide.covariance)[at]
+    np.testing.assert_allclose(variance, 0.004**2, rtol=0.5)
+    assert (wide.dispersion > 2.0 * plain.dispersion).all()
+
+
+def test_error_of_the_reference_that_all_vehicles_share_is_its_centre() -> None:
+    K = 2
+    rows, by = rows_of(random_faults(5, vehicles=40, branches=K), seed=5), np.zeros(5 * K)
+    by[:K], by[3 * K - 1] = (0.02, -0.015), 0.006
+    plain, shifted = learned(rows), learned(moved(rows, np.tile(by, (40, 1))))
+    np.testing.assert_allclose(shifted.spread.mean - plain.spread.mean, by, atol=0.0012)
+    np.testing.assert_allclose(shifted.prior.counts, plain.prior.counts, atol=0.03)
+
+
+def test_order_of_the_vehicles_does_not_matter_even_if_some_are_learned_from(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(learning, "MOST_LEARNT", 25)
+    rows = rows_of(random_faults(6, vehicles=40, branches=2), seed=6)
+    same(learned(rows.take(np.random.default_rng(6).permutation(40))), learned(rows), rtol=1e-6)
+
+
+def test_fleet_twice_says_the_same() -> None:
+    faults = random_faults(7, vehicles=30, branches=2)
+    rows = rows_of(faults, seed=7)
+    once, twice = learned(rows), learned(rows.take(np.repeat(np.arange(30), 2)))
+    np.testing.assert_allclose(twice.spread.mean, once.spread.mean, atol=5e-4)
+    np.testing.assert_allclose(twice.prior.counts, once.prior.counts, atol=0.05)
+    assert twice.prior.gain.low == pytest.approx(once.prior.gain.low, rel=0.15)
+    assert twice.log_evidence == pytest.approx(2.0 * once.log_evidence, rel=0.05)
+
+
+def test_known_prior_is_kept() -> None:
+    prior = known_prior(first_prior(2).counts, (0.05, 0.25))
+    law = learn_laws(rows_of(random_faults(8, vehicles=20, branches=2), seed=8), feed=0, known=prior)[0]
+    assert law.priors == ((1.0, prior),)
+
+
+def test_share_of_faulty_vehicles_is_as_expected() -> None:
+    rows = rows_of(random_faults(9, vehicles=20, branches=2, sparsity=90.0), seed=9)
+    for share in (0.1, 0.6):
+        assert learned(rows, expected_faults=share).prior.counts[:, 1:].sum() == pytest.approx(share, abs=1e-9)
+
+
+def test_centre_that_trusted_vehicles_carry_is_kept() -> None:
+    K = 2
+    rows, fixed = rows_of(random_faults(10, vehicles=25, branches=K), seed=10), np.full(5 * K, np.nan)
+    fixed[[0, 3 * K - 1]] = 0.001, -0.0005
+    law = learn_laws(rows, feed=0, fixed=fixed)[0]
+    np.testing.assert_array_equal(law.spread.mean[[0, 3 * K - 1]], fixed[[0, 3 * K - 1]])
+    assert np.isnan(fixed[4 * K - 1]), "what the caller gave is not changed"
+
+
+@pytest.mark.parametrize("declared", [None, 0.0125])
+def test_load_of_all_vehicles_is_found_or_taken_as_declared(declared: float | None) -> None:
+    K = 3
+    rows = rows_of(random_faults(11, vehicles=40, branches=K), seed=11, load=0.0125)
+    laws = learn_laws(rows, feed=0, load=declared)
+    assert laws[0].spread.mean[4 * K - 1] == pytest.approx(0.0125, abs=3e-4)
+    assert not laws[0].spread.shared[:K].any()
+    assert laws[0].prior.counts[0].sum() == pytest.approx(0.7, abs=0.2)
+    if declared is not None:
+        assert laws[0].spread.mean[4 * K - 1] == declared
+
+
+@pytest.mark.parametrize("K", [2, 3])
+def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K: int) -> None:
+    """Currents that sum to less than zero: no load gives current."""
+    faults = random_faults(12, vehicles=40, branches=K)
+    faults.offset_a[:, 0] -= 0.03
+    causes = shared_by(learn_laws(rows_of(faults, seed=12), feed=0))
+    assert causes.get((), 0.0) < 0.01
+    assert max(causes, key=causes.__getitem__) == (0,)
+
+
+@pytest.mark.parametrize("of_sensor", [False, True])
+def test_vehicles_that_share_a_constant_are_a_group_and_its_cause_is_left_open(of_sensor: bool) -> None:
+    faults, some = random_faults(13, vehicles=40, branches=2), np.arange(40) < 12
+    faults.offset_a[some, 0] += 0.03 * of_sensor
+    laws = learn_laws(rows_of(faults, seed=13, load=0.0 if of_sensor else 0.03 * some), feed=0)
+    (share,), (centre,) = laws[0].prior.group_share, laws[0].prior.group_centre
+    assert share == pytest.approx(0.3, abs=0.1)
+    assert centre == pytest.approx(0.03, abs=0.001)
+    assert {law.spread.shared[-1] for law in laws} == {0.0, 1.0}
+
+
+@pytest.mark.parametrize("gain", [0.08, -0.05])
+@pytest.mark.parametrize(("K", "branch"), [(3, 0), (3, 2), (2, 1)])
+def test_gain_that_all_sensors_of_a_branch_share_is_found_and_of_two_branches_either_may_have_it(
+    K: int, branch: int, gain: float
+) -> None:
+    faults = random_faults(14, vehicles=30, branches=K)
+    faults.drift[:, branch] = (1.0 + gain) * (1.0 + faults.drift[:, branch]) - 1.0
+    rows = rows_of(faults, seed=14)
+    rows.relative[:, branch] -= np.log1p(gain)  # the fleet's model has the same error
+    causes = shared_by(learn_laws(rows, feed=0))
+    if K == 2:
+        assert causes == pytest.approx({(2,): 0.5, (3,): 0.5}, abs=0.01)
+    else:
+        assert causes.get((K + branch,), 0.0) > 0.99
+
+
+def law_of(K: int, prior: Prior | None = None) -> Law:
+    """Law of vehicles that are alike but for their faults."""
+    spread = Spread(
+        mean=np.zeros(5 * K), covariance=1e-10 * np.eye(5 * K), dispersion=np.ones(K), shared=np.zeros(2 * K + 1)
+    )
+    return Law(spread=spread, priors=((1.0, prior or first_prior(K)),))
+
+
+def test_vehicle_that_no_explanation_fits_is_known_less_well_and_others_are_as_before() -> None:
+    K = 2
+    rows = rows_of(random_faults(15, vehicles=6, branches=K), seed=15)
+    by = np.zeros((6, 5 * K))
+    by[2, 0], by[2, 1], by[2, 2] = 0.2, -0.3, 0.15  # three ratios that agree with no two gains ...
+    by[2, 5], by[2, 6], by[2, 7] = 0.1, 0.2, -0.4
+    read = rows.covariance.copy()
+    read[2, [3, 4, 8, 9], [3, 4, 8, 9]] = 1e-6  # ... while readings say that all sensors are right
+    rows = replace(rows, covariance=read)
+    plain, odd = (explain(each, law_of(K), feed=0) for each in (rows, moved(rows, by)))
+    wide = [np.sqrt((draws.fits.root[2, : draws.fits.number[2]] ** 2).max()) for draws in (plain, odd)]
+    assert wide[1] > 3.0 * wide[0]
+    for j in (0, 1, 3, 4, 5):
+        n = plain.fits.number[j]
+        np.testing.assert_array_equal(odd.fits.theta[j, :n], plain.fits.theta[j, :n])
+
+
+def test_weights_are_averaged_over_the_priors_of_a_law() -> None:
+    K = 2
+    rows = rows_of(random_faults(16, vehicles=5, branches=K), seed=16)
+    priors = first_prior(K), known_prior(first_prior(K).counts, (0.05, 0.25))
+    law = replace(law_of(K), priors=((0.6, priors[0]), (0.4, priors[1])))
+    draws = explain(rows, law, feed=0)
+    expected = 0.6 * weigh(draws, priors[0])[0] + 0.4 * weigh(draws, priors[1])[0]
+    np.testing.assert_allclose(weigh_law(draws, law), expected, atol=1e-15)
+
+
+def test_one_vehicle_and_a_branch_that_nobody_used_are_learned_from_without_failing() -> None:
+    K = 3
+    rows = rows_of(Faults(**{name: values[:1] for name, values in vars(no_faults(2, K)).items()}), seed=17)
+    assert len(learn_laws(rows, feed=0)) >= 1
+    rows = rows_of(no_faults(8, K), seed=17, currents=np.array([0.1, -0.1, 0.0]))
+    for row in (K - 1, 2 * K - 2):
+        rows.covariance[:, row], rows.covariance[:, :, row] = 0.0, 0.0
+        rows.covariance[:, row, row] = 100.0
+        rows.relative[:, row] = 0.0
+    law = learned(rows)
+    assert np.isfinite(law.spread.covariance).all()
+    assert law.spread.mean[K - 1] == pytest.approx(0.0, abs=1e-3)

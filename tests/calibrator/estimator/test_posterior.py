@@ -1,0 +1,279 @@
+"""Weights of the draws: those of integration on a grid, probabilities for fleets that the prior describes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from calibrator.drive import Array
+from calibrator.estimator.explanations import fit_explanations
+from calibrator.estimator.posterior import GAIN, OFFSET, Draws, draw_explanations, size_evidence, weigh
+from calibrator.estimator.prior import GRID, LOAD_DENSITY, Prior, Slab, known_prior, with_slabs
+from calibrator.estimator.rows import EvidenceRows
+from calibrator.faults import Faults
+from tests.calibrator.estimator.simulated_drives import no_faults
+from tests.calibrator.estimator.simulated_rows import (
+    Errors,
+    all_supports,
+    dense_fit,
+    parameters_of,
+    plain_evidence,
+    plain_residual,
+    random_faults,
+    rows_of,
+)
+
+MAGNITUDE = (0.05, 0.25)
+VAGUE = Errors(slope=0.02, ratio=0.02, intercept=0.01, junction=0.01)
+
+
+def paper_prior(K: int, *totals: int) -> Prior:
+    """Of vehicles with so many faults in all, each number as likely, half of them without a hardware fault."""
+    counts = np.zeros((K + 1, 2 * K + 1))
+    for n in totals:
+        chosen = np.array([on for on in all_supports(K) if 3 * K not in on and len(on) == n], dtype=int)
+        sensor = ((chosen > 0) & (chosen <= K)) | (chosen >= 2 * K)
+        for s in sensor.sum(axis=1):
+            counts[n - s, s] += 0.5 / len(chosen) / len(totals)
+            counts[0, s] += 0.5 / len(chosen) / len(totals)
+    return known_prior(counts, MAGNITUDE)
+
+
+def drawn(rows: EvidenceRows, prior: Prior, shared: Array | None = None) -> Draws:
+    evidence = plain_evidence(rows, shared=shared)
+    log_load = float(np.log(prior.load_share + prior.group_share.sum()))
+    return draw_explanations(fit_explanations(evidence, prior.log_supports + 1.0, log_load + 2.0), evidence)
+
+
+def log_prior(prior: Prior, theta: Array, on: tuple[int, ...]) -> Array:
+    """Logarithm of the prior density of parameters (S, 3K + 1) with this support, without any group."""
+    K = prior.branches
+    hardware, sensor = sum(p == 0 or K < p < 2 * K for p in on), sum(1 <= p <= K or 2 * K <= p < 3 * K for p in on)
+    load = prior.load_share if 3 * K in on else 1.0 - prior.load_share
+    density = np.full(len(theta), prior.log_supports[hardware, sensor] + np.log(load))
+    for p in on:
+        table, size, change = prior.offset.density, np.abs(theta[:, p]), 0.0 * theta[:, p]
+        if p <= K:  # d = e^x - 1
+            table, size, change = prior.gain.density, np.abs(np.expm1(theta[:, p])), theta[:, p]
+        elif 2 * K <= p < 3 * K:  # o = (1 + d) omega
+            change = theta[:, p - 2 * K + 1]
+            size = size * np.exp(change)
+        elif p == 3 * K:
+            table = LOAD_DENSITY
+        density += np.log(np.interp(size, GRID, table)) + change - np.log(2.0)
+        if p == 3 * K:
+            density += np.where(theta[:, p] > 0.0, np.log(2.0), -1e3)
+    return density
+
+
+def integrated(rows: EvidenceRows, prior: Prior, on: tuple[int, ...], points: int) -> tuple[float, Array]:
+    """Log evidence of one support of a vehicle, and its mean parameters, by sums over a grid."""
+    centre, covariance, _ = dense_fit(rows, on)
+    sd, steps = np.sqrt(np.diag(covariance)), np.linspace(-7.0, 7.0, points)
+    theta = np.zeros((points ** len(on), 3 * prior.branches + 1))
+    for i, p in enumerate(on):
+        theta[:, p] = centre[p] + sd[i] * steps[np.arange(len(theta)) // points**i % points]
+    e, cell = plain_residual(rows, theta), np.sum(np.log(sd * (steps[1] - steps[0])))
+    precision, log_det = np.linalg.inv(rows.covariance[0]), np.linalg.slogdet(2.0 * np.pi * rows.covariance[0])[1]
+    value = log_prior(prior, theta, on) - 0.5 * (np.einsum("sa,ab,sb->s", e, precision, e) + log_det)
+    total = float(logsumexp(value))
+    return total + float(cell), np.exp(value - total) @ theta
+
+
+def of_supports(draws: Draws, weight: Array, vehicle: int) -> dict[tuple[int, ...], tuple[float, Array]]:
+    """Weight of each support of a vehicle and its mean parameters."""
+    found = {}
+    for q in range(draws.fits.number[vehicle]):
+        w = weight[vehicle, q].sum(axis=1)
+        mean = w @ draws.values[vehicle, q] / max(w.sum(), 1e-300)
+        found[tuple(np.flatnonzero(draws.fits.support[vehicle, q]).tolist())] = (float(w.sum()), mean)
+    return found
+
+
+@pytest.mark.parametrize(("faults", "points", "tolerance"), [(1, 1001, 0.04), (2, 121, 0.08)])
+def test_weights_are_those_of_integration_on_a_grid(faults: int, points: int, tolerance: float) -> None:
+    """Vague rows: the posterior is cut by the bounds of the sizes, and offsets depend on gains."""
+    prior = paper_prior(2, *range(faults + 1))
+    truth = random_faults(2, vehicles=6, branches=2, sparsity=100.0 * (1.0 - faults / 6.0))
+    rows = rows_of(truth, seed=2, errors=VAGUE)
+    draws = drawn(rows, prior)
+    weight, log_evidence = weigh(draws, prior)
+    for j in range(len(rows)):
+        one = rows.take(slice(j, j + 1))
+        supports = [on for on in all_supports(2) if len(on) <= faults and 6 not in on]
+        grid = {on: integrated(one, prior, on, points) for on in supports}
+        total = logsumexp([value for value, _ in grid.values()])
+        assert log_evidence[j] == pytest.approx(total, abs=2.0 * tolerance)
+        found = of_supports(draws, weight, j)
+        for on, (value, mean) in grid.items():
+            share = float(np.exp(value - total))
+            if share > 0.01:
+                assert found[on][0] == pytest.approx(share, abs=tolerance)
+                np.testing.assert_allclose(found[on][1], mean, atol=0.004)
+
+
+def test_load_weighs_as_on_a_grid_and_is_never_negative() -> None:
+    prior = Prior(
+        counts=paper_prior(2, 0, 1).counts,
+        gain=Slab(low=0.05, high=0.25, tail=1e-6),
+        offset=Slab(low=0.01, high=0.25, tail=1e-6),
+        load_share=0.3,
+    )
+    rows = rows_of(no_faults(3, 2), errors=Errors(intercept=0.003, junction=0.003), load=np.array([0.01, 0.004, -0.02]))
+    draws = drawn(rows, prior)
+    weight, _ = weigh(draws, prior)
+    supports = [on for on in all_supports(2) if len(on) <= 1]
+    for j in range(3):
+        grid = {on: integrated(rows.take(slice(j, j + 1)), prior, on, 2001)[0] for on in supports}
+        share = np.exp(grid[6,] - logsumexp(list(grid.values())))
+        assert of_supports(draws, weight, j)[6,][0] == pytest.approx(share, abs=0.04)
+    loads = draws.values[..., 6] * draws.fits.support[:, :, None, 6]
+    assert weight[loads < 0.0].max() < 1e-30
+    assert [of_supports(draws, weight, j)[6,][0] > 0.5 for j in range(3)] == [True, False, False]
+
+
+@pytest.mark.parametrize("K", [2, 3])
+def test_weights_sum_to_one_over_every_vehicle(K: int) -> None:
+    rows = rows_of(random_faults(3, vehicles=20, branches=K, sparsity=60.0), seed=3)
+    rows.relative[0, 0], rows.constant[1, 0] = 3.0, -40.0  # nothing explains these
+    weight, log_evidence = weigh(drawn(rows, paper_prior(K, 1, 2)), paper_prior(K, 1, 2))
+    np.testing.assert_allclose(weight.sum(axis=(1, 2, 3)), 1.0, rtol=1e-12)
+    assert (weight >= 0.0).all()
+    assert np.isfinite(log_evidence).all()
+
+
+@pytest.mark.parametrize("sparsity", [83.0, 67.0])
+def test_weights_are_probabilities_for_fleets_that_the_prior_describes(sparsity: float) -> None:
+    truth = random_faults(4, vehicles=500, branches=2, sparsity=sparsity)
+    counts = np.zeros((3, 5))
+    np.add.at(
+        counts,
+        (
+            (truth.hardware_drift != 0.0) * 1 + (truth.hardware_offset_a[:, 0] != 0.0),
+            np.count_nonzero(np.hstack([truth.drift, truth.offset_a]), axis=1),
+        ),
+        1.0 / 500.0,
+    )
+    prior = known_prior(counts, MAGNITUDE)
+    draws = drawn(rows_of(truth, seed=4), prior)
+    weight, _ = weigh(draws, prior)
+    of_fit, present = weight.sum(axis=(2, 3)), parameters_of(truth) != 0.0
+    best = np.argmax(of_fit, axis=1)
+    confidence = of_fit[np.arange(500), best]
+    hit = (draws.fits.support[np.arange(500), best] == present).all(axis=1)
+    error = np.sqrt(np.sum(confidence * (1.0 - confidence))) / 500.0
+    assert hit.mean() == pytest.approx(confidence.mean(), abs=3.0 * error + 0.005)
+
+
+def test_gain_that_no_row_shows_keeps_its_prior() -> None:
+    """The third branch hardly moves, and carries no current: whether its gain is wrong is as open as before."""
+    K, prior = 3, paper_prior(3, 0, 1)
+    rows = rows_of(no_faults(1, K), noise=0.0, currents=np.array([0.1, -0.1, 0.0]))
+    for row in (K - 1, 2 * K - 2):
+        rows.covariance[:, row], rows.covariance[:, :, row] = 0.0, 0.0
+        rows.covariance[:, row, row] = 100.0
+    draws = drawn(rows, prior)
+    weight, _ = weigh(draws, prior)
+    found = of_supports(draws, weight, 0)
+    odds = np.exp(prior.log_supports[0, 1] - prior.log_supports[0, 0])
+    assert found[3,][0] / found[()][0] == pytest.approx(odds, rel=0.3)  # few draws of a wide Gaussian meet the bounds
+    drift, w = np.expm1(draws.values[0, ..., 3]), weight[0].sum(axis=2) * draws.fits.support[0, :, 3:4]
+    assert (w * np.sign(drift)).sum() == pytest.approx(0.0, abs=0.1 * w.sum())
+    assert np.abs(drift[w > 1e-6]).min() < 0.08
+    assert np.abs(drift[w > 1e-6]).max() > 0.22
+
+
+def test_ever_smaller_errors_make_the_simplest_explanation_sure() -> None:
+    truth = random_faults(5, vehicles=30, branches=3, sparsity=89.0)
+    prior = paper_prior(3, 0, 1, 2)
+    sure = []
+    for sd in (0.02, 0.002):
+        draws = drawn(rows_of(truth, errors=Errors(slope=sd, ratio=sd, intercept=sd, junction=sd), noise=0.0), prior)
+        weight, _ = weigh(draws, prior)
+        right = (draws.fits.support == (parameters_of(truth) != 0.0)[:, None]).all(axis=2)
+        sure.append((weight.sum(axis=(2, 3)) * right).sum(axis=1))
+    assert sure[1].mean() > sure[0].mean()
+    assert sure[1].min() > 0.9
+
+
+@pytest.mark.parametrize("K", [2, 3])
+def test_exact_readings_of_offsets_make_no_false_gains(K: int) -> None:
+    """A hardware offset and a sensor offset in one branch, both known once the sensor was read without a current."""
+    truth, prior = no_faults(1, K), paper_prior(K, 0, 1, 2)
+    truth.hardware_offset_a[0, [0, -1]], truth.offset_a[0, 0] = (0.113, -0.113), -0.171
+    draws = drawn(rows_of(truth, seed=6, errors=Errors(offset_read=1e-4)), prior)
+    weight, _ = weigh(draws, prior)
+    false_gain = draws.fits.support[0, :, : K + 1].any(axis=1)
+    assert weight[0, false_gain].sum() < 0.05
+    mean = np.einsum("qmg,qmp->p", weight[0], draws.values[0])
+    np.testing.assert_allclose(mean, parameters_of(truth)[0], atol=0.003)
+
+
+@pytest.mark.parametrize("of_sensor", [False, True])
+def test_vehicle_of_a_group_belongs_to_it(of_sensor: bool) -> None:
+    share, centre, sd = np.array([[0.3], [0.02], [0.001]])
+    plain = known_prior(paper_prior(2, 0, 1).counts, MAGNITUDE)
+    prior = replace(plain, load_share=0.01, group_share=share, group_centre=centre, group_sd=sd)
+    rows = rows_of(no_faults(3, 2), seed=7, load=np.array([0.0, 0.02, 0.03]))
+    shared = np.append(np.zeros(4), of_sensor)
+    weight, log_evidence = weigh(drawn(rows, prior, shared), prior)
+    of_group = weight[..., 1].sum(axis=(1, 2))
+    assert of_group[0] < 1e-3
+    assert of_group[1] > 0.99
+    assert of_group[2] < 0.01  # ten standard deviations away: a load of its own
+    # A group of zero width at the load: density of the rows there, by the sum of squares
+    fixed = plain_residual(rows.take(slice(1, 2)), np.array([[0, 0, 0, 0, 0, 0, 0.02]]))[0]
+    covariance = rows.covariance[1].copy()
+    covariance[np.ix_([5, 7], [5, 7])] += 0.001**2
+    expected = -0.5 * (fixed @ np.linalg.solve(covariance, fixed) + np.linalg.slogdet(2.0 * np.pi * covariance)[1])
+    expected += np.log(0.3) + prior.log_supports[0, 0]
+    assert log_evidence[1] == pytest.approx(expected, abs=0.05)
+
+
+def test_fault_beside_what_a_group_shares_is_found() -> None:
+    prior = Prior(
+        counts=paper_prior(2, 0, 1).counts,
+        gain=Slab(low=0.05, high=0.25, tail=1e-6),
+        offset=Slab(low=0.05, high=0.25, tail=1e-6),
+        group_share=np.array([0.4]),
+        group_centre=np.array([0.02]),
+        group_sd=np.array([0.001]),
+    )
+    truth = no_faults(1, 2)
+    truth.offset_a[0, 0] = 0.12
+    draws = drawn(rows_of(truth, seed=8), prior)
+    weight, _ = weigh(draws, prior)
+    both = weight[0, draws.fits.support[0, :, 4]].sum(axis=(0, 1))
+    assert both.sum() > 0.9
+    assert both[0] / both[1] == pytest.approx((1.0 - 0.4 - prior.load_share) / 0.4, rel=0.02)
+
+
+@pytest.mark.parametrize("kind", [GAIN, OFFSET])
+@pytest.mark.parametrize("every", [1, 4])
+def test_evidence_of_sizes_is_that_of_the_weights(kind: int, every: int) -> None:
+    prior = paper_prior(2, 0, 1, 2)
+    draws = drawn(rows_of(random_faults(9, vehicles=40, branches=2, sparsity=70.0), seed=9), prior)
+    slabs = [Slab(low=low, high=high, tail=0.02) for low, high in ((0.02, 0.3), (0.05, 0.25), (0.1, 0.5))]
+    found = size_evidence(draws, prior, kind, np.stack([slab.density for slab in slabs]), every=every)
+    parts = [(slab, prior.offset) if kind == GAIN else (prior.gain, slab) for slab in slabs]
+    exact = np.array([weigh(draws, with_slabs(prior, *part))[1].sum() for part in parts])
+    np.testing.assert_allclose(found - found[0], exact - exact[0], atol=1e-6 if every == 1 else 3.0)
+    assert np.argmax(found) == np.argmax(exact) == 1
+
+
+def test_order_of_the_vehicles_does_not_matter() -> None:
+    truth, order = random_faults(10, vehicles=30, branches=3, sparsity=70.0), np.random.default_rng(10).permutation(30)
+    rows, prior = rows_of(truth, seed=10), paper_prior(3, 1, 2, 3)
+    plain, other = (weigh(drawn(each, prior), prior) for each in (rows, rows.take(order)))
+    np.testing.assert_array_equal(other[1], plain[1][order])
+    most = min(plain[0].shape[1], other[0].shape[1])
+    np.testing.assert_array_equal(other[0][:, :most], plain[0][order][:, :most])
+
+
+def test_vehicle_twice_is_counted_twice() -> None:
+    prior = paper_prior(2, 0, 1, 2)
+    truth = random_faults(11, vehicles=10, branches=2, sparsity=70.0)
+    twice = Faults(**{name: np.repeat(values, 2, axis=0) for name, values in vars(truth).items()})
+    once, doubled = (weigh(drawn(rows_of(each, noise=0.0), prior), prior)[1].sum() for each in (truth, twice))
+    assert doubled == pytest.approx(2.0 * once, rel=1e-12)

@@ -1,0 +1,57 @@
+"""What the published method says of a fleet whose mean is hardly a reference."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrator.artificial.random_fleet import draw_faults
+from calibrator.estimator.published_fleet import LEAST_VEHICLES, SLOPE_SPREAD, few_vehicles_notice
+from calibrator.faults import slopes_and_intercepts
+from tests.calibrator.command_here import calibrator
+
+LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
+FILES = ("--layout", LAYOUT, "--workers", 1)
+
+
+def test_spread_of_slopes_is_that_of_the_default_faults() -> None:
+    faults = draw_faults(
+        np.random.default_rng(0),
+        vehicles=20_000,
+        branches=2,
+        sparsity=80.0,
+        magnitude=(0.05, 0.25),
+        full_scale_a=400.0,
+    )
+    slopes, _ = slopes_and_intercepts(faults)
+    assert slopes.std() == pytest.approx(SLOPE_SPREAD, rel=0.02)
+
+
+def test_few_vehicles_are_told_with_the_error_of_their_mean() -> None:
+    (notice,) = few_vehicles_notice(4)
+    assert "4 vehicles are few for the published method" in notice
+    assert "off by about 5%" in notice
+    assert len(few_vehicles_notice(LEAST_VEHICLES - 1)) == 1
+    assert few_vehicles_notice(LEAST_VEHICLES) == ()
+
+
+@pytest.fixture(scope="module")
+def small_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("small") / "fleet"
+    calibrator(
+        "simulate", "--vehicles", 3, "--minutes", 3, "--unseen-minutes", 0.1, "--common-drive", *FILES, "--out", out
+    )
+    return out
+
+
+@pytest.mark.parametrize(("options", "notices"), [([], 1), (["--symmetric"], 0)])
+def test_small_fleet_is_noticed_on_the_screen_and_in_the_record(
+    small_fleet: Path, options: list[str], notices: int, tmp_path: Path
+) -> None:
+    method = ["--method", "published", "--classifier", "threshold", *options]
+    run = calibrator("calibrate", small_fleet, *method, "--out", tmp_path / "result", *FILES)
+    record = json.loads((tmp_path / "result" / "run.json").read_text())
+    told = [notice for notice in record["notices"] if notice.startswith("3 vehicles are few")]
+    assert len(told) == notices
+    assert all(f"notice: {notice}" in run.stdout for notice in told)

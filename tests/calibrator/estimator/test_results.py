@@ -1,0 +1,152 @@
+"""Result folders: what is written is found again, and what is no result is named."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+from msgspec.structs import replace
+
+from calibrator.errors import FleetError
+from calibrator.estimator.results import (
+    MOST_FILES,
+    PARTS,
+    RunRecord,
+    count_rows,
+    encode_chunk,
+    join_rows,
+    left_out_of,
+    read_part,
+    read_results,
+    read_run,
+    report_of,
+    write_parameter_files,
+    write_run,
+    written_of,
+)
+from calibrator.estimator.vehicle_evidence import VehicleEvidence
+from calibrator.report.fleet_table import read_fleet_table
+from calibrator.report.overview import overview_of
+from calibrator.summaries.buckets import bucket_of
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import VehicleParameters, decode_parameters, read_parameters
+from tests.calibrator.conftest import run_command
+from tests.calibrator.report.results_at_hand import BRANCHES, six_vehicle_result
+from tests.ecu_node.vehicles import parameters_for
+
+BUCKETS = 16
+RUN = RunRecord(
+    tool="test",
+    method="posterior",
+    fleet="f",
+    layout="hv_powertrain",
+    branches=["battery", "motor"],
+    model_inputs=[],
+    settings={},
+    created="2026-01-01T00:00:00Z",
+    details={},
+    vehicles=2,
+    buckets=BUCKETS,
+    left_out={},
+    notices=[],
+)
+
+
+def vehicle(database: VehicleDatabase, name: str) -> VehicleParameters:
+    return replace(parameters_for(database, battery=(0.1, 0.0), motor=(0.0, 1.0)), vehicle=name)
+
+
+@pytest.fixture(params=[2, MOST_FILES + 1], ids=["a file each", "in parts"])
+def result(request: pytest.FixtureRequest, tmp_path: Path, database: VehicleDatabase) -> Path:
+    """A result of two vehicles, written as one of few or of many."""
+    parts = {}
+    for name in ("v1", "v2"):
+        parts[bucket_of(name, BUCKETS)] = tmp_path / f"{name}.parquet"
+        (tmp_path / f"{name}.parquet").write_bytes(encode_chunk([vehicle(database, name)], {}).parameters)
+    folder = tmp_path / "result"
+    folder.mkdir()
+    where = write_parameter_files(folder, parts, vehicles=request.param)
+    assert where == ("params" if request.param == 2 else PARTS)
+    assert (folder / "params").exists() == (where == "params")
+    write_run(folder, RUN)
+    return folder
+
+
+def test_parameters_of_a_vehicle_are_found_however_many_there_are(result: Path) -> None:
+    for name in ("v1", "v2"):
+        assert decode_parameters(written_of(result, name).text, name).vehicle == name
+    assert read_run(result) == RUN
+
+
+@pytest.mark.parametrize("name", ["v3", "../params/v1", ""])
+def test_unknown_vehicle_is_named(result: Path, name: str) -> None:
+    with pytest.raises(FleetError, match=rf"no vehicle '{name}' in it; results\.parquet names all that are"):
+        written_of(result, name)
+
+
+def test_vehicle_left_out_is_named_with_its_reason(result: Path, tmp_path: Path) -> None:
+    (tmp_path / "part").write_bytes(encode_chunk([], {"v3": "too short"}).rows)
+    assert join_rows(result, [tmp_path / "part"], {"a log": "unreadable", "v3": "known"}) == 0
+    assert left_out_of(result) == ({"a log": "unreadable", "v3": "too short"}, 2)
+    with pytest.raises(FleetError, match=r"no parameters of vehicle 'v3', it was left out: too short"):
+        written_of(result, "v3")
+
+
+def test_parameter_files_are_written_by_the_command(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(["params", str(result), "v1", "v2", "--out", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out.splitlines() == [str(tmp_path / "out" / f"{name}.json") for name in ("v1", "v2")]
+    assert read_parameters(tmp_path / "out" / "v2.json").branches["motor"].offset_a == 1.0
+    assert run_command(["params", str(result), "v1", "v9", "--out", str(tmp_path / "none")]) == 1
+    assert "no vehicle 'v9' in it" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
+def test_chunk_keeps_evidence_and_digest_of_the_drives(tmp_path: Path, database: VehicleDatabase) -> None:
+    evidence = VehicleEvidence(value=[1.0, None], sd=[0.5, None], explained=[1.0, 2.0])
+    chunk = encode_chunk([vehicle(database, "v1")], {}, drives={"v1": "abc"}, evidence={"v1": evidence})
+    (tmp_path / "part").write_bytes(chunk.parameters)
+    (written,) = read_part(tmp_path / "part").values()
+    assert (written.drives, written.evidence) == ("abc", evidence)
+
+
+def test_parameters_that_cannot_be_written_leave_their_vehicle_out(tmp_path: Path, database: VehicleDatabase) -> None:
+    good = vehicle(database, "v1")
+    bad = replace(good, vehicle="v2", branches={"battery": replace(good.branches["battery"], offset_a=float("nan"))})
+    (tmp_path / "part").write_bytes(encode_chunk([bad, good], {}).rows)
+    assert join_rows(tmp_path, [tmp_path / "part"], {}) == 1
+    (reason,) = left_out_of(tmp_path)[0].values()
+    assert reason.endswith("; look at its recordings")
+
+
+def test_folder_that_is_no_result_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FleetError, match=r"run\.json: not a result of 'calibrator calibrate': No such file"):
+        read_run(tmp_path)
+    with pytest.raises(FleetError, match=r"results\.parquet: not a result of 'calibrator calibrate'"):
+        read_results(tmp_path)
+    (tmp_path / "run.json").write_text('{"tool": 1}')
+    with pytest.raises(FleetError, match=r"run\.json: not a run of 'calibrator calibrate': .*; calibrate again"):
+        read_run(tmp_path)
+
+
+def test_vehicles_and_branches_are_counted_as_the_report_page_counts_them(
+    tmp_path: Path, database: VehicleDatabase
+) -> None:
+    folder = six_vehicle_result(tmp_path / "result", database)
+    rows = pq.ParquetFile(folder / "results.parquet").read(use_threads=False)
+    found = count_rows(rows.filter(pc.field("branch").is_valid()), BRANCHES)
+    assert found.verdicts == {"corrected": 2, "no sensor fault": 2, "cannot tell": 2}
+    assert found.held_back == {"harm limit": 1, "beyond the limits": 1}
+    assert (found.hardware_suspected, found.moved_vehicles, found.moved_sensors) == (1, 1, 1)
+    report, page = (
+        report_of(folder, read_run(folder), parameters="p", shown=folder),
+        overview_of(read_fleet_table(folder)),
+    )
+    assert (report.verdicts, report.held_back) == (page.verdicts, page.held_back)
+    assert (report.hardware_count, report.moved_count) == (page.hardware_suspected, 1)
+    assert set(report.corrected) == {"V1", "V10"}
+    assert isinstance(rows, pa.Table)
+    assert np.isfinite(report.junction_rms_deployed_a)

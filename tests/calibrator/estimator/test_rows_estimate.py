@@ -1,0 +1,128 @@
+"""From evidence rows to estimates: right where they are sure, each vehicle by itself, harmless in odd worlds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrator.drive import Array, Mask
+from calibrator.estimator.fleet_estimate import HARM_LIMIT, RowsEstimate, estimate_rows
+from calibrator.estimator.learning import learn_laws
+from calibrator.estimator.rows import EvidenceRows
+from calibrator.faults import Faults
+from calibrator.score import harmed, recovered
+from tests.calibrator.estimator.simulated_drives import no_faults
+from tests.calibrator.estimator.simulated_rows import random_faults, rows_of
+
+VARIANCE = 0.04
+"""Of the currents, in squares of full scale."""
+
+
+def moments(rows: EvidenceRows) -> dict[str, Array]:
+    mean, ideal = rows.means[:, 1], rows.means[0, 0]
+    return {"mean": mean, "mean_square": mean**2 + VARIANCE, "usual": np.stack([ideal, ideal**2 + VARIANCE])}
+
+
+def estimated(faults: Faults, *, seed: int, load: Array | float = 0.0) -> tuple[RowsEstimate, Faults]:
+    """Estimate, and what of it would be deployed."""
+    rows = rows_of(faults, seed=seed, load=load)
+    found = estimate_rows(rows, learn_laws(rows, feed=0), feed=0, **moments(rows))
+    deployed = found.identifiable & (found.harm_probability < HARM_LIMIT)
+    none = no_faults(*faults.drift.shape)
+    return found, replace(none, drift=found.drift * deployed, offset_a=found.offset * deployed)
+
+
+def worse(deployed: Faults, faults: Faults) -> Mask:
+    """Whether any branch of a vehicle is worse on another drive."""
+    mean = np.full(faults.drift.shape, 0.05)
+    return harmed(deployed, faults, mean_a=mean, mean_square_a2=mean**2 + VARIANCE)
+
+
+@pytest.mark.parametrize("magnitude", [(0.05, 0.25), (0.01, 0.05), (0.3, 0.6)])
+@pytest.mark.parametrize("K", [2, 3])
+def test_faults_are_recovered_and_corrected_whatever_their_size(K: int, magnitude: tuple[float, float]) -> None:
+    faults = random_faults(1, vehicles=40, branches=K, magnitude=magnitude)
+    found, deployed = estimated(faults, seed=1)
+    estimate = replace(no_faults(40, K), drift=found.drift, offset_a=found.offset)
+    right = recovered(estimate, faults, full_scale_a=1.0, smallest_fault=magnitude[0])
+    assert right.mean() >= 0.9
+    assert not worse(deployed, faults).any()
+    faulty = (faults.drift != 0.0) | (faults.offset_a != 0.0)
+    assert ((deployed.drift != 0.0) | (deployed.offset_a != 0.0))[faulty].mean() > 0.8
+    spread = np.sqrt(np.sum(found.confidence * (1.0 - found.confidence)))
+    assert abs(right.sum() - found.confidence.sum()) < 3.0 * spread + 1.0
+
+
+@pytest.mark.parametrize("offset", [0.0125, 0.05, -0.03])
+@pytest.mark.parametrize("share", [0.6, 1.0])
+def test_batch_of_sensors_with_a_common_offset_makes_no_vehicle_worse(offset: float, share: float) -> None:
+    faults = random_faults(2, vehicles=30, branches=2)
+    faults.offset_a[: round(30 * share), 0] += offset
+    found, deployed = estimated(faults, seed=2)
+    assert not worse(deployed, faults).any()
+    assert np.abs(found.offset[:, 1] - faults.offset_a[:, 1]).max() < 0.01
+
+
+@pytest.mark.parametrize(("load", "share"), [(0.0125, 0.3), (0.025, 0.15), (0.0125, 1.0)])
+def test_load_without_a_sensor_makes_no_vehicle_worse(load: float, share: float) -> None:
+    faults = random_faults(3, vehicles=30, branches=3)
+    found, deployed = estimated(faults, seed=3, load=load * (np.arange(30) < 30 * share))
+    assert not worse(deployed, faults).any()
+    assert np.abs(found.offset[:, 1:] - faults.offset_a[:, 1:]).max() < 0.01
+
+
+@pytest.mark.parametrize("gain", [0.04, -0.04])
+@pytest.mark.parametrize("K", [2, 3])
+def test_batch_of_sensors_with_a_common_gain_makes_no_vehicle_worse(K: int, gain: float) -> None:
+    faults = random_faults(4, vehicles=30, branches=K)
+    faults.drift[:, 1] = (1.0 + gain) * (1.0 + faults.drift[:, 1]) - 1.0
+    assert not worse(estimated(faults, seed=4)[1], faults).any()
+
+
+def test_vehicles_without_faults_are_not_corrected() -> None:
+    found, deployed = estimated(no_faults(30, 3), seed=5)
+    assert not deployed.drift.any()
+    assert not deployed.offset_a.any()
+    assert found.confidence.min() > 0.9
+    assert found.hardware_probability.max() < 0.2
+
+
+def test_standard_deviations_are_those_of_the_errors() -> None:
+    faults = random_faults(6, vehicles=120, branches=2)
+    found, _ = estimated(faults, seed=6)
+    truth = np.hstack([faults.drift, faults.offset_a])
+    error, sd = np.hstack([found.drift, found.offset]) - truth, np.hstack([found.drift_sd, found.offset_sd])
+    sure = (found.confidence > 0.95)[:, None] & (truth != 0.0)
+    within = np.abs(error[sure]) / sd[sure]
+    assert 0.55 < (within < 1.0).mean() < 0.95
+    assert (within > 3.5).mean() < 0.02
+
+
+@pytest.mark.parametrize("K", [2, 3])
+def test_vehicle_is_estimated_alike_to_the_bit_alone_and_in_any_fleet(K: int) -> None:
+    rows = rows_of(random_faults(7, vehicles=300, branches=K, sparsity=70.0), seed=7)
+    laws, drives = learn_laws(rows.take(slice(0, 40)), feed=0), moments(rows)
+    together = estimate_rows(rows, laws, feed=0, **drives)
+    for j in (0, 171, 299):
+        one = slice(j, j + 1)
+        own = {"mean": drives["mean"][one], "mean_square": drives["mean_square"][one], "usual": drives["usual"]}
+        alone = estimate_rows(rows.take(one), laws, feed=0, **own)
+        for name, values in vars(alone).items():
+            if isinstance(values, np.ndarray):
+                np.testing.assert_array_equal(values[0], getattr(together, name)[j], err_msg=name)
+        for found, other in zip(alone.explanations[0], together.explanations[j], strict=True):
+            assert found[0] == other[0]
+            np.testing.assert_array_equal(found[1], other[1])
+
+
+def test_probabilities_of_the_explanations_are_those_of_the_posterior() -> None:
+    found, _ = estimated(random_faults(8, vehicles=20, branches=2, sparsity=60.0), seed=8)
+    for j, explanations in enumerate(found.explanations):
+        shares = [share for share, _ in explanations]
+        assert shares == sorted(shares, reverse=True)
+        assert sum(shares) == pytest.approx(1.0, abs=0.001)
+        hardware = sum(share for share, values in explanations if values[:2].any())
+        assert found.hardware_probability[j] == pytest.approx(min(hardware, 1.0))
+        for k in range(2):
+            faulty = sum(share for share, values in explanations if values[2:, k].any())
+            assert found.fault_probability[j, k] == pytest.approx(faulty, abs=0.001)

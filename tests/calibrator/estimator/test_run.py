@@ -1,0 +1,537 @@
+"""Whole runs, as a user types them and bucket by bucket: every vehicle by itself, and none stops the others."""
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from calibrator.errors import FleetError
+from calibrator.estimator import run
+from calibrator.estimator.fleet_task import FleetTask, learn_task
+from calibrator.estimator.results import ChunkResult, read_results, read_run
+from calibrator.estimator.run import calibrate_bucket, read_sample, take_census
+from calibrator.estimator.settings import CalibrationSettings
+from calibrator.estimator.unfinished import unfinished_run
+from calibrator.estimator.workers import Workers
+from calibrator.faults import Faults
+from calibrator.files.parameter_files import RunIdentity
+from calibrator.files.storage import open_storage
+from calibrator.options import Method
+from calibrator.summaries.record import Record
+from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.vehicle_summary import VehicleSummary
+from ecu_node.database import VehicleDatabase
+from tests.calibrator.command_here import calibrator
+from tests.calibrator.estimator.simulated_drives import Conditions, summaries_of
+from tests.calibrator.summaries.small_stores import BRANCHES, random_faults, record_of, small_store
+
+LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
+VEHICLES = 60
+ONE = Workers(processes=1)
+ENVIRONMENT = {**os.environ, "SOURCE_DATE_EPOCH": "1700000000", "OMP_NUM_THREADS": "1"}
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "calibrator", *map(str, arguments)]
+
+
+def calibrate(store: str, out: Path, *options: object) -> subprocess.CompletedProcess[str]:
+    line = command("calibrate", store, "--layout", LAYOUT, "--out", out, *options)
+    return subprocess.run(line, capture_output=True, text=True, check=False, timeout=300, env=ENVIRONMENT)
+
+
+def calibrate_here(store: str, out: Path, *options: object) -> subprocess.CompletedProcess[str]:
+    return calibrator("calibrate", store, "--layout", LAYOUT, "--out", out, *options)
+
+
+def contents(result: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(result)): path.read_bytes() for path in sorted(result.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def store(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -> SummaryStore:
+    return small_store(tmp_path_factory.mktemp("fleet") / "store", database, random_faults(VEHICLES))
+
+
+@pytest.fixture(scope="module")
+def result(store: SummaryStore) -> Path:
+    out = Path(store.url).parent / "result"
+    done = calibrate(store.url, out, "--workers", 1)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+@pytest.fixture(scope="module")
+def task(store: SummaryStore, database: VehicleDatabase) -> FleetTask:
+    identity = RunIdentity(
+        database=database, method=Method.POSTERIOR, fleet="small", created="2026-01-01T00:00:00+00:00"
+    )
+    settings = CalibrationSettings()
+    sample = read_sample(store, take_census(store, ONE), settings, ())
+    return learn_task(sample, settings, {}, branches=BRANCHES, identity=identity, fleet_size=VEHICLES)[0]
+
+
+def texts(chunk: ChunkResult) -> dict[str, bytes]:
+    table = pq.read_table(pa.BufferReader(chunk.parameters)).to_pylist()
+    return {row["vehicle"]: row["parameters"].encode() for row in table}
+
+
+def rows(chunk: ChunkResult) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = pq.read_table(pa.BufferReader(chunk.rows)).to_pylist()
+    return found
+
+
+def left_out(chunk: ChunkResult) -> dict[str, str]:
+    return {row["vehicle"]: row["reason"] for row in rows(chunk) if row["branch"] is None}
+
+
+def rewritten(store: SummaryStore, folder: Path, bucket: int, records: Mapping[str, Sequence[Record]]) -> SummaryStore:
+    """A store with one bucket of other content."""
+    other = SummaryStore(storage=open_storage(folder), identity=store.identity)
+    other.write(bucket, records)
+    return other
+
+
+def copied(store: SummaryStore, folder: Path, name: str, records: Sequence[Record]) -> SummaryStore:
+    """A copy of a store with other records of one vehicle."""
+    shutil.copytree(store.url, folder)
+    other = SummaryStore(storage=open_storage(folder), identity=store.identity)
+    bucket = other.bucket_of(name)
+    other.write(bucket, {**other.read(bucket), name: records})
+    return other
+
+
+def fullest(store: SummaryStore) -> int:
+    return max(store.buckets(), key=lambda bucket: len(store.outlines(bucket)))
+
+
+def spoilt(record: Record, **changes: Any) -> Record:
+    """The same record with another summary."""
+    assert record.found is not None
+    return replace(record, found=replace(record.found, summary=replace(record.found.summary, **changes)))
+
+
+# The result
+
+
+def test_result_has_every_vehicle_once_in_order(result: Path) -> None:
+    found = read_results(result)
+    assert [row["vehicle"] for row in found[::2]] == [f"V{j:03d}" for j in range(VEHICLES)]
+    assert sorted(path.stem for path in (result / "params").iterdir()) == [f"V{j:03d}" for j in range(VEHICLES)]
+    assert read_run(result).vehicles == VEHICLES
+    assert not (result.parent / ".result.unfinished").exists()
+
+
+def test_result_is_the_same_for_any_number_of_workers(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+    done = calibrate(store.url, tmp_path / "two", "--workers", 2)
+    assert done.returncode == 0, done.stderr
+    assert contents(tmp_path / "two") == contents(result)
+
+
+def test_killed_run_goes_on_where_it_stopped(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+    out, chunks = tmp_path / "out", tmp_path / ".out.unfinished" / "chunks"
+    line = command("calibrate", store.url, "--layout", LAYOUT, "--out", out, "--workers", 1)
+    written: dict[str, int] = {}
+    for wanted in (1, 6):
+        with subprocess.Popen(line, stderr=subprocess.PIPE, env=ENVIRONMENT) as process:
+            until = time.monotonic() + 120.0
+            while len(list(chunks.glob("*.rows.parquet"))) < wanted and time.monotonic() < until:
+                time.sleep(0.002)
+            process.send_signal(signal.SIGKILL)
+        found = {path.name: path.stat().st_mtime_ns for path in chunks.glob("*.rows.parquet")}
+        assert len(found) >= wanted
+        assert written.items() <= found.items(), "chunks that are done are not made again"
+        assert not out.exists()
+        written = found
+    assert calibrate(store.url, out, "--workers", 1).returncode == 0
+    assert contents(out) == contents(result)
+
+
+def test_chunks_of_other_settings_are_not_used(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+    unfinished = tmp_path / ".out.unfinished"
+    (unfinished / "chunks").mkdir(parents=True)
+    (unfinished / "plan").write_text("another plan\n1999")
+    (unfinished / "chunks" / "00000.rows.parquet").write_bytes(b"nonsense")
+    assert calibrate(store.url, tmp_path / "out", "--workers", 1).returncode == 0
+    assert contents(tmp_path / "out") == contents(result)
+
+
+def test_second_run_to_the_same_place_is_refused(store: SummaryStore, tmp_path: Path) -> None:
+    with unfinished_run(tmp_path / "out"):
+        second = calibrate_here(store.url, tmp_path / "out")
+    assert second.returncode == 1
+    assert "another run is writing this result; wait for it or choose another --out" in second.stderr
+
+
+def test_only_computed_work_is_kept(store: SummaryStore, tmp_path: Path) -> None:
+    out, folder = tmp_path / "out", tmp_path / ".out.unfinished"
+    for name, kept in (("chunks/00003.rows.parquet", True), ("summaries/buckets/00003.parquet", True), ("plan", False)):
+        with suppress(FleetError), unfinished_run(out):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).touch()
+            raise FleetError("a slip")
+        assert folder.exists() == kept
+        shutil.rmtree(folder, ignore_errors=True)
+    (tmp_path / "earlier").mkdir()
+    (tmp_path / "earlier" / "run.json").touch()
+    shutil.copytree(store.url, tmp_path / "earlier" / "summaries")
+    for new in (False, True):
+        with suppress(FleetError), unfinished_run(out) as unfinished:
+            unfinished.summaries_since(tmp_path / "earlier")
+            if new:
+                (unfinished.summaries / "buckets" / "00003.parquet").touch()
+            raise FleetError("a slip")
+        assert folder.exists() == new, "copies of earlier summaries are nothing new"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.ENOSPC, "Error writing bytes to file. Detail: [errno 28] No space left on device"),
+        shutil.Error([("a", "b", "[Errno 28] No space left on device: 'b'")]),
+    ],
+)
+def test_full_disk_says_what_to_do(tmp_path: Path, error: OSError) -> None:
+    where = "b" if isinstance(error, shutil.Error) else rf"{tmp_path}/\.out\.unfinished"
+    message = rf"^{where}: cannot write it: .*No space left on device.*; make room, and run the same command again"
+    with pytest.raises(FleetError, match=message), unfinished_run(tmp_path / "out"):
+        raise error
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "message"),
+    [
+        (("--method", "published"), 1, "a store of summaries, and --method published needs the drives"),
+        (("--branches", "battery,motor"), 1, "a store of summaries, and --branches needs the drives"),
+        (("--trusted", "V777"), 1, "fleet small: no usable vehicle V777 to trust"),
+        (("--hold-out", "V777"), 1, "fleet small: no usable vehicle V777 to hold out"),
+        (
+            ("--trusted", ",".join(f"V{number}" for number in range(700, 710))),
+            1,
+            "V700, V701, V702, V703, V704, V705 and 4 more to trust",
+        ),
+        (("--hold-out", "V003", "--trusted", "V003"), 2, "vehicle V003 is both held out and trusted"),
+        (("--since", "earlier", "--branches", "battery,motor"), 2, "--branches and --since exclude each other"),
+        (("--since", "nothing"), 1, "not a result of 'calibrator calibrate'"),
+        (("--expected-faults", "1.5"), 2, "1.5: expected a number from 0 to 1"),
+        (("--expected-faults", "0.5", "--method", "published"), 2, "belongs to --method posterior, not published"),
+        (("--scheduler", "tcp://127.0.0.1:9"), 1, "tcp://127.0.0.1:9: no Dask scheduler answers"),
+        (("--scheduler", ""), 2, "'': expected the address of a Dask scheduler, tcp://HOST:PORT or tls://HOST:PORT"),
+        (("--scheduler", "tcp://127.0.0.1:99999"), 2, "port 1 to 65535"),
+    ],
+)
+def test_wrong_option_is_refused_in_one_line_and_leaves_nothing(
+    store: SummaryStore, tmp_path: Path, options: tuple[str, ...], code: int, message: str
+) -> None:
+    done = calibrate_here(store.url, tmp_path / "out", *options)
+    assert done.returncode == code
+    assert message in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_place_that_is_no_fleet_is_refused(store: SummaryStore, tmp_path: Path) -> None:
+    shutil.copytree(store.url, tmp_path / "both")
+    (tmp_path / "both" / "drives").mkdir()
+    shutil.copytree(store.url, tmp_path / "empty", ignore=shutil.ignore_patterns("*.parquet"))
+    (tmp_path / "file").touch()
+    for place, code, message in (
+        (tmp_path / "nothing", 1, "nothing: no such folder, store of drives or store of summaries"),
+        (tmp_path / "file", 1, "file: is a file; give a store of drives or of summaries, or a folder with one folder"),
+        (tmp_path / "both", 1, "both: holds drives (drives) and summaries (summaries.json); move one of them"),
+        (tmp_path / "empty", 1, "empty: the store of summaries is empty; add drives with 'calibrator summarise'"),
+        ("memory://none", 1, "memory://none: no store of summaries there; make one with 'calibrator summarise --out'"),
+        ("", 2, "an empty name; give the path"),
+        ("file://", 1, "'file://': names no place"),
+    ):
+        done = calibrate_here(str(place), tmp_path / "out")
+        assert (done.returncode, message in done.stderr.splitlines()[-1]) == (code, True), done.stderr
+        assert not (tmp_path / ".out.unfinished").exists()
+
+
+def test_summaries_do_not_go_into_a_folder_of_something_else(result: Path, tmp_path: Path) -> None:
+    (tmp_path / "fleet").mkdir()
+    for out, code, message in (
+        (result, 1, "no store of summaries, and not empty: parameters, params, results.parquet, run.json; choose"),
+        (result / "run.json", 1, "run.json: is a file; name a folder"),
+        ("memory://m", 1, "memory://m: is gone when the command ends"),
+    ):
+        done = calibrator("summarise", tmp_path / "fleet", "--layout", LAYOUT, "--out", out)
+        assert (done.returncode, message in done.stderr.splitlines()[-1]) == (code, True), done.stderr
+
+
+def test_cluster_without_dask_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)  # makes its import fail
+    with pytest.raises(FleetError, match=r"--scheduler needs Dask: pip install 'hv-current-correction\[cluster\]'"):
+        Workers(processes=1, scheduler="tcp://127.0.0.1:8786")
+
+
+# First pass
+
+
+def test_sample_of_a_small_fleet_is_all_of_it_less_those_held_out(store: SummaryStore) -> None:
+    census = take_census(store, ONE)
+    names = {item.vehicle for item in read_sample(store, census, CalibrationSettings(), ())}
+    assert names == {f"V{j:03d}" for j in range(VEHICLES)}
+    held_out = CalibrationSettings(hold_out=frozenset({"V003", "V004"}))
+    assert names - {item.vehicle for item in read_sample(store, census, held_out, ("V004",))} == {"V003"}
+
+
+def test_sample_of_a_large_fleet_has_a_fixed_size_and_holds_the_trusted(
+    store: SummaryStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "MOST_LEARNT", 10)
+    census = take_census(store, ONE)
+    last = list(store.read(max(census.usable)))[-1]
+    settings = CalibrationSettings(trusted=frozenset({last}))
+    sample = [item.vehicle for item in read_sample(store, census, settings, ())]
+    assert last in sample
+    assert len(sample) == 11
+
+
+def test_one_vehicle_is_no_fleet(database: VehicleDatabase, tmp_path: Path) -> None:
+    lonely = small_store(tmp_path, database, random_faults(1))
+    with pytest.raises(FleetError, match="1 usable vehicle to learn from, at least 2 are needed"):
+        read_sample(lonely, take_census(lonely, ONE), CalibrationSettings(), ())
+
+
+# Second pass
+
+
+def test_vehicle_gets_the_same_parameters_in_any_company(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
+    bucket = fullest(store)
+    records = store.read(bucket)
+    together = texts(calibrate_bucket(bucket, store=store, task=task))
+    assert len(together) >= 5
+    for name, items in records.items():
+        alone = rewritten(store, tmp_path, bucket, {name: items})
+        (found,) = texts(calibrate_bucket(bucket, store=alone, task=task)).values()
+        assert found.decode().splitlines() == together[name].decode().splitlines()
+
+
+@pytest.mark.parametrize("what", ["huge", "infinite", "noise nan", "noise negative"])
+def test_vehicle_with_impossible_numbers_stops_neither_pass(
+    store: SummaryStore, task: FleetTask, tmp_path: Path, what: str
+) -> None:
+    bucket = fullest(store)
+    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
+    expected = texts(calibrate_bucket(bucket, store=store, task=task))
+    bad = min(records)
+    record = records[bad][0]
+    assert record.found is not None
+    moments, noise_a2 = record.found.summary.moments.copy(), record.found.summary.noise_a2
+    moments[2, 1, 1] = np.inf
+    changes = {
+        "huge": {"moments": 1e200 * record.found.summary.moments},
+        "infinite": {"moments": moments},
+        "noise nan": {"noise_a2": np.full_like(noise_a2, np.nan)},
+        "noise negative": {"noise_a2": -np.ones_like(noise_a2)},
+    }
+    records[bad] = [spoilt(record, **changes[what])]
+    other = rewritten(store, tmp_path, bucket, records)
+    sample = read_sample(other, take_census(other, ONE), CalibrationSettings(), ())
+    assert {item.vehicle for item in sample} == records.keys() - {bad}
+    chunk = calibrate_bucket(bucket, store=other, task=task)
+    assert texts(chunk) == {name: text for name, text in expected.items() if name != bad}
+    assert left_out(chunk)[bad].startswith("its summary holds impossible numbers; look at its recordings")
+
+
+def test_vehicle_without_usable_drives_is_left_out_with_its_reason(
+    store: SummaryStore, task: FleetTask, tmp_path: Path
+) -> None:
+    bucket = fullest(store)
+    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
+    bad = next(name for name in (f"V9{j:02d}" for j in range(100)) if store.bucket_of(name) == bucket)
+    records[bad] = [Record(vehicle=bad, drives=("x",), sources=("",), found=None, problem="drive x:\ncut")]
+    other = rewritten(store, tmp_path, bucket, records)
+    assert left_out(calibrate_bucket(bucket, store=other, task=task)) == {bad: "drive x: cut"}
+    census = take_census(other, ONE)
+    assert (census.size, census.reasons) == (len(records) - 1, {bad: "drive x: cut"})
+
+
+def failing_for(bad: str, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From now on vehicles cannot be estimated if this one is among them."""
+    estimate = FleetTask.estimate
+
+    def refusing(task: FleetTask, vehicles: Sequence[VehicleSummary]) -> Any:
+        if bad in {vehicle.vehicle for vehicle in vehicles}:
+            raise error
+        return estimate(task, vehicles)
+
+    monkeypatch.setattr(FleetTask, "estimate", refusing)
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (FleetError("evidence is not finite"), "its evidence cannot be used: evidence is not finite; look at its rec"),
+        (ZeroDivisionError("by nothing"), "internal error: ZeroDivisionError: by nothing (test_run.py:"),
+        (KeyError("x"), "internal error: KeyError: 'x' (test_run.py:"),
+    ],
+)
+def test_vehicle_that_cannot_be_estimated_does_not_stop_the_others(
+    store: SummaryStore, task: FleetTask, monkeypatch: pytest.MonkeyPatch, error: Exception, reason: str
+) -> None:
+    bucket = fullest(store)
+    expected = texts(calibrate_bucket(bucket, store=store, task=task))
+    bad, *others = expected
+    failing_for(bad, error, monkeypatch)
+    chunk = calibrate_bucket(bucket, store=store, task=task)
+    assert texts(chunk) == {name: expected[name] for name in others}
+    assert left_out(chunk)[bad].startswith(reason)
+
+
+def test_internal_error_is_named_and_ends_the_command_with_70(
+    store: SummaryStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failing_for("V012", ZeroDivisionError("by nothing"), monkeypatch)
+    done = calibrate_here(store.url, tmp_path / "out", "--workers", 1)
+    assert done.returncode == 70
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("calibrator: internal error in 1 vehicle, which are left out: V012: ZeroDivisionError: by")
+    assert read_run(tmp_path / "out").vehicles == VEHICLES - 1
+
+
+# Since an earlier result
+
+
+def earlier_result(folder: Path, chunk: ChunkResult, bucket: int) -> Path:
+    (folder / "parameters").mkdir(parents=True)
+    (folder / "parameters" / f"{bucket:05d}.parquet").write_bytes(chunk.parameters)
+    return folder
+
+
+def faults_of_vehicle(j: int, **changes: float) -> Faults:
+    """Faults of vehicle j of the store, with changes to its battery sensor."""
+    faults = random_faults(VEHICLES).take(slice(j, j + 1))
+    drift, offset_a = faults.drift.copy(), faults.offset_a.copy()
+    drift[0, 0] += changes.get("drift", 0.0)
+    offset_a[0, 0] += changes.get("offset_a", 0.0)
+    return replace(faults, drift=drift, offset_a=offset_a)
+
+
+def test_only_those_who_drove_since_are_calibrated(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+    (new,) = summaries_of(faults_of_vehicle(9, drift=0.08), Conditions(model_error_a=0.5), seed=5)
+    before = store.read(store.bucket_of("V009"))["V009"]
+    grown = copied(store, tmp_path / "store", "V009", [*before, record_of("V009", new, ("d2",))])
+    done = calibrate_here(grown.url, tmp_path / "out", "--since", result, "--workers", 1)
+    assert done.returncode == 0, done.stderr
+    assert "moved since the earlier result:" in done.stdout
+    assert "V009: battery drift" in done.stdout
+    old, now = contents(result / "params"), contents(tmp_path / "out" / "params")
+    assert [name for name in old if old[name] != now[name]] == ["V009.json"]
+
+
+def test_since_a_result_without_its_parameters_is_refused(store: SummaryStore, result: Path, tmp_path: Path) -> None:
+    shutil.copytree(result, tmp_path / "earlier")
+    shutil.rmtree(tmp_path / "earlier" / "parameters")
+    done = calibrate_here(store.url, tmp_path / "out", "--since", tmp_path / "earlier")
+    assert done.returncode == 1
+    assert "earlier/parameters: no such folder; expected the parameters of the earlier result: give" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("method", "published", "a result of the method published; --since goes on from one of the posterior"),
+        ("branches", ["battery"], "a result with branches battery; this fleet has battery, motor"),
+        ("layout_sha256", "0", "made with another version of layout or DBC"),
+        ("buckets", 32, "made from a store of 32 buckets, and this one has 16"),
+    ],
+)
+def test_since_a_result_of_something_else_is_refused(
+    store: SummaryStore, result: Path, tmp_path: Path, key: str, value: object, message: str
+) -> None:
+    shutil.copytree(result, tmp_path / "earlier")
+    run_file = tmp_path / "earlier" / "run.json"
+    run_file.write_text(json.dumps({**json.loads(run_file.read_text()), key: value}))
+    done = calibrate_here(store.url, tmp_path / "out", "--since", tmp_path / "earlier")
+    assert (done.returncode, message in done.stderr.splitlines()[-1]) == (1, True), done.stderr
+
+
+def test_vehicles_that_have_not_driven_keep_their_parameters(
+    store: SummaryStore, task: FleetTask, tmp_path: Path
+) -> None:
+    bucket = fullest(store)
+    first = calibrate_bucket(bucket, store=store, task=task)
+    later = replace(task, identity=replace(task.identity, created="2027-01-01T00:00:00+00:00"))
+    again = calibrate_bucket(bucket, store=store, task=later, previous=earlier_result(tmp_path, first, bucket))
+    assert texts(again) == texts(first)
+
+
+def test_changed_drive_counts_though_its_name_is_known(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
+    bucket = fullest(store)
+    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
+    previous = earlier_result(tmp_path / "r", calibrate_bucket(bucket, store=store, task=task), bucket)
+    name = min(name for name in records if int(name[1:]) % 3 == 0)
+    (changed,) = summaries_of(faults_of_vehicle(int(name[1:]), drift=0.08), Conditions(model_error_a=0.5), seed=7)
+    records[name] = [replace(record_of(name, changed), sources=("3-4",))]
+    other = rewritten(store, tmp_path / "s", bucket, records)
+    chunk = calibrate_bucket(bucket, store=other, task=task, previous=previous)
+    (battery,) = [row for row in rows(chunk) if row["vehicle"] == name and row["branch"] == "battery"]
+    assert battery["drift"] == pytest.approx(0.08, abs=0.005)
+
+
+def test_earlier_vehicle_that_the_store_lacks_is_named(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
+    bucket = fullest(store)
+    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
+    previous = earlier_result(tmp_path / "r", calibrate_bucket(bucket, store=store, task=task), bucket)
+    name = max(records)
+    del records[name]
+    other = rewritten(store, tmp_path / "s", bucket, records)
+    reasons = left_out(calibrate_bucket(bucket, store=other, task=task, previous=previous))
+    assert reasons == {name: run.NOT_THERE}
+
+
+def test_earlier_result_that_cannot_be_read_is_refused(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:
+    bucket = fullest(store)
+    with pytest.raises(FleetError, match="the earlier result cannot be reached from here"):
+        calibrate_bucket(bucket, store=store, task=task, previous=tmp_path)
+    (tmp_path / "parameters").mkdir()
+    (tmp_path / "parameters" / f"{bucket:05d}.parquet").write_bytes(b"nonsense")
+    with pytest.raises(FleetError, match="damaged part of a result"):
+        calibrate_bucket(bucket, store=store, task=task, previous=tmp_path)
+
+
+@pytest.mark.parametrize(("changes", "text"), [({}, None), ({"drift": 0.08}, "drift"), ({"offset_a": 30.0}, "offset")])
+def test_moved_sensor_is_named_and_calibrated_from_the_new_drives(
+    store: SummaryStore, task: FleetTask, tmp_path: Path, changes: dict[str, float], text: str | None
+) -> None:
+    bucket = fullest(store)
+    records: dict[str, Sequence[Record]] = dict(store.read(bucket))
+    name = min(name for name in records if int(name[1:]) % 3 == 0)
+    previous = earlier_result(tmp_path / "r", calibrate_bucket(bucket, store=store, task=task), bucket)
+    faults = faults_of_vehicle(int(name[1:]), **changes)
+    (new,) = summaries_of(faults, Conditions(model_error_a=0.5), seed=77)
+    records[name] = [*records[name], record_of(name, new, ("d2",))]
+    other = rewritten(store, tmp_path / "s", bucket, records)
+    chunk = calibrate_bucket(bucket, store=other, task=task, previous=previous)
+    moved = {str(row["branch"]): str(row["moved"]) for row in rows(chunk) if row["moved"] is not None}
+    if text is None:
+        assert not moved
+        assert b'"d1",\n      "d2"' in texts(chunk)[name]
+        return
+    assert list(moved) == ["battery"]
+    assert text in moved["battery"]
+    (battery,) = [row for row in rows(chunk) if row["vehicle"] == name and row["branch"] == "battery"]
+    for column, truth in (("drift", faults.drift), ("offset_a", faults.offset_a)):
+        sd = battery["drift_sd" if column == "drift" else "offset_sd_a"]
+        assert abs(battery[column] - truth[0, 0]) <= 4.0 * sd
+    assert b'"d1"' not in texts(chunk)[name]

@@ -1,0 +1,204 @@
+"""What is said of a vehicle: what would decide, what was found in words, the evidence in the units of its sensors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from msgspec.structs import replace as changed
+
+from calibrator.drive import Array
+from calibrator.estimator.fleet_estimate import FleetEstimate
+from calibrator.estimator.rows import EvidenceRows, evidence_names
+from calibrator.estimator.vehicle_evidence import reported_evidence
+from calibrator.estimator.vehicle_report import deciding_evidence, explained, impossible
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import BranchParameters, Explanation, Finding, HardwareFault
+from tests.ecu_node.vehicles import parameters_for
+
+NAMES = ("battery", "motor")
+FULL_SCALE_A = 400.0
+
+
+def of(
+    probability: float, *, drift: tuple[float, float] = (0, 0), offset_a: tuple[float, float] = (0, 0)
+) -> Explanation:
+    """An explanation by faults of the two sensors."""
+    drifts, offsets = (dict(zip(NAMES, map(float, values), strict=True)) for values in (drift, offset_a))
+    return Explanation(
+        probability=probability,
+        drift={name: value for name, value in drifts.items() if value},
+        offset_a={name: value for name, value in offsets.items() if value},
+    )
+
+
+def estimate(
+    *explanations: Explanation, held_back: tuple[str, str] = ("", ""), findings: tuple[Finding, ...] = ()
+) -> FleetEstimate:
+    """Of one vehicle, whose most probable explanation is the estimate."""
+
+    def both(values: dict[str, float]) -> Array:
+        return np.array([[values.get(name, 0.0) for name in NAMES]])
+
+    none = np.zeros((1, 2))
+    return FleetEstimate(
+        drift=both(explanations[0].drift),
+        offset_a=both(explanations[0].offset_a),
+        drift_sd=np.array([[0.0005, 0.006]]),
+        offset_sd_a=np.array([[3.0, 0.5]]),
+        fault_probability=none,
+        harm_probability=none,
+        identifiable=np.ones((1, 2), bool),
+        corrected=np.zeros((1, 2), bool),
+        held_back=np.array([held_back]),
+        hardware_drift=np.zeros(1),
+        hardware_offset_a=none,
+        hardware_probability=np.zeros(1),
+        confidence=np.ones(1),
+        verdicts=("cannot tell",),
+        explanations=[explanations],
+        findings=[findings],
+    )
+
+
+def advice(found: FleetEstimate) -> str:
+    return deciding_evidence(found, 0, NAMES, full_scale_a=FULL_SCALE_A, layout="hv.toml")
+
+
+@pytest.mark.parametrize(
+    ("explanations", "held_back", "text"),
+    [
+        (
+            (of(0.6, offset_a=(40, 0)), of(0.4, offset_a=(0, 40))),
+            ("", ""),
+            "a zero-current window (contactors open) would decide: the battery sensor then shows +40.0 A or +0.0 A",
+        ),
+        (
+            (of(0.6, drift=(0.1, 0)), of(0.4, drift=(0, -0.2))),
+            ("", ""),
+            "a check of the motor sensor against a reference would decide: its gain is off by +0.0% or -20.0%",
+        ),
+        (
+            (of(0.5, drift=(0.1, 0)), of(0.5, drift=(0.1, 0))),
+            ("", ""),
+            "the explanations differ in the vehicle, not in its sensors: inspect the hardware",
+        ),
+        (  # of a branch that is held back, the explanation in its way counts, not the second one
+            (
+                of(0.958, drift=(0.1, 0), offset_a=(0, 8)),
+                of(0.04, drift=(0.2, 0), offset_a=(0, 8)),
+                of(0.002, drift=(0.1, 0), offset_a=(8, 0)),
+            ),
+            ("", "harm limit"),
+            "a zero-current window (contactors open) would decide: the battery sensor then shows +0.0 A or +8.0 A",
+        ),
+        (  # no rival that is probable enough
+            (of(0.99, drift=(0.1, 0)), of(0.01, drift=(0, 0.1))),
+            ("", ""),
+            "more drives would decide: the motor sensor's drift is known to +-0.60%",
+        ),
+        (
+            (of(0.99, drift=(0.1, 0)), of(0.01, drift=(0, 0.1))),
+            ("harm limit", ""),
+            "a check of the battery sensor against a reference would decide: its gain is off by +10.0% or +0.0%",
+        ),
+        (  # rivals agree on the branch that is held back
+            (of(0.6, drift=(0.1, 0)), of(0.4, drift=(0.2, 0))),
+            ("", "harm limit"),
+            "more drives would decide: the motor sensor's drift is known to +-0.60% and its offset to +-0.50 A only",
+        ),
+        (
+            (of(1.0, drift=(0.0, 0.06), offset_a=(60, 0)),),
+            ("", ""),
+            "more drives would decide: the motor sensor's drift is known to +-0.60%",
+        ),
+        (
+            (of(1.0, drift=(0.9, 0)),),
+            ("beyond the limits", ""),
+            "the battery sensor is off by +90.0% and +0.0 A, beyond the limits of hv.toml: replace the sensor",
+        ),
+        (
+            (of(1.0, drift=(0.9, 0)),),
+            ("reference in doubt", ""),
+            "bench-checked vehicles would decide: the fleet's reference is in doubt for branch battery",
+        ),
+    ],
+)
+def test_what_would_decide(explanations: tuple[Explanation, ...], held_back: tuple[str, str], text: str) -> None:
+    assert advice(estimate(*explanations, held_back=held_back)).startswith(text)
+
+
+def test_finding_says_why_its_branch_is_not_corrected() -> None:
+    finding = Finding(branch="motor", cause="clipped", probability=0.98, text="the motor sensor clips at 100 A")
+    found = estimate(of(1.0, drift=(0, 0.1)), held_back=("", "does not fit"), findings=(finding,))
+    assert advice(found) == "the motor sensor clips at 100 A"
+    assert "a check of the motor sensor would decide" in advice(replace(found, findings=[()]))
+
+
+def test_gain_error_of_a_whole_or_more_has_no_parameters() -> None:
+    assert impossible(estimate(of(1.0, drift=(0.9, 0))), 0, NAMES) == ""
+    assert "its motor current does not follow its inputs" in impossible(estimate(of(1.0, drift=(0, 1.2))), 0, NAMES)
+
+
+def test_explanation_in_words_names_sensors_vehicle_and_findings(database: VehicleDatabase) -> None:
+    plain = parameters_for(database, battery=(0.1, 4.0), motor=(0.0, 0.0))
+    held = BranchParameters(drift=0.2, drift_sd=0.01, offset_a=0.0, apply=False, held_back="harm limit")
+    text = explained(
+        changed(
+            plain,
+            vehicle="V7",
+            verdict="corrected",
+            confidence=0.97,
+            branches={**plain.branches, "motor": held},
+            hardware_fault=HardwareFault(suspected=True, drift=-0.06, offset_a={"motor": 2.0}, probability=0.9),
+            explanations=[of(0.6, drift=(0.1, 0.2)), Explanation(probability=0.4)],
+            findings=[Finding(branch="motor", cause="step", probability=0.8, text="the motor gain stepped")],
+            deciding_evidence="a check would decide",
+        )
+    )
+    for part in (
+        "V7: corrected (confidence 0.97)",
+        "battery: gain error (drift) +10.00%, offset +4.00 A: corrected",
+        "motor: gain error (drift) +20.00% +- 1.00%, offset +0.00 A: not corrected, because the",
+        "differs from its fleet, probability 0.90: hardware: all currents -6.00%; hardware: motor +2.00 A",
+        "0.600  battery sensor: drift +10.00%; motor sensor: drift +20.00%",
+        "0.400  no fault",
+        "0.80  the motor gain stepped",
+        "\na check would decide\n",
+    ):
+        assert part in text
+
+
+def test_evidence_is_reported_in_the_units_of_the_sensors() -> None:
+    drift, offset_a = np.array([[0.1, 0.0]]), np.array([[0.0, 12.0]])
+    hardware, hardware_a = np.array([0.05]), np.array([[2.0, -2.0]])
+    gain = 1.0 + drift
+    ratios = [1.1 * 1.05, 1.05, 1.1, 1.1, 1.0]
+    seen = np.array([1.1, 1.0, 1.1, 1.0, 1.0]) * FULL_SCALE_A
+    constants_a = np.array([1.1 * 2.0, 12.0 - 2.0, 1.1 * 12.0, 0.0, 0.0])
+    variance = np.full(10, 1e-4)
+    variance[[3, 4, 8, 9]] = 100.0  # nothing was read on a bench
+    rows = EvidenceRows(
+        relative=np.log([ratios]),
+        constant=constants_a[None] / FULL_SCALE_A,
+        covariance=np.diag(variance)[None],
+        means=np.zeros((1, 2, 2)),
+    )
+    (found,) = reported_evidence(
+        rows,
+        centre=np.concatenate([np.zeros(7), [2.0 / FULL_SCALE_A], np.zeros(2)]),
+        covariance=rows.covariance,
+        drift=drift,
+        offset_a=offset_a,
+        hardware_drift=hardware,
+        hardware_offset_a=hardware_a,
+        full_scale_a=FULL_SCALE_A,
+    )
+    names = evidence_names(NAMES)
+    value, sd, made = (dict(zip(names, values, strict=True)) for values in (found.value, found.sd, found.explained))
+    assert [value[name] for name in ("gain read battery", "offset read motor")] == [None, None]
+    assert value["slope battery"] == pytest.approx(1.155) == made["slope battery"]
+    assert sd["slope battery"] == pytest.approx(0.01 * 1.155)
+    assert sd["junction constant"] == pytest.approx(0.01 * seen[2])
+    assert made["gain ratio battery / motor"] == pytest.approx(float(gain[0, 0]))
+    assert (made["intercept battery"], made["intercept motor"]) == pytest.approx((2.2, 10.0))
+    assert made["junction constant"] == pytest.approx(1.1 * (12.0 + 2.0))  # with the load that no branch measures

@@ -1,0 +1,81 @@
+"""Fleets of the experiments in memory, and ``simulate`` -> logs -> ``calibrate``: same vehicles, same result."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from calibrator.cli import app
+from calibrator.drive import Channel, Drive
+from calibrator.drives.store import write_drive
+from calibrator.experiments.methods import POSTERIOR
+from calibrator.experiments.outcome import judge
+from calibrator.experiments.recorded_fleet import read_fleet
+from calibrator.experiments.recorded_trial import RecordedCase, recorded_trial
+from calibrator.faults import Faults
+from calibrator.score import recovered
+from ecu_node.database import read_database
+from ecu_node.layout import read_layout
+from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet
+
+VEHICLES = 12
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Trips as ``calibrator import`` leaves them."""
+    folder = tmp_path_factory.mktemp("trips") / "store"
+    for number, trip in enumerate(small_fleet(VEHICLES).trips):
+        branches, inputs = (
+            {name: Channel(time_s=trip.time_s, value=x, good=np.isfinite(x)) for name, x in group.items()}
+            for group in (trip.currents_a, trip.inputs)
+        )
+        drive = Drive(vehicle=f"trip-{number:02d}", name="d", branches=branches, inputs=inputs)
+        write_drive(folder, drive, read_layout(LAYOUT))
+    return folder
+
+
+def calibrated(store: Path, out: Path, *more: str) -> pd.DataFrame:
+    """Result of the commands that users run, by vehicle and branch."""
+    layout = ("--layout", str(LAYOUT))
+    drawn = ("--vehicles", str(VEHICLES), "--drives", str(store), "--unseen-minutes", "1", *more)
+    for command in (
+        ("simulate", *layout, *drawn, "--out", str(out / "fleet")),
+        ("calibrate", str(out / "fleet"), *layout, "--out", str(out / "result")),
+    ):
+        ran = CliRunner().invoke(app, command)
+        assert ran.exit_code == 0, ran.output
+    rows = pd.read_parquet(out / "result" / "results.parquet")
+    return rows[rows["branch"].notna()].pivot_table(index="vehicle", columns="branch", aggfunc="first", sort=True)
+
+
+@pytest.mark.parametrize("balanced", [True, False], ids=["balanced", "any vehicle"])
+def test_recovery_and_deployment_are_those_of_the_commands(store: Path, tmp_path: Path, *, balanced: bool) -> None:
+    fleet = read_fleet(store, read_database(read_layout(LAYOUT)))
+    case = RecordedCase(balanced=balanced)
+    trial = recorded_trial(fleet, case, 0)
+    estimate = POSTERIOR.estimate(trial)
+    options = ("--sparsity", f"{case.sparsity:g}", "--seed", "0", *(("--balanced",) if balanced else ()))
+    table = calibrated(store, tmp_path, *options)
+    branches = list(fleet.with_branches(2)[0].currents_a)
+
+    def column(name: str) -> np.ndarray:
+        return np.asarray(table[name][branches], dtype=float)
+
+    found = Faults(
+        hardware_drift=column("hardware_drift")[:, 0],
+        hardware_offset_a=column("hardware_offset_a"),
+        drift=column("drift"),
+        offset_a=column("offset_a"),
+    )
+    # noise, instants of frames and steps of signals are other ones: what is sure agrees, what is not nearly does
+    judged = judge(estimate, trial)
+    by_commands = recovered(found, trial.truth, full_scale_a=fleet.full_scale_a, smallest_fault=case.magnitude[0])
+    np.testing.assert_array_equal(by_commands, judged.recovered)
+    np.testing.assert_array_equal(column("applied").astype(bool), estimate.corrected)
+    both = estimate.corrected & judged.recovered[:, None]
+    np.testing.assert_allclose(found.drift[both], estimate.faults.drift[both], atol=0.01)
+    np.testing.assert_allclose(found.offset_a[both], estimate.faults.offset_a[both], atol=0.01 * fleet.full_scale_a)
+    assert judged.recovered.mean() > 0.7

@@ -1,0 +1,92 @@
+"""Sensors that are not linear on recorded trips of the BMW i3: found and named; none is where all are linear."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrator.artificial.random_fleet import draw_faults
+from calibrator.drive import Array
+from calibrator.drives.align import Samples
+from calibrator.estimator.checks import check_fit, learn_usual_misfits
+from calibrator.estimator.fleet_model import fit_fleet_model
+from calibrator.estimator.moments import stack_summaries
+from calibrator.experiments.recorded_fleet import RecordedFleet, read_fleet
+from calibrator.faults import measured_currents, true_currents
+from calibrator.files.layout_files import vehicle_database
+from calibrator.summaries.summariser import summarise
+from ecu_node.parameters import Finding
+from tests.real.delay_trips import LAYOUT, import_trips
+
+Bend = Callable[[Array, Array], Array]
+"""What a sensor shows of its currents [A], given the share of the time that has passed."""
+BENDS: dict[str, Bend] = {
+    "inverted": lambda x, _: -x,
+    "dead": lambda x, _: 0.0 * x,
+    "clipped": lambda x, _: np.clip(x, -0.5 * np.abs(x).max(), 0.5 * np.abs(x).max()),
+    "quadratic": lambda x, _: x + 0.15 * x**2 / 400.0,
+    "sign": lambda x, _: np.where(x > 0.0, 1.12 * x, x),
+    "step": lambda x, share: np.where(share > 0.5, 1.15 * x, x),
+    "temperature": lambda x, share: x * (1.0 + 0.006 * 25.0 * np.sqrt(share)),
+}
+
+
+@pytest.fixture(scope="module")
+def fleet(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> RecordedFleet:
+    store = tmp_path_factory.mktemp("i3") / "store"
+    import_trips(shared_data, store)
+    return read_fleet(store, vehicle_database(LAYOUT))
+
+
+def checked(fleet: RecordedFleet, branches: int, seed: int, bends: dict[int, Bend]) -> list[tuple[Finding, ...]]:
+    """Findings in a fleet with gain errors and offsets, in which the batteries' sensors of some vehicles are bent."""
+    trips, rng, summaries = fleet.with_branches(branches), np.random.default_rng(seed), []
+    faults = draw_faults(
+        rng,
+        vehicles=len(trips),
+        branches=branches,
+        sparsity=70.0,
+        magnitude=(0.05, 0.25),
+        full_scale_a=fleet.full_scale_a,
+        balanced=True,
+    )
+    for j, trip in enumerate(trips):
+        own, share = faults.take(j), np.arange(len(trip)) / len(trip)
+        i_m = measured_currents(true_currents(trip.matrix_a(), own), own)
+        if j in bends:
+            i_m[:, 0] = bends[j](i_m[:, 0] - own.offset_a[0], share) + own.offset_a[0]
+        inputs = fleet.inputs(trip)
+        samples = Samples(
+            branch_names=tuple(trip.currents_a),
+            input_names=tuple(inputs),
+            time_s=trip.time_s,
+            currents_a=i_m + rng.normal(0.0, 0.4, i_m.shape),
+            inputs=np.column_stack(list(inputs.values())),
+            valid=np.ones(len(trip), bool),
+            masked={},
+        ).with_inputs(fleet.database.layout.fleet_inputs)
+        warm_c = 10.0 + 25.0 * np.sqrt(share)
+        summaries.append(summarise([samples], period_s=fleet.period_s, temperatures_c=[warm_c]))
+    read_out = fit_fleet_model(stack_summaries(summaries)).read_out
+    usual = learn_usual_misfits(summaries, read_out, full_scale_a=fleet.full_scale_a)
+    names = tuple(trips[0].currents_a)
+    return check_fit(summaries, read_out, usual, full_scale_a=fleet.full_scale_a, branches=names)
+
+
+@pytest.mark.parametrize("branches", [2, 3])
+def test_of_vehicles_with_linear_sensors_at_most_one_in_a_hundred_has_a_finding(
+    fleet: RecordedFleet, branches: int
+) -> None:
+    found = [mine for seed in range(4) for mine in checked(fleet, branches, seed, {})]
+    assert sum(map(bool, found)) <= 0.01 * len(found)
+
+
+@pytest.mark.parametrize("branches", [2, 3])
+def test_sensors_that_are_not_linear_are_named(fleet: RecordedFleet, branches: int) -> None:
+    vehicles = [int(j) for j in np.argsort([-np.ptp(trip.matrix_a()[:, 0]) for trip in fleet.with_branches(branches)])]
+    put = dict(zip(vehicles[::3], BENDS, strict=False))
+    found = checked(fleet, branches, 5, {j: BENDS[cause] for j, cause in put.items()})
+    named = {j: (found[j][0].cause, found[j][0].branch) for j in put if found[j]}
+    assert named == {j: (cause, "battery") for j, cause in put.items()}
+    assert not any(mine for j, mine in enumerate(found) if j not in put)
