@@ -33,8 +33,18 @@ def noticed_interrupts() -> Iterator[Callable[[], bool]]:
 def interrupts_held() -> Iterator[None]:
     """Within the block SIGINT waits; processes that are started in it never get one."""
     resource_tracker.ensure_running()  # its start, else within the block, would let SIGINT through
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before, came = signal.getsignal(signal.SIGINT), threading.Event()
+    # The mask, which children inherit, is this thread's: a thread of a library may still take the signal, and Python
+    # would then run the handler here.
+    holds = threading.current_thread() is threading.main_thread() and callable(before)
+    if holds:
+        signal.signal(signal.SIGINT, lambda _number, _frame: came.set())
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if holds:
+            signal.signal(signal.SIGINT, before)
+        if came.is_set() and callable(before):
+            before(signal.SIGINT, None)

@@ -1,6 +1,9 @@
+import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -9,6 +12,7 @@ from joblib import delayed
 
 from calibrator.drive import Array
 from calibrator.processes.computing import in_processes
+from calibrator.processes.held_interrupts import interrupts_held
 from calibrator.processes.interrupts import importing, interrupted_message, terminated_message
 
 
@@ -36,6 +40,21 @@ def test_ctrl_c_is_handled_as_before_afterwards() -> None:
     with importing():
         assert handler() is not before
     list(in_processes((delayed(abs)(1) for _ in range(2)), workers=2))
+    assert handler() is before
+
+
+def test_ctrl_c_waits_for_the_end_of_the_block_even_where_another_thread_takes_it() -> None:
+    over, reached = threading.Event(), False
+    threading.Thread(target=over.wait, daemon=True).start()
+    before = handler()
+    try:
+        with pytest.raises(KeyboardInterrupt), interrupts_held():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.1)
+            reached = True
+    finally:
+        over.set()
+    assert reached
     assert handler() is before
 
 
