@@ -1,1 +1,17 @@
-"""The default method: from drive summaries of a fleet to the faults of its sensors."""
+"""From the summaries of a fleet to what each of its sensors does wrong.
+
+Read in this order, with docs/method.md beside it:
+
+    moments, fleet_model, junction_law   regressions of each vehicle on the fleet, and on the junction law
+    clusters                             what most of a fleet agrees on
+    rows, readings                       their results as evidence rows, with what is known of single sensors
+    prior, explanations, posterior       which faults explain the rows of a vehicle, and how probable each is
+    learning                             what the fleet says of its faults, and of vehicles without any
+    decision, checks                     estimate, confidence, harm; whether the best explanation fits
+    fleet_estimate                       all of this for a fleet, then for each vehicle
+    fleet_task, run, results             the command: bucket by bucket, over processes, into a folder
+    fleet, frames                        the door for Python: data frames in, parameters out
+
+``published_fleet`` is the published method in the same frame; ``state_space``, ``filter_bank_choice`` and
+``fleet_identification`` find a filter bank where inputs alone do not tell the currents.
+"""

@@ -33,14 +33,11 @@ class Cluster:
         Mean and standard deviation of its members, sampling error apart.
     share : float
         Share of the values in it. [1]
-    gain : float
-        Logarithm of its likelihood over that of the background alone.
     """
 
     centre: float
     spread: float
     share: float
-    gain: float
 
 
 def densest_clusters(
@@ -70,7 +67,7 @@ def densest_clusters(
         return []
     extent, narrowest = float(np.ptp(values)), float(np.median(sd))
     if extent <= narrowest:
-        return [Cluster(centre=float(np.median(near)), spread=0.0, share=1.0, gain=0.0)]
+        return [Cluster(centre=float(np.median(near)), spread=0.0, share=1.0)]
     centres = np.unique(np.quantile(near, np.linspace(0.0, 1.0, min(len(near), MOST_CENTRES)), method="nearest"))
     spreads = np.geomspace(narrowest / 4.0, max(extent / 4.0, narrowest), SPREADS)
     wide, sd_wide = max(extent * (1.0 + 2.0 * MARGIN), widest), max(values.std(), widest / SD_OF_RANGE)
@@ -91,8 +88,6 @@ def densest_clusters(
         variance = sd**2 + spreads[s] ** 2
         members = np.abs(values - centres[c]) <= 3.0 * np.sqrt(variance)
         centre = float(np.average(values, weights=members / variance))
-        clusters.append(
-            Cluster(centre=centre, spread=float(spreads[s]), share=float(share[s, c]), gain=float(gain[s, c]))
-        )
+        clusters.append(Cluster(centre=centre, spread=float(spreads[s]), share=float(share[s, c])))
         gain[:, np.abs(centres - centre) <= 3.0 * (spreads[s] + narrowest)] = -np.inf
     return clusters

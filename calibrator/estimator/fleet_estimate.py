@@ -6,7 +6,7 @@
 What is said of a vehicle does not depend on which others are estimated with it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -44,10 +44,16 @@ CONFIDENT, SUSPECTED = 0.95, 0.5
 """Confidence from which on a vehicle counts as sound, and probability from which on hardware is suspected. [1]"""
 FEWEST_VEHICLES = 5
 """Of a fleet that is compared with itself: in a smaller one it is not clear who differs from whom."""
+MOST_RATIO, SURE = 3.0, 0.9
+"""Gain ratio that no two sensors have, and partial correlation from which on noise does not make it. [1]"""
+LEAST_OWN = 1e-9
+"""Share of a current's variance that is its own at least. [1]"""
 MOST_GAIN_SD = 0.1
 """Standard deviation from which on a gain is not known: smaller than the faults that matter. [1]"""
 LEAST_EXPLANATION = 1e-5
 """Probability of an explanation that is reported. [1]"""
+LEAST_SAID = 0.005
+"""Probability of a cause that a notice names. [1]"""
 CENTRAL = 0.6827
 """Share of a normal distribution within one standard deviation. [1]"""
 LEFT_OUT_CAUSES = ("spikes", "outliers")
@@ -454,13 +460,14 @@ def learn_fleet(
     Raises
     ------
     FleetError
-        If there is no vehicle.
+        If there is no vehicle, or in most of them a branch has the wrong sign or unit.
     """
     if not summaries:
         raise FleetError("no vehicle to learn the fleet's reference from")
     plain = stack_summaries(summaries)
     order = tuple(np.argsort(-np.median(plain.variance_a2, axis=0), kind="stable").tolist())
     fleet = stack_summaries(summaries, order)
+    _require_balance(fleet, [branches[k] for k in order])
     feed = int(np.argmax(np.median(fleet.mean_a, axis=0)))
     model = fit_fleet_model(fleet)
     measured, usual_correlation = collect_rows(fleet, model, full_scale_a=full_scale_a)
@@ -512,6 +519,28 @@ def learn_fleet(
         differing=tuple(np.flatnonzero(differing).tolist()),
     )
     return FleetReference(**{**vars(reference), "notices": tuple(_notices(reference))})
+
+
+def _require_balance(fleet: FleetMoments, branches: Sequence[str]) -> None:
+    """Refuse a fleet in which most currents balance in a ratio that is no gain error: a sign or a unit is wrong."""
+    M, K = fleet.inputs, fleet.branches
+    mean_a = fleet.mean_a
+    covariance = fleet.mean[:, M : M + K, M : M + K] - mean_a[:, :, None] * mean_a[:, None, :]
+    sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), np.finfo(float).tiny))
+    precision = np.linalg.inv(covariance / sd[:, :, None] / sd[:, None, :] + LEAST_OWN * np.eye(K))
+    own = np.diagonal(precision, axis1=1, axis2=2)
+    partial = precision[:, 0, 1:] / np.sqrt(own[:, :1] * own[:, 1:])  # correlation with all others the same; < 0 is odd
+    ratio = precision[:, 0, 1:] / own[:, :1] * sd[:, :1] / sd[:, 1:]
+    wrong = (np.abs(partial) > SURE) & ((ratio < 1.0 / MOST_RATIO) | (ratio > MOST_RATIO))
+    found = np.flatnonzero(wrong.mean(axis=0) > 0.5)
+    if found.size:
+        k = int(found[0])
+        alone = branches[0] if 1 < found.size == K - 1 else f"{branches[k + 1]} or {branches[0]}"
+        raise FleetError(
+            f"the currents of most vehicles do not balance: 1 A in branch {branches[k + 1]} goes with "
+            f"{-np.median(ratio[:, k]):+.2g} A in branch {branches[0]}, expected -1 A; check sign and unit of branch "
+            f"{alone}"
+        )
 
 
 def _with_knowledge(
@@ -582,8 +611,7 @@ def _notices(reference: FleetReference) -> list[str]:
     constant = best.spread.mean[4 * K - 1]
     if reference.load is None and abs(constant) > DOUBT:
         notices.append(
-            f"the currents of most vehicles sum to {constant * scale_a:+.1f} A: "
-            + _causes(reference.laws, lambda law: law.spread.shared[:K], ordered)
+            f"the currents of most vehicles sum to {constant * scale_a:+.1f} A: " + _causes(reference.laws, ordered)
         )
     for share, centre in zip(best.prior.group_share, best.prior.group_centre, strict=True):
         sensor = sum(law.probability for law in reference.laws if law.spread.shared[-1])
@@ -592,7 +620,7 @@ def _notices(reference: FleetReference) -> list[str]:
             f"load without a sensor ({1.0 - sensor:.0%}), or an offset of a batch of sensors ({sensor:.0%})"
         )
     gains = sum(law.probability for law in reference.laws if law.spread.shared[K : 2 * K].any())
-    if gains > DOUBT:
+    if gains > LEAST_SAID:
         size = next(law.spread.shared[K : 2 * K] for law in reference.laws if law.spread.shared[K : 2 * K].any())
         notices.append(
             f"most vehicles break the junction law by {np.abs(size).max():.1%}: a gain error that a batch of sensors "
@@ -609,16 +637,16 @@ def _notices(reference: FleetReference) -> list[str]:
     return notices
 
 
-def _causes(laws: Sequence[Law], shared: Callable[[Law], Array], branches: Sequence[str]) -> str:
+def _causes(laws: Sequence[Law], branches: Sequence[str]) -> str:
     """Causes of what most vehicles share, with their probabilities."""
     share = {"a load without a sensor": 0.0}
     for law in laws:
-        offsets = shared(law)
+        offsets = law.spread.shared[: len(branches)]
         cause = "a load without a sensor"
         if np.abs(offsets).max() > DOUBT:
             cause = f"an offset that the sensors of branch {branches[int(np.argmax(np.abs(offsets)))]} share"
         share[cause] = share.get(cause, 0.0) + law.probability
-    said = sorted(((p, cause) for cause, p in share.items() if p > 0.005), reverse=True)
+    said = sorted(((p, cause) for cause, p in share.items() if p > LEAST_SAID), reverse=True)
     return " or ".join(f"{cause} ({p:.0%})" for p, cause in said) + "; declare the load if it is known"
 
 

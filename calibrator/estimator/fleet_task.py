@@ -4,30 +4,50 @@ Only the project's own errors about data leave a vehicle out with advice. Any ot
 its vehicle is left out by name, and the others go on.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import compress
+from typing import cast
 
 import numpy as np
 
-from calibrator.estimator.fleet_estimate import FleetEstimate, FleetReference, estimate_vehicles, learn_fleet
+from calibrator.drives.delays import BranchDelays
+from calibrator.estimator.fleet_estimate import (
+    CONFIDENT,
+    SUSPECTED,
+    FleetEstimate,
+    FleetReference,
+    estimate_vehicles,
+    learn_fleet,
+)
 from calibrator.estimator.readings import BenchTable, contradicted_readings, merge_readings, trust_notices
 from calibrator.estimator.results import internal_error
 from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.estimator.vehicle_evidence import VehicleEvidence
-from calibrator.estimator.vehicle_report import impossible, vehicle_parameters
-from calibrator.files.parameter_files import RunIdentity
+from calibrator.estimator.vehicle_report import deciding_evidence, faults_of, impossible
+from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.errors import UserError
-from ecu_node.parameters import VehicleParameters
+from ecu_node.parameters import (
+    BranchParameters,
+    Explanation,
+    HardwareFault,
+    HeldBack,
+    VehicleParameters,
+    Verdict,
+)
 
 __all__ = ["Calibrated", "FleetTask", "learn_task"]
+
+MOST_REPORTED, LEAST_REPORTED = 3, 0.02
+"""Explanations that are reported, and the least probability of one after the first. [1]"""
 
 
 @dataclass(kw_only=True)
 class Calibrated:
-    """What has been found of some vehicles so far, by name."""
+    """What has been found of some vehicles so far, by name; what has moved by vehicle and branch."""
 
-    parameters: list[VehicleParameters] = field(default_factory=list)
+    parameters: dict[str, VehicleParameters] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     evidence: dict[str, VehicleEvidence] = field(default_factory=dict)
     moved: dict[tuple[str, str], str] = field(default_factory=dict)
@@ -40,11 +60,9 @@ class FleetTask:
     Attributes
     ----------
     reference : FleetReference
-        Of the fleet.
+        Of the fleet; its branches are those of the vehicles.
     identity : RunIdentity
         For the parameter files.
-    branches : tuple of str
-        Names of the K branches.
     harm_limit : float
         Largest probability of harm with which a branch is corrected. [1]
     bench : mapping
@@ -57,11 +75,15 @@ class FleetTask:
 
     reference: FleetReference
     identity: RunIdentity
-    branches: tuple[str, ...]
     harm_limit: float
     bench: BenchTable
     believed: frozenset[str]
     fleet_size: int
+
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """Names of the K branches."""
+        return self.reference.branches
 
     def estimate(self, vehicles: Sequence[VehicleSummary]) -> FleetEstimate:
         """Estimate some vehicles, at least one; what comes out does not depend on which others are among them."""
@@ -83,41 +105,85 @@ class FleetTask:
         if not vehicles:
             return
         try:
-            made = self._calibrated(vehicles)
+            with np.errstate(all="ignore"):  # numbers that are not finite are refused where they come out
+                estimate = self.estimate(vehicles)
+            for j, vehicle in enumerate(vehicles):
+                if why := impossible(estimate, j, self.branches):
+                    found.left_out[vehicle.vehicle] = why
+                else:
+                    found.parameters[vehicle.vehicle] = self._parameters(vehicle, estimate, j)
+                    found.evidence[vehicle.vehicle] = estimate.evidence[j]
         except Exception as error:  # noqa: BLE001 (a fault of the program is reported with its vehicle)
-            if len(vehicles) == 1:
-                advice = f"its evidence cannot be used: {error}; look at its recordings"
-                own = isinstance(error, UserError)
-                found.left_out[vehicles[0].vehicle] = advice if own else internal_error(error)
+            if len(vehicles) > 1:
+                for vehicle in vehicles:
+                    self.calibrate([vehicle], found)
                 return
-            for vehicle in vehicles:
-                self.calibrate([vehicle], found)
-        else:
-            found.parameters += made.parameters
-            found.left_out |= made.left_out
-            found.evidence |= made.evidence
+            advice = f"its evidence cannot be used: {error}; look at its recordings"
+            found.left_out[vehicles[0].vehicle] = advice if isinstance(error, UserError) else internal_error(error)
 
-    def _calibrated(self, vehicles: Sequence[VehicleSummary]) -> Calibrated:
-        found = Calibrated()
-        with np.errstate(all="ignore"):  # numbers that are not finite are refused where they come out
-            estimate = self.estimate(vehicles)
-        for j, vehicle in enumerate(vehicles):
-            if why := impossible(estimate, j, self.branches):
-                found.left_out[vehicle.vehicle] = why
-                continue
-            parameters = vehicle_parameters(
-                vehicle,
-                estimate,
-                j,
-                branches=self.branches,
-                identity=self.identity,
-                fleet_size=self.fleet_size,
-                expected_a=self.reference.expected_a,
+    def _parameters(self, vehicle: VehicleSummary, estimate: FleetEstimate, j: int) -> VehicleParameters:
+        """Write down what was found for vehicle j of an estimate."""
+        identity, branches, corrected = self.identity, self.branches, estimate.corrected[j]
+        unsettled = estimate.verdicts[j] == "cannot tell" or not estimate.confidence[j] >= CONFIDENT
+        reported: list[Explanation] = []
+        decisive = ""
+        if unsettled or (estimate.held_back[j] != "").any():
+            first, *others = estimate.explanations[j][:MOST_REPORTED]
+            reported = [first, *(each for each in others if each.probability >= LEAST_REPORTED)]
+            layout = identity.database.layout
+            decisive = deciding_evidence(
+                estimate, j, branches, full_scale_a=layout.full_scale_a, layout=layout.path.name
             )
-            found.parameters.append(parameters)
-            if estimate.evidence:
-                found.evidence[vehicle.vehicle] = estimate.evidence[j]
-        return found
+        hardware = _probability(estimate.hardware_probability[j])
+        return VehicleParameters(
+            vehicle=vehicle.vehicle,
+            layout=identity.layout,
+            dbc=identity.dbc,
+            verdict=cast("Verdict", estimate.verdicts[j]),
+            confidence=_probability(estimate.confidence[j]),
+            branches={name: _branch(vehicle.delays, estimate, (j, k), name) for k, name in enumerate(branches)},
+            hardware_fault=HardwareFault(
+                suspected=hardware is not None and hardware > SUSPECTED,
+                drift=float(estimate.hardware_drift[j]),
+                offset_a=by_branch(branches, estimate.hardware_offset_a[j]),
+                probability=hardware,
+            ),
+            explanations=reported,
+            deciding_evidence=decisive,
+            findings=list(estimate.findings[j]),
+            junction_residual=junction_residual(
+                current_moments(vehicle.summary.mean_a, vehicle.summary.mean_product_a2),
+                gain=np.where(corrected, 1.0 + estimate.drift[j], 1.0)[None],
+                offset_a=np.where(corrected, estimate.offset_a[j], 0.0),
+                expected_a=self.reference.expected_a,
+            ),
+            provenance=identity.provenance(
+                fleet_size=self.fleet_size, drives=vehicle.drives, duration_s=vehicle.summary.duration_s
+            ),
+        )
+
+
+def _branch(delays: BranchDelays, estimate: FleetEstimate, place: tuple[int, int], name: str) -> BranchParameters:
+    k = delays.branches.index(name)
+    delay_s, delay_sd_s = (float(values[k]) if delays.known[k] else None for values in (delays.delay_s, delays.sd_s))
+    return BranchParameters(
+        drift=float(estimate.drift[place]),
+        offset_a=float(estimate.offset_a[place]),
+        drift_sd=float(estimate.drift_sd[place]),
+        offset_sd_a=float(estimate.offset_sd_a[place]),
+        apply=bool(estimate.corrected[place]),
+        held_back=cast("HeldBack | None", str(estimate.held_back[place]) or None),
+        delay_s=delay_s,
+        delay_sd_s=delay_sd_s,
+        fault_probability=_probability(estimate.fault_probability[place]),
+        harm_probability=_probability(estimate.harm_probability[place]),
+        identifiable=bool(estimate.identifiable[place]),
+    )
+
+
+def _probability(value: float) -> float | None:
+    """A probability free of rounding beyond its range; None where it is not known (NaN)."""
+    return None if np.isnan(value) else float(np.clip(value, 0.0, 1.0))
 
 
 def learn_task(
@@ -158,29 +224,28 @@ def learn_task(
     FleetError
         If too few vehicles can be learnt from.
     """
-    names, layout = [vehicle.vehicle for vehicle in vehicles], identity.database.layout
-    learning = np.array(require_learning(names, settings, {}))
-    trusted = np.array([name in settings.trusted for name in names])
-    learners = [name for name, use in zip(names, learning, strict=True) if use]
+    layout = identity.database.layout
+    learning = np.array(require_learning([vehicle.vehicle for vehicle in vehicles], settings, {}))
+    learners = list(compress(vehicles, learning))
+    trusted = np.array([vehicle.vehicle in settings.trusted for vehicle in learners])
 
     def learn(used: BenchTable) -> tuple[FleetTask, list[str]]:
         readings, notices = merge_readings(vehicles, used, branches)
         reference = learn_fleet(
-            [vehicle.summary for vehicle, use in zip(vehicles, learning, strict=True) if use],
+            [vehicle.summary for vehicle in learners],
             full_scale_a=layout.full_scale_a,
             branches=branches,
             readings=readings.take(learning),
-            trusted=trusted[learning],
+            trusted=trusted,
             load=layout.unmeasured_load,
             expected_faults=settings.expected_faults,
         )
         task = FleetTask(
             reference=reference,
             identity=identity,
-            branches=branches,
             harm_limit=settings.harm_limit,
             bench=used,
-            believed=settings.trusted - {learners[j] for j in reference.distrusted},
+            believed=settings.trusted - {learners[j].vehicle for j in reference.distrusted},
             fleet_size=fleet_size,
         )
         return task, notices
@@ -190,46 +255,37 @@ def learn_task(
         wrong = _contradicted(task, vehicles, bench)
         task, notices = learn({sensor: values for sensor, values in bench.items() if sensor not in wrong})
         notices += wrong.values()
-    return task, [
-        *task.reference.notices,
-        *trust_notices(
-            [vehicle for vehicle, use in zip(vehicles, learning, strict=True) if use],
-            trusted[learning],
-            branches,
-            untrusted=task.reference.distrusted,
-            differing=task.reference.differing,
-            full_scale_a=layout.full_scale_a,
-        ),
-        *notices,
-    ]
+    reference = task.reference
+    distrust = trust_notices(
+        learners,
+        trusted,
+        branches,
+        untrusted=reference.distrusted,
+        differing=reference.differing,
+        full_scale_a=layout.full_scale_a,
+    )
+    return task, [*reference.notices, *distrust, *notices]
 
 
-def _contradicted(
-    task: FleetTask, vehicles: Sequence[VehicleSummary], bench: BenchTable
-) -> Mapping[tuple[str, str], str]:
+def _contradicted(task: FleetTask, vehicles: Sequence[VehicleSummary], bench: BenchTable) -> dict[tuple[str, str], str]:
     """Bench readings that the drives contradict, by vehicle and branch, and what to say of them."""
-    named = {vehicle for vehicle, _ in bench}
+    named, branches = {vehicle for vehicle, _ in bench}, task.branches
     checked = [vehicle for vehicle in vehicles if vehicle.vehicle in named]
     if not checked:
         return {}
-    found, branches = task.estimate(checked), task.branches
-    certain = np.isfinite(found.confidence)  # where the reference is in doubt, drives contradict nothing
-    most = max(len(each) for each in found.explanations)
-    weight = np.zeros((len(checked), most))
-    values = np.zeros((2, len(checked), most, len(branches)))
+    found = task.estimate(checked)
+    most = max(map(len, found.explanations))
+    weight, faults = np.zeros((len(checked), most)), np.zeros((2, len(checked), most, len(branches)))
     for j, explanations in enumerate(found.explanations):
-        for s, each in enumerate(explanations):
-            weight[j, s] = each.probability
-            values[:, j, s] = [[part.get(name, 0.0) for name in branches] for part in (each.drift, each.offset_a)]
-    wrong = contradicted_readings(
+        weight[j, : len(explanations)] = [each.probability for each in explanations]
+        faults[:, j, : len(explanations)] = np.stack([faults_of(each, branches) for each in explanations], axis=1)
+    return contradicted_readings(
         bench,
         [vehicle.vehicle for vehicle in checked],
         branches,
         weight=weight,
-        drift=values[0],
+        drift=faults[0],
         drift_sd=np.repeat(found.drift_sd[:, None], most, axis=1),
-        offset_a=values[1],
+        offset_a=faults[1],
         offset_sd_a=np.repeat(found.offset_sd_a[:, None], most, axis=1),
     )
-    sure = {vehicle.vehicle for vehicle, is_certain in zip(checked, certain, strict=True) if is_certain}
-    return {sensor: text for sensor, text in wrong.items() if sensor[0] in sure}

@@ -1,6 +1,6 @@
 """``calibrator identify``: the filter bank that a fleet's vehicles share."""
 
-import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -17,36 +17,24 @@ __all__ = ["identify"]
 
 SHORTEST_POLE_S, LONGEST_POLE_S = 0.01, 600.0
 """Time constants of low-passes: from below the time base of any layout to ten minutes. [s]"""
+POLES_HELP = f"Low-passes to use: time constants with commas, each {SHORTEST_POLE_S:g} to {LONGEST_POLE_S:g} [s]."
 
 
 def _time_constants_s(value: str) -> list[float]:
     """Read the option ``--poles``."""
-    try:
+    with suppress(ValueError):
         numbers = [float(number) for number in value.split(",")]
-    except ValueError:
-        numbers = [math.nan]
-    if not all(SHORTEST_POLE_S <= number <= LONGEST_POLE_S for number in numbers):  # nor is not-a-number
-        raise typer.BadParameter(
-            f"{value}: expected time constants with commas, each from {SHORTEST_POLE_S:g} to {LONGEST_POLE_S:g} s",
-            param_hint="'--poles'",
-        )
-    return numbers
-
-
-PolesOption = Annotated[
-    str | None,
-    typer.Option(
-        "--poles",
-        help=f"Low-passes to use: time constants with commas, each {SHORTEST_POLE_S:g} to {LONGEST_POLE_S:g} [s].",
-    ),
-]
+        if all(SHORTEST_POLE_S <= number <= LONGEST_POLE_S for number in numbers):  # nor is not-a-number
+            return numbers
+    expected = f"time constants with commas, each from {SHORTEST_POLE_S:g} to {LONGEST_POLE_S:g} s"
+    raise typer.BadParameter(f"{value}: expected {expected}", param_hint="'--poles'")
 
 
 def identify(
     fleet: FleetArgument,
     layout: LayoutOption,
     bank: BankOption = None,
-    poles: PolesOption = None,
+    poles: Annotated[str | None, typer.Option("--poles", help=POLES_HELP)] = None,
     out: Annotated[Path | None, typer.Option("--out", help="File to write the filter bank to (JSON).")] = None,
     workers: WorkersOption = 2,
     json: JsonOption = False,
@@ -54,7 +42,7 @@ def identify(
     """Choose the filter bank that a fleet's vehicles share, and tell how well it simulates each of them.
 
     Without --bank or --poles it is chosen from some vehicles, by how well it simulates blocks of their drives that were
-    held out. A vehicle whose own dynamics differ too much gets a model of its own, and is named.
+    held out.
     """
     if bank is not None and poles is not None:
         raise typer.BadParameter("a bank has its own poles; give --bank or --poles", param_hint="--poles")
@@ -65,12 +53,9 @@ def identify(
         from calibrator.estimator.fleet_identification import identify_fleet
         from calibrator.summaries.filter_bank import read_bank
 
+    given = None if bank is None else read_bank(bank)
     report = identify_fleet(
-        fleet,
-        vehicle_database(layout),
-        bank=None if bank is None else read_bank(bank),
-        time_constants_s=time_constants_s,
-        workers=workers,
+        fleet, vehicle_database(layout), bank=given, time_constants_s=time_constants_s, workers=workers
     )
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

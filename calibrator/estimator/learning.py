@@ -13,6 +13,7 @@ junction's constant may be a load without a sensor or an offset of the sensors o
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
@@ -39,6 +40,8 @@ MOST_LEARNT = 200
 """Vehicles that a law is learnt from; more change it less than the faults themselves. [1]"""
 START_ROUNDS, ROUNDS, PRIOR_STEPS = 2, 5, 6
 """Rounds of each start, of the best ones after that, and steps of the prior in each round."""
+MOST_COMMON = 3
+"""Clusters of all slopes that are started from: vehicles with a hardware fault agree with themselves. [1]"""
 KEPT_STARTS = 2
 """Starts that are climbed to their end."""
 SAME_DENSITY = 0.2
@@ -49,8 +52,8 @@ DOUBT = 0.001
 """Shared constant below which it does not matter what makes it, in fractions of full scale. [1]"""
 SPREAD_VEHICLES = 5.0
 """Weight of the guessed model spread, in vehicles."""
-SPREAD_OVER_SAMPLING = 2.0
-"""Guess of the model spread over the usual sampling deviation: a model errs alike over a whole drive. [1]"""
+SPREAD_OVER_SAMPLING, JUNCTION_SPREAD_OVER_SAMPLING = 2.0, 1.0
+"""Guess of the model spread over the usual sampling deviation: the fleet model errs alike over a whole drive. [1]"""
 MOST_LOAD_SPREAD = 0.005
 """Of loads without a sensor over vehicles before anything is known, in fractions of full scale: some A. [1]"""
 LEAST_SPREAD = (1e-5, 1e-6)
@@ -58,7 +61,7 @@ LEAST_SPREAD = (1e-5, 1e-6)
 FIRST_DISPERSION = 4.0
 """Where the variance of intercepts over what their blocks show starts: it falls fast. [1]"""
 TAIL_DEGREES = 8.0
-"""Degrees of freedom of Student's t with which a vehicle that fits badly counts less for the model spread. [1]"""
+"""Degrees of freedom of Student's t, as which the vehicles differ in each row: what is far off counts less. [1]"""
 COUNT_VEHICLES = 2.5
 """Weight of the law of sparse faults against the fleet's own numbers of faults, in vehicles."""
 USED_FITS = 16
@@ -241,29 +244,42 @@ class _Learner:
         for row in [*range(2 * K - 1), *range(3 * K - 1, 4 * K)]:
             known = rows.known[:, row]
             guess[row] = np.median(variance[known, row]) if known.any() else 1.0
-        return np.diag(SPREAD_OVER_SAMPLING**2 * guess)
+        factor = np.full(5 * K, SPREAD_OVER_SAMPLING)
+        factor[[*range(K, 2 * K - 1), 4 * K - 1]] = JUNCTION_SPREAD_OVER_SAMPLING
+        return np.diag(factor**2 * guess)
+
+    def clusters(self, row: int, most: int = 1, farthest: float = np.inf) -> list[float]:
+        """Centres of the densest clusters of a row, 0 if there is none."""
+        rows, known = self.rows, self.rows.known[:, row]
+        sd = np.sqrt(rows.covariance[known, row, row])
+        found = densest_clusters(rows.values[known, row], sd, most=most, farthest=farthest)
+        return [cluster.centre for cluster in found] or [0.0]
 
     def centres(self) -> list[Array]:
-        """Where to start: what vehicles agree on row by row, with each zero that the feeding branch may have.
+        """Where to start, from what vehicles agree on.
 
-        Intercepts of a vehicle without faults add up to its junction constant, as do those of a centre.
+        How much further the model is off in one branch than in the first, every vehicle tells whatever its faults, by
+        two slopes and their gain ratio; by how much in all of them, clusters of all slopes. The zero of the feeding
+        branch has clusters as well. Intercepts of a vehicle without faults add up to its junction constant, as do those
+        of a centre.
         """
         rows, K = self.rows, self.rows.branches
-        sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
-
-        def clusters(row: int, farthest: float = np.inf) -> list[float]:
-            known = rows.known[:, row]
-            found = densest_clusters(rows.values[known, row], sd[known, row], most=2, farthest=farthest)
-            return [cluster.centre for cluster in found] or [0.0]
-
         centre, junction, intercept = np.zeros(5 * K), 4 * K - 1, 3 * K - 1 + self.feed
-        for row in np.flatnonzero(centre_rows(K)):
-            centre[row] = clusters(int(row))[0]
+        for k in range(1, K):
+            known = rows.known[:, [0, k, K + k - 1]].all(axis=1)
+            apart = rows.values[known, k] - rows.values[known, 0] + rows.values[known, K + k - 1]
+            centre[k] = np.median(apart) if known.any() else 0.0
+        known, sd = rows.known[:, :K], np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2)[:, :K])
+        common = densest_clusters((rows.values[:, :K] - centre[:K])[known], sd[known], most=MOST_COMMON)
+        for row in range(3 * K - 1, junction):
+            centre[row] = self.clusters(row)[0]
         others = centre[3 * K - 1 : junction].sum() - centre[intercept]
-        by_feed = [zero + others for zero in clusters(intercept, LARGEST_SHARED)]
+        zeros = [zero + others for zero in self.clusters(intercept, 2, LARGEST_SHARED)]
         found: list[Array] = []
-        for constant in (*clusters(junction, LARGEST_SHARED), 0.0, *by_feed):  # the junction shows it most exactly
+        # The junction shows its constant most exactly.
+        for constant, cluster in product((*self.clusters(junction, 2, LARGEST_SHARED), 0.0, *zeros), common):
             start = centre.copy()
+            start[:K] += cluster.centre
             start[intercept], start[junction] = constant - others, constant
             start = np.where(np.isnan(self.fixed), start, self.fixed)
             if not any(np.abs(start - other).max() < DOUBT for other in found):
@@ -319,14 +335,20 @@ class _Learner:
             (plausible, replace(best, spread=replace(best.spread, shared=shared)))
             for plausible, shared in self._shared_constants(float(best.spread.mean[4 * K - 1]), prior)
         ]
-        slopes = self.centres()[0][:K]  # as most vehicles show them: with what their sensors share
+        slopes = np.array([self.clusters(k)[0] for k in range(K)])  # with what the sensors of most vehicles share
         for shared in self._shared_gains():
             mean = best.spread.mean.copy()
             mean[:K] = np.where(self.free[:K], slopes - shared[K : 2 * K], mean[:K])
             fresh = replace(self.start(mean), spread=replace(best.spread, mean=mean, shared=shared))
             found.append((0.0, self.climb(fresh, START_ROUNDS)))
         if len(found) > 1:
-            found = [(plausible, self.climb(law, START_ROUNDS, begun=True)) for plausible, law in found]
+            climbed = [(plausible, self.climb(law, START_ROUNDS, begun=True)) for plausible, law in found]
+            # Where no vehicle is left in a group, its cause is no question.
+            found = [
+                (p, law)
+                for p, law in climbed
+                if not law.spread.shared[-1] or law.prior.group_share.max() > 1.0 / len(self.rows)
+            ]
         evidence = np.array([law.log_evidence for _, law in found])
         of_gains = np.array([law.spread.shared[K : 2 * K].any() for _, law in found])
         if self.free[:K].all() and of_gains.any():
@@ -487,8 +509,10 @@ class _Learner:
             feed=self.feed,
         )
         left = row_residuals(evidence, theta)
-        chi2 = np.einsum("nqa,nab,nqb->nq", left, evidence.precision, left) / (2 * K + 2)
-        counted = share * (1.0 + TAIL_DEGREES) / (1.0 + TAIL_DEGREES * np.maximum(chi2, 1.0))
+
+        def counted(square: Array, variance: Array) -> Array:
+            """Weights of Student's t, row by row."""
+            return share[:, :, None] * (TAIL_DEGREES + 1.0) / (TAIL_DEGREES + square / variance)
 
         def expected(prior_covariance: Array, gain: Array) -> tuple[Array, Array]:
             """Mean (N, Q, r) and covariance (N, Q, r, r) of a part of the error that has this prior and gain."""
@@ -497,19 +521,23 @@ class _Learner:
 
         V, P = spread.covariance, evidence.precision
         mean, covariance = expected((V - V @ P @ V)[:, None], V @ P)
-        shift = np.where(self.free, np.einsum("nq,nqa->a", counted, mean) / counted.sum(), 0.0)
-        apart = mean - shift
-        scatter = np.einsum("nq,nqa,nqb->ab", counted, apart, apart) + np.einsum("nq,nqab->ab", share, covariance)
+        count = counted(mean**2 + np.diagonal(covariance, axis1=2, axis2=3), np.diag(V))
+        shift = np.where(self.free, np.einsum("nqa,nqa->a", count, mean) / count.sum(axis=(0, 1)), 0.0)
+        root_count = np.sqrt(count)
+        apart = root_count * (mean - shift)
+        scatter = np.einsum("nqa,nqb->ab", apart, apart)
+        scatter += np.einsum("nqa,nqb,nqab->ab", root_count, root_count, covariance)
         b = slice(3 * K - 1, 4 * K - 1)
         gain = added @ P[:, b]
         error, doubt = expected((added - gain[:, :, b] @ added)[:, None], gain)
         stated = np.diagonal(rows.intercept_covariance(), axis1=1, axis2=2)[:, None]
         more = (error**2 + np.diagonal(doubt, axis1=2, axis2=3)) / stated
+        count = counted(more, np.maximum(spread.dispersion - 1.0, 1.0))
         guessed = SPREAD_VEHICLES / (SPREAD_VEHICLES + N)
         return Spread(
             mean=spread.mean + shift,
             covariance=(1.0 - guessed) * scatter / N + guessed * self.guess + self.least,
-            dispersion=1.0 + (np.einsum("nq,nqk->k", counted, more) + SPREAD_VEHICLES) / (N + SPREAD_VEHICLES),
+            dispersion=1.0 + ((count * more).sum(axis=(0, 1)) + SPREAD_VEHICLES) / (N + SPREAD_VEHICLES),
             shared=spread.shared,
         )
 

@@ -5,13 +5,15 @@ and the verdict is 'cannot tell': whatever they are, they do not explain this ve
 """
 
 from collections.abc import Sequence
+from itertools import compress
 
 import numpy as np
 
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.estimator.fleet_identification import VehicleModel, read_vehicle_model
-from calibrator.estimator.settings import CalibrationSettings, FleetOutcome, require_learning
+from calibrator.estimator.results import ChunkResult, encode_chunk
+from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.fleet_truth import faults_of
 from calibrator.published.calibration import ExpectedFaults, calibrate_published
@@ -35,7 +37,7 @@ LEAST_VEHICLES = 20
 
 def calibrate_fleet_published(
     fleet: FleetSource, equipment: Equipment, identity: RunIdentity, settings: CalibrationSettings, *, workers: int
-) -> FleetOutcome:
+) -> tuple[ChunkResult, dict[str, object], tuple[str, ...]]:
     """Calibrate a fleet as published.
 
     Parameters
@@ -51,62 +53,62 @@ def calibrate_fleet_published(
 
     Returns
     -------
-    FleetOutcome
-        Parameters of every vehicle that could be used.
+    chunk : ChunkResult
+        Parameters of every vehicle that could be used, and why the others could not.
+    details : dict of str to JSON values
+        For the record of the run.
+    notices : tuple of str
+        What the user should know.
 
     Raises
     ------
     FleetError
         If too few vehicles can be used.
     """
+    branches, layout = equipment.branches, identity.database.layout
     vehicles, left_out = read_vehicles(
         read_vehicle_model, fleet, equipment, identity.database, workers=workers, limit_s=settings.time_limit_s
     )
-    vehicles = _without_misfits(vehicles, settings.hold_out, equipment, left_out)
-    learning = require_learning([vehicle.vehicle for vehicle in vehicles], settings, left_out)
-    unity = _unity_vehicle([v for v, used in zip(vehicles, learning, strict=True) if used], settings.unity)
+    vehicles = _without_misfits(vehicles, settings.hold_out, branches, left_out)
+    names = [vehicle.vehicle for vehicle in vehicles]
+    learning = require_learning(names, settings, left_out)
+    learners = list(compress(vehicles, learning))
+    unity = _unity_vehicle(learners, settings.unity)
     with progress_bar("estimate the faults", None):
-        recovery = _recover(vehicles, unity, equipment, identity, settings)
-    left_out |= {vehicles[j].vehicle: reason for j, reason in recovery.failed.items()}
-    parameters = [
-        _parameters(
-            vehicle,
-            recovery,
-            position=j,
-            branches=equipment.branches,
-            identity=identity,
-            fleet_size=len(vehicles),
+        if settings.truth is not None and tuple(settings.truth.branches) != branches:
+            raise FleetError(f"the truth is of branches {settings.truth.branches}, the fleet has {branches}")
+        recovery = calibrate_published(
+            [vehicle.model.simulate(unity.held_out_inputs)[unity.lead_in :] for vehicle in vehicles],  # (2)
+            junction_a2=np.array([float(np.sum(vehicle.moment_a2)) for vehicle in vehicles]),
+            in_reference=np.array(learning),
+            simulation_error_a=_median_error_a(learners),
+            full_scale_a=layout.full_scale_a,
+            classifier=settings.classifier,
+            expected=ExpectedFaults(
+                sparsity=settings.sparsity,
+                magnitude=settings.magnitude,
+                symmetric=settings.symmetric,
+                seed=settings.seed,
+            ),
+            truth=None if settings.truth is None else faults_of(settings.truth, names),
         )
+    left_out |= {names[j]: reason for j, reason in recovery.failed.items()}
+    parameters = [
+        _parameters(vehicle, recovery, j, branches=branches, identity=identity, fleet_size=len(vehicles))
         for j, vehicle in enumerate(vehicles)
         if j not in recovery.failed
     ]
-    snr = np.nanmedian([vehicle.snr_db for vehicle in vehicles], axis=0)
-    period_s = identity.database.layout.period_s
-    return FleetOutcome(
-        parameters=parameters,
-        left_out=left_out,
-        notices=() if settings.symmetric else few_vehicles_notice(sum(learning)),
-        details={
-            "unity_vehicle": unity.vehicle,
-            "unity_duration_s": period_s * (len(unity.held_out_inputs) - unity.lead_in),
-            "simulation_snr_db": by_branch(equipment.branches, snr),
-        },
-    )
+    details = {
+        "unity_vehicle": unity.vehicle,
+        "unity_duration_s": layout.period_s * (len(unity.held_out_inputs) - unity.lead_in),
+        "simulation_snr_db": by_branch(branches, np.nanmedian([vehicle.snr_db for vehicle in vehicles], axis=0)),
+    }
+    notices = () if settings.symmetric else few_vehicles_notice(len(learners))
+    return encode_chunk(parameters, left_out), details, notices
 
 
 def few_vehicles_notice(learning: int) -> tuple[str, ...]:
-    """Say so if the mean of the fleet (3) is of so few vehicles that it is hardly a reference.
-
-    Parameters
-    ----------
-    learning : int
-        Vehicles whose mean it is.
-
-    Returns
-    -------
-    tuple of str
-        At most one notice.
-    """
+    """Say so if the mean of the fleet (3) is of so few vehicles that it is hardly a reference: at most one notice."""
     if learning >= LEAST_VEHICLES:
         return ()
     return (
@@ -117,11 +119,10 @@ def few_vehicles_notice(learning: int) -> tuple[str, ...]:
 
 
 def _without_misfits(
-    vehicles: Sequence[VehicleModel], hold_out: frozenset[str], equipment: Equipment, left_out: dict[str, str]
+    vehicles: Sequence[VehicleModel], hold_out: frozenset[str], branches: Sequence[str], left_out: dict[str, str]
 ) -> list[VehicleModel]:
     """Vehicles whose models hold on their own last 20 % about as well as the fleet's do; the others are named."""
-    learning = [vehicle for vehicle in vehicles if vehicle.vehicle not in hold_out]
-    usual_a = _median_error_a(learning or vehicles)
+    usual_a = _median_error_a([vehicle for vehicle in vehicles if vehicle.vehicle not in hold_out] or vehicles)
     kept: list[VehicleModel] = []
     for vehicle in vehicles:
         ratio = vehicle.simulation_error_a / np.maximum(usual_a, np.finfo(float).tiny)
@@ -129,8 +130,8 @@ def _without_misfits(
             kept.append(vehicle)
         else:
             left_out[vehicle.vehicle] = (
-                f"its model misses the {equipment.branches[int(ratio.argmax())]} current of its own last 20 % "
-                f"{ratio.max():.0f} times as far as the fleet's models do; record a drive with more varied use"
+                f"its model misses the {branches[int(ratio.argmax())]} current of its own last 20 % {ratio.max():.0f} "
+                f"times as far as the fleet's models do; record a drive with more varied use"
             )
     return kept
 
@@ -151,50 +152,17 @@ def _unity_vehicle(vehicles: Sequence[VehicleModel], wanted: str | None) -> Vehi
     raise FleetError(f"no usable vehicle {wanted!r} to take the unity drive from; there are {there}")
 
 
-def _recover(
-    vehicles: Sequence[VehicleModel],
-    unity: VehicleModel,
-    equipment: Equipment,
-    identity: RunIdentity,
-    settings: CalibrationSettings,
-) -> Recovery:
-    """Simulate every vehicle on the unity drive (2) and estimate its faults."""
-    simulated = [vehicle.model.simulate(unity.held_out_inputs)[unity.lead_in :] for vehicle in vehicles]
-    names = [vehicle.vehicle for vehicle in vehicles]
-    truth = None
-    if settings.truth is not None:
-        if tuple(settings.truth.branches) != equipment.branches:
-            raise FleetError(f"the truth is of branches {settings.truth.branches}, the fleet has {equipment.branches}")
-        truth = faults_of(settings.truth, names)
-    in_reference = np.array([name not in settings.hold_out for name in names])
-    return calibrate_published(
-        simulated,
-        junction_a2=np.array([float(np.sum(vehicle.moment_a2)) for vehicle in vehicles]),
-        in_reference=in_reference,
-        simulation_error_a=_median_error_a([v for v, used in zip(vehicles, in_reference, strict=True) if used]),
-        full_scale_a=identity.database.layout.full_scale_a,
-        classifier=settings.classifier,
-        expected=ExpectedFaults(
-            sparsity=settings.sparsity,
-            magnitude=settings.magnitude,
-            symmetric=settings.symmetric,
-            seed=settings.seed,
-        ),
-        truth=truth,
-    )
-
-
 def _parameters(
     vehicle: VehicleModel,
     recovery: Recovery,
+    j: int,
     *,
-    position: int,
     branches: Sequence[str],
     identity: RunIdentity,
     fleet_size: int,
 ) -> VehicleParameters:
-    """Write down what was found for one vehicle."""
-    faults = recovery.faults.take(position)
+    """Write down what was found for vehicle j."""
+    faults, classes = recovery.faults.take(j), recovery.classification
     residual = junction_residual(
         current_moments(vehicle.mean_a, vehicle.moment_a2),
         gain=1.0 + faults.drift[None],
@@ -202,8 +170,7 @@ def _parameters(
         expected_a=0.0,
     )
     helps = residual.corrected_a <= residual.measured_a
-    sensor = bool(recovery.classification.sensor[position])
-    verdict: Verdict = "no sensor fault" if not sensor else "corrected" if helps else "cannot tell"
+    verdict: Verdict = "no sensor fault" if not classes.sensor[j] else "corrected" if helps else "cannot tell"
     return VehicleParameters(
         vehicle=vehicle.vehicle,
         layout=identity.layout,
@@ -214,7 +181,7 @@ def _parameters(
             for k, name in enumerate(branches)
         },
         hardware_fault=HardwareFault(
-            suspected=bool(recovery.classification.hardware[position]),
+            suspected=bool(classes.hardware[j]),
             drift=float(faults.hardware_drift),
             offset_a=by_branch(branches, faults.hardware_offset_a),
         ),

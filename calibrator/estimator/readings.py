@@ -7,11 +7,11 @@ offset_sd_a`` or both pairs; a pair of empty cells was not read. measured = (1 +
 """
 
 import csv
-import io
 import math
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -59,92 +59,67 @@ MOST_LOAD = 0.015
 
 PAIRS = (("drift", "drift_sd"), ("offset_a", "offset_sd_a"))
 COLUMNS = ("vehicle", "branch", *PAIRS[0], *PAIRS[1])
+MEANING = {"drift": "a relative gain error; 2 % is 0.02", "drift_sd": "a standard deviation; 0.1 % is 0.001"}
 LEAST_SD = 1e-5
 """Least standard deviation of a reading: no bench is sharper; of offsets over full scale. [1]"""
 LARGEST = 0.9
 """Largest fault that a sensor of a running vehicle is read with; a drift of 2 is 2 %, wrongly typed. [1]"""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Readings:
     """Readings of N vehicles with K branches; NaN where there is none.
 
     Attributes
     ----------
-    drift, drift_sd : ndarray of shape (N, K)
-        Drift as read, above -1, and its standard deviation, positive. [1]
-    offset_a, offset_sd_a : ndarray of shape (N, K)
-        Offset as read and its standard deviation, positive. [A]
+    values : ndarray of shape (2, 2, N, K)
+        Value and its standard deviation, positive, each of drift [1], above -1, and offset [A].
     """
 
-    drift: Array
-    drift_sd: Array
-    offset_a: Array
-    offset_sd_a: Array
+    values: Array
 
     @classmethod
     def none(cls, vehicles: int, branches: int) -> "Readings":
         """No readings at all."""
-        nothing = np.full((vehicles, branches), np.nan)
-        return cls(drift=nothing, drift_sd=nothing, offset_a=nothing, offset_sd_a=nothing)
+        return cls(np.full((2, 2, vehicles, branches), np.nan))
 
     @classmethod
     def of_trusted(cls, trusted: Mask, branches: int, full_scale_a: float) -> "Readings":
         """Readings of zero for all K sensors of the trusted of N vehicles, none for the others; full scale in A."""
-        zero = np.where(trusted[:, None], 0.0, np.nan) * np.ones(branches)
-        offset_sd_a = zero + TRUSTED_OFFSET_SD * full_scale_a
-        return cls(drift=zero, drift_sd=zero + TRUSTED_DRIFT_SD, offset_a=zero, offset_sd_a=offset_sd_a)
+        accuracy = np.array([[0.0, 0.0], [TRUSTED_DRIFT_SD, TRUSTED_OFFSET_SD * full_scale_a]])
+        return cls(np.where(trusted[:, None], accuracy[:, :, None, None], np.nan) * np.ones(branches))
 
     @classmethod
     def of_bench(cls, bench: "BenchTable", vehicles: Sequence[str], branches: Sequence[str]) -> "Readings":
         """Readings of a bench table for N vehicles and K branches, by their names."""
-        unread = (math.nan,) * 4
-        values = [[bench.get((vehicle, branch), unread)[:4] for branch in branches] for vehicle in vehicles]
-        drift, drift_sd, offset_a, offset_sd_a = np.moveaxis(np.array(values), 2, 0)
-        return cls(drift=drift, drift_sd=drift_sd, offset_a=offset_a, offset_sd_a=offset_sd_a)
+        unread = BenchReading(np.nan, np.nan, np.nan, np.nan, "")
+        read = [[bench.get((vehicle, branch), unread) for branch in branches] for vehicle in vehicles]
+        values = np.array([[each[:4] for each in row] for row in read]).reshape(len(vehicles), len(branches), 2, 2)
+        return cls(values.transpose(3, 2, 0, 1))
 
     def merged(self, other: "Readings") -> "Readings":
         """Both together: of a sensor that was read twice the mean, weighted by precision."""
-        drift, drift_sd = weighted_mean((self.drift, self.drift_sd), (other.drift, other.drift_sd))
-        offset_a, offset_sd_a = weighted_mean((self.offset_a, self.offset_sd_a), (other.offset_a, other.offset_sd_a))
-        return Readings(drift=drift, drift_sd=drift_sd, offset_a=offset_a, offset_sd_a=offset_sd_a)
+        return Readings(np.array(weighted_mean((self.values[0], self.values[1]), (other.values[0], other.values[1]))))
 
     def take(self, index: Index) -> "Readings":
         """Return the readings of some of the vehicles."""
-        return Readings(**{name: values[index] for name, values in vars(self).items()})
+        return Readings(self.values[:, :, index])
 
     def take_branches(self, order: Sequence[int]) -> "Readings":
         """Return the same readings with the branches in another order."""
-        return Readings(**{name: values[:, list(order)] for name, values in vars(self).items()})
+        return Readings(self.values[..., list(order)])
 
 
 def with_readings(rows: EvidenceRows, readings: Readings, *, full_scale_a: float) -> EvidenceRows:
-    """Put direct readings into the evidence.
-
-    Parameters
-    ----------
-    rows : EvidenceRows
-        Of N vehicles.
-    readings : Readings
-        Of the same vehicles and branches.
-    full_scale_a : float
-        Full scale of the junction. [A]
-
-    Returns
-    -------
-    EvidenceRows
-        The same with the rows of the readings filled in.
-    """
-    K = rows.branches
+    """Evidence rows of N vehicles with direct readings of the same vehicles and branches; full scale in A."""
+    K, ((drift, offset_a), (drift_sd, offset_sd_a)) = rows.branches, readings.values
+    value = np.array([np.log1p(drift), offset_a / full_scale_a])
+    sd = np.array([drift_sd / (1.0 + drift), offset_sd_a / full_scale_a])
+    known = np.isfinite(value) & np.isfinite(sd)
     relative, constant, covariance = rows.relative.copy(), rows.constant.copy(), rows.covariance.copy()
-    log_sd = readings.drift_sd / (1.0 + readings.drift)
-    for values, value, sd, first in (
-        (relative[:, 2 * K - 1 :], np.log1p(readings.drift), log_sd, 2 * K - 1),
-        (constant[:, K + 1 :], readings.offset_a / full_scale_a, readings.offset_sd_a / full_scale_a, 4 * K),
-    ):
-        known, row = np.isfinite(value) & np.isfinite(sd), np.arange(first, first + K)
-        values[:] = np.where(known, value, 0.0)
-        covariance[:, row, row] = np.where(known, sd**2, UNKNOWN_VARIANCE)
+    relative[:, 2 * K - 1 :], constant[:, K + 1 :] = np.where(known, value, 0.0)
+    row = np.r_[2 * K - 1 : 3 * K - 1, 4 * K : 5 * K]
+    covariance[:, row, row] = np.hstack([*np.where(known, sd**2, UNKNOWN_VARIANCE)])
     return replace(rows, relative=relative, constant=constant, covariance=covariance)
 
 
@@ -159,11 +134,12 @@ class BenchReading(NamedTuple):
     """File and line, for messages."""
 
 
+Names = Collection[str]
 BenchTable = Mapping[tuple[str, str], BenchReading]
 """Bench readings by vehicle and branch."""
 
 
-def read_bench_table(path: Path, branches: Collection[str], *, full_scale_a: float) -> BenchTable:
+def read_bench_table(path: Path, branches: Names, *, full_scale_a: float) -> BenchTable:
     """Read a table of bench readings.
 
     Parameters
@@ -185,14 +161,13 @@ def read_bench_table(path: Path, branches: Collection[str], *, full_scale_a: flo
     FleetError
         Naming file, line, what was expected.
     """
+    bench: dict[tuple[str, str], BenchReading] = {}
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        lines = csv.reader(path.read_text(encoding="utf-8-sig").splitlines(), skipinitialspace=True)
     except OSError as error:
         raise FleetError(f"{path}: cannot read the bench readings: {error.strerror}; give a CSV table") from None
     except UnicodeDecodeError:
         raise FleetError(f"{path}: not a table of bench readings: the file is not UTF-8 text") from None
-    lines = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
-    bench: dict[tuple[str, str], BenchReading] = {}
     try:
         header = [cell.strip() for cell in next(lines, [])]
         complete = {"vehicle", "branch"} <= set(header) <= set(COLUMNS) and len(set(header)) == len(header)
@@ -231,25 +206,18 @@ def _reading(row: Mapping[str, str], place: str, full_scale_a: float) -> BenchRe
                 raise FleetError(f"{place}: {name} is {row[name]!r}; expected {expected}")
     if all(map(math.isnan, numbers.values())):
         raise FleetError(f"{place}: nothing was read; give drift and drift_sd, or offset_a and offset_sd_a")
-    for name, low, high, what in (
-        ("drift", 0.0, LARGEST, "a relative gain error; 2 % is 0.02"),
-        ("drift_sd", LEAST_SD, LARGEST, "a standard deviation; 0.1 % is 0.001"),
-        ("offset_a", 0.0, LARGEST * full_scale_a, "in A"),
-        ("offset_sd_a", LEAST_SD * full_scale_a, LARGEST * full_scale_a, "in A"),
-    ):
-        size, value = ("a number", numbers[name]) if "sd" in name else ("a magnitude", abs(numbers[name]))
-        if value < low or value > high:  # NaN, which was not read, is neither
-            raise FleetError(f"{place}: {name} is {row[name]}; expected {size} from {low:g} to {high:g}: {what}")
+    for name in numbers:
+        unit = full_scale_a if name.startswith("offset") else 1.0
+        value = numbers[name] if "sd" in name else abs(numbers[name])
+        size, low = ("a number", LEAST_SD) if "sd" in name else ("a magnitude", 0.0)
+        if value < low * unit or value > LARGEST * unit:  # NaN, which was not read, is neither
+            expected = f"{size} from {low * unit:g} to {LARGEST * unit:g}: {MEANING.get(name, 'in A')}"
+            raise FleetError(f"{place}: {name} is {row[name]}; expected {expected}")
     return BenchReading(**numbers, place=place)
 
 
 def check_bench_table(
-    bench: BenchTable,
-    vehicles: Collection[str],
-    *,
-    left_out: Mapping[str, str],
-    trusted: Collection[str],
-    full_scale_a: float,
+    bench: BenchTable, vehicles: Names, *, left_out: Mapping[str, str], trusted: Names, full_scale_a: float
 ) -> None:
     """Refuse bench readings of vehicles that do not exist, or that contradict the trust in a vehicle.
 
@@ -271,15 +239,14 @@ def check_bench_table(
     FleetError
         Naming file and line of the reading.
     """
+    accuracy_a = TRUSTED_OFFSET_SD * full_scale_a
     for (vehicle, branch), (drift, drift_sd, offset_a, offset_sd_a, place) in bench.items():
+        if vehicle in left_out and vehicle not in vehicles:
+            raise FleetError(f"{place}: vehicle {vehicle!r} is left out: {left_out[vehicle]}")
         if vehicle not in vehicles:
-            if vehicle in left_out:
-                raise FleetError(f"{place}: vehicle {vehicle!r} is left out: {left_out[vehicle]}")
             raise FleetError(f"{place}: no vehicle {vehicle!r} in this fleet; known are {few(sorted(vehicles))}")
-        if vehicle in trusted and (
-            abs(drift) > CONTRADICTION * np.hypot(drift_sd, TRUSTED_DRIFT_SD)
-            or abs(offset_a) > CONTRADICTION * np.hypot(offset_sd_a, TRUSTED_OFFSET_SD * full_scale_a)
-        ):
+        apart = abs(drift) / np.hypot(drift_sd, TRUSTED_DRIFT_SD), abs(offset_a) / np.hypot(offset_sd_a, accuracy_a)
+        if vehicle in trusted and np.nanmax(apart) > CONTRADICTION:
             raise FleetError(
                 f"{place}: the {branch} sensor of {vehicle} was read as faulty, and {vehicle} is trusted; a trusted "
                 f"vehicle is one whose sensors were all found faultless"
@@ -308,25 +275,20 @@ def merge_readings(
         Where they do, and readings that could not be used.
     """
     names = [vehicle.vehicle for vehicle in vehicles]
-    offset_a = np.stack([vehicle.zero_current.offset_a for vehicle in vehicles])
-    sd_a = np.stack([vehicle.zero_current.sd_a for vehicle in vehicles])
     read = Readings.of_bench(bench, names, branches)
-    apart = np.abs(offset_a - read.offset_a) > CONTRADICTION * np.hypot(sd_a, read.offset_sd_a)
+    shown = Readings.none(len(names), len(branches))
+    shown.values[:, 1] = np.stack([(each.zero_current.offset_a, each.zero_current.sd_a) for each in vehicles], axis=1)
+    merged, (offset_a, sd_a), (read_a, read_sd_a) = shown.merged(read), shown.values[:, 1], read.values[:, 1]
+    apart = np.abs(offset_a - read_a) > CONTRADICTION * np.hypot(sd_a, read_sd_a)
+    merged.values[:, 1, apart] = np.nan
     notices = [
-        f"vehicle {names[j]}: its {branches[k]} sensor was read as {read.offset_a[j, k]:+.1f} A on the bench, and "
+        f"vehicle {names[j]}: its {branches[k]} sensor was read as {read_a[j, k]:+.1f} A on the bench, and "
         f"showed {offset_a[j, k]:+.1f} A with open contactors: neither is used; check it again"
         for j, k in np.argwhere(apart).tolist()
     ]
-    unused = sorted({vehicle for vehicle, _ in bench} - set(names))
-    if unused:
+    if unused := sorted({vehicle for vehicle, _ in bench} - set(names)):
         notices.append(f"bench readings of vehicles that are left out are not used: {', '.join(unused)}")
-    windows = replace(Readings.none(*offset_a.shape), offset_a=offset_a, offset_sd_a=sd_a)
-    merged = windows.merged(read)
-    return replace(
-        merged,
-        offset_a=np.where(apart, np.nan, merged.offset_a),
-        offset_sd_a=np.where(apart, np.nan, merged.offset_sd_a),
-    ), notices
+    return merged, notices
 
 
 def contradicted_readings(
@@ -358,20 +320,16 @@ def contradicted_readings(
     dict of (str, str) to str
         What to say of each such sensor.
     """
-    found = {}
-    for (vehicle, branch), read in bench.items():
-        if vehicle not in vehicles:
-            continue
-        j, k = vehicles.index(vehicle), branches.index(branch)
-        drift_apart = np.abs(read.drift - drift[j, :, k]) / np.hypot(read.drift_sd, drift_sd[j, :, k])
-        offset_apart = np.abs(read.offset_a - offset_a[j, :, k]) / np.hypot(read.offset_sd_a, offset_sd_a[j, :, k])
-        far = (drift_apart > CONTRADICTION) | (offset_apart > CONTRADICTION)  # what was not read is not far
-        if weight[j] @ ~far < LEAST_PROBABILITY:
-            found[vehicle, branch] = (
-                f"vehicle {vehicle}: the bench reading of its {branch} sensor is not what its drives show, and is not "
-                f"used; check it again, and whether it is of this vehicle"
-            )
-    return found
+    read = Readings.of_bench(bench, vehicles, branches).values[:, :, :, None]
+    apart = np.abs(read[0] - np.array([drift, offset_a])) / np.hypot(read[1], np.array([drift_sd, offset_sd_a]))
+    near = ~(apart > CONTRADICTION).any(axis=0)  # what was not read is not far
+    wrong = np.einsum("js,jsk->jk", weight, near) < LEAST_PROBABILITY
+    return {
+        (vehicle, branch): f"vehicle {vehicle}: the bench reading of its {branch} sensor is not what its drives show, "
+        f"and is not used; check it again, and whether it is of this vehicle"
+        for vehicle, branch in bench
+        if vehicle in vehicles and wrong[vehicles.index(vehicle), branches.index(branch)]
+    }
 
 
 def untrusted_vehicles(
@@ -406,25 +364,22 @@ def untrusted_vehicles(
     """
     K = rows.branches
     sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
-    ratio, constant = rows.relative[:, K : 2 * K - 1], rows.constant[:, K]
+    ratio, sum_a = rows.relative[:, K : 2 * K - 1], rows.constant[:, K] * full_scale_a
     accuracy = np.sqrt(2.0 * TRUSTED_DRIFT_SD**2 + LEAST_GAIN**2)
-    gain_off = np.abs(ratio) > CONTRADICTION * np.hypot(sd[:, K : 2 * K - 1], accuracy)
-    lowest, highest, spread = 0.0, MOST_LOAD, 0.0
-    why = "no load without a sensor explains"
+    off = np.where(np.abs(ratio) > CONTRADICTION * np.hypot(sd[:, K : 2 * K - 1], accuracy), np.abs(ratio), 0.0)
+    low_a, high_a, spread_a, why = 0.0, MOST_LOAD * full_scale_a, 0.0, "no load without a sensor explains"
     if load is not None:
-        lowest = highest = load.mean_a / full_scale_a
-        spread = load.sd_a / full_scale_a
+        low_a, high_a, spread_a = load.mean_a, load.mean_a, load.sd_a
         why = f"the declared load of {load.mean_a:g} A does not explain"
-    accuracy = np.sqrt(K * TRUSTED_OFFSET_SD**2 + spread**2 + LEAST_OFFSET**2)
-    away = np.maximum(lowest - constant, constant - highest)
-    constant_off = away > CONTRADICTION * np.hypot(sd[:, 4 * K - 1], accuracy)
+    accuracy_a = np.hypot(np.sqrt(K * TRUSTED_OFFSET_SD**2 + LEAST_OFFSET**2) * full_scale_a, spread_a)
+    away_a = np.maximum(low_a - sum_a, sum_a - high_a)
+    sum_off = away_a > CONTRADICTION * np.hypot(sd[:, 4 * K - 1] * full_scale_a, accuracy_a)
     found = {}
-    for j in np.flatnonzero(trusted & (gain_off.any(axis=1) | constant_off)).tolist():
-        if gain_off[j].any():
-            k = int(np.argmax(np.where(gain_off[j], np.abs(ratio[j]), 0.0)))
+    for j in np.flatnonzero(trusted & (off.any(axis=1) | sum_off)).tolist():
+        k = int(np.argmax(off[j]))
+        found[j] = f"its currents sum to {sum_a[j]:+.1f} A on average, which {why}"
+        if off[j, k]:
             found[j] = f"the gains of its sensors {branches[k + 1]} and {branches[0]} differ by {ratio[j, k]:+.1%}"
-        else:
-            found[j] = f"its currents sum to {constant[j] * full_scale_a:+.1f} A on average, which {why}"
     return found
 
 
@@ -472,12 +427,12 @@ def trust_notices(
         f"as by a hardware fault"
         for j in differing
     ]
-    for vehicle in (vehicles[j] for j in np.flatnonzero(trusted).tolist()):
-        offset_a, sd_a = vehicle.zero_current.offset_a, vehicle.zero_current.sd_a
-        surprising = np.abs(offset_a) > CONTRADICTION * np.hypot(sd_a, TRUSTED_OFFSET_SD * full_scale_a)
-        notices += [
-            f"trusted vehicle {vehicle.vehicle}: its {branches[k]} sensor showed {offset_a[k]:+.1f} A with open "
-            f"contactors; it was taken for faultless: check it again, or do not trust it"
-            for k in np.flatnonzero(surprising).tolist()
-        ]
-    return notices
+    return notices + [
+        f"trusted vehicle {vehicle.vehicle}: its {branch} sensor showed {offset_a:+.1f} A with open contactors; it was "
+        f"taken for faultless: check it again, or do not trust it"
+        for vehicle in compress(vehicles, trusted)
+        for branch, offset_a, sd_a in zip(
+            branches, vehicle.zero_current.offset_a, vehicle.zero_current.sd_a, strict=True
+        )
+        if abs(offset_a) > CONTRADICTION * math.hypot(sd_a, TRUSTED_OFFSET_SD * full_scale_a)
+    ]

@@ -10,11 +10,11 @@ import io
 import shutil
 import traceback
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -47,6 +47,7 @@ __all__ = [
     "internal_errors",
     "join_rows",
     "left_out_of",
+    "part_file",
     "read_part",
     "read_results",
     "read_run",
@@ -70,6 +71,7 @@ LEFT_OUT = "left out"
 INTERNAL_ERROR = "internal error: "
 """Begins the reason of a vehicle that an error of the program itself left out."""
 REMEDY = "name a folder that 'calibrator calibrate --out' wrote"
+Rows = list[dict[str, Any]]
 
 _UNITS = {
     "drift": "1",
@@ -149,27 +151,17 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     notices: list[str]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Written:
-    """Parameters of one vehicle as they were written.
-
-    Attributes
-    ----------
-    drives : str
-        Digest of the drives' files; empty if it is not known.
-    text : bytes
-        Of the parameter file.
-    evidence : VehicleEvidence or None
-        What they were found from; None if it was not kept.
-    """
+class Written(NamedTuple):
+    """Parameters of one vehicle as they were written."""
 
     drives: str
+    """Digest of the drives' files; empty: not known."""
     text: bytes
-    evidence: VehicleEvidence | None = None
+    evidence: VehicleEvidence | None
+    """What they were found from; None: not kept."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChunkResult:
+class ChunkResult(NamedTuple):
     """Result of some vehicles of a fleet: their rows of ``results.parquet``, and their parameters, as files."""
 
     rows: bytes
@@ -177,26 +169,26 @@ class ChunkResult:
 
 
 def encode_chunk(
-    parameters: Sequence[VehicleParameters],
+    parameters: Iterable[VehicleParameters],
     left_out: Mapping[str, str],
     *,
-    moved: Mapping[tuple[str, str], str] | None = None,
-    drives: Mapping[str, str] | None = None,
-    evidence: Mapping[str, VehicleEvidence] | None = None,
+    moved: Mapping[tuple[str, str], str] = {},
+    drives: Mapping[str, str] = {},
+    evidence: Mapping[str, VehicleEvidence] = {},
 ) -> ChunkResult:
     """Write down the result of some vehicles, in the order of their names.
 
     Parameters
     ----------
-    parameters : sequence of VehicleParameters
+    parameters : iterable of VehicleParameters
         One per calibrated vehicle; one whose parameters cannot be written is left out.
     left_out : mapping of str to str
         Why the other vehicles have none.
-    moved : mapping of (str, str) to str, or None
+    moved : mapping of (str, str) to str
         What has moved since an earlier result, by vehicle and branch.
-    drives : mapping of str to str, or None
+    drives : mapping of str to str
         Digest of the drives' files by vehicle.
-    evidence : mapping of str to VehicleEvidence, or None
+    evidence : mapping of str to VehicleEvidence
         What the parameters were found from, by vehicle.
 
     Returns
@@ -204,8 +196,8 @@ def encode_chunk(
     ChunkResult
         As files.
     """
-    rows: list[dict[str, Any]] = []
-    texts: list[dict[str, Any]] = []
+    rows: Rows = []
+    texts: Rows = []
     reasons = dict(left_out)
     for item in sorted(parameters, key=lambda item: item.vehicle):
         name = item.vehicle
@@ -214,42 +206,40 @@ def encode_chunk(
         except ParameterError as error:
             reasons[name] = f"{error}; look at its recordings"
             continue
-        told = (evidence or {}).get(name)
-        columns = {} if told is None else {f"evidence_{column}": values for column, values in vars(told).items()}
-        texts.append({"vehicle": name, "drives": (drives or {}).get(name, ""), "parameters": text, **columns})
-        rows += [{**row, "moved": (moved or {}).get((name, row["branch"]))} for row in _rows_of(item)]
+        columns = (
+            {f"evidence_{key}": values for key, values in vars(evidence[name]).items()} if name in evidence else {}
+        )
+        texts.append({"vehicle": name, "drives": drives.get(name, ""), "parameters": text, **columns})
+        rows += [{**row, "moved": moved.get((name, row["branch"]))} for row in _rows_of(item)]
     rows += _left_out_rows(reasons)
-    return ChunkResult(rows=_parquet(rows, SCHEMA), parameters=_parquet(texts, PARAMETERS_SCHEMA))
+    return ChunkResult(_parquet(rows, SCHEMA), _parquet(texts, PARAMETERS_SCHEMA))
 
 
-def _rows_of(item: VehicleParameters) -> list[dict[str, Any]]:
-    """Rows of a vehicle, one per branch."""
-    vehicle = {
-        "vehicle": item.vehicle,
-        "verdict": item.verdict,
-        "confidence": item.confidence,
-        "hardware_fault": item.hardware_fault.suspected,
-        "hardware_probability": item.hardware_fault.probability,
-        "hardware_drift": item.hardware_fault.drift,
-        "junction_rms_measured_a": item.junction_residual.measured_a,
-        "junction_rms_corrected_a": item.junction_residual.corrected_a,
-        "duration_s": item.provenance.duration_s,
-        "reason": item.deciding_evidence or None,
-    }
-    same = ("drift", "offset_a", "drift_sd", "offset_sd_a", "delay_s", "held_back", "fault_probability")
+def _rows_of(item: VehicleParameters) -> Rows:
+    """Rows of a vehicle, one per branch; keys that are no columns are not written."""
+    hardware, residual = item.hardware_fault, item.junction_residual
     return [
         {
-            **vehicle,
+            **msgspec.structs.asdict(branch),
+            "vehicle": item.vehicle,
             "branch": name,
-            **{column: getattr(branch, column) for column in (*same, "harm_probability")},
+            "verdict": item.verdict,
             "applied": branch.apply,
-            "hardware_offset_a": item.hardware_fault.offset_a.get(name, 0.0),
+            "confidence": item.confidence,
+            "hardware_fault": hardware.suspected,
+            "hardware_probability": hardware.probability,
+            "hardware_drift": hardware.drift,
+            "hardware_offset_a": hardware.offset_a.get(name, 0.0),
+            "junction_rms_measured_a": residual.measured_a,
+            "junction_rms_corrected_a": residual.corrected_a,
+            "duration_s": item.provenance.duration_s,
+            "reason": item.deciding_evidence or None,
         }
         for name, branch in item.branches.items()
     ]
 
 
-def _left_out_rows(left_out: Mapping[str, str]) -> list[dict[str, Any]]:
+def _left_out_rows(left_out: Mapping[str, str]) -> Rows:
     return [{"vehicle": vehicle, "verdict": LEFT_OUT, "reason": left_out[vehicle]} for vehicle in sorted(left_out)]
 
 
@@ -269,7 +259,7 @@ def join_rows(folder: Path, parts: Sequence[Path], left_out: Mapping[str, str]) 
     parts : sequence of Path
         Files with the rows of each chunk.
     left_out : mapping of str to str
-        Vehicles, or files of unclear vehicle, that are in no chunk, and why.
+        Vehicles, or files of unclear vehicle, and why; those that are in a chunk are not written twice.
 
     Returns
     -------
@@ -312,7 +302,7 @@ def write_parameter_files(folder: Path, parts: Mapping[int, Path], *, vehicles: 
     """
     (folder / PARTS).mkdir()
     for number, part in parts.items():
-        shutil.copyfile(part, _part(folder, number))
+        shutil.copyfile(part, part_file(folder, number))
     if vehicles > MOST_FILES:
         return PARTS
     (folder / FILES).mkdir()
@@ -322,89 +312,48 @@ def write_parameter_files(folder: Path, parts: Mapping[int, Path], *, vehicles: 
     return FILES
 
 
-def _part(result: Path, number: int) -> Path:
+def part_file(result: Path, number: int) -> Path:
+    """File of a result with the parameters of a chunk."""
     return result / PARTS / f"{number:05d}.parquet"
 
 
 def read_part(path: Path) -> dict[str, Written]:
-    """Parameters of a chunk by vehicle, from a file of a result; none if there is no such file.
-
-    Raises
-    ------
-    FleetError
-        If the file is damaged.
-    """
+    """Parameters of a chunk by vehicle, none if there is no such file; FleetError if it is damaged."""
     try:
         rows = pq.ParquetFile(path).read(use_threads=False).to_pylist()
-        return {row["vehicle"]: _written(row) for row in rows}
+        found = {}
+        for row in rows:
+            value, sd, explained = (row.get(f"evidence_{name}") for name in ("value", "sd", "explained"))
+            evidence = None if value is None else VehicleEvidence(value=value, sd=sd, explained=explained)
+            found[row["vehicle"]] = Written(row["drives"], row["parameters"].encode(), evidence)
+        return found
     except FileNotFoundError:
         return {}
     except (pa.ArrowException, OSError, KeyError) as error:
         raise FleetError(f"{path}: damaged part of a result: {_first_line(error)}; calibrate again") from None
 
 
-def _written(row: Mapping[str, Any]) -> Written:
-    evidence = None
-    if row.get("evidence_value") is not None:
-        evidence = VehicleEvidence(**{name: row[f"evidence_{name}"] for name in ("value", "sd", "explained")})
-    return Written(drives=row["drives"], text=row["parameters"].encode(), evidence=evidence)
-
-
 def written_of(result: Path, vehicle: str) -> Written:
-    """Parameters of one vehicle.
-
-    Parameters
-    ----------
-    result : Path
-        Folder of a result.
-    vehicle : str
-        Name.
-
-    Returns
-    -------
-    Written
-        With the text as the node reads it.
-
-    Raises
-    ------
-    FleetError
-        If it is no result, or there are no parameters of this vehicle in it.
-    """
+    """Parameters of one vehicle; FleetError if it is no result, or has none of this vehicle."""
     run = read_run(result)
-    found = read_part(_part(result, bucket_of(vehicle, run.buckets) if run.buckets else 0))
+    found = read_part(part_file(result, bucket_of(vehicle, run.buckets) if run.buckets else 0))
     if vehicle in found:
         return found[vehicle]
     if not (result / PARTS).is_dir():
         raise FleetError(f"{result / PARTS}: no such folder; give all that 'calibrator calibrate' wrote")
     try:
-        rows = pq.ParquetFile(result / ROWS).read(columns=["vehicle", "reason"], use_threads=False)
-        reasons = rows.filter(pc.equal(rows["vehicle"], vehicle))["reason"].to_pylist()
+        reason = left_out_of(result).get(vehicle)
     except (pa.ArrowException, OSError):
-        reasons = []
-    if not reasons:
+        reason = None
+    if reason is None:
         raise FleetError(f"{result}: no vehicle {vehicle!r} in it; {ROWS} names all that are")
-    raise FleetError(f"{result}: no parameters of vehicle {vehicle!r}, it was left out: {reasons[0]}")
+    raise FleetError(f"{result}: no parameters of vehicle {vehicle!r}, it was left out: {reason}")
 
 
-def read_results(result: Path) -> list[dict[str, Any]]:
-    """Rows of ``results.parquet`` of a result folder; FleetError if it is none."""
-    path = result / ROWS
-    try:
-        found = pq.read_table(path, use_threads=False)
-    except (OSError, pa.ArrowInvalid) as error:
-        raise FleetError(f"{path}: not a result of 'calibrator calibrate': {_first_line(error)}; {REMEDY}") from None
-    missing = [name for name in SCHEMA.names if name not in found.column_names]
-    if missing:
-        raise FleetError(f"{path}: column {', '.join(missing)} is missing; write the result anew with this version")
-    rows: list[dict[str, Any]] = found.to_pylist()
-    return rows
-
-
-def left_out_of(result: Path) -> tuple[dict[str, str], int]:
-    """Vehicles of ``results.parquet`` that have no parameters and why, the first :data:`MOST_NAMED`; how many."""
+def left_out_of(result: Path) -> dict[str, str]:
+    """Vehicles of ``results.parquet`` that have no parameters, and why."""
     found = pq.read_table(result / ROWS, columns=["vehicle", "branch", "reason"], use_threads=False)
-    found = found.filter(pc.field("branch").is_null())
-    return {row["vehicle"]: row["reason"] for row in found.slice(0, MOST_NAMED).to_pylist()}, found.num_rows
+    return {row["vehicle"]: row["reason"] for row in found.filter(pc.field("branch").is_null()).to_pylist()}
 
 
 def internal_error(error: Exception) -> str:
@@ -415,9 +364,26 @@ def internal_error(error: Exception) -> str:
 
 def internal_errors(result: Path) -> dict[str, str]:
     """Vehicles of a result that errors of the program itself left out, and which errors."""
-    found = pq.read_table(result / ROWS, columns=["vehicle", "branch", "reason"], use_threads=False)
-    found = found.filter(pc.field("branch").is_null() & pc.starts_with(pc.field("reason"), INTERNAL_ERROR))
-    return {row["vehicle"]: row["reason"].removeprefix(INTERNAL_ERROR) for row in found.to_pylist()}
+    found = left_out_of(result).items()
+    return {name: why.removeprefix(INTERNAL_ERROR) for name, why in found if why.startswith(INTERNAL_ERROR)}
+
+
+def read_results(result: Path) -> Rows:
+    """Rows of ``results.parquet`` of a result folder; FleetError if it is none."""
+    path = result / ROWS
+    try:
+        found = pq.read_table(path, use_threads=False)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise FleetError(f"{path}: not a result of 'calibrator calibrate': {_first_line(error)}; {REMEDY}") from None
+    missing = [name for name in SCHEMA.names if name not in found.column_names]
+    if missing:
+        raise FleetError(f"{path}: column {', '.join(missing)} is missing; write the result anew with this version")
+    rows: Rows = found.to_pylist()
+    return rows
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0][:120]
 
 
 def write_run(folder: Path, run: RunRecord) -> None:
@@ -436,49 +402,24 @@ def read_run(result: Path) -> RunRecord:
         raise FleetError(f"{path}: not a run of 'calibrator calibrate': {error}; calibrate again") from None
 
 
-def _first_line(error: Exception) -> str:
-    return str(error).partition("\n")[0][:120]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Counts:
-    """Numbers of a result.
+    """Numbers of a result."""
 
-    Attributes
-    ----------
-    verdicts : Counter of str
-        Vehicles per verdict, in the order in which verdicts first come.
-    held_back : Counter of str
-        Branches in which a fault was found that is not applied, by reason, in the same order.
-    hardware_suspected : int
-        Vehicles of which a hardware fault is suspected.
-    moved_vehicles, moved_sensors : int
-        Vehicles with sensors that have moved since an earlier result, and these sensors.
-    """
-
-    verdicts: Counter[str] = field(default_factory=Counter)
-    held_back: Counter[str] = field(default_factory=Counter)
-    hardware_suspected: int = 0
-    moved_vehicles: int = 0
-    moved_sensors: int = 0
+    verdicts: Counter[str]
+    """Vehicles per verdict, in the order in which verdicts first come."""
+    held_back: Counter[str]
+    """Branches in which a fault was found that is not applied, by reason, in the same order."""
+    hardware_suspected: int
+    """Vehicles of which a hardware fault is suspected."""
+    moved_vehicles: int
+    moved_sensors: int
+    """Sensors that have moved since an earlier result."""
 
 
 def count_rows(rows: pa.Table, branches: Sequence[str]) -> Counts:
-    """Count rows of ``results.parquet`` that have a branch.
-
-    Parameters
-    ----------
-    rows : pyarrow.Table
-        All rows of each of some vehicles, one per branch.
-    branches : sequence of str
-        Names of the branches; what is said of a vehicle as a whole is taken from its row of the first.
-
-    Returns
-    -------
-    Counts
-        Of these vehicles.
-    """
-    vehicles = rows.filter(pc.field("branch") == branches[0])
+    """Count rows of ``results.parquet`` that have a branch: all rows of each of some vehicles, one per branch."""
+    vehicles = rows.filter(pc.field("branch") == branches[0])  # each has what is said of its vehicle as a whole
     moved = rows.filter(pc.field("moved").is_valid())
     verdicts, held_back = (
         Counter({item["values"]: item["counts"] for item in pc.value_counts(column).to_pylist()})
@@ -494,7 +435,7 @@ def count_rows(rows: pa.Table, branches: Sequence[str]) -> Counts:
 
 
 def deployed_rms_a(applied: Mask, *, measured_a: Array, corrected_a: Array) -> Array:
-    """Root mean square of the Kirchhoff sum with what the node applies.
+    """Root mean square of the Kirchhoff sum with what the node applies, shape (N,): as measured where it is nothing.
 
     Parameters
     ----------
@@ -502,11 +443,6 @@ def deployed_rms_a(applied: Mask, *, measured_a: Array, corrected_a: Array) -> A
         Branches that the node corrects.
     measured_a, corrected_a : ndarray of shape (N,)
         The same as measured, and with what is applied. [A]
-
-    Returns
-    -------
-    ndarray of shape (N,)
-        As measured where nothing is applied. [A]
     """
     return np.where(applied.any(axis=1), corrected_a, measured_a)
 
@@ -545,11 +481,9 @@ class CalibrationReport:
     def as_text(self) -> str:
         """The report for people."""
         run, details = self.run, self.run.details
-        snr, agreeing, spread = (
-            details.get("simulation_snr_db", {}),
-            details.get("reference", {}).get("agreeing_share", {}),
-            details.get("hyperparameters", {}).get("model_spread", {}),
-        )
+        agreeing = details.get("reference", {}).get("agreeing_share", {})
+        spread = details.get("hyperparameters", {}).get("model_spread", {})
+        snr = details.get("simulation_snr_db", {})
         rows = [
             ("vehicles calibrated", f"{run.vehicles}"),
             *((f"  {verdict}", f"{count}") for verdict, count in self.verdicts.items()),
@@ -595,45 +529,44 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
         Of all its vehicles.
     """
     rows = pq.read_table(result / ROWS, use_threads=False).filter(pc.field("branch").is_valid())
-    vehicles, K = rows.filter(pc.field("branch") == run.branches[0]), len(run.branches)
-    applied = rows["applied"].to_numpy().reshape(-1, K)
+    vehicles, counts = rows.filter(pc.field("branch") == run.branches[0]), count_rows(rows, run.branches)
     measured_a, corrected_a = (vehicles[f"junction_rms_{name}_a"].to_numpy() for name in ("measured", "corrected"))
+    applied = rows["applied"].to_numpy().reshape(-1, len(run.branches))
     deployed_a = deployed_rms_a(applied, measured_a=measured_a, corrected_a=corrected_a)
-    counts = count_rows(rows, run.branches)
-    moved = _named(rows.filter(pc.field("moved").is_valid()))
-    corrected = _named(rows.filter((pc.field("verdict") == "corrected") & pc.field("applied")))
-    suspected = _named(vehicles.filter(pc.field("hardware_fault")))
-    undecided = _named(vehicles.filter(pc.field("verdict") == "cannot tell"))
 
-    def doubt(confidence: float | None) -> str:
+    def corrected(rows: Rows) -> str:
+        names, confidence = ", ".join(row["branch"] for row in rows), rows[0]["confidence"]
         unsure = confidence is not None and confidence < CONFIDENT
-        return f" (all of its faults: confidence {confidence:.2f})" if unsure else ""
+        return f"{names} (all of its faults: confidence {confidence:.2f})" if unsure else names
 
-    def probability(value: float | None) -> str:
-        return "" if value is None else f"probability {value:.1f}"
+    def suspected(rows: Rows) -> str:
+        probability = rows[0]["hardware_probability"]
+        return "" if probability is None else f"probability {probability:.1f}"
 
     return CalibrationReport(
         result=str(shown),
         parameters=parameters,
         run=run,
         verdicts=dict(counts.verdicts),
-        undecided={name: items[0]["reason"] or "" for name, items in undecided.items()},
-        corrected={
-            name: ", ".join(row["branch"] for row in items) + doubt(items[0]["confidence"])
-            for name, items in corrected.items()
-        },
-        hardware_suspected={name: probability(items[0]["hardware_probability"]) for name, items in suspected.items()},
+        undecided=_said(vehicles, pc.field("verdict") == "cannot tell", lambda rows: rows[0]["reason"] or ""),
+        corrected=_said(rows, (pc.field("verdict") == "corrected") & pc.field("applied"), corrected),
+        hardware_suspected=_said(vehicles, pc.field("hardware_fault"), suspected),
         hardware_count=counts.hardware_suspected,
         held_back=dict(counts.held_back),
-        moved={name: "; ".join(f"{row['branch']} {row['moved']}" for row in items) for name, items in moved.items()},
+        moved=_said(
+            rows,
+            pc.field("moved").is_valid(),
+            lambda rows: "; ".join(f"{row['branch']} {row['moved']}" for row in rows),
+        ),
         moved_count=counts.moved_vehicles,
         junction_rms_measured_a=float(np.median(measured_a)),
         junction_rms_deployed_a=float(np.median(deployed_a)),
     )
 
 
-def _named(rows: pa.Table) -> dict[str, list[dict[str, Any]]]:
-    """Rows by vehicle, of the first vehicles; those of a vehicle stand together, K at most."""
+def _said(rows: pa.Table, which: pc.Expression, text: Callable[[Rows], str]) -> dict[str, str]:
+    """What is said of the first vehicles with rows of some condition; rows of a vehicle stand together."""
+    rows = rows.filter(which)
     names = pc.unique(rows["vehicle"]).slice(0, MOST_NAMED)
     found = rows.filter(pc.is_in(rows["vehicle"], value_set=names)).to_pylist()
-    return {name: list(group) for name, group in groupby(found, key=lambda row: str(row["vehicle"]))}
+    return {name: text(list(group)) for name, group in groupby(found, key=lambda row: str(row["vehicle"]))}

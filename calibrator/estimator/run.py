@@ -11,7 +11,7 @@ Faults of the program in single vehicles (:mod:`calibrator.estimator.fleet_task`
 import hashlib
 import shutil
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -30,15 +30,16 @@ from calibrator.estimator.readings import (
     read_bench_table,
 )
 from calibrator.estimator.results import (
+    MOST_NAMED,
     PARTS,
     CalibrationReport,
     ChunkResult,
     RunRecord,
-    Written,
     encode_chunk,
     internal_error,
     join_rows,
     left_out_of,
+    part_file,
     read_part,
     read_run,
     report_of,
@@ -47,6 +48,7 @@ from calibrator.estimator.results import (
 )
 from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.estimator.unfinished import Unfinished, unfinished_run
+from calibrator.estimator.vehicle_report import faults_of
 from calibrator.estimator.workers import Workers
 from calibrator.files.folders import require_new_folder
 from calibrator.files.parameter_files import RunIdentity
@@ -62,7 +64,7 @@ from calibrator.sources.fleet_source import (
     probe_equipment,
 )
 from calibrator.summaries.add_drives import add_drives
-from calibrator.summaries.identity import StoreIdentity, read_identity
+from calibrator.summaries.identity import StoreIdentity, read_identity, store_identity
 from calibrator.summaries.open_store import open_store
 from calibrator.summaries.record import Outline, Record, drives_digest, joined_records
 from calibrator.summaries.store import SummaryStore
@@ -97,17 +99,6 @@ MOVED_SD = 4.0
 LEAST_PROBABILITY = 1e-3
 """Of the explanations near the earlier faults: below, a sensor has moved. [1]"""
 NOT_THERE = "it is not in this store; its earlier parameters are in the earlier result"
-
-
-@dataclass(frozen=True, kw_only=True)
-class FleetFacts:
-    """What a result says of its fleet."""
-
-    name: str
-    fleet_ids: tuple[str, ...]
-    equipment: Equipment
-    left_out: Mapping[str, str]
-    notices: tuple[str, ...]
 
 
 def calibrate_fleet(
@@ -153,24 +144,17 @@ def calibrate_fleet(
     require_new_folder(out)
     storage = open_storage(place)
     identity = require_fleet(storage, place, database)
-    if identity is not None:
+    if identity is None:
+        fleet = _find_drives(Path(storage.url), settings, everyone=since is None)
+        passes = 3 if settings.method is Method.PUBLISHED else 5
+    else:
         _require_summaries_enough(storage, settings)
-        store = SummaryStore(storage=storage, identity=identity)
-        about = FleetFacts(
-            name=identity.fleet,
-            fleet_ids=identity.fleet_ids,
-            equipment=identity.equipment,
-            left_out={},
-            notices=identity.notices,
-        )
-        with unfinished_run(out) as unfinished, numbered_passes(4):  # look, learn, calibrate, write
-            run = _Run(unfinished=unfinished, database=database, settings=settings, workers=workers, since=since)
-            return run.summaries(store, about)
-    fleet = _find_drives(Path(storage.url), settings, everyone=since is None)
-    published = settings.method is Method.PUBLISHED
-    with unfinished_run(out) as unfinished, numbered_passes(3 if published else 5):
+        passes = 4  # look, learn, calibrate, write
+    with unfinished_run(out) as unfinished, numbered_passes(passes):
         run = _Run(unfinished=unfinished, database=database, settings=settings, workers=workers, since=since)
-        return run.published(fleet) if published else run.drives(fleet)
+        if identity is not None:
+            return run.summaries(SummaryStore(storage=storage, identity=identity), identity, {})
+        return run.published(fleet) if settings.method is Method.PUBLISHED else run.drives(fleet)
 
 
 def require_fleet(storage: Storage, place: str | Path, database: VehicleDatabase) -> StoreIdentity | None:
@@ -218,19 +202,9 @@ def _find_drives(path: Path, settings: CalibrationSettings, *, everyone: bool) -
     return fleet
 
 
-def _facts_of_drives(fleet: FleetSource, equipment: Equipment) -> FleetFacts:
-    return FleetFacts(
-        name=fleet.path.resolve().name,
-        fleet_ids=tuple(sorted(fleet.fleet_ids)),
-        equipment=equipment,
-        left_out=fleet.left_out,
-        notices=(*fleet.notices, *equipment.notices),
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class Census:
-    """Who there is in a store: numbers only, as a fleet has millions of names.
+    """Who there is in a store: hardly any names, as a fleet has millions of them.
 
     Attributes
     ----------
@@ -240,11 +214,14 @@ class Census:
         Why others cannot; the first few.
     left_out : int
         How many others there are.
+    known : mapping of str to Outline
+        Of the vehicles that were asked for and are there, and of those of the first bucket.
     """
 
     usable: Mapping[int, int]
     reasons: Mapping[str, str]
     left_out: int
+    known: Mapping[str, Outline]
 
     @property
     def size(self) -> int:
@@ -252,41 +229,31 @@ class Census:
         return sum(self.usable.values())
 
 
-def take_census(store: SummaryStore, workers: Workers) -> Census:
+def take_census(store: SummaryStore, workers: Workers, asked: Collection[str] = ()) -> Census:
     """Look at every bucket of a store; UserError if one cannot be read, or there is no vehicle."""
-    buckets, usable, reasons, seen = store.buckets(), dict[int, int](), dict[str, str](), 0
+    buckets, usable, reasons, known, seen = store.buckets(), dict[int, int](), dict[str, str](), dict[str, Outline](), 0
     with progress_bar("look at vehicles", len(buckets), "chunks") as progress:
         for done, (bucket, outlines) in enumerate(zip(buckets, workers.map(store.outlines, buckets), strict=True), 1):
             seen += len(outlines)
             problems = {item.vehicle: item.problem for item in outlines if item.problem}
             usable[bucket] = len(outlines) - len(problems)
             reasons |= dict(list(problems.items())[: MOST_REASONS - len(reasons)])
+            known |= {item.vehicle: item for item in outlines if done == 1 or item.vehicle in asked}
             progress(done)
     if not seen:
         raise FleetError(f"{store.url}: the store of summaries is empty; add drives with 'calibrator summarise'")
-    return Census(usable=usable, reasons=reasons, left_out=seen - sum(usable.values()))
-
-
-def _outlines_of(store: SummaryStore, census: Census, names: Collection[str]) -> dict[str, Outline]:
-    """What there is of some vehicles, by name; those that are not in the store are not."""
-    found: dict[str, Outline] = {}
-    for bucket, wanted in store.by_bucket(names).items():
-        if bucket in census.usable:
-            found |= {item.vehicle: item for item in store.outlines(bucket) if item.vehicle in wanted}
-    return found
+    return Census(usable=usable, reasons=reasons, left_out=seen - sum(usable.values()), known=known)
 
 
 def read_sample(
     store: SummaryStore, census: Census, settings: CalibrationSettings, checked: Collection[str]
 ) -> list[VehicleSummary]:
-    """Read the vehicles to learn from.
+    """Read the vehicles to learn from; FleetError if they are too few.
 
     Parameters
     ----------
-    store : SummaryStore
-        The store.
-    census : Census
-        Who there is in it.
+    store, census : SummaryStore, Census
+        The store, and who there is in it.
     settings : CalibrationSettings
         Says which vehicles are held out, and which are trusted.
     checked : collection of str
@@ -296,11 +263,6 @@ def read_sample(
     -------
     list of VehicleSummary
         Trusted and checked ones, and others, by hash of their names, up to :data:`MOST_LEARNT` that may be learnt from.
-
-    Raises
-    ------
-    FleetError
-        If there are too few to learn from.
     """
     wanted = settings.trusted | frozenset(checked)
     apart = {store.bucket_of(name) for name in wanted}
@@ -335,29 +297,23 @@ class _Run:
         """Calibrate by the published method, which needs all models at once; its result is one chunk."""
         from calibrator.estimator.published_fleet import calibrate_fleet_published  # noqa: PLC0415 (takes a second to import)
 
-        settings = self.settings
-        equipment = probe_equipment(fleet, self.database, settings.branches, limit_s=settings.time_limit_s)
-        about = _facts_of_drives(fleet, equipment)
+        equipment = self._equipment(fleet)
+        about = self._about(fleet, equipment)
         identity = self._identity(about, None)
-        found = calibrate_fleet_published(fleet, equipment, identity, settings, workers=self.workers.processes)
-        self.unfinished.put(0, encode_chunk(found.parameters, found.left_out))
-        return self._result(replace(about, left_out={}), identity, details=found.details, notices=found.notices)
+        chunk, details, notices = calibrate_fleet_published(
+            fleet, equipment, identity, self.settings, workers=self.workers.processes
+        )
+        self.unfinished.put(0, chunk)
+        return self._result(about, identity, {}, details=details, notices=notices)
 
     def drives(self, fleet: FleetSource) -> CalibrationReport:
         """Summarise drives, and calibrate from the summaries."""
-        store, limit_s = self._own_store(fleet), self.settings.time_limit_s
-        if self.since is None:  # a slip in the table is reported before the drives are read
-            self._bench(store.identity.branches, fleet.vehicles.keys(), fleet.left_out)
-        add_drives(
-            store,
-            fleet,
-            self.database,
-            workers=self.workers.processes,
-            time_limit_s=limit_s,
-            exactly=self.since is None,
-        )
+        store, limit_s, everyone = self._own_store(fleet), self.settings.time_limit_s, self.since is None
+        if everyone:  # a slip in the table is reported before the drives are read
+            self._check(self._bench_table(store), fleet.vehicles, fleet.left_out)
+        add_drives(store, fleet, self.database, workers=self.workers.processes, time_limit_s=limit_s, exactly=everyone)
         keep_unity_window(store, fleet, self.database, time_limit_s=limit_s)
-        return self.summaries(store, _facts_of_drives(fleet, store.identity.equipment))
+        return self.summaries(store, self._about(fleet, store.identity.equipment), fleet.left_out)
 
     def _own_store(self, fleet: FleetSource) -> SummaryStore:
         """Store of the summaries read so far; one that was begun with other branches or another layout is made anew."""
@@ -374,25 +330,40 @@ class _Run:
             identity = read_identity(storage, self.database)
             assert identity is not None
             return SummaryStore(storage=storage, identity=identity)
-        settings = self.settings
-        equipment = probe_equipment(fleet, self.database, settings.branches, limit_s=settings.time_limit_s)
+        equipment = self._equipment(fleet)
         try:
             return open_store(storage, equipment, self.database, fleet)
         except FleetError:
             shutil.rmtree(folder, ignore_errors=True)
             return open_store(storage, equipment, self.database, fleet)
 
-    def summaries(self, store: SummaryStore, about: FleetFacts) -> CalibrationReport:
+    def _equipment(self, fleet: FleetSource) -> Equipment:
+        return probe_equipment(fleet, self.database, self.settings.branches, limit_s=self.settings.time_limit_s)
+
+    def _about(self, fleet: FleetSource, equipment: Equipment) -> StoreIdentity:
+        """What a result says of a fleet of drives."""
+        name, vehicles = fleet.path.resolve().name, len(fleet.vehicles)
+        about = store_identity(equipment, self.database, vehicles=vehicles, fleet=name, fleet_ids=fleet.fleet_ids)
+        return msgspec.structs.replace(about, notices=(*fleet.notices, *equipment.notices))
+
+    def summaries(self, store: SummaryStore, about: StoreIdentity, left_out: Mapping[str, str]) -> CalibrationReport:
         """Calibrate every vehicle of a store; summaries that were read by this run become part of its result."""
         previous = None if self.since is None else self.since.absolute()
         if self.since is not None:
             _require_previous(self.since, self.database, store.identity)
         versions = store.versions()
         identity = self._identity(about, self._plan(store, versions, previous))
-        census = take_census(store, self.workers)
-        self._require_named(store, census, fleet=about.name)
-        with threadpool_limits(1):  # so that the reference is the same wherever it is learnt
-            task, notices = self._learn(store, census, identity)
+        bench = self._bench_table(store)
+        checked = {vehicle for vehicle, _ in bench}
+        census = take_census(store, self.workers, self.settings.hold_out | self.settings.trusted | checked)
+        self._require_named(census, fleet=about.fleet)
+        problems = {name: item.problem for name, item in census.known.items() if item.problem}
+        self._check(bench, census.known.keys() - problems.keys(), problems)
+        with progress_bar("learn the fleet", None), threadpool_limits(1):  # one: the reference is the same anywhere
+            sample = read_sample(store, census, self.settings, checked)
+            task, notices = learn_task(
+                sample, self.settings, bench, branches=about.branches, identity=identity, fleet_size=census.size
+            )
         done = self.unfinished.done()
         todo = [bucket for bucket in census.usable if bucket not in done]
         calibrate = partial(calibrate_bucket, store=store, task=task, previous=previous)
@@ -405,104 +376,77 @@ class _Run:
                 progress(seen)
         if store.versions() != versions:
             raise FleetError(f"{store.url}: the summaries were changed during the run; run the same command again")
-        window, buckets = store.storage.read_if_there(UNITY_FILE), store.identity.buckets
-        details = task.reference.details()
-        return self._result(about, identity, details=details, notices=notices, window=window, buckets=buckets)
+        return self._result(about, identity, left_out, details=task.reference.details(), notices=notices, store=store)
 
     def _plan(self, store: SummaryStore, versions: Mapping[str, str], previous: Path | None) -> str:
-        """Digest of all that decides what is computed."""
-        decides = (
-            __version__,
-            store.identity,
-            versions,
-            self.database.layout.digest,
-            self.database.digest,
-            self.settings.record(),
-            None if previous is None else (str(previous), file_digest(previous / "run.json")),
-        )
+        """Digest of all that decides what is computed; the store's identity holds the digests of layout and DBC."""
+        earlier = None if previous is None else (str(previous), file_digest(previous / "run.json"))
+        decides = (__version__, store.identity, versions, self.settings.record(), earlier)
         return hashlib.blake2b(msgspec.json.encode(decides, order="sorted"), digest_size=16).hexdigest()
 
-    def _identity(self, about: FleetFacts, plan: str | None) -> RunIdentity:
+    def _identity(self, about: StoreIdentity, plan: str | None) -> RunIdentity:
         created = self.unfinished.begin(plan, time_of_run())
-        return RunIdentity(database=self.database, method=self.settings.method, fleet=about.name, created=created)
+        return RunIdentity(database=self.database, method=self.settings.method, fleet=about.fleet, created=created)
 
-    def _require_named(self, store: SummaryStore, census: Census, *, fleet: str) -> None:
+    def _require_named(self, census: Census, *, fleet: str) -> None:
         """Refuse names of vehicles that there are not."""
-        hold_out, trusted = self.settings.hold_out, self.settings.trusted
-        there = _outlines_of(store, census, hold_out | trusted)
-        for names, what in ((hold_out, "hold out"), (trusted, "trust")):
-            missing = [name for name in sorted(names) if name not in there or (there[name].problem and what == "trust")]
-            if missing:
-                reasons = few_reasons({name: there[name].problem for name in missing if name in there})
+        known = census.known
+        for names, what in ((self.settings.hold_out, "hold out"), (self.settings.trusted, "trust")):
+            unusable = {name for name in names if name not in known or (known[name].problem and what == "trust")}
+            if missing := sorted(unusable):
+                reasons = few_reasons({name: known[name].problem for name in missing if name in known})
                 raise FleetError(f"fleet {fleet}: no usable vehicle {few(missing)} to {what}{reasons}")
 
-    def _learn(self, store: SummaryStore, census: Census, identity: RunIdentity) -> tuple[FleetTask, list[str]]:
-        """Read the bench table and the sample, and learn from them."""
-        branches = store.identity.branches
-        bench: BenchTable = {}
-        if self.settings.readings is not None:
-            named = {vehicle for vehicle, _ in self._bench_table(branches)}
-            there = _outlines_of(store, census, named)
-            some = {item.vehicle for bucket in list(census.usable)[:1] for item in store.outlines(bucket)}  # to name
-            usable = {name for name, item in there.items() if not item.problem} | some - there.keys()
-            bench = self._bench(branches, usable, {name: item.problem for name, item in there.items() if item.problem})
-        with progress_bar("learn the fleet", None):
-            vehicles = read_sample(store, census, self.settings, {vehicle for vehicle, _ in bench})
-            return learn_task(
-                vehicles, self.settings, bench, branches=branches, identity=identity, fleet_size=census.size
-            )
+    def _bench_table(self, store: SummaryStore) -> BenchTable:
+        path, scale_a = self.settings.readings, self.database.layout.full_scale_a
+        return {} if path is None else read_bench_table(path, store.identity.branches, full_scale_a=scale_a)
 
-    def _bench_table(self, branches: Collection[str]) -> BenchTable:
-        path = self.settings.readings
-        return {} if path is None else read_bench_table(path, branches, full_scale_a=self.database.layout.full_scale_a)
-
-    def _bench(self, branches: Collection[str], vehicles: Collection[str], left_out: Mapping[str, str]) -> BenchTable:
-        """Bench readings, all of vehicles that there are and none against the trust in one."""
-        bench, scale_a = self._bench_table(branches), self.database.layout.full_scale_a
+    def _check(self, bench: BenchTable, vehicles: Collection[str], left_out: Mapping[str, str]) -> None:
+        """Refuse bench readings of vehicles that there are not, or against the trust in one."""
+        scale_a = self.database.layout.full_scale_a
         check_bench_table(bench, vehicles, left_out=left_out, trusted=self.settings.trusted, full_scale_a=scale_a)
-        return bench
 
     def _result(
         self,
-        about: FleetFacts,
+        about: StoreIdentity,
         identity: RunIdentity,
+        others: Mapping[str, str],
         *,
         details: Mapping[str, object],
         notices: Sequence[str],
-        window: bytes | None = None,
-        buckets: int = 0,
+        store: SummaryStore | None = None,
     ) -> CalibrationReport:
-        """Put the chunks together to the result."""
-        unfinished = self.unfinished
+        """Put the chunks together to the result; ``others`` are in none of them."""
+        unfinished, layout = self.unfinished, self.database.layout
         folder, numbers = unfinished.result(), unfinished.done()
-        vehicles = join_rows(folder, [unfinished.rows(number) for number in numbers], about.left_out)
-        left_out, left_out_count = left_out_of(folder)
+        vehicles = join_rows(folder, [unfinished.part(n, "rows") for n in numbers], others)
+        left_out = left_out_of(folder)
         if not vehicles:
             why = next(iter(left_out.values()), "there is none")
-            raise FleetError(f"{about.name}: no vehicle can be calibrated; the first: {why}")
+            raise FleetError(f"{about.fleet}: no vehicle can be calibrated; the first: {why}")
+        parts = {n: unfinished.part(n, "parameters") for n in numbers}
         with progress_bar("write the result", None):
-            where = write_parameter_files(folder, {n: unfinished.parameters(n) for n in numbers}, vehicles=vehicles)
+            where = write_parameter_files(folder, parts, vehicles=vehicles)
         if unfinished.summaries.exists():
             copy = folder / unfinished.summaries.name
             shutil.copytree(unfinished.summaries, copy, ignore=shutil.ignore_patterns(".*"))
-        if window is not None:
+        if store is not None and (window := store.storage.read_if_there(UNITY_FILE)) is not None:
             write_atomically(folder / UNITY_FILE, window)
-        layout = self.database.layout
         run = RunRecord(
             tool=identity.tool,
             method=identity.method.value,
-            fleet=identity.fleet,
+            fleet=about.fleet,
             fleet_ids=list(about.fleet_ids),
             layout=layout.name,
-            branches=list(about.equipment.branches),
-            model_inputs=list(about.equipment.inputs),
+            branches=list(about.branches),
+            model_inputs=list(about.inputs),
             settings=self.settings.record(),
             created=identity.created,
             details=dict(details),
             vehicles=vehicles,
-            buckets=buckets,
-            left_out=left_out,
-            left_out_count=left_out_count,
+            buckets=0 if store is None else store.identity.buckets,
+            left_out=dict(list(left_out.items())[:MOST_NAMED]),
+            left_out_count=len(left_out),
             full_scale_a=layout.full_scale_a,
             layout_sha256=layout.digest,
             dbc_sha256=self.database.digest,
@@ -521,10 +465,8 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
     ----------
     bucket : int
         Which.
-    store : SummaryStore
-        The store.
-    task : FleetTask
-        What was learnt.
+    store, task : SummaryStore, FleetTask
+        The store, and what was learnt from it.
     previous : Path or None
         Earlier result to go on from.
 
@@ -533,15 +475,19 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
     ChunkResult
         Parameters, and who was left out and why.
     """
-    records, found = store.read(bucket), Calibrated()
-    before = {} if previous is None else _earlier_part(previous, bucket)
+    if previous is not None and not (previous / PARTS).is_dir():
+        raise FleetError(
+            f"{previous / PARTS}: the earlier result cannot be reached from here; put it where every worker reaches it "
+            f"by this path"
+        )
+    records, before = store.read(bucket), {} if previous is None else read_part(part_file(previous, bucket))
     digests = {name: drives_digest(items) for name, items in records.items()}
+    found = Calibrated(left_out=dict.fromkeys(before.keys() - records.keys(), NOT_THERE))
     todo: list[VehicleSummary] = []
     for name, items in records.items():
-        written = before.get(name)
-        earlier = None if written is None else decode_parameters(written.text, f"earlier parameters of {name}")
-        if earlier is not None and written is not None and written.drives == digests[name]:
-            found.parameters.append(earlier)  # its evidence was found against another reference, and is not kept
+        earlier = decode_parameters(before[name].text, f"earlier parameters of {name}") if name in before else None
+        if earlier is not None and before[name].drives == digests[name]:
+            found.parameters[name] = earlier  # its evidence was found against another reference, and is not kept
             continue
         try:
             todo.append(_what_holds(items, earlier, task, found))
@@ -551,19 +497,10 @@ def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previ
             raise
         except Exception as error:  # noqa: BLE001 (a fault of the program is reported with its vehicle)
             found.left_out[name] = internal_error(error)
-    found.left_out |= dict.fromkeys(before.keys() - records.keys(), NOT_THERE)
     task.calibrate(todo, found)
-    return encode_chunk(found.parameters, found.left_out, moved=found.moved, drives=digests, evidence=found.evidence)
-
-
-def _earlier_part(previous: Path, bucket: int) -> dict[str, Written]:
-    """Parameters of the vehicles of a bucket in an earlier result; FleetError if they cannot be read."""
-    if not (previous / PARTS).is_dir():
-        raise FleetError(
-            f"{previous / PARTS}: the earlier result cannot be reached from here; put it where every worker reaches it "
-            f"by this path"
-        )
-    return read_part(previous / PARTS / f"{bucket:05d}.parquet")
+    return encode_chunk(
+        found.parameters.values(), found.left_out, moved=found.moved, drives=digests, evidence=found.evidence
+    )
 
 
 def _what_holds(
@@ -583,49 +520,33 @@ def _what_holds(
         return everything
     try:
         recent = joined_records(new)
-        changes = moved_sensors(earlier, task.estimate([recent]), task)
+        changes = _moved_sensors(earlier, task.estimate([recent]), task)
     except UserError:  # the new drives alone do not suffice
         return everything
     found.moved |= {(earlier.vehicle, branch): text for branch, text in changes.items()}
     return recent if changes else everything
 
 
-def moved_sensors(before: VehicleParameters, now: FleetEstimate, task: FleetTask) -> dict[str, str]:
-    """Sensors that have moved: the earlier faults of a vehicle are none of the explanations of its new drives.
+def _moved_sensors(before: VehicleParameters, now: FleetEstimate, task: FleetTask) -> dict[str, str]:
+    """Sensors that have moved, from where to where, by branch: no explanation of the new drives has the earlier faults.
 
-    Parameters
-    ----------
-    before : VehicleParameters
-        Earlier parameters of the vehicle.
-    now : FleetEstimate
-        Of the vehicle, from drives that came since and from these alone.
-    task : FleetTask
-        What was learnt.
-
-    Returns
-    -------
-    dict of str to str
-        What has moved from where to where, by branch; nothing if the earlier faults still explain the vehicle.
+    ``now`` is the estimate of the vehicle from drives that came since ``before``, and from these alone.
     """
     branches, scale_a = task.branches, task.identity.database.layout.full_scale_a
     old = [before.branches[name] for name in branches]
-    value = np.array([[item.drift for item in old], [item.offset_a for item in old]])
-    old_sd = np.array([[item.drift_sd or 0.0 for item in old], [item.offset_sd_a or 0.0 for item in old]])
+    was = np.array([[item.drift for item in old], [item.offset_a for item in old]])
+    was_sd = np.array([[item.drift_sd or 0.0 for item in old], [item.offset_sd_a or 0.0 for item in old]])
+    is_now, now_sd = np.array([now.drift[0], now.offset_a[0]]), np.array([now.drift_sd[0], now.offset_sd_a[0]])
     accuracy = np.array([[TRUSTED_DRIFT_SD], [TRUSTED_OFFSET_SD * scale_a]])
-    sd = np.sqrt(np.array([now.drift_sd[0], now.offset_sd_a[0]]) ** 2 + old_sd**2 + accuracy**2)
-    near = 0.0
-    for each in now.explanations[0]:
-        found = np.array([[part.get(name, 0.0) for name in branches] for part in (each.drift, each.offset_a)])
-        near += each.probability * bool((np.abs(found - value) <= MOVED_SD * sd).all())
-    if near >= LEAST_PROBABILITY:
+    same = MOVED_SD * np.sqrt(now_sd**2 + was_sd**2 + accuracy**2)
+    near = (each.probability for each in now.explanations[0] if (np.abs(faults_of(each, branches) - was) <= same).all())
+    if sum(near) >= LEAST_PROBABILITY:
         return {}
-    found = np.array([now.drift[0], now.offset_a[0]])
-    moved = (np.abs(found - value) > MOVED_SD * sd).any(axis=0)
     return {
         branches[k]: (
-            f"drift {old[k].drift:+.2%} -> {found[0, k]:+.2%}, offset {old[k].offset_a:+.2f} A -> {found[1, k]:+.2f} A"
+            f"drift {was[0, k]:+.2%} -> {is_now[0, k]:+.2%}, offset {was[1, k]:+.2f} A -> {is_now[1, k]:+.2f} A"
         )
-        for k in np.flatnonzero(moved).tolist()
+        for k in np.flatnonzero((np.abs(is_now - was) > same).any(axis=0)).tolist()
     }
 
 

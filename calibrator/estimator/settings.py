@@ -1,4 +1,4 @@
-"""How a fleet is calibrated: the user's choices, and what a method makes of a fleet."""
+"""How a fleet is calibrated: the user's choices."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,9 +11,8 @@ from calibrator.options import Classifier, Method
 from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.terminal.text import counted, few, few_reasons
 from ecu_node.layout import file_digest
-from ecu_node.parameters import VehicleParameters
 
-__all__ = ["HARM_LIMIT", "LEAST_VEHICLES", "CalibrationSettings", "FleetOutcome", "require_learning"]
+__all__ = ["HARM_LIMIT", "LEAST_VEHICLES", "CalibrationSettings", "require_learning"]
 
 LEAST_VEHICLES = 2
 """A single vehicle would be its own reference."""
@@ -88,9 +87,9 @@ class CalibrationSettings:
 
     def record(self) -> dict[str, Any]:
         """What the method in use heeds, for the record of a run."""
-        names = ["classifier", "sparsity", "magnitude", "symmetric", "unity", "seed"]
         found: dict[str, Any] = {"branches": self.branches, "hold_out": sorted(self.hold_out)}
         if self.method is Method.PUBLISHED:
+            names = ("classifier", "sparsity", "magnitude", "symmetric", "unity", "seed")
             return found | {name: getattr(self, name) for name in names}
         return found | {
             "harm_limit": self.harm_limit,
@@ -98,28 +97,6 @@ class CalibrationSettings:
             "readings": None if self.readings is None else [self.readings.name, file_digest(self.readings)],
             "expected_faults": self.expected_faults,
         }
-
-
-@dataclass(frozen=True, kw_only=True)
-class FleetOutcome:
-    """What a method that needs all vehicles at once found.
-
-    Attributes
-    ----------
-    parameters : sequence of VehicleParameters
-        One per calibrated vehicle.
-    left_out : mapping of str to str
-        Why the other vehicles have none.
-    notices : tuple of str
-        What the user should know.
-    details : mapping of str to JSON values
-        For the record of the run.
-    """
-
-    parameters: Sequence[VehicleParameters]
-    left_out: Mapping[str, str]
-    notices: tuple[str, ...]
-    details: Mapping[str, Any]
 
 
 def require_learning(

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from calibrator.errors import FleetError
 from calibrator.estimator.results import ChunkResult
@@ -44,18 +45,14 @@ class Unfinished:
         """Store of the summaries of drives that this run reads itself."""
         return self.folder / "summaries"
 
-    def rows(self, number: int) -> Path:
-        """File with the rows of a chunk."""
-        return self.folder / "chunks" / f"{number:05d}.rows.parquet"
-
-    def parameters(self, number: int) -> Path:
-        """File with the parameters of a chunk."""
-        return self.folder / "chunks" / f"{number:05d}.parameters.parquet"
+    def part(self, number: int, what: Literal["rows", "parameters"]) -> Path:
+        """File with the rows or the parameters of a chunk."""
+        return self.folder / "chunks" / f"{number:05d}.{what}.parquet"
 
     def put(self, number: int, chunk: ChunkResult) -> None:
         """Keep a chunk; it counts from when its rows are there, which are written last."""
-        write_atomically(self.parameters(number), chunk.parameters)
-        write_atomically(self.rows(number), chunk.rows)
+        write_atomically(self.part(number, "parameters"), chunk.parameters)
+        write_atomically(self.part(number, "rows"), chunk.rows)
 
     def done(self) -> list[int]:
         """Numbers of the chunks that are there."""
@@ -64,25 +61,15 @@ class Unfinished:
     def begin(self, plan: str | None, created: str) -> str:
         """Keep the chunks that are there if they were computed by the same plan, else remove them.
 
-        Parameters
-        ----------
-        plan : str or None
-            Digest of what the run computes, and from what. None: begin anew.
-        created : str
-            Time of this run.
-
-        Returns
-        -------
-        str
-            Time of the first run of this plan.
+        ``plan`` is a digest of what the run computes and from what, None to begin anew; ``created`` the time of this
+        run. Returned is the time of the first run of this plan.
         """
         path = self.folder / "plan"
         before, _, noted = path.read_text().partition("\n") if path.exists() else ("", "", "")
         if plan is not None and before == plan:
             return noted
         path.unlink(missing_ok=True)  # first, so that no other plan is ever taken for that of the chunks
-        shutil.rmtree(self.folder / "chunks", ignore_errors=True)
-        (self.folder / "chunks").mkdir()
+        _empty(self.folder / "chunks")
         write_atomically(path, f"{plan or ''}\n{created}".encode())
         return created
 
@@ -115,10 +102,7 @@ class Unfinished:
 
     def result(self) -> Path:
         """Empty folder for the result; what a killed run has put there is gone."""
-        folder = self.folder / "result"
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        return folder
+        return _empty(self.folder / "result")
 
     def finish(self) -> None:
         """Put the result where it belongs, and remove the rest."""
@@ -128,10 +112,16 @@ class Unfinished:
                 self.out.rmdir()
             made.rename(self.out)
         except OSError as error:
-            raise FleetError(
-                f"{self.out}: cannot be replaced: {error.strerror}; what was made stands in {made}"
-            ) from None
+            why = f"cannot be replaced: {error.strerror}; what was made stands in {made}"
+            raise FleetError(f"{self.out}: {why}") from None
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _empty(folder: Path) -> Path:
+    """The folder, made anew."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
 
 
 @contextmanager
@@ -164,9 +154,8 @@ def unfinished_run(out: Path) -> Iterator[Unfinished]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise FleetError(
-                f"{out}: another run is writing this result; wait for it or choose another --out"
-            ) from None
+            why = "another run is writing this result; wait for it or choose another --out"
+            raise FleetError(f"{out}: {why}") from None
         unfinished = Unfinished(folder=folder, out=out, shown=shown)
         try:
             yield unfinished

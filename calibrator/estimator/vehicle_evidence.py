@@ -1,6 +1,7 @@
 """The evidence rows of each vehicle in the units of its sensors, beside what its estimate makes of them."""
 
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 
@@ -65,18 +66,16 @@ def reported_evidence(
     seen = np.concatenate([gain, first, np.ones_like(gain)], axis=1) * full_scale_a  # constants are held over (1 + d)
     value = np.concatenate([ratios, rows.constant * full_scale_a], axis=1)
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) * np.concatenate([ratios, seen], axis=1)
-    value[~rows.known], sd[~rows.known] = np.nan, np.nan
     # a_k = (1 + d_k)(1 + d_h); -g_k = (1 + d_1) / (1 + d_k); b_k = o_k + (1 + d_k) o_h,k; c = (1 + d_1) sum o/(1 + d)
     relative = np.concatenate([gain * (1.0 + hardware_drift[:, None]), first / gain[:, 1:], gain], axis=1)
     junction = first * (offset_a / gain).sum(axis=1, keepdims=True)
     constant = np.concatenate([offset_a + gain * hardware_offset_a, junction, offset_a], axis=1)
     R = ratios.shape[1]
     made = np.concatenate([relative * np.exp(centre[:R]), constant + seen * centre[R:]], axis=1)
-    return [
-        VehicleEvidence(
-            value=[v if np.isfinite(v) else None for v in value[j].tolist()],
-            sd=[v if np.isfinite(v) else None for v in sd[j].tolist()],
-            explained=made[j].tolist(),
-        )
-        for j in range(len(value))
-    ]
+    value[~rows.known], sd[~rows.known] = np.nan, np.nan
+
+    def told(values: Array) -> list[list[float | None]]:
+        return [[v if isfinite(v) else None for v in row] for row in values.tolist()]
+
+    columns = zip(told(value), told(sd), made.tolist(), strict=True)
+    return [VehicleEvidence(value=v, sd=s, explained=m) for v, s, m in columns]

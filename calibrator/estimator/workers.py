@@ -28,6 +28,7 @@ AHEAD_PER_WORKER = 3
 """Items that are given to a cluster before it is the turn of their results: enough that no worker waits. [1]"""
 TIMEOUT_S = 10.0
 """Within which a scheduler must answer. [s]"""
+AGAIN = "; the same command, run again, goes on where it stopped"
 TALKATIVE = ("distributed", "distributed.client", "tornado.application", "asyncio")
 """Loggers that print tracebacks of what is told in one line here."""
 
@@ -41,12 +42,7 @@ class Workers:
     processes : int
         Number of processes on this machine.
     scheduler : str or None
-        Address of a Dask scheduler, ``tcp://host:port``, whose workers are used instead.
-
-    Raises
-    ------
-    FleetError
-        If there is a scheduler, but Dask is not installed.
+        Address of a Dask scheduler, ``tcp://host:port``, whose workers are used instead. FleetError if Dask is missing.
     """
 
     processes: int
@@ -57,29 +53,14 @@ class Workers:
             raise FleetError("--scheduler needs Dask: pip install 'hv-current-correction[cluster]'")
 
     def map(self, function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
-        """Apply a function to each item.
+        """Apply a function to each item, taken as they are needed; results come in the order of the items.
 
-        Parameters
-        ----------
-        function : callable
-            Of module level, or a partial of such a function, as it goes to other processes.
-        items : iterable
-            Taken as they are needed.
-
-        Yields
-        ------
-        object
-            Results, in the order of the items.
-
-        Raises
-        ------
-        FleetError
-            If a process died, or the cluster cannot be reached.
+        The function goes to other processes: one of module level, or a partial of such a function. FleetError if a
+        process died, or the cluster cannot be reached.
         """
         if self.scheduler is not None:
-            yield from _on_cluster(self.scheduler, function, items)
-            return
-        yield from in_processes((delayed(_alone)(function, item) for item in items), workers=self.processes)
+            return _on_cluster(self.scheduler, function, items)
+        return in_processes((delayed(_alone)(function, item) for item in items), workers=self.processes)
 
 
 def _alone(function: Callable[[Any], Any], item: Any) -> Any:
@@ -114,28 +95,23 @@ def _on_cluster(scheduler: str, function: Callable[[_Item], _Result], items: Ite
             try:
                 yield from _in_turn(client, function, items)
             except KilledWorker:
-                raise FleetError(
-                    f"{scheduler}: workers of the cluster died again and again, as by a lack of memory; look at their "
-                    f"logs; the same command, run again, goes on where it stopped"
-                ) from None
+                why = f"workers of the cluster died again and again, as by a lack of memory; look at their logs{AGAIN}"
+                raise FleetError(f"{scheduler}: {why}") from None
             except (CancelledError, CommClosedError):
-                raise FleetError(
-                    f"{scheduler}: the scheduler is gone; start it and its workers again; the same command, run again, "
-                    f"goes on where it stopped"
-                ) from None
+                why = f"the scheduler is gone; start it and its workers again{AGAIN}"
+                raise FleetError(f"{scheduler}: {why}") from None
 
 
 @contextmanager
 def _silenced(names: Iterable[str]) -> Iterator[None]:
     """While the block runs, some loggers say nothing."""
-    loggers = [logging.getLogger(name) for name in names]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
+    levels = {logger: logger.level for logger in map(logging.getLogger, names)}
+    for logger in levels:
         logger.setLevel(logging.CRITICAL + 1)
     try:
         yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
+        for logger, level in levels.items():
             logger.setLevel(level)
 
 

@@ -35,16 +35,10 @@ class BranchHealth:
         Share of the vehicles whose sensors agree. [1]
     model_spread : float or None
         What vehicles without any fault differ by. [1]
-    mean_distance : float or None
-        How far the mean of all vehicles is off, on which the published method rests; logarithm of a gain. [1]
-    doubtful : bool
-        Whether its scale or zero may be wrong for the whole fleet.
     """
 
     agreeing_share: float | None
     model_spread: float | None
-    mean_distance: float | None
-    doubtful: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,8 +219,6 @@ def _reference(branches: Sequence[str], details: Mapping[str, object]) -> dict[s
         name: BranchHealth(
             agreeing_share=reference.get("agreeing_share", {}).get(name),
             model_spread=learnt.get("model_spread", {}).get(name),
-            mean_distance=reference.get("mean_distance", {}).get(name),
-            doubtful=name in reference.get("doubtful", ()),
         )
         for name in branches
     }

@@ -148,7 +148,6 @@ def _texts(page: FleetPage, changes: Mapping[str, Array], *, listed: int) -> dic
         "run": table.run,
         "overview": page.overview,
         "beside": _beside(page),
-        "doubtful": [name for name, branch in page.overview.reference.items() if branch.doubtful],
         "ranked": largest_faults(table),
         "drawn_limited": bool((table.faulty.sum(axis=0) > MOST_POINTS).any()),
         "most_points": MOST_POINTS,

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 from markupsafe import Markup
 
-from calibrator.estimator.fleet_estimate import SUSPECTED
 from calibrator.estimator.vehicle_evidence import VehicleEvidence
 from calibrator.estimator.vehicle_report import explanation_text
 from calibrator.report.drawings import draw_evidence, draw_traces
@@ -47,14 +46,12 @@ def vehicle_page(
     str
         HTML.
     """
-    expected_a = parameters.junction_residual.expected_a
-    residual, hardware = parameters.junction_residual, parameters.hardware_fault
+    residual = parameters.junction_residual
     held_back = [name for name, branch in parameters.branches.items() if branch.held_back]
     return template("vehicle.html").render(
         parameters=parameters,
         grows=held_back if residual.corrected_a > residual.measured_a else [],
-        in_doubt=not hardware.suspected and (hardware.probability or 0.0) > SUSPECTED,
-        drawn=[{"title": each.title, "svg": draw_traces(each, expected_a=expected_a)} for each in traces],
+        drawn=[{"title": each.title, "svg": draw_traces(each, expected_a=residual.expected_a)} for each in traces],
         evidence=None if evidence is None else draw_evidence(evidence, names, ratios=ratios),
         explanations=[(each.probability, explanation_text(each)) for each in parameters.explanations],
         missing=missing,

@@ -12,9 +12,21 @@ from scipy.signal import lfilter
 
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
+from calibrator.estimator.filter_bank_choice import held_out_snr_db, read_outs
 from calibrator.estimator.state_space import StateSpaceModel
+from calibrator.summaries.filter_bank import FilterBank
+from calibrator.summaries.summariser import summarise
 
-__all__ = ["INPUT_NAMES", "PERIOD_S", "SAMPLES", "DynamicVehicle", "drive_inputs", "dynamic_vehicle", "recorded"]
+__all__ = [
+    "INPUT_NAMES",
+    "PERIOD_S",
+    "SAMPLES",
+    "DynamicVehicle",
+    "bank_model",
+    "drive_inputs",
+    "dynamic_vehicle",
+    "recorded",
+]
 
 PERIOD_S = 0.1
 """Distance of the samples. [s]"""
@@ -130,6 +142,36 @@ def recorded(
             valid=np.ones(samples, bool),
             masked={},
         ),
+    )
+
+
+def bank_model(bank: FilterBank, drive: Samples) -> StateSpaceModel:
+    """Identify a vehicle with the poles of a bank, judged on held-out blocks.
+
+    Parameters
+    ----------
+    bank : FilterBank
+        A and B.
+    drive : Samples
+        What the vehicle recorded.
+
+    Returns
+    -------
+    StateSpaceModel
+        With the state of the vehicle's mean inputs as initial state.
+    """
+    summary = summarise([drive], period_s=PERIOD_S, bank=bank)
+    (coefficients,), (offset_a,) = read_outs(summary.total[None], summary.branches)
+    (A, B), M = bank.system(), len(bank.input_names)
+    mean_inputs = summary.total[-1, :M] / summary.total[-1, -1]
+    return StateSpaceModel(
+        A=A,
+        B=B,
+        C=coefficients[M:].T,
+        D=coefficients[:M].T,
+        x0=np.linalg.solve(np.eye(len(A)) - A, B @ mean_inputs),
+        offset_a=offset_a,
+        snr_db=held_out_snr_db([summary])[0],
     )
 
 

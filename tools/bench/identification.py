@@ -19,10 +19,10 @@ from nfoursid.nfoursid import NFourSID
 from sippy_unipi import system_identification
 from threadpoolctl import threadpool_limits
 
-from bench.dynamic_vehicles import PERIOD_S, DynamicVehicle, drive_inputs, recorded
+from bench.dynamic_vehicles import PERIOD_S, DynamicVehicle, bank_model, drive_inputs, recorded
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
-from calibrator.estimator.filter_bank_choice import choose_filter_bank, fit_read_outs, state_space_model
+from calibrator.estimator.filter_bank_choice import choose_filter_bank, held_out_snr_db, read_outs
 from calibrator.estimator.state_space import StateSpaceModel, simulation_snr_db
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.summariser import summarise
@@ -74,7 +74,7 @@ def rows(*, quick: bool) -> list[Row]:
     """
     with threadpool_limits(1):
         bank, vehicles = _fleet(COMPARED_DB, 2 if quick else 5)
-        ours = _measure(lambda drive: _ours(drive, bank), vehicles, REPETITIONS)
+        ours = _measure(lambda drive: bank_model(bank, drive), vehicles, REPETITIONS)
         peers = {
             f"nfoursid {version('nfoursid')}": _measure(_nfoursid, vehicles, 1),
             f"sippy {version('sippy-unipi')} N4SID": _measure(_sippy, vehicles, 1),
@@ -141,10 +141,11 @@ def _compared(ours: _Result, name: str, peer: _Result) -> list[Row]:
 def _parts(bank: FilterBank, drive: Samples) -> list[Row]:
     """Where the time goes, by the median of repetitions."""
     batch = [summarise([drive], period_s=PERIOD_S, bank=bank)] * 100
+    moments, branches = np.stack([summary.total for summary in batch]), batch[0].branches
     names = ("of it filters and moments", "of it read-out and its judgement, a vehicle of 100 at once")
     times_s = (
         _median_s(lambda: summarise([drive], period_s=PERIOD_S, bank=bank)),
-        _median_s(lambda: fit_read_outs(batch)) / len(batch),
+        _median_s(lambda: (read_outs(moments, branches), held_out_snr_db(batch))) / len(batch),
     )
     parts = [Row(name=name, value=1e3 * s, unit="ms") for name, s in zip(names, times_s, strict=True)]
     return [*parts, Row(name="columns of the bank", value=float(bank.width), unit="1")]
@@ -162,7 +163,7 @@ def _median_s(action: Callable[[], object]) -> float:
 def _alone(snr_db: float, count: int) -> list[Row]:
     """What more vehicles than the packages have time for say, at one noise."""
     bank, vehicles = _fleet(snr_db, count)
-    found = _measure(lambda drive: _ours(drive, bank), vehicles, 1)
+    found = _measure(lambda drive: bank_model(bank, drive), vehicles, 1)
     what = f"SNR {snr_db:.0f}, {count} vehicles"
     return [
         Row(name=f"slope error at {what}, 95th percentile", value=100.0 * found.slope_error, unit="%"),
@@ -170,10 +171,6 @@ def _alone(snr_db: float, count: int) -> list[Row]:
         Row(name=f"worst channel at {what}, 5th percentile", value=float(np.percentile(found.worst_db, 5)), unit="dB"),
         Row(name=f"worst channel at {what}, worst vehicle", value=float(found.worst_db.min()), unit="dB"),
     ]
-
-
-def _ours(drive: Samples, bank: FilterBank) -> StateSpaceModel:
-    return state_space_model(bank, fit_read_outs([summarise([drive], period_s=PERIOD_S, bank=bank)]), 0)
 
 
 def _nfoursid(drive: Samples) -> StateSpaceModel:

@@ -40,12 +40,12 @@ def test_scale_shift_order_and_copies_pass_through() -> None:
     plain, scaled = densest_clusters(values, sd)[0], densest_clusters(5.0 - 100.0 * values, 100.0 * sd)[0]
     assert scaled.centre == pytest.approx(5.0 - 100.0 * plain.centre)
     assert scaled.spread == pytest.approx(100.0 * plain.spread)
-    assert scaled.gain == pytest.approx(plain.gain)
+    assert scaled.share == pytest.approx(plain.share)
     order = np.random.default_rng(4).permutation(100)
     assert densest_clusters(values[order], sd[order])[0].centre == pytest.approx(plain.centre, rel=1e-12)
     twice = densest_clusters(np.tile(values, 2), np.tile(sd, 2))[0]
     assert twice.centre == pytest.approx(plain.centre, abs=2e-4)
-    assert twice.gain == pytest.approx(2.0 * plain.gain, rel=0.01)
+    assert twice.share == pytest.approx(plain.share, rel=0.01)
 
 
 def test_two_variants_give_two_clusters_the_larger_first() -> None:
@@ -55,7 +55,7 @@ def test_two_variants_give_two_clusters_the_larger_first() -> None:
     first, second = densest_clusters(values, sd, most=2)
     assert first.centre == pytest.approx(1.0, abs=0.002)
     assert second.centre == pytest.approx(1.15, abs=0.002)
-    assert first.gain > second.gain
+    assert first.share > second.share
     assert densest_clusters(values, sd, farthest=0.5) == []
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.dynamic_vehicles import INPUT_NAMES, PERIOD_S, drive_inputs, dynamic_vehicle, recorded
+from bench.dynamic_vehicles import INPUT_NAMES, PERIOD_S, bank_model, drive_inputs, dynamic_vehicle, recorded
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
@@ -14,9 +14,8 @@ from calibrator.estimator.filter_bank_choice import (
     FOLDS,
     LONGEST_S,
     choose_filter_bank,
-    far_below_fleet,
-    fit_read_outs,
-    state_space_model,
+    held_out_snr_db,
+    read_outs,
 )
 from calibrator.estimator.state_space import StateSpaceModel, simulation_snr_db
 from calibrator.summaries.filter_bank import FilterBank, low_pass_bank, plain_bank
@@ -73,7 +72,7 @@ def lagging_vehicle(*poles: float) -> StateSpaceModel:
 def test_vehicle_whose_poles_the_bank_has_is_found() -> None:
     vehicle = recorded(1, snr_db=200.0)
     bank = bank_of(vehicle.model)
-    model = state_space_model(bank, fit_read_outs([summary_of(vehicle.samples, bank)]), 0)
+    model = bank_model(bank, vehicle.samples)
     # The states of the bank start at rest, and 5 % of that error remain when samples are used.
     expected, found = (each.simulate(drive_inputs(999))[LEAD_IN:] for each in (vehicle.model, model))
     assert simulation_snr_db(expected, found).min() > 50.0
@@ -81,21 +80,23 @@ def test_vehicle_whose_poles_the_bank_has_is_found() -> None:
 
 def test_read_outs_and_their_snr_are_those_of_least_squares_on_the_samples() -> None:
     drives = [recorded(j, snr_db=20.0, samples=3000 + 500 * j).samples for j in range(4)]
-    found = fit_read_outs([summary_of(drive) for drive in drives])
+    summaries = [summary_of(drive) for drive in drives]
+    coefficients, offset_a = read_outs(np.stack([summary.total for summary in summaries]), 4)
+    snr_db = held_out_snr_db(summaries)
     for j, drive in enumerate(drives):
         z, y, block = by_samples(drive)
         expected = np.linalg.lstsq(z, y, rcond=None)[0]
-        np.testing.assert_allclose(found.coefficients[j], expected[:-1], rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(found.offset_a[j], expected[-1], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(coefficients[j], expected[:-1], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(offset_a[j], expected[-1], rtol=1e-6, atol=1e-6)
         held_out = block % FOLDS == FIRST_HELD_OUT
         fit = np.linalg.lstsq(z[~held_out], y[~held_out], rcond=None)[0]
-        np.testing.assert_allclose(found.snr_db[j], simulation_snr_db(y[held_out], z[held_out] @ fit), atol=1e-6)
+        np.testing.assert_allclose(snr_db[j], simulation_snr_db(y[held_out], z[held_out] @ fit), atol=1e-6)
 
 
 def test_units_and_zeros_of_inputs_and_currents_do_not_matter() -> None:
     drive = recorded(4, snr_db=20.0, samples=3000).samples
     changed = replace(drive, inputs=1e3 * drive.inputs - 50.0, currents_a=1e-2 * drive.currents_a + 3.0)
-    plain, scaled = (state_space_model(FILTERED, fit_read_outs([summary_of(each)]), 0) for each in (drive, changed))
+    plain, scaled = (bank_model(FILTERED, each) for each in (drive, changed))
     unity = drive_inputs(999, samples=500)
     expected = 1e-2 * plain.simulate(unity) + 3.0
     np.testing.assert_allclose(scaled.simulate(1e3 * unity - 50.0), expected, rtol=1e-6, atol=1e-7)
@@ -106,26 +107,18 @@ def test_inputs_and_currents_that_stand_still_get_zeros_and_no_figure() -> None:
     drive = recorded(5, snr_db=20.0, samples=3000).samples
     inputs, currents = drive.inputs.copy(), drive.currents_a.copy()
     inputs[:, 1], currents[:, 2] = 7.0, -4.0
-    found = fit_read_outs([summary_of(replace(drive, inputs=inputs, currents_a=currents))])
-    np.testing.assert_array_equal(found.coefficients[0, 1::3], 0.0)
-    np.testing.assert_allclose(found.coefficients[0, :, 2], 0.0, atol=1e-9)
-    assert found.offset_a[0, 2] == pytest.approx(-4.0, abs=1e-6)
-    assert np.isnan(found.snr_db[0]).tolist() == [False, False, True, False]
+    summary = summary_of(replace(drive, inputs=inputs, currents_a=currents))
+    coefficients, offset_a = read_outs(summary.total[None], 4)
+    np.testing.assert_array_equal(coefficients[0, 1::3], 0.0)
+    np.testing.assert_allclose(coefficients[0, :, 2], 0.0, atol=1e-9)
+    assert offset_a[0, 2] == pytest.approx(-4.0, abs=1e-6)
+    assert np.isnan(held_out_snr_db([summary])[0]).tolist() == [False, False, True, False]
 
 
 def test_two_blocks_are_fitted_and_not_judged() -> None:
-    found = fit_read_outs([summary_of(recorded(6, snr_db=20.0, samples=2 * BLOCK).samples, PLAIN)])
-    assert np.isfinite(found.coefficients).all()
-    assert np.isnan(found.snr_db).all()
-    assert not far_below_fleet(found).any()
-
-
-def test_summaries_of_different_banks_are_refused() -> None:
-    drive = recorded(7, snr_db=20.0, samples=3000).samples
-    with pytest.raises(DriveError, match="made with 2 filter banks"):
-        fit_read_outs([summary_of(drive, bank) for bank in (PLAIN, FILTERED)])
-    with pytest.raises(DriveError, match=r"do not fit the bank .*; summarise the drives with this bank"):
-        state_space_model(PLAIN, fit_read_outs([summary_of(drive)]), 0)
+    summary = summary_of(recorded(6, snr_db=20.0, samples=2 * BLOCK).samples, PLAIN)
+    assert np.isfinite(read_outs(summary.total[None], 4)[0]).all()
+    assert np.isnan(held_out_snr_db([summary])).all()
 
 
 @pytest.mark.parametrize(
@@ -136,10 +129,9 @@ def test_vehicles_whose_poles_differ_are_followed_by_the_bank_of_others(
 ) -> None:
     bank = choose_filter_bank([[recorded(j, snr_db=snr_db).samples] for j in range(100, 106)], period_s=PERIOD_S)
     vehicles = [recorded(j, snr_db=snr_db) for j in range(10)]
-    read_outs = fit_read_outs([summary_of(vehicle.samples, bank) for vehicle in vehicles])
     unity, slopes, errors_db = drive_inputs(999), [], []
-    for j, vehicle in enumerate(vehicles):
-        models = (vehicle.model, state_space_model(bank, read_outs, j))
+    for vehicle in vehicles:
+        models = (vehicle.model, bank_model(bank, vehicle.samples))
         true, simulated = (model.simulate(unity)[LEAD_IN:] for model in models)
         centred = true - true.mean(axis=0)
         slopes.append(np.sum(centred * simulated, axis=0) / np.sum(centred**2, axis=0))
@@ -147,15 +139,6 @@ def test_vehicles_whose_poles_differ_are_followed_by_the_bank_of_others(
     assert np.percentile(np.abs(np.concatenate(slopes) - 1.0), 95) < slope
     assert np.median(errors_db) > median_db
     assert min(errors_db) > worst_db
-    assert not far_below_fleet(read_outs).any()
-
-
-def test_vehicle_of_other_dynamics_is_noticed_and_no_other() -> None:
-    bank = bank_of(dynamic_vehicle(0, pole_spread=0.0))
-    models = [dynamic_vehicle(j, pole_spread=0.02) for j in range(5)] + [dynamic_vehicle(5, pole_scale=2.5)]
-    drives = [recorded(j, snr_db=30.0, model=model).samples for j, model in enumerate(models)]
-    read_outs = fit_read_outs([summary_of(drive, bank) for drive in drives])
-    assert far_below_fleet(read_outs).tolist() == [False] * 5 + [True]
 
 
 def test_vehicles_without_dynamics_get_the_plain_inputs() -> None:

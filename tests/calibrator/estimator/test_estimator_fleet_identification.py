@@ -9,17 +9,12 @@ import pytest
 from scipy.signal import lfilter
 from typer.testing import CliRunner, Result
 
-from bench.dynamic_vehicles import PERIOD_S, dynamic_vehicle, recorded
+from bench.dynamic_vehicles import PERIOD_S
 from calibrator.cli import app
 from calibrator.drive import Array, Channel, Drive, DriveFile, Mask
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError, FleetError
-from calibrator.estimator.fleet_identification import (
-    OWN_GAIN_DB,
-    VehicleModel,
-    identify_better,
-    read_vehicle_model,
-)
+from calibrator.estimator.fleet_identification import VehicleModel, read_vehicle_model
 from calibrator.faults import corrected_currents
 from calibrator.files.parameter_files import current_moments, junction_residual
 from calibrator.sources.fleet_source import Equipment
@@ -124,15 +119,6 @@ def test_junction_residual_from_moments_is_that_of_the_samples() -> None:
     assert found.about_expected() == pytest.approx(about)
 
 
-def test_only_a_vehicle_of_different_poles_gets_a_model_of_its_own() -> None:
-    different = recorded(8, snr_db=30.0, model=dynamic_vehicle(8, pole_scale=2.0)).samples
-    own = identify_better([different], np.full(4, 12.0), period_s=PERIOD_S, vehicle="different")
-    assert own.snr_db.min() > max(12.0 + OWN_GAIN_DB, 20.0)
-    noisy = recorded(9, snr_db=10.0).samples
-    with pytest.raises(DriveError, match=r"a model of its own simulates it to \d+\.\d dB, the shared one to 9\.5 dB"):
-        identify_better([noisy], np.full(4, 9.5), period_s=PERIOD_S, vehicle="noisy")
-
-
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("identify") / "store"
@@ -154,10 +140,9 @@ def test_given_pole_is_used_and_the_vehicle_that_has_another_is_named(store: Pat
     run = run_identify(store, "--poles", MOTOR_S, "--out", bank, "--json")
     assert run.exit_code == 0, run.output
     figures = json.loads(run.stdout)
-    assert list(figures["own_models"]) == [SLUGGISH]
     assert figures["branches"]["motor"]["worst_vehicle"] == SLUGGISH
     assert figures["branches"]["motor"]["median_db"] > 30.0
-    assert figures["own_models"][SLUGGISH]["snr_db"]["motor"] > figures["snr_db"][SLUGGISH]["motor"] + 3.0
+    assert figures["branches"]["motor"]["worst_db"] == figures["snr_db"][SLUGGISH]["motor"] < 20.0
     assert read_bank(bank).described() == "2 s"
     assert json.loads(run_identify(store, "--bank", bank, "--json").stdout) == figures
 

@@ -1,7 +1,6 @@
 """Direct readings: every slip in a table is named, contradictions are named, and nothing is averaged over them."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -83,10 +82,12 @@ def test_table_is_read_in_any_order_and_empty_cells_are_not_read(tmp_path: Path)
     bench = read(tmp_path, HEADER, "V2, motor, 0.02, 0.001, , ", "", "V1,battery,,,-1.5,0.2")
     check(bench)
     readings = Readings.of_bench(bench, VEHICLES, BRANCHES)
-    np.testing.assert_array_equal(readings.drift, [[NAN, NAN], [NAN, 0.02]])
-    np.testing.assert_array_equal(readings.drift_sd, [[NAN, NAN], [NAN, 0.001]])
-    np.testing.assert_array_equal(readings.offset_a, [[-1.5, NAN], [NAN, NAN]])
-    np.testing.assert_array_equal(readings.take_branches([1, 0]).offset_sd_a, [[NAN, 0.2], [NAN, NAN]])
+    (drift, offset_a), (drift_sd, offset_sd_a) = readings.values
+    np.testing.assert_array_equal(drift, [[NAN, NAN], [NAN, 0.02]])
+    np.testing.assert_array_equal(drift_sd, [[NAN, NAN], [NAN, 0.001]])
+    np.testing.assert_array_equal(offset_a, [[-1.5, NAN], [NAN, NAN]])
+    np.testing.assert_array_equal(offset_sd_a, [[0.2, NAN], [NAN, NAN]])
+    np.testing.assert_array_equal(readings.take_branches([1, 0]).values[1, 1], [[NAN, 0.2], [NAN, NAN]])
     other = read(tmp_path, 'branch , vehicle,offset_sd_a,"offset_a"', 'motor,"V1",0.1,3')
     assert other["V1", "motor"][2:4] == (3.0, 0.1)
 
@@ -142,26 +143,23 @@ def test_window_and_reading_that_agree_count_together() -> None:
     bench = {**bench_of(NAN, NAN, 5.1, 0.1), **bench_of(0.02, 0.001, NAN, NAN, "V2", "motor")}
     readings, notices = merge_readings(vehicles_that_showed(4.9, 0.1), bench, BRANCHES)
     assert notices == []
-    assert readings.offset_a[0, 0] == pytest.approx(5.0)
-    assert readings.offset_sd_a[0, 0] == pytest.approx(0.1 / np.sqrt(2.0))
-    assert readings.drift[1, 1] == pytest.approx(0.02)
+    assert readings.values[:, 1, 0, 0] == pytest.approx([5.0, 0.1 / np.sqrt(2.0)])
+    assert readings.values[0, 0, 1, 1] == pytest.approx(0.02)
 
 
 def test_of_window_and_reading_that_contradict_each_other_neither_is_used() -> None:
     bench = {**bench_of(0.03, 0.001, -5.0, 0.1), **bench_of(0.02, 0.001, NAN, NAN, "gone", "motor")}
     readings, notices = merge_readings(vehicles_that_showed(5.0, 0.1), bench, BRANCHES)
-    assert np.isnan(readings.offset_a[0, 0])
-    assert np.isnan(readings.offset_sd_a[0, 0])
-    assert readings.drift[0, 0] == pytest.approx(0.03)
+    assert np.isnan(readings.values[:, 1, 0, 0]).all()
+    assert readings.values[0, 0, 0, 0] == pytest.approx(0.03)
     assert notices[0].startswith("vehicle V1: its battery sensor was read as -5.0 A on the bench, and showed +5.0 A")
     assert notices[1] == "bench readings of vehicles that are left out are not used: gone"
 
 
 def test_readings_become_rows_and_what_was_not_read_stays_unknown() -> None:
     rows = rows_of(0.1, (1.0, 2.0))
-    trusted = Readings.of_trusted(np.array([False, True]), 3, FULL_SCALE_A)
-    one = replace(trusted, drift=trusted.drift.copy(), drift_sd=trusted.drift_sd.copy())
-    one.drift[0, 1], one.drift_sd[0, 1] = 0.25, 0.01
+    one = Readings.of_trusted(np.array([False, True]), 3, FULL_SCALE_A)
+    one.values[:, 0, 0, 1] = 0.25, 0.01
     found = with_readings(rows, one, full_scale_a=FULL_SCALE_A)
     variance = np.diagonal(found.covariance, axis1=1, axis2=2)
     assert found.relative[0, 5:] == pytest.approx([0.0, np.log(1.25), 0.0])

@@ -1,6 +1,7 @@
 """From summaries to what is corrected: known truth, one vehicle at a time, limits, few vehicles, batches."""
 
 import pickle
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -128,6 +129,29 @@ def test_pit_of_the_truth_lies_between_zero_and_one(
         assert pit.shape == (VEHICLES, K)
         assert ((pit >= 0.0) & (pit <= 1.0 + 1e-9)).all()
         assert 0.3 < pit.mean() < 0.7
+
+
+@pytest.mark.parametrize(
+    ("factor", "told"),
+    [
+        (-1.0, "1 A in branch battery goes with +1 A in branch motor"),
+        (0.1, "1 A in branch motor goes with -10 A in branch battery"),
+        (360.0, "1 A in branch battery goes with -3.6e+02 A in branch motor"),
+    ],
+)
+def test_a_wrong_sign_or_unit_in_most_vehicles_is_refused(
+    summaries: list[DriveSummary], factor: float, told: str
+) -> None:
+    def wrong(summary: DriveSummary) -> DriveSummary:
+        moments = summary.moments.copy()
+        moments[:, -2, :] *= factor  # of the motor
+        moments[:, :, -2] *= factor
+        return replace(summary, moments=moments)
+
+    most, few = ([*map(wrong, summaries[n:]), *summaries[:n]] for n in (4, 20))
+    with pytest.raises(FleetError, match=re.escape(f"{told}, expected -1 A; check sign and unit of branch")):
+        learn_fleet(most, full_scale_a=SCALE_A, branches=NAMES)
+    assert learn_fleet(few, full_scale_a=SCALE_A, branches=NAMES).vehicles == VEHICLES
 
 
 def test_no_vehicle_is_no_fleet() -> None:

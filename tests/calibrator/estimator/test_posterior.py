@@ -113,6 +113,29 @@ def test_weights_are_those_of_integration_on_a_grid(faults: int, points: int, to
                 np.testing.assert_allclose(found[on][1], mean, atol=0.004)
 
 
+def test_an_offset_is_known_though_the_gain_of_its_branch_is_not() -> None:
+    """A current that hardly changed: o = (1 + d) omega is exact, so d and omega lie on a narrow curve."""
+    prior, truth = paper_prior(2, 1, 2), no_faults(1, 2)
+    truth.offset_a[0, 1] = 0.19
+    blind = Errors(slope=0.4, ratio=0.4, intercept=1e-4, junction=1e-4)
+    rows = rows_of(truth, errors=blind, currents=np.array([0.001, -0.001]))
+    draws = drawn(rows, prior)
+    found = of_supports(draws, weigh(draws, prior)[0], 0)
+    gain, away = np.meshgrid(np.linspace(-0.4, 0.3, 701), np.linspace(-8e-4, 8e-4, 161))
+    precision = np.linalg.inv(rows.covariance[0])
+    log_evidence = []
+    for on in ((5,), (2, 5)):
+        theta = np.zeros((gain.size, 7))
+        theta[:, 2] = gain.ravel() if 2 in on else 0.0
+        theta[:, 5] = (0.19 + away.ravel()) * np.exp(-theta[:, 2])
+        e = plain_residual(rows, theta)
+        value = log_prior(prior, theta, on) - 0.5 * np.einsum("sa,ab,sb->s", e, precision, e) - theta[:, 2]
+        log_evidence.append(logsumexp(value) + np.log(1e-3 if 2 in on else 1.0 / 701))
+    odds = float(np.exp(log_evidence[1] - log_evidence[0]))
+    assert 0.05 < odds < 20.0  # the recording does not tell
+    assert found[2, 5][0] / found[5,][0] == pytest.approx(odds, rel=0.15)
+
+
 def test_load_weighs_as_on_a_grid_and_is_never_negative() -> None:
     prior = Prior(
         counts=paper_prior(2, 0, 1).counts,

@@ -89,7 +89,7 @@ def test_unknown_vehicle_is_named(result: Path, name: str) -> None:
 def test_vehicle_left_out_is_named_with_its_reason(result: Path, tmp_path: Path) -> None:
     (tmp_path / "part").write_bytes(encode_chunk([], {"v3": "too short"}).rows)
     assert join_rows(result, [tmp_path / "part"], {"a log": "unreadable", "v3": "known"}) == 0
-    assert left_out_of(result) == ({"a log": "unreadable", "v3": "too short"}, 2)
+    assert left_out_of(result) == {"a log": "unreadable", "v3": "too short"}
     with pytest.raises(FleetError, match=r"no parameters of vehicle 'v3', it was left out: too short"):
         written_of(result, "v3")
 
@@ -118,7 +118,7 @@ def test_parameters_that_cannot_be_written_leave_their_vehicle_out(tmp_path: Pat
     bad = replace(good, vehicle="v2", branches={"battery": replace(good.branches["battery"], offset_a=float("nan"))})
     (tmp_path / "part").write_bytes(encode_chunk([bad, good], {}).rows)
     assert join_rows(tmp_path, [tmp_path / "part"], {}) == 1
-    (reason,) = left_out_of(tmp_path)[0].values()
+    (reason,) = left_out_of(tmp_path).values()
     assert reason.endswith("; look at its recordings")
 
 

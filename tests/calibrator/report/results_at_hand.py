@@ -157,7 +157,7 @@ def write_result(
     """A result folder as ``calibrator calibrate`` writes it."""
     folder.mkdir()
     told = {item.vehicle: evidence_of(item) for item in vehicles} if evidence else {}
-    chunk = encode_chunk(vehicles, left_out or {}, moved=moved, evidence=told)
+    chunk = encode_chunk(vehicles, left_out or {}, moved=moved or {}, evidence=told)
     rows, parameters = folder / "rows", folder / "part"
     rows.write_bytes(chunk.rows)
     parameters.write_bytes(chunk.parameters)
@@ -176,9 +176,7 @@ def run_of(vehicles: int, left_out: Mapping[str, str], *, method: str, evidence:
     """How a result at hand was made."""
     reference = {
         "agreeing_share": {"battery": 0.8, "motor": 0.75},
-        "mean_distance": {"battery": 0.012, "motor": -0.004},
         "unmeasured_a": 0.3,
-        "doubtful": [],
         "read_out": READ_OUT_A,
     }
     spread = {"model_spread": {"battery": 0.004, "motor": 0.005}}
