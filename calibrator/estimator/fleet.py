@@ -9,18 +9,21 @@ import hashlib
 import html
 import inspect
 import math
+import os
 import shutil
+import sys
 import warnings
 import weakref
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import ExitStack, nullcontext
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
-from numbers import Real
+from numbers import Integral, Real
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
 
 from calibrator.errors import ContradictionError, FleetError
+from ecu_node.errors import UserError
 from ecu_node.layout import Branch, Input, Layout
 
 if TYPE_CHECKING:
@@ -66,6 +69,49 @@ NO_NODE_FILES = (
 )
 
 
+def _require(good: Any, what: str, given: Any, expected: str) -> None:
+    """Refuse an argument, showing it if it is short."""
+    if not good:
+        shown = text if len(text := repr(given)) < 80 and "\n" not in text else f"of type {type(given).__name__}"
+        raise FleetError(f"{what} {shown}: expected {expected}")
+
+
+def _path(given: Any, what: str, expected: str = "the path of a layout (TOML)") -> Path:
+    """An argument that names a file or folder."""
+    _require(isinstance(given, (str, os.PathLike)) and os.fspath(given), what, given, expected)
+    return Path(given)
+
+
+def _is_number(given: Any, low: float, high: float, kind: Any = Real) -> bool:
+    return isinstance(given, kind) and not isinstance(given, bool) and low <= float(given) <= high
+
+
+def _names(given: Any, what: str, *, sets: bool = False) -> tuple[str, ...]:
+    """Names of anything like a list, numbers as strings; a set has no order, so it does for some arguments only."""
+    names: list[Any] = [None]
+    with suppress(TypeError):
+        names = names if isinstance(given, (str, bytes, Mapping, *(() if sets else (set, frozenset)))) else [*given]
+    named = (not isinstance(name, bool) and isinstance(name, (str, Integral)) and str(name).strip() for name in names)
+    _require(all(named), what, given, "a list of names, such as ['one', 'other']")
+    return tuple(map(str, names))
+
+
+def _in_python(text: str) -> str:
+    """A text of the command with arguments instead of its options."""
+    for name in inspect.signature(FleetCalibrator).parameters:
+        text = text.replace(f"--{name.replace('_', '-')}", name)
+    return text.replace("another --out", "another folder")
+
+
+@contextmanager
+def _errors_in_python() -> Iterator[None]:
+    try:
+        yield
+    except UserError as error:
+        error.args = (_in_python(str(error)),)
+        raise
+
+
 @dataclass(frozen=True)
 class Junction:
     """Where the high-voltage currents of a vehicle meet; the sum of the K branch currents is 0 A (Kirchhoff).
@@ -89,18 +135,18 @@ class Junction:
     """Layout and DBC, set by :meth:`from_layout`."""
 
     def __post_init__(self) -> None:
-        names = [] if isinstance(self.branches, str) else list(self.branches)
-        if not all(isinstance(name, str) and name.strip() for name in names) or len(set(names)) < len(names):
-            raise FleetError(f"branches {names}: expected different names, such as ['battery', 'motor']")
+        names = _names(self.branches, "branches")
+        _require(
+            len(set(names)) == len(names), "branches", self.branches, "different names, such as ['battery', 'motor']"
+        )
         if not 2 <= len(names) <= MOST_BRANCHES:
             raise FleetError(
-                f"branches {self.branches!r}: a junction has 2 to {MOST_BRANCHES} branches, in a list; name all "
-                f"currents that are measured, as nothing tells what a single sensor does wrong"
+                f"branches {self.branches!r}: a junction has 2 to {MOST_BRANCHES} branches; name all currents that are "
+                f"measured, as nothing tells what a single sensor does wrong"
             )
-        scale_a: Any = self.full_scale_a
-        if not (isinstance(scale_a, Real) and math.isfinite(scale_a) and float(scale_a) > 0.0):
-            raise FleetError(f"full_scale_a {scale_a!r}: expected the nominal maximum current in A, such as 400.0")
-        object.__setattr__(self, "branches", tuple(names))
+        good = _is_number(self.full_scale_a, math.ulp(0.0), sys.float_info.max)
+        _require(good, "full_scale_a", self.full_scale_a, "the nominal maximum current in A, such as 400.0")
+        object.__setattr__(self, "branches", names)
 
     @classmethod
     def from_layout(cls, path: str | Path, *, branches: Sequence[str] | None = None) -> "Junction":
@@ -125,11 +171,11 @@ class Junction:
         """
         from calibrator.files.layout_files import vehicle_database
 
-        database = vehicle_database(Path(path))
+        database = vehicle_database(_path(path, "path"))
         layout = database.layout
-        for name in branches or ():
+        chosen = layout.branch_names if branches is None else _names(branches, "branches")
+        for name in chosen:
             layout.find_branch(name)
-        chosen = layout.branch_names if branches is None else branches
         return cls(branches=chosen, full_scale_a=layout.full_scale_a, database=database)
 
     @property
@@ -208,7 +254,8 @@ class Fleet:
         from calibrator.files.layout_files import vehicle_database
         from calibrator.files.storage import open_storage
 
-        database, storage = vehicle_database(Path(layout)), open_storage(path)
+        _path(path, "path", "a drive store, a folder of logs, or summaries")
+        database, storage = vehicle_database(_path(layout, "layout")), open_storage(path)
         require_fleet(storage, path, database)
         return cls(place=storage.url, database=database, has_layout=True)
 
@@ -225,8 +272,8 @@ class Fleet:
         Parameters
         ----------
         frames : mapping of str to DataFrame, or to a sequence of them
-            Drives by vehicle. Index: seconds, or a DatetimeIndex, rising. Columns: every branch of the junction,
-            positive into it [A], and the inputs; NaN where a sample is bad.
+            Drives by vehicle. Index: seconds, or a DatetimeIndex, rising; gaps over 60 s count as 60 s. Columns: every
+            branch of the junction, positive into it [A], and the inputs; NaN where a sample is bad.
         junction : Junction
             Says which columns are branches. One made by :meth:`Junction.from_layout` also has derived inputs.
         inputs : sequence of str or None
@@ -245,6 +292,8 @@ class Fleet:
         """
         from calibrator.estimator.frames import summarise_frames
 
+        _require(isinstance(junction, Junction), "junction", junction, "a Junction")
+        inputs = None if inputs is None else _names(inputs, "inputs")
         with ExitStack() as stack:
             folder = mkdtemp(prefix="calibrator-")
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
@@ -252,6 +301,11 @@ class Fleet:
             fleet = cls(place=folder, database=database, has_layout=junction.layout is not None, in_memory=True)
             weakref.finalize(fleet, stack.pop_all().close)  # the summaries go with the fleet
         return fleet
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self.in_memory:
+            raise FleetError("a Fleet of data frames cannot be pickled or copied; pickle the frames, or what it gave")
+        return vars(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,21 +338,22 @@ class Vehicle:
         DriveError
             If a corrected branch is missing or holds no numbers.
         """
-        from calibrator.estimator.frames import column_values, require_columns
+        from calibrator.estimator.frames import column_values, named_columns, require_columns
 
         where = f"vehicle {self.parameters.vehicle}"
+        named = named_columns(frame, where)
         corrected = {name: branch for name, branch in self.parameters.branches.items() if branch.apply}
-        require_columns(frame, list(corrected), where)
-        currents = {name: column_values(frame, name, where) for name in corrected}
-        return frame.assign(
+        require_columns(named, list(corrected), where)
+        currents = {name: column_values(named, name, where) for name in corrected}
+        return named.assign(
             **{name: (i_m - corrected[name].offset_a) / (1.0 + corrected[name].drift) for name, i_m in currents.items()}
-        )
+        ).set_axis(frame.columns, axis=1)
 
     def explain(self) -> str:
         """What was found for each sensor and why, other explanations, findings, and what would decide."""
         from calibrator.estimator.vehicle_report import explained
 
-        return explained(self.parameters)
+        return _in_python(explained(self.parameters))
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(self.explain())}</pre>"
@@ -416,9 +471,9 @@ class FleetCalibrator:
         from calibrator.estimator.workers import Workers
         from calibrator.terminal.progress import no_progress
 
-        if not isinstance(fleet, Fleet):
-            raise FleetError(f"{type(fleet).__name__} given; expected a Fleet: Fleet.from_frames or Fleet.from_folder")
-        with TemporaryDirectory(prefix="calibrator-") as folder, nullcontext() if self.verbose else no_progress():
+        _require(isinstance(fleet, Fleet), "fleet", fleet, "Fleet.from_frames(...) or Fleet.from_folder(...)")
+        progress = nullcontext() if self.verbose else no_progress()
+        with TemporaryDirectory(prefix="calibrator-") as folder, progress, _errors_in_python():
             settings, out = self._settings(Path(folder)), Path(folder) / "result"
             # frames are so few that another process takes longer to start than they take here
             workers = Workers(processes=1 if fleet.in_memory else self.workers, scheduler=self.scheduler)
@@ -427,22 +482,25 @@ class FleetCalibrator:
         return self
 
     def _settings(self, folder: Path) -> "CalibrationSettings":
-        """Parameters of the constructor as the command takes them; ContradictionError if one makes no sense."""
+        """Parameters of the constructor as the command takes them; FleetError if one makes no sense."""
         from calibrator.estimator.settings import CalibrationSettings
 
-        for name, low, high in (("harm_limit", 0, 1), ("expected_faults", 0, 1), ("workers", 1, 256)):
-            value = getattr(self, name)
-            if name == "expected_faults" and value is None:
-                continue
-            if not (isinstance(value, Real) and low <= float(value) <= high):
-                raise ContradictionError(f"{name} is {value!r}; expected a number from {low} to {high}")
+        faults = 0.0 if self.expected_faults is None else self.expected_faults
+        _require(_is_number(self.harm_limit, 0, 1), "harm_limit", self.harm_limit, "a number from 0 to 1")
+        _require(_is_number(faults, 0, 1), "expected_faults", faults, "a number from 0 to 1")
+        _require(_is_number(self.workers, 1, 256, Integral), "workers", self.workers, "a whole number from 1 to 256")
+        _require(isinstance(self.scheduler, str | None), "scheduler", self.scheduler, "the address of a Dask scheduler")
         trusted, hold_out = (
-            frozenset([names] if isinstance(names, str) else names) for names in (self.trusted, self.hold_out)
+            frozenset(_names([given] if isinstance(given, str) else () if given is None else given, name, sets=True))
+            for name, given in (("trusted", self.trusted), ("hold_out", self.hold_out))
         )
-        readings = self.readings
-        if readings is not None and not isinstance(readings, (str, Path)):
+        readings: Any = self.readings
+        if hasattr(readings, "to_csv"):
             readings.to_csv(folder / "readings.csv", index=False)
             readings = folder / "readings.csv"
+        if readings is not None:
+            path = _path(readings, "readings", "a DataFrame or the path of a CSV table")
+            _require(path.is_file(), "readings", readings, "a file that exists")
         return CalibrationSettings(
             harm_limit=self.harm_limit,
             readings=None if readings is None else Path(readings),
@@ -478,7 +536,7 @@ class FleetCalibrator:
         self.left_out_ = dict(zip(left_out["vehicle"], left_out["reason"], strict=True))
         self.parameters_ = rows[rows["branch"].notna()].rename(columns=NAMES)[list(COLUMNS)].reset_index(drop=True)
         self.parameters_["corrected"] = self.parameters_["corrected"].astype(bool)
-        self.notices_ = list(report.run.notices)
+        self.notices_ = [_in_python(notice) for notice in report.run.notices]
         if failed := internal_errors(out):
             warnings.warn(
                 f"internal error, left out: {'; '.join(told_once(failed.items()))}", RuntimeWarning, stacklevel=3
@@ -522,7 +580,7 @@ class FleetCalibrator:
         from calibrator.files.folders import whole_folder
 
         self._require_fitted()
-        with whole_folder(Path(folder)) as partial:
+        with _errors_in_python(), whole_folder(_path(folder, "folder", "the path of a new folder")) as partial:
             for name, content in self._files.items():
                 (partial / name).parent.mkdir(parents=True, exist_ok=True)
                 (partial / name).write_bytes(content)
@@ -600,6 +658,7 @@ def read_log(path: str | Path, layout: str | Path) -> Log:
     from calibrator.files.layout_files import vehicle_database
     from calibrator.recordings.readers import read_drive
 
-    database, log = vehicle_database(Path(layout)), Path(path)
+    log = _path(path, "path", "the path of a log")
+    database = vehicle_database(_path(layout, "layout"))
     drive = read_drive(log, database, vehicle=log.absolute().parent.name, name=log.name.partition(".")[0])
     return Log(drive=drive, layout=database.layout)

@@ -12,10 +12,11 @@ import numpy as np
 import pandas as pd
 
 from calibrator.drive import Array, Channel, Drive
-from calibrator.drives.align import base_inputs, choose_inputs
+from calibrator.drives.align import TIME_RESOLUTION_S, base_inputs, choose_inputs
 from calibrator.drives.plain_names import require_plain_name
 from calibrator.errors import DriveError, FleetError
 from calibrator.files.storage import open_storage
+from calibrator.recordings.log_time import CLOCK_GAP_S
 from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.record import Record
@@ -27,12 +28,14 @@ from ecu_node.database import VehicleDatabase
 if TYPE_CHECKING:
     from calibrator.estimator.fleet import Junction
 
-__all__ = ["column_values", "require_columns", "summarise_frames"]
+__all__ = ["column_values", "named_columns", "require_columns", "summarise_frames"]
 
 FINEST_PERIOD_S, COARSEST_PERIOD_S = 0.1, 5.0
 """Time base of data frames without a layout: that of logs, or slower; still several rows per block of 30 s. [s]"""
 LEAST_OF_SCALE, MOST_OF_SCALE = 0.002, 10.0
 """Of full scale: currents that never reach the former, or go beyond the latter, are in another unit. [1]"""
+OTHER_SPACING = 20.0
+"""Row spacing of a frame over that of the fleet, or the reverse, from which on its time is in another unit. [1]"""
 OTHER_UNIT = 100.0
 """Largest current of the median vehicle over that of this one, from which on the latter is in another unit. [1]"""
 
@@ -95,7 +98,7 @@ def _vehicles(frames: Mapping[str, Any]) -> dict[str, list[pd.DataFrame]]:
             raise FleetError(f"vehicle {vehicle}: {type(given).__name__} given; expected a DataFrame or a list of them")
         if not drives:
             raise FleetError(f"vehicle {vehicle}: no frame in its list; leave the vehicle out")
-        found[vehicle] = list(drives)
+        found[vehicle] = [named_columns(frame, f"vehicle {vehicle}") for frame in drives]
     if len(found) < 2:
         raise FleetError(f"a single vehicle, {vehicle}: at least 2 are needed, as each is compared with its fleet")
     return found
@@ -106,8 +109,8 @@ def _chosen_inputs(
 ) -> tuple[str, ...]:
     """Names of the inputs; every frame has the columns that it takes."""
     branches = list(junction.branches)
-    if isinstance(inputs, str):
-        raise FleetError(f"inputs {inputs!r}: expected a list of column names, [{inputs!r}]")
+    for where, frame in labelled:
+        require_columns(frame, branches, where)
     both = sorted(set(inputs or ()) & set(branches))
     if both:
         raise FleetError(f"inputs {few(both)}: a branch of the junction cannot be an input of its model")
@@ -122,10 +125,10 @@ def _chosen_inputs(
         needed = [*branches, *sorted(base_inputs(junction.layout, chosen))]
     else:
         (first, frame), *others = labelled
-        chosen = tuple(str(name) for name in frame.columns if name not in branches) if inputs is None else tuple(inputs)
+        chosen = tuple(name for name in frame.columns if name not in branches) if inputs is None else tuple(inputs)
         needed = [*branches, *chosen]
         for where, other in others if inputs is None else ():
-            if more := sorted(str(name) for name in set(other.columns) - set(needed)):
+            if more := sorted(set(other.columns) - set(needed)):
                 raise FleetError(
                     f"{where}: column {few(more)}, which {first} has not; all vehicles need the same columns, or name "
                     f"those to use with inputs=[...]"
@@ -140,21 +143,24 @@ def _chosen_inputs(
     return chosen
 
 
-def require_columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> None:
-    """Refuse a frame that lacks columns."""
+def named_columns(frame: pd.DataFrame, where: str) -> pd.DataFrame:
+    """The same with the labels of its columns, which may be numbers, as strings; DriveError if it is no frame."""
     if not isinstance(frame, pd.DataFrame):
         raise DriveError(f"{where}: {type(frame).__name__} given; expected a DataFrame")
+    return frame.set_axis([str(label) for label in frame.columns], axis=1)
+
+
+def require_columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> None:
+    """Refuse a frame that lacks columns."""
     if missing := [name for name in names if name not in frame.columns]:
-        there = few([str(name) for name in frame.columns])
-        raise DriveError(f"{where}: no column {few(missing)}; it has {there or 'none'}")
+        raise DriveError(f"{where}: no column {few(missing)}; it has {few(list(frame.columns)) or 'none'}")
 
 
 def _seconds(frame: pd.DataFrame, where: str) -> Array:
     """Instants of a frame from 0, rising. [s]"""
     index = frame.index
     if isinstance(index, pd.RangeIndex) or not (
-        isinstance(index, (pd.DatetimeIndex, pd.TimedeltaIndex))
-        or (pd.api.types.is_numeric_dtype(index) and not pd.api.types.is_bool_dtype(index))
+        isinstance(index, (pd.DatetimeIndex, pd.TimedeltaIndex)) or pd.api.types.is_any_real_numeric_dtype(index)
     ):
         what = "counts rows" if isinstance(index, pd.RangeIndex) else f"is of {index.dtype}"
         raise DriveError(
@@ -163,7 +169,7 @@ def _seconds(frame: pd.DataFrame, where: str) -> Array:
     if len(index) < 2:
         raise DriveError(f"{where}: {len(index)} rows; leave the frame out")
     if isinstance(index, (pd.DatetimeIndex, pd.TimedeltaIndex)):
-        time_s = np.asarray((index - index[0]).total_seconds(), np.float64)
+        time_s = np.asarray((index - index.min()).total_seconds(), np.float64)
     else:
         time_s = index.to_numpy(np.float64)
     if not np.isfinite(time_s).all():
@@ -180,22 +186,30 @@ def _seconds(frame: pd.DataFrame, where: str) -> Array:
 
 
 def _period_s(times: Mapping[str, Array], junction: "Junction") -> float:
-    """Time base of the fleet: that of the layout, or of the rows."""
-    row_s = float(np.median([np.median(np.diff(time_s)) for time_s in times.values()]))
-    if junction.layout is not None:
-        shortest_s = min(junction.layout.max_age_s, *(branch.timeout_s for branch in junction.layout.branch))
-        if row_s > shortest_s:
-            raise FleetError(
-                f"rows are {row_s:.3g} s apart, and in {junction.layout.path.name} a value is stale after "
-                f"{shortest_s:g} s; give the signals as recorded, or Junction(branches=..., full_scale_a=...)"
-            )
-        return junction.layout.period_s
-    if row_s > COARSEST_PERIOD_S:
-        raise FleetError(
-            f"rows are {row_s:.3g} s apart, expected {COARSEST_PERIOD_S:g} s at most; if the index is not in seconds, "
-            f"convert it"
+    """Time base of the fleet: that of the layout, or of the rows, which are about as far apart in every frame."""
+    layout = junction.layout
+    spacing_s = {where: float(np.median(np.diff(time_s))) for where, time_s in times.items()}
+    usual_s = float(np.median([*spacing_s.values()]))
+    unit = "if the index is not in seconds, convert it"
+    most_s, why = COARSEST_PERIOD_S, f"expected {COARSEST_PERIOD_S:g} s at most; {unit}"
+    if layout is not None:
+        most_s = min(layout.max_age_s, *(branch.timeout_s for branch in layout.branch))
+        why = (
+            f"and in {layout.path.name} a value is stale after {most_s:g} s; give the signals as recorded, or "
+            f"Junction(branches=..., full_scale_a=...)"
         )
-    return max(round(row_s, 6), FINEST_PERIOD_S)
+    for where, row_s in spacing_s.items():
+        if row_s > OTHER_SPACING * usual_s or usual_s > OTHER_SPACING * row_s:
+            why = f"and those of the fleet {usual_s:.3g} s; {unit}"
+        elif row_s <= most_s + TIME_RESOLUTION_S:
+            continue
+        raise FleetError(f"{where}: rows are {row_s:.3g} s apart, {why}")
+    return max(round(usual_s, 6), FINEST_PERIOD_S) if layout is None else layout.period_s
+
+
+def _without_pauses(time_s: Array) -> Array:
+    """Instants with longer gaps cut to that of logs whose clock was set, as time bases go through them. [s]"""
+    return np.asarray(time_s - np.append(0.0, np.cumsum(np.maximum(np.diff(time_s) - CLOCK_GAP_S, 0.0))))
 
 
 def column_values(frame: pd.DataFrame, name: str, where: str) -> Array:
@@ -224,9 +238,8 @@ def _drives(
         found[vehicle] = []
         for number, frame in enumerate(frames, start=1):
             where = f"vehicle {vehicle}, frame {number}"
-            channels = {
-                name: _channel(times[where], column_values(frame, name, where), name, where) for name in columns
-            }
+            time_s = _without_pauses(times[where])
+            channels = {name: _channel(time_s, column_values(frame, name, where), name, where) for name in columns}
             content = b"".join(part.tobytes() for item in channels.values() for part in (item.time_s, item.value))
             digest = hashlib.blake2b(content).digest()
             if digest in seen:

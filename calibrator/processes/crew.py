@@ -9,12 +9,14 @@ import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext
+from types import ModuleType
 from typing import Any, Generic, TypeVar
 
 from calibrator.processes.held_interrupts import interrupts_held
@@ -105,8 +107,13 @@ class _Worker:
         context = _context()
         ours, theirs = context.Pipe()
         process = context.Process(target=work, args=(theirs, pickle.dumps(read), folder), daemon=True)
+        main = sys.modules["__main__"]
         with interrupts_held():
-            process.start()
+            sys.modules["__main__"] = ModuleType("__main__")  # or the worker would run the user's script once more
+            try:
+                process.start()
+            finally:
+                sys.modules["__main__"] = main
         theirs.close()
         return _Worker(process=process, pipe=ours)
 
