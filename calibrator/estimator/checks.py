@@ -8,16 +8,20 @@ Equations: (M22) to (M25) of docs/method.md, section "Does the best explanation 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import t as student_t
 
 from calibrator.drive import Array
+from calibrator.estimator.junction_law import MOST_NOISE, NOISE_ROUNDS
+from calibrator.estimator.moments import FleetMoments, products, stack_summaries
 from calibrator.summaries.moments import DriveSummary
 from ecu_node.parameters import Finding
 
-__all__ = ["CAUSES", "Misfits", "UsualMisfits", "check_fit", "learn_usual_misfits", "measure_misfits"]
+__all__ = ["UsualMisfits", "check_fit", "learn_usual_misfits"]
 
 PRIOR = 0.01
 """Probability of each cause in a vehicle, before anything is seen. [1]"""
@@ -67,68 +71,16 @@ MAD_TO_SD = 1.4826
 """Of the normal distribution."""
 WHITE_GAIN = 1.5
 """Variance of the second difference of white noise of variance 1."""
-MOST_NOISE = 0.9
-"""Largest share of a current's variance that is taken for noise. [1]"""
 SHARE_SD = 0.15
 """How well a misfit is found again in the branch that has it, where its model is exact. [1]"""
 
 BENDS_A: Array = np.array(
     [10.0, 15, 20, 25, 30, 37, 45, 55, 65, 77, 90, 105, 120, 140, 160, 185, 210, 245, 280, 325, 370, 430, 500]
 )
-"""Currents at which a gain may change, two per level; below, noise sorts samples into levels. [A]"""
+"""Currents at which a gain may change, two per level; below, noise sorts samples into levels. They are absolute as the
+levels are: summaries are made without the full scale of the junction. [A]"""
 CAUSES = ("quadratic", "cubic", "sign", "bend", "step", "ramp", "temperature")
 """Causes that are columns or splits of the junction law; a bend is a clipped or a saturating sensor."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Misfits:
-    """What each cause explains of the junction law of N vehicles with K branches.
-
-    Attributes
-    ----------
-    misfit_a : ndarray of shape (N, C)
-        Root mean square of what each of :data:`CAUSES` explains beyond gains and offsets. [A]
-    fit : ndarray of shape (N, C)
-        Logarithm of its likelihood over that of linear sensors, less what its parameters cost.
-    size, place : ndarray of shape (N, C)
-        Of causes by level: error at full scale, or change of the gain [1]. Where it is: level at which a bend begins
-        [A], share of the time before a step [1], standard deviation of a temperature [K].
-    level_branch : ndarray of int of shape (N, C)
-        Branch by whose level it is; -1 for causes by time.
-    branch_fit : ndarray of shape (N, C, K)
-        Logarithm of the likelihood that the sensor of branch k has it, by the fleet model.
-    residual_a2 : ndarray of shape (N, C + 1)
-        Mean square of what each cause, or none (last), leaves of the junction law. [A^2]
-    fast_a2 : ndarray of shape (N,)
-        White part of it. [A^2]
-    slope, slope_sd, mean_a : ndarray of shape (N, K)
-        Of each measured current over the fleet model, and its mean. [1], [A]
-    moves_a, model_error_a : ndarray of shape (N, K)
-        Standard deviation of the fleet model, and of each measured current about it. [A]
-    noise_share : ndarray of shape (N, K)
-        Share of each sensor in the fast part of the residual. [1]
-    spikes : ndarray of shape (N, K, 2)
-        Share of samples that are upward and downward spikes. [1]
-    samples : ndarray of shape (N,)
-        Number of samples.
-    """
-
-    misfit_a: Array
-    fit: Array
-    size: Array
-    place: Array
-    level_branch: NDArray[np.int64]
-    branch_fit: Array
-    residual_a2: Array
-    fast_a2: Array
-    slope: Array
-    slope_sd: Array
-    mean_a: Array
-    moves_a: Array
-    model_error_a: Array
-    noise_share: Array
-    spikes: Array
-    samples: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,109 +110,217 @@ class UsualMisfits:
     spike_rate: float
 
 
+class _Causes(NamedTuple):
+    """What all C of :data:`CAUSES`, or one (without that axis), explain of the junction law of N vehicles.
+
+    Attributes
+    ----------
+    explained_a2 : ndarray of shape (N, C)
+        Sum of squares beyond gains and offsets. [A^2]
+    fit : ndarray of shape (N, C)
+        Logarithm of the likelihood over that of linear sensors, less what the parameters cost.
+    size, place : ndarray of shape (N, C)
+        Of causes by level: error at full scale, or change of the gain [1]. Where it is: level at which a bend begins
+        [A], share of the time before a step [1], standard deviation of a temperature [K].
+    level_branch : ndarray of int of shape (N, C)
+        Branch by whose level it is; -1 for causes by time.
+    pattern, square : ndarray of shape (N, C, p), (N, C)
+        Products of the misfit with all columns, and with itself.
+    """
+
+    explained_a2: Array
+    fit: Array
+    size: Array
+    place: Array
+    level_branch: NDArray[np.int64]
+    pattern: Array
+    square: Array
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Residual:
     """Residual r = y - g^T z of the junction law of N vehicles: y the branch that moves most, z the others and 1.
 
     Attributes
     ----------
-    blocks : ndarray of shape (B, p, p)
-        Moments of (inputs, measured currents, 1) of all blocks.
-    first, vehicle : ndarray of int of shape (N,), (B,)
-        First block of each vehicle, vehicle of each block.
+    fleet : FleetMoments
+        Of the vehicles.
+    total : ndarray of shape (N, p, p)
+        Moments of (inputs, measured currents, 1) of all blocks of a vehicle.
     y, z : int, ndarray of int of shape (K,)
         Columns of the law.
-    law : ndarray of shape (N, K)
-        g: gain ratios and constant [A].
-    of_z : ndarray of shape (B, p, K)
-        Moments of all columns with z.
+    law, weights : ndarray of shape (N, K)
+        g: gain ratios and constant [A]; weight of each branch in r [1].
     with_z : ndarray of shape (B, K)
         Sums of z r, without the product of the noise of z with itself.
-    square_a2, samples : ndarray of shape (N,)
-        Sum of r^2 [A^2], number of samples.
-    n_eff : ndarray of shape (N,)
-        Samples that do not repeat each other.
+    square_a2, n_eff : ndarray of shape (N,)
+        Sum of r^2 [A^2], number of samples that do not repeat each other.
     """
 
-    blocks: Array
-    first: NDArray[np.int64]
-    vehicle: NDArray[np.int64]
+    fleet: FleetMoments
+    total: Array
     y: int
     z: NDArray[np.int64]
     law: Array
-    of_z: Array
+    weights: Array
     with_z: Array
     square_a2: Array
-    samples: Array
     n_eff: Array
 
-    def total(self, values: Array) -> Array:
-        return np.asarray(np.add.reduceat(values, self.first, axis=0))
+    @property
+    def samples(self) -> Array:
+        """Number of samples, shape (N,)."""
+        return self.total[:, -1, -1]
 
-    def likelihood(self, explained: Array, parameters: float) -> Array:
-        """Logarithm of the likelihood ratio with noise of unknown size, less what parameters cost (BIC)."""
-        left = np.maximum(1.0 - explained / self.square_a2, RIDGE)
-        return np.asarray(-0.5 * self.n_eff * np.log(left) - 0.5 * parameters * np.log(self.n_eff))
+    @property
+    def gram(self) -> Array:
+        """Moments of z with z, shape (N, K, K)."""
+        return self.total[:, self.z[:, None], self.z]
+
+    @cached_property
+    def of_z(self) -> Array:
+        """Moments of all columns with z in each block, shape (B, p, K)."""
+        return self.fleet.moments[:, :, self.z]
+
+    def cause(
+        self,
+        explained_a2: Array,
+        parameters: float,
+        *,
+        place: ArrayLike,
+        pattern: Array,
+        square: Array,
+        size: ArrayLike = 0.0,
+        level_branch: ArrayLike = -1,
+    ) -> _Causes:
+        """Make a cause whose fit is that with noise of unknown size, less what its parameters cost (BIC)."""
+        explained_a2, N = np.maximum(explained_a2, 0.0), len(explained_a2)
+        left = np.maximum(1.0 - explained_a2 / self.square_a2, RIDGE)
+        fit = -0.5 * self.n_eff * np.log(left) - 0.5 * parameters * np.log(self.n_eff)
+        size, place, level_branch = (np.broadcast_to(each, N) for each in (size, place, level_branch))
+        return _Causes(explained_a2, fit, size, place, level_branch, pattern, square)
 
 
-def measure_misfits(summaries: Sequence[DriveSummary], read_out: Array, *, full_scale_a: float) -> Misfits:
-    """Measure what each cause explains in each vehicle.
+@dataclass(frozen=True, kw_only=True)
+class _OverModel:
+    """Each measured current of N vehicles regressed on the fleet model's and 1.
 
-    Parameters
+    Attributes
     ----------
-    summaries : sequence of N DriveSummary
-        With fit sums.
-    read_out : ndarray of shape (M + 1, K)
-        Of the fleet model, its branches in the order of the summaries. [A]
-    full_scale_a : float
-        Full scale of the junction. [A]
-
-    Returns
-    -------
-    Misfits
-        Of the N vehicles.
+    columns : ndarray of int of shape (M + 1,)
+        Inputs and 1 among the columns of the moments.
+    basis : ndarray of shape (K, M + 1, 2)
+        The fleet model's current and 1, over these.
+    gram, right : ndarray of shape (N, K, 2, 2), (N, K, 2)
+        Normal equations.
+    slope, slope_sd, zero_a : ndarray of shape (N, K)
+        Slope and its standard deviation [1], reading where the model has no current [A].
+    variance_a2 : ndarray of shape (N, K)
+        Variance of the residual times the number of neighbouring samples that repeat each other. [A^2]
+    moves_a, error_a : ndarray of shape (N, K)
+        Standard deviations of the model and of the residual. [A]
     """
-    counts = np.array([len(summary.moments) for summary in summaries])
-    first, vehicle = np.cumsum(counts) - counts, np.repeat(np.arange(len(counts)), counts)
-    blocks = np.concatenate([summary.moments for summary in summaries])
+
+    columns: NDArray[np.int64]
+    basis: Array
+    gram: Array
+    right: Array
+    slope: Array
+    slope_sd: Array
+    zero_a: Array
+    variance_a2: Array
+    moves_a: Array
+    error_a: Array
+
+    def whose(self, pattern: Array, square: Array, weights: Array) -> Array:
+        """Logarithm of the likelihood that each branch's sensor makes the misfit of each cause, shape (N, C, K).
+
+        The misfit is regressed out of each branch's residual over the fleet model: where it is this branch's, all of it
+        is found there, and nothing in the others.
+        """
+        M, K = self.basis.shape[1] - 1, len(self.basis)
+        cross = np.einsum("ncm,kma->ncka", pattern[..., self.columns], self.basis)
+        base = _solve(self.gram[:, None], cross)
+        alone = np.maximum(square[..., None] - _dot(base, cross), TINY)
+        share = weights[:, None] * (pattern[..., M:-1] - _dot(base, self.right[:, None])) / alone
+        sd = np.hypot(weights[:, None] * np.sqrt(self.variance_a2[:, None] / alone), SHARE_SD)
+        off = np.sum(((share[..., None, :] - np.eye(K)) / sd[..., None, :]) ** 2, axis=-1)
+        return np.asarray(-0.5 * (K - 1) / K * off)  # the shares of all branches add up to one
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Misfits:
+    """What each cause explains of the junction law of N vehicles with K branches.
+
+    Attributes
+    ----------
+    causes : _Causes
+        All of them.
+    model : _OverModel
+        The currents over the fleet model.
+    misfit_a : ndarray of shape (N, C)
+        Root mean square of what each cause explains beyond gains and offsets. [A]
+    branch_fit : ndarray of shape (N, C, K)
+        Logarithm of the likelihood that the sensor of branch k has it, by the fleet model.
+    residual_a2 : ndarray of shape (N, C + 1)
+        Mean square of what each cause, or none (last), leaves of the junction law. [A^2]
+    fast_a2 : ndarray of shape (N,)
+        White part of it. [A^2]
+    mean_a : ndarray of shape (N, K)
+        Mean measured currents. [A]
+    noise_share : ndarray of shape (N, K)
+        Share of each sensor in the fast part of the residual. [1]
+    spikes : ndarray of shape (N, K, 2)
+        Share of samples that are upward and downward spikes. [1]
+    samples : ndarray of shape (N,)
+        Number of samples.
+    """
+
+    causes: _Causes
+    model: _OverModel
+    misfit_a: Array
+    branch_fit: Array
+    residual_a2: Array
+    fast_a2: Array
+    mean_a: Array
+    noise_share: Array
+    spikes: Array
+    samples: Array
+
+
+def _measure_misfits(summaries: Sequence[DriveSummary], read_out: Array, full_scale_a: float) -> _Misfits:
+    """Measure what each cause explains in each of N vehicles with fit sums."""
+    fleet = stack_summaries(summaries)
     fits = [summary.fit for summary in summaries if summary.fit is not None]
     fast = np.stack([fit.fast_a2.sum(axis=0) for fit in fits])
-    residual, weights = _junction_residual(blocks, first, vehicle, fast)
-    total, samples = residual.total(blocks), residual.samples
-    K = fast.shape[1]
-    M = blocks.shape[1] - K - 1
-    slope, slope_sd, zero_a, variance, moves_a, error_a = _over_fleet_model(residual, total, read_out)
     levels = np.stack([fit.levels for fit in fits])
+    spikes = np.stack([fit.spikes.sum(axis=0) for fit in fits])
     middle = np.concatenate([np.cumsum(n := s.moments[:, -1, -1]) - n / 2.0 for s in summaries])
     warm_c = np.concatenate([fit.temperature_c for fit in fits])
-    found = [
-        *_by_level(residual, total, levels, zero_a=zero_a, weights=weights, full_scale_a=full_scale_a),
-        _step(residual, total),
-        _drifting(residual, total, middle / samples[vehicle], least=0.0),
-        _drifting(residual, total, warm_c, least=WARMING_K),
+    residual = _junction_residual(fleet, fast)
+    model = _over_fleet_model(residual, read_out)
+    samples, weights = residual.samples, residual.weights
+    causes = [
+        *_by_level(residual, levels, zero_a=model.zero_a, full_scale_a=full_scale_a),
+        _step(residual),
+        _drifting(residual, middle / samples[fleet.blocks.vehicle], least=0.0),
+        _drifting(residual, warm_c, least=WARMING_K),
     ]
-    explained, fit, size, place, level_branch, pattern, square = (
-        np.stack(part, axis=1) for part in zip(*found, strict=True)
-    )
+    found = _Causes(*(np.stack(part, axis=1) for part in zip(*causes, strict=True)))
     unit = np.sqrt((weights**2).mean(axis=1))  # gain errors of the branches do not scale the residual
     white = np.einsum("nk,nkl,nl->n", weights, fast, weights)
-    left = np.maximum(residual.square_a2[:, None] - np.column_stack([explained, np.zeros(len(counts))]), 0.0)
-    return Misfits(
-        misfit_a=np.sqrt(explained / samples[:, None]) / unit[:, None],
-        fit=fit,
-        size=size,
-        place=place,
-        level_branch=level_branch.astype(np.int64),
-        branch_fit=_whose(total, read_out, variance=variance, weights=weights, pattern=pattern, square=square),
+    explained_a2 = np.column_stack([found.explained_a2, np.zeros(len(fleet))])
+    left = np.maximum(residual.square_a2[:, None] - explained_a2, 0.0)
+    return _Misfits(
+        causes=found,
+        model=model,
+        misfit_a=np.sqrt(found.explained_a2 / samples[:, None]) / unit[:, None],
+        branch_fit=model.whose(found.pattern, found.square, weights),
         residual_a2=left / (samples * unit**2)[:, None],
         fast_a2=white / (WHITE_GAIN * samples * unit**2),
-        slope=slope,
-        slope_sd=slope_sd,
-        mean_a=total[:, -1, M:-1] / samples[:, None],
-        moves_a=moves_a,
-        model_error_a=error_a,
+        mean_a=fleet.mean_a,
         noise_share=weights * np.einsum("nkl,nl->nk", fast, weights) / np.maximum(white, TINY)[:, None],
-        spikes=np.stack([fit.spikes.sum(axis=0) for fit in fits]) / samples[:, None, None],
+        spikes=spikes / samples[:, None, None],
         samples=samples,
     )
 
@@ -276,101 +336,83 @@ def _dot(a: Array, b: Array) -> Array:
     return np.asarray(np.sum(a * b, axis=-1))
 
 
-def _junction_residual(
-    blocks: Array, first: NDArray[np.int64], vehicle: NDArray[np.int64], fast: Array
-) -> tuple[_Residual, Array]:
-    """Junction law of each vehicle, and the weight of each branch in it, shape (N, K).
+def _junction_residual(fleet: FleetMoments, fast: Array) -> _Residual:
+    """Junction law of each vehicle.
 
     The noise of z draws g towards zero. White noise n_k makes fast changes that the junction law does not balance: with
     the residual's fast part q = sum w_l q_l, E[q_k q] = 1.5 n_k w_k. It is taken out of the moments.
     """
-    total = np.add.reduceat(blocks, first, axis=0)
-    N, K = fast.shape[:2]
-    M, samples = blocks.shape[1] - K - 1, total[:, -1, -1]
-    spread = (
-        np.diagonal(total, axis1=1, axis2=2)[:, M:-1] / samples[:, None] - (total[:, -1, M:-1] / samples[:, None]) ** 2
-    )
-    y = M + int(np.argmax(np.median(spread, axis=0)))
+    M, K, blocks, variance_a2 = fleet.inputs, fleet.branches, fleet.blocks, fleet.variance_a2
+    total = blocks.total(fleet.moments)
+    samples = total[:, -1, -1]
+    y = M + int(np.argmax(np.median(variance_a2, axis=0)))
     z = np.array([i for i in range(M, M + K + 1) if i != y])
-    noise, weights = np.zeros((N, K)), np.zeros((N, K))
-    weights[:, y - M] = 1.0
-    for _ in range(3):
-        clean = total[:, z[:, None], z].copy()
+    others = z[:-1] - M
+    noise, weights = np.zeros((len(fleet), K)), np.ones((len(fleet), K))
+    for _ in range(NOISE_ROUNDS):
+        clean = total[:, z[:, None], z]
         clean[:, range(K), range(K)] -= samples[:, None] * noise
         law = _solve(clean, total[:, z, y])
-        weights[:, z[:-1] - M] = -law[:, :-1]
-        unbalanced = np.einsum("nkl,nl->nk", fast, weights)[:, z[:-1] - M] / -np.where(law[:, :-1], law[:, :-1], 1.0)
-        most = MOST_NOISE * spread[:, z[:-1] - M]
-        noise[:, :-1] = np.clip(unbalanced / (WHITE_GAIN * samples[:, None]), 0.0, most)
-    own, of_z = blocks[:, -1, -1, None], blocks[:, :, z]
-    with_z = (
-        blocks[:, z, y] - np.einsum("bij,bj->bi", blocks[:, z[:, None], z], law[vehicle]) + own * (noise * law)[vehicle]
-    )
-    turned = np.concatenate([np.ones((N, 1)), -law], axis=1)
-    columns = np.array([y, *z])
-    small = blocks[:, columns[:, None], columns]
-    scores = np.einsum("bij,bj->bi", small, turned[vehicle])
-    squares = np.add.reduceat(_dot(scores, turned[vehicle]), first)
+        weights[:, others] = -law[:, :-1]
+        unbalanced = np.einsum("nkl,nl->nk", fast, weights)[:, others] / -np.where(law[:, :-1], law[:, :-1], 1.0)
+        noise[:, :-1] = np.clip(unbalanced / (WHITE_GAIN * samples[:, None]), 0.0, MOST_NOISE * variance_a2[:, others])
+    sums = np.column_stack([weights, -law[:, -1]])[blocks.vehicle]
+    scores = products(fleet.moments[:, M:, M:], sums)  # of (measured currents, 1) with r
+    own = fleet.moments[:, -1, -1]
+    squares = blocks.total(_dot(scores, sums))
     # Neighbouring samples repeat each other where blocks' sums of r scatter more than white noise's would.
-    scatter = np.add.reduceat(scores[:, -1] ** 2 / own[:, 0], first) / np.bincount(vehicle)
+    scatter = blocks.total(scores[:, -1] ** 2 / own) / blocks.count
     repeated = max(float(np.median(scatter / np.maximum(squares / samples, TINY))), 1.0)
-    residual = _Residual(
-        blocks=blocks,
-        first=first,
-        vehicle=vehicle,
+    return _Residual(
+        fleet=fleet,
+        total=total,
         y=y,
         z=z,
         law=law,
-        of_z=of_z,
-        with_z=with_z,
+        weights=weights,
+        with_z=scores[:, z - M] + own[:, None] * (noise * law)[blocks.vehicle],
         square_a2=np.maximum(squares, TINY),
-        samples=samples,
         n_eff=samples / repeated,
     )
-    return residual, weights
 
 
-def _over_fleet_model(residual: _Residual, total: Array, read_out: Array) -> tuple[Array, ...]:
-    """Regress each measured current on the fleet model.
+def _over_fleet_model(residual: _Residual, read_out: Array) -> _OverModel:
+    """Regress each measured current on the fleet model."""
+    fleet, total = residual.fleet, residual.total
+    M, K, blocks = fleet.inputs, fleet.branches, fleet.blocks
+    columns = np.array([*range(M), M + K])
+    basis = np.stack([read_out.T, np.tile(np.eye(M + 1)[-1], (K, 1))], axis=-1)
 
-    Returns
-    -------
-    slope, slope_sd, zero_a, variance, moves_a, error_a : ndarray of shape (N, K)
-        Slope and its standard deviation [1], reading where the model has no current [A], variance of the residual [A^2]
-        times the number of neighbouring samples that repeat each other, standard deviations of the model and of the
-        residual [A].
-    """
-    M, K = len(read_out) - 1, read_out.shape[1]
-    u = np.array([*range(M), M + K])
-    blocks, results = residual.blocks, []
-    for k in range(K):
-        basis = np.column_stack([read_out[:, k], np.eye(M + 1)[-1]])
-        gram, right = basis.T @ total[:, u[:, None], u] @ basis, total[:, u, M + k] @ basis
-        fitted = _solve(gram, right)
-        left = np.maximum(total[:, M + k, M + k] - _dot(fitted, right), TINY) / residual.samples
-        scores = blocks[:, u, M + k] @ basis
-        scores -= np.einsum("bij,bj->bi", basis.T @ blocks[:, u[:, None], u] @ basis, fitted[residual.vehicle])
-        first_row = _solve(gram, np.broadcast_to([1.0, 0.0], right.shape))
-        sd = np.sqrt(residual.total(_dot(scores, first_row[residual.vehicle]) ** 2))
-        repeated = max(float(np.median(sd**2 / np.maximum(left * first_row[:, 0], TINY))), 1.0)
-        moves = np.sqrt(np.maximum(gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2, 0.0)) / residual.samples
-        results.append((fitted[:, 0], sd, fitted[:, 1], repeated * left, moves, np.sqrt(left)))
-    return tuple(np.stack(part, axis=1) for part in zip(*results, strict=True))
+    def normal_equations(moments: Array) -> tuple[Array, Array]:
+        gram = np.swapaxes(basis, 1, 2) @ moments[:, None, columns[:, None], columns] @ basis
+        return gram, np.einsum("nmk,kma->nka", moments[:, columns, M:-1], basis)
+
+    (gram, right), (each_gram, each_right) = normal_equations(total), normal_equations(fleet.moments)
+    fitted, own = _solve(gram, right), _solve(gram, np.broadcast_to([1.0, 0.0], right.shape))
+    left = np.maximum(np.diagonal(total, axis1=1, axis2=2)[:, M:-1] - _dot(fitted, right), TINY) / total[:, -1, -1:]
+    scores = each_right - _dot(each_gram, fitted[blocks.vehicle][:, :, None])
+    slope_sd = np.sqrt(blocks.total(_dot(scores, own[blocks.vehicle]) ** 2))
+    repeated = np.maximum(np.median(slope_sd**2 / np.maximum(left * own[..., 0], TINY), axis=0), 1.0)
+    determinant = gram[..., 0, 0] * gram[..., 1, 1] - gram[..., 0, 1] ** 2
+    return _OverModel(
+        columns=columns,
+        basis=basis,
+        gram=gram,
+        right=right,
+        slope=fitted[..., 0],
+        slope_sd=slope_sd,
+        zero_a=fitted[..., 1],
+        variance_a2=repeated * left,
+        moves_a=np.sqrt(np.maximum(determinant, 0.0)) / total[:, -1, -1:],
+        error_a=np.sqrt(left),
+    )
 
 
-_Cause = tuple[Array, Array, Array, Array, Array, Array, Array]
-"""Of one cause: sum of squares explained, fit, size, place, branch of the level, each (N,); products of the misfit with
-all columns (N, p) and with itself (N,)."""
-
-
-def _by_level(
-    residual: _Residual, total: Array, levels: Array, *, zero_a: Array, weights: Array, full_scale_a: float
-) -> list[_Cause]:
+def _by_level(residual: _Residual, levels: Array, *, zero_a: Array, full_scale_a: float) -> list[_Causes]:
     """Quadratic, cubic, two gains by sign, a bend: a column that depends on the level of one of the currents."""
-    (N, K, _, wide), z = levels.shape, residual.z
-    M = wide - K - 2
-    count = levels[..., M + K]
-    x = np.stack([levels[:, k, :, M + k] for k in range(K)], axis=1) / np.maximum(count, 1.0)
+    fleet, z, (N, K) = residual.fleet, residual.z, zero_a.shape
+    count = levels[..., -2]
+    x = np.stack([levels[:, k, :, fleet.inputs + k] for k in range(K)], axis=1) / np.maximum(count, 1.0)
     from_zero = x - zero_a[:, :, None]
     above, below = (np.stack([np.maximum(sign * x - bend, 0.0) for bend in BENDS_A], axis=2) for sign in (1.0, -1.0))
     shapes = {
@@ -379,116 +421,84 @@ def _by_level(
         "sign": np.maximum(from_zero, 0.0)[:, :, None],
         "bend": np.concatenate([above, -below, above - below], axis=2),
     }
-    rms = np.sqrt(
-        np.maximum(
-            np.diagonal(total, axis1=1, axis2=2) / residual.samples[:, None]
-            - (total[:, -1] / residual.samples[:, None]) ** 2,
-            0.0,
-        )
-    )
-    moving = rms[:, M : M + K, None] > MOVING * full_scale_a
-    gram, found = total[:, z[:, None], z], []
+    moving = fleet.variance_a2[:, :, None] > (MOVING * full_scale_a) ** 2
+    gram, found = residual.gram[:, None, None], []
     for cause, h in shapes.items():  # h: (N, K, S, L), constant within a level
-        products = np.einsum("nksl,nkli->nksi", h, levels[..., :-1])
+        with_all = np.einsum("nksl,nkli->nksi", h, levels[..., :-1])
         square = np.einsum("nksl,nkl->nks", h**2, count)
-        alone = square - _dot(_solve(gram[:, None, None], products[..., z]), products[..., z])
-        with_r = products[..., residual.y] - np.einsum("nksi,ni->nks", products[..., z], residual.law)
+        alone = square - _dot(_solve(gram, with_all[..., z]), with_all[..., z])
+        with_r = with_all[..., residual.y] - np.einsum("nksi,ni->nks", with_all[..., z], residual.law)
         beyond = np.einsum("nksl,nkl->nks", h != 0.0, count)
         usable = moving & (alone > ALONE * square) & (beyond >= FEWEST)
         size = np.where(usable, with_r, 0.0) / np.where(usable, alone, 1.0)
-        explained = (size * with_r).reshape(N, -1)
-        best = explained.argmax(axis=1)
-        at = (np.arange(N), *np.unravel_index(best, size.shape[1:]))
-        place = BENDS_A[at[2] % len(BENDS_A)] if cause == "bend" else np.zeros(N)
+        explained_a2 = (size * with_r).reshape(N, -1)
+        at = (np.arange(N), *np.unravel_index(explained_a2.argmax(axis=1), size.shape[1:]))
+        weight, bent = residual.weights[at[:2]], cause == "bend"
         found.append(
-            (
-                explained.max(axis=1),
-                residual.likelihood(explained.max(axis=1), 2.0 if cause == "bend" else 1.0),
-                size[at] / np.where(weights[at[:2]], weights[at[:2]], 1.0),
-                place,
-                at[1],
-                products[at] * size[at][:, None],
-                square[at] * size[at] ** 2,
+            residual.cause(
+                explained_a2.max(axis=1),
+                2.0 if bent else 1.0,
+                size=size[at] / np.where(weight, weight, 1.0),
+                place=BENDS_A[at[2] % len(BENDS_A)] if bent else 0.0,
+                level_branch=at[1],
+                pattern=with_all[at] * size[at][:, None],
+                square=square[at] * size[at] ** 2,
             )
         )
     return found
 
 
-def _step(residual: _Residual, total: Array) -> _Cause:
+def _step(residual: _Residual) -> _Causes:
     """Another law from some block on; the block in which it changes has one of its own."""
-    z, vehicle, q = residual.z, residual.vehicle, len(residual.z)
-    gram = residual.of_z[:, z]
-    grams, rights = np.cumsum(gram, axis=0), np.cumsum(residual.with_z, axis=0)
-    before = grams - gram - (grams - gram)[residual.first][vehicle]
-    before_r = rights - residual.with_z - (rights - residual.with_z)[residual.first][vehicle]
-    after = total[:, z[:, None], z][vehicle] - before - gram
-    after_r = residual.total(residual.with_z)[vehicle] - before_r - residual.with_z
-    parts = ((before, before_r), (gram, residual.with_z), (after, after_r))
-    laws = [_solve(part, right) for part, right in parts]
-    number = np.arange(len(vehicle)) - residual.first[vehicle]
-    inside = (number >= 2) & (number <= np.bincount(vehicle)[vehicle] - 3)
-    explained = np.where(inside, sum(_dot(law, right) for law, (_, right) in zip(laws, parts, strict=True)), 0.0)
-    ends = np.append(residual.first[1:], len(vehicle))
-    best = np.array([a + np.argmax(explained[a:b]) for a, b in zip(residual.first, ends, strict=True)])
+    z, blocks, gram, right = residual.z, residual.fleet.blocks, residual.of_z[:, residual.z], residual.with_z
+    last = np.cumsum(blocks.count)
+    first, vehicle = last - blocks.count, blocks.vehicle
+
+    def before(values: Array) -> Array:
+        """Sums over the earlier blocks of the same vehicle."""
+        sums = np.cumsum(values, axis=0) - values
+        return np.asarray(sums - sums[first][vehicle])
+
+    earlier = before(gram), before(right)
+    later = residual.gram[vehicle] - earlier[0] - gram, blocks.total(right)[vehicle] - earlier[1] - right
+    parts = (earlier, (gram, right), later)
+    laws = [_solve(*part) for part in parts]
+    number = np.arange(len(vehicle)) - first[vehicle]
+    inside = (number >= 2) & (number <= blocks.count[vehicle] - 3)
+    explained_a2 = np.where(inside, sum(_dot(law, part[1]) for law, part in zip(laws, parts, strict=True)), 0.0)
+    best = np.array([a + np.argmax(explained_a2[a:b]) for a, b in zip(first, last, strict=True)])
     change = laws[2][best] - laws[0][best]
-    late = residual.total(residual.of_z * (np.arange(len(vehicle)) > best[vehicle])[:, None, None])
-    return (
-        np.maximum(explained[best], 0.0),
-        residual.likelihood(np.maximum(explained[best], 0.0), q + 2.0),
-        np.zeros(len(best)),
-        (before[best, -1, -1] + 0.5 * gram[best, -1, -1]) / residual.samples,
-        np.full(len(best), -1),
-        np.einsum("nij,nj->ni", late, change),
-        np.einsum("ni,nij,nj->n", change, late[:, z], change),
+    late = blocks.total(residual.of_z * (np.arange(len(vehicle)) > best[vehicle])[:, None, None])
+    return residual.cause(
+        explained_a2[best],
+        len(z) + 2.0,
+        place=(earlier[0][best, -1, -1] + 0.5 * gram[best, -1, -1]) / residual.samples,
+        pattern=np.einsum("nij,nj->ni", late, change),
+        square=np.einsum("ni,nij,nj->n", change, late[:, z], change),
     )
 
 
-def _drifting(residual: _Residual, total: Array, course: Array, *, least: float) -> _Cause:
+def _drifting(residual: _Residual, course: Array, *, least: float) -> _Causes:
     """A law that changes in proportion to a course (B,), as time or temperature; where it is not known it is NaN."""
-    z, q, own = residual.z, len(residual.z), residual.blocks[:, -1, -1]
+    z, blocks, own = residual.z, residual.fleet.blocks, residual.fleet.moments[:, -1, -1]
     known = np.isfinite(course)
     course = np.where(known, course, 0.0)
-    course = course - (residual.total(course * own) / residual.samples)[residual.vehicle]
-    deviation = np.sqrt(residual.total(course**2 * own) / residual.samples)
-    usable = (deviation > least) & (residual.total(known * 1.0) == np.bincount(residual.vehicle))
-    first = residual.total(course[:, None, None] * residual.of_z)
-    second = residual.total(course[:, None, None] ** 2 * residual.of_z[:, z])
-    moments = [[total[:, z[:, None], z], first[:, z]], [first[:, z], second]]
-    gram = np.concatenate([np.concatenate(row, axis=2) for row in moments], axis=1)
-    right = np.concatenate([residual.total(residual.with_z), residual.total(course[:, None] * residual.with_z)], axis=1)
+    course = course - (blocks.total(course * own) / residual.samples)[blocks.vehicle]
+    deviation = np.sqrt(blocks.total(course**2 * own) / residual.samples)
+    usable = (deviation > least) & (blocks.total(known * 1.0) == blocks.count)
+    first = blocks.total(course[:, None, None] * residual.of_z)
+    second = blocks.total(course[:, None, None] ** 2 * residual.of_z[:, z])
+    gram = np.block([[residual.gram, first[:, z]], [first[:, z], second]])
+    right = blocks.total(np.column_stack([residual.with_z, course[:, None] * residual.with_z]))
     fitted = _solve(gram, right)
-    explained = np.where(usable, np.maximum(_dot(fitted, right), 0.0), 0.0)
-    change = np.where(usable[:, None], fitted[:, q:], 0.0)
-    return (
-        explained,
-        residual.likelihood(explained, float(q)),
-        np.zeros(len(change)),
-        deviation,
-        np.full(len(change), -1),
-        np.einsum("nij,nj->ni", first, change),
-        np.einsum("ni,nij,nj->n", change, second, change),
+    change = np.where(usable[:, None], fitted[:, len(z) :], 0.0)
+    return residual.cause(
+        np.where(usable, _dot(fitted, right), 0.0),
+        len(z),
+        place=deviation,
+        pattern=np.einsum("nij,nj->ni", first, change),
+        square=np.einsum("ni,nij,nj->n", change, second, change),
     )
-
-
-def _whose(total: Array, read_out: Array, *, variance: Array, weights: Array, pattern: Array, square: Array) -> Array:
-    """Logarithm of the likelihood that each branch's sensor makes the misfit of each cause, shape (N, C, K).
-
-    The misfit is regressed out of each branch's residual over the fleet model: where it is this branch's, all of it is
-    found there, and nothing in the others.
-    """
-    M, K = len(read_out) - 1, read_out.shape[1]
-    u = np.array([*range(M), M + K])
-    share, sd = np.zeros((*square.shape, K)), np.zeros((*square.shape, K))
-    for k in range(K):
-        basis = np.column_stack([read_out[:, k], np.eye(M + 1)[-1]])
-        gram, cross = (basis.T @ total[:, u[:, None], u] @ basis)[:, None], pattern[..., u] @ basis
-        base = _solve(gram, cross)
-        alone = np.maximum(square - _dot(base, cross), TINY)
-        seen = pattern[..., M + k] - _dot(base, (total[:, u, M + k] @ basis)[:, None])
-        share[..., k] = weights[:, None, k] * seen / alone
-        sd[..., k] = np.hypot(np.abs(weights[:, None, k]) * np.sqrt(variance[:, None, k] / alone), SHARE_SD)
-    off = [np.sum(((share - np.eye(K)[k]) / sd) ** 2, axis=-1) for k in range(K)]
-    return np.asarray(-0.5 * (K - 1) / K * np.stack(off, axis=-1))  # the shares of all branches add up to one
 
 
 def learn_usual_misfits(
@@ -513,8 +523,8 @@ def learn_usual_misfits(
     known = [summary for summary in summaries if summary.fit is not None]
     if not known:
         return None
-    misfits = measure_misfits(known, read_out, full_scale_a=full_scale_a)
-    left = np.log(np.maximum(misfits.residual_a2[:, -1], TINY))
+    misfits = _measure_misfits(known, read_out, full_scale_a)
+    model, left = misfits.model, np.log(np.maximum(misfits.residual_a2[:, -1], TINY))
     centre = np.median(left)
     return UsualMisfits(
         # The size of a misfit has half of a symmetric distribution, whose median is 0.67 standard deviations.
@@ -522,8 +532,8 @@ def learn_usual_misfits(
         residual_a2=float(np.exp(centre)),
         fast_a2=float(np.median(misfits.fast_a2)),
         residual_spread=max(MAD_TO_SD * float(np.median(np.abs(left - centre))), LEAST_NOISE_SPREAD),
-        slope_spread=MAD_TO_SD * np.median(np.abs(misfits.slope - np.median(misfits.slope, axis=0)), axis=0),
-        model_error_a=np.median(misfits.model_error_a, axis=0),
+        slope_spread=MAD_TO_SD * np.median(np.abs(model.slope - np.median(model.slope, axis=0)), axis=0),
+        model_error_a=np.median(model.error_a, axis=0),
         spike_rate=max(float(np.median(misfits.spikes.sum(axis=2))), SPIKE_RATE),
     )
 
@@ -562,14 +572,14 @@ def check_fit(
     places = [j for j, summary in enumerate(summaries) if summary.fit is not None]
     if usual is None or not places:
         return found
-    misfits = measure_misfits([summaries[j] for j in places], read_out, full_scale_a=full_scale_a)
+    misfits = _measure_misfits([summaries[j] for j in places], read_out, full_scale_a)
     # Where there is more noise than usual, larger misfits come by chance.
     noisier = np.sqrt(np.maximum(misfits.residual_a2[:, :-1] / usual.residual_a2, 1.0))
     shape = _probability(misfits.misfit_a, usual.misfit_a * noisier, LARGEST_MISFIT * full_scale_a)
     above = np.log(np.maximum(misfits.residual_a2, TINY) / usual.residual_a2) / usual.residual_spread
     factor = usual.residual_spread / (NOISE_RANGE * np.maximum(student_t.pdf(above, TAIL), TINY))
     unusual = np.where(above > 0.0, _posterior(PRIOR * factor), 0.0)
-    inverted, dead = _of_slopes(misfits, usual)
+    inverted, dead = _of_slopes(misfits.model, usual)
     for i, j in enumerate(places):
         vehicle = _Vehicle(misfits, usual, i, tuple(branches), NEAR_ZERO * full_scale_a)
         mine = vehicle.of_slopes(inverted[i], dead[i])
@@ -593,15 +603,15 @@ def _probability(misfit_a: Array, usual_a: Array, largest_a: float) -> Array:
     return _posterior(PRIOR * alternative / np.maximum(2.0 * student_t.pdf(z, TAIL), 1e-300))
 
 
-def _of_slopes(misfits: Misfits, usual: UsualMisfits) -> tuple[Array, Array]:
+def _of_slopes(model: _OverModel, usual: UsualMisfits) -> tuple[Array, Array]:
     """Probabilities that each sensor is inverted, and that it is dead, shape (N, K)."""
 
     def density(about: float, sd: Array) -> Array:
-        return np.asarray(np.exp(-0.5 * ((misfits.slope - about) / sd) ** 2) / sd)
+        return np.asarray(np.exp(-0.5 * ((model.slope - about) / sd) ** 2) / sd)
 
     # What the model misses may follow it by chance, and hides it where the current hardly moves.
-    chance = CHANCE * usual.model_error_a / np.maximum(misfits.moves_a, TINY)
-    sd = np.hypot(misfits.slope_sd, np.minimum(chance, 100.0))
+    chance = CHANCE * usual.model_error_a / np.maximum(model.moves_a, TINY)
+    sd = np.hypot(model.slope_sd, np.minimum(chance, 100.0))
     wide = np.hypot(np.hypot(GAIN_SD, usual.slope_spread), sd)
     inverted, dead = PRIOR * density(-1.0, wide), PRIOR * density(0.0, np.hypot(DEAD_SD, sd))
     whole = (1.0 - PRIOR) * density(1.0, wide) + inverted + dead + TINY
@@ -621,7 +631,7 @@ def _who(name: str | None) -> str:
 class _Vehicle:
     """Vehicle j of some misfits; its methods word what is found in it."""
 
-    misfits: Misfits
+    misfits: _Misfits
     usual: UsualMisfits
     j: int
     branches: tuple[str, ...]
@@ -629,26 +639,23 @@ class _Vehicle:
 
     def of_slopes(self, inverted: Array, dead: Array) -> list[Finding]:
         """Sensors that are inverted or dead, by their slope over the fleet model."""
-        found, misfits, j = [], self.misfits, self.j
+        found, slope, mean_a = [], self.misfits.model.slope[self.j], self.misfits.mean_a[self.j]
         for k, name in enumerate(self.branches):
             if inverted[k] >= LEAST_PROBABILITY:
-                text = (
-                    f"sensor {name} reads with the wrong sign, {misfits.slope[j, k]:+.2f} A per ampere of the fleet's; "
-                )
-                found.append(
-                    _finding(name, "inverted", inverted[k], f"{text}turn it round, or correct its signal's sign")
-                )
+                text = f"sensor {name} reads with the wrong sign, {slope[k]:+.2f} A per ampere of the fleet's; turn it "
+                found.append(_finding(name, "inverted", inverted[k], f"{text}round, or correct its signal's sign"))
             if dead[k] >= LEAST_PROBABILITY:
-                text = f"sensor {name} does not follow the current, it stays near {misfits.mean_a[j, k]:.1f} A; "
+                text = f"sensor {name} does not follow the current, it stays near {mean_a[k]:.1f} A; "
                 found.append(_finding(name, "dead", dead[k], f"{text}check it, its plug and its supply"))
         return found
 
     def of_law(self, shape: Array, unusual: Array) -> list[Finding]:
         """The cause that explains most of the junction law's residual; noise and switched loads by what is left."""
         misfits, usual, j = self.misfits, self.usual, self.j
-        c = int(misfits.fit[j].argmax())
-        share = 1.0 / np.exp(np.minimum(misfits.fit[j] - misfits.fit[j, c], 0.0)).sum()
-        probability = float(shape[c] * share) if misfits.fit[j, c] > 0.0 else 0.0
+        fit = misfits.causes.fit[j]
+        c = int(fit.argmax())
+        share = 1.0 / np.exp(fit - fit[c]).sum()
+        probability = float(shape[c] * share) if fit[c] > 0.0 else 0.0
         at = c if probability >= LEAST_PROBABILITY else -1
         found, left = [], misfits.residual_a2[j]
         excess, fast = left[at] - usual.residual_a2, misfits.fast_a2[j] - usual.fast_a2
@@ -669,11 +676,11 @@ class _Vehicle:
 
     def _worded(self, c: int, probability: float) -> Finding:
         """One of :data:`CAUSES`, with its sensor and figures."""
-        misfits, j, cause = self.misfits, self.j, CAUSES[c]
+        misfits, causes, j, cause = self.misfits, self.misfits.causes, self.j, CAUSES[c]
         weight = np.exp(misfits.branch_fit[j, c] - misfits.branch_fit[j, c].max())
         k = int(weight.argmax())
         name = self.branches[k] if weight[k] >= NAMED * weight.sum() else None
-        size, place, level = misfits.size[j, c], misfits.place[j, c], misfits.level_branch[j, c]
+        size, place, level = causes.size[j, c], causes.place[j, c], causes.level_branch[j, c]
         percent, rms_a = f"{100.0 * abs(size):.0f} %", misfits.misfit_a[j, c]
         if cause in {"bend", "sign"}:
             cause = "clipped" if abs(size) >= CLIPPED else "sign" if place <= self.near_zero_a else "saturating"

@@ -1,17 +1,24 @@
 """Explanations of a vehicle's evidence: which of its parameters are not zero, and how well each choice fits.
 
-The P = 3K + 1 parameters of a vehicle with K branches, in the symbols of docs/method.md:
+The P = 3K + 1 parameters of a vehicle with K branches, in the symbols of docs/method.md and with the names of
+:class:`calibrator.estimator.rows.ParameterPlaces`:
 
-    0           eta = log(1 + d_h)                       hardware
-    1 .. K      lambda_k = log(1 + d_k)                  gain of sensor k
-    K+1 .. 2K-1 o_h,k of all branches but the last       hardware
-    2K .. 3K-1  omega_k = o_k / (1 + d_k)                offset of sensor k as seen in true currents
-    3K          l                                        load without a sensor, carried by the feeding branch
+    0            eta               eta = log(1 + d_h)             hardware
+    1 .. K       gains             lambda_k = log(1 + d_k)        gain of sensor k
+    K+1 .. 2K-1  hardware_offsets  o_h,k, all k but the last      hardware
+    2K .. 3K-1   offsets           omega_k = o_k / (1 + d_k)      offset of sensor k as seen in true currents
+    3K           load              l                              load without a sensor, carried by the feeding branch
+
+The 5K rows, with the names of :class:`calibrator.estimator.rows.RowPlaces`; branches are counted from 0:
+
+    0 .. K-1      slopes           3K-1 .. 4K-2  intercepts
+    K .. 2K-2     ratios           4K-1          junction
+    2K-1 .. 3K-2  gain_reads       4K .. 5K-1    offset_reads
 
 Offsets and loads are in fractions of full scale. A support is the set of parameters that are not zero. Every support is
 fitted by Gauss-Newton steps on the evidence rows (M11), under a wide Gaussian prior (M12); the prior that is meant
 comes in later (:mod:`calibrator.estimator.posterior`). The loops are compiled by numba: tuples of arrays go in, arrays
-are filled.
+are filled, and rows and parameters go by these numbers.
 """
 
 from math import exp, expm1, log, sqrt
@@ -22,6 +29,7 @@ from numpy.typing import NDArray
 
 from calibrator.compiled import compiled_with_notice, inner
 from calibrator.drive import Array, Mask
+from calibrator.estimator.rows import parameter_places, row_places
 
 Integers = NDArray[np.int64]
 
@@ -108,7 +116,7 @@ class Fits(NamedTuple):
 def evidence_of(values: Array, covariance: Array, means: Array, *, centre: Array, shared: Array, feed: int) -> Evidence:
     """Evidence with the inverses of its covariance (N, 5K, 5K); the other parameters as in :class:`Evidence`."""
     rows = values.shape[1]
-    relative = slice(0, (3 * rows) // 5 - 1)
+    relative = row_places(rows // 5).relative
     precision = np.linalg.inv(covariance)
     return Evidence(
         values=np.ascontiguousarray(values),
@@ -154,8 +162,9 @@ def fit_explanations(evidence: Evidence, log_prior: Array, log_load: float) -> F
         chi2=np.zeros((N, MOST_FITTED)),
     )
     _fit_all(evidence, log_prior, log_load, fits)
-    fits.hardware[:] = fits.support[:, :, 0] + fits.support[:, :, K + 1 : 2 * K].sum(axis=2)
-    fits.sensor[:] = fits.support[:, :, 1 : K + 1].sum(axis=2) + fits.support[:, :, 2 * K : 3 * K].sum(axis=2)
+    at, on = parameter_places(K), fits.support
+    fits.hardware[:] = on[:, :, at.eta] + on[:, :, at.hardware_offsets].sum(axis=2)
+    fits.sensor[:] = on[:, :, at.gains].sum(axis=2) + on[:, :, at.offsets].sum(axis=2)
     most = max(int(fits.number.max(initial=1)), 1)
     kept = {name: np.ascontiguousarray(values[:, :most]) for name, values in fits._asdict().items() if name != "number"}
     return fits._replace(**kept)
@@ -186,7 +195,7 @@ def residual(theta: Array, evidence: Evidence, j: int, e: Array) -> None:
         evidence.feed,
     )
     K = len(y) // 5
-    c, oh_last = 3 * K - 1, 0.0  # first constant row; hardware offset of the last branch
+    c, oh_last = 3 * K - 1, 0.0  # first of the intercepts; hardware offset of the last branch
     first = theta[1] + shared[K]
     for k in range(K):
         gain = theta[1 + k] + shared[K + k]

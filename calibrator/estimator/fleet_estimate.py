@@ -7,7 +7,7 @@ What is said of a vehicle does not depend on which others are estimated with it.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,51 +64,71 @@ VARIANT_SHARE, VARIANT_SPREAD, FEWEST_VARIANT = 0.15, 0.012, 4
 
 @dataclass(frozen=True, kw_only=True)
 class RowsEstimate:
-    """What the evidence rows of N vehicles with K branches say, branches in the order of the rows.
+    """What the evidence rows of N vehicles with K branches say, branches in their own order.
 
     Attributes
     ----------
-    drift, offset, drift_sd, offset_sd : ndarray of shape (N, K)
-        Sensor faults, offsets in fractions of full scale, and their standard deviations. [1]
+    drift, offset_a, drift_sd, offset_sd_a : ndarray of shape (N, K)
+        Sensor faults and their standard deviations. [1], [A]
     hardware_drift, hardware_probability, confidence : ndarray of shape (N,)
-        Of a hardware fault; posterior probability that the estimate is recovered. [1]
-    hardware_offset : ndarray of shape (N, K)
-        In fractions of full scale. [1]
+        Of a hardware fault; probability that the estimate is recovered: within 10 % of the truth. [1]
+    hardware_offset_a : ndarray of shape (N, K)
+        Of a hardware fault. [A]
     fault_probability, harm_probability : ndarray of shape (N, K)
-        That the sensor is faulty; that correction makes the branch worse. [1]
+        That the sensor is faulty; that its correction makes the branch worse. [1]
     identifiable : ndarray of bool of shape (N, K)
-        Whether some row shows the gain.
-    load_probability, load : ndarray of shape (N,)
-        That a load without a sensor is carried by the feeding branch in this vehicle alone, and its expected size, in
-        fractions of full scale. [1]
+        Whether the branch moved enough for its gain to be known: some row shows it.
+    load_probability, load_a : ndarray of shape (N,)
+        That a load without a sensor is carried by the feeding branch in this vehicle alone, and its expected size. [1],
+        [A]
     group_probability : ndarray of shape (N, g)
         That the vehicle is one of each group that shares a constant of the feeding branch. [1]
-    explanations : list of N lists of (float, ndarray of shape (4, K))
-        Probability; hardware drift (first column), hardware offsets, drifts and offsets; by falling probability.
-    points : list of N Points
+    supports : sequence of N sequences of (float, ndarray of shape (4, K))
+        Explanations by falling probability: this; hardware drift (first column), hardware offsets, drifts and offsets.
+    points : sequence of N Points
         The posterior.
+    order : tuple of int
+        Branches of supports and points, whose offsets are in fractions of full scale: position of each in their own
+        order.
+    full_scale_a : float
+        Full scale of the junction. [A]
     """
 
     drift: Array
-    offset: Array
+    offset_a: Array
     drift_sd: Array
-    offset_sd: Array
+    offset_sd_a: Array
     hardware_drift: Array
-    hardware_offset: Array
+    hardware_offset_a: Array
     hardware_probability: Array
     confidence: Array
     fault_probability: Array
     harm_probability: Array
     identifiable: Mask
     load_probability: Array
-    load: Array
+    load_a: Array
     group_probability: Array
-    explanations: list[list[tuple[float, Array]]]
-    points: list[Points]
+    supports: Sequence[Sequence[tuple[float, Array]]]
+    points: Sequence[Points]
+    order: tuple[int, ...]
+    full_scale_a: float
+
+    @property
+    def faulty(self) -> Mask:
+        """Branches that would be corrected if nothing spoke against it, shape (N, K)."""
+        return np.asarray((self.drift != 0.0) | (self.offset_a != 0.0))
 
 
 def estimate_rows(
-    rows: EvidenceRows, laws: Sequence[Law], *, feed: int, mean: Array, mean_square: Array, usual: Array
+    rows: EvidenceRows,
+    laws: Sequence[Law],
+    *,
+    feed: int,
+    mean: Array,
+    mean_square: Array,
+    usual: Array,
+    order: Sequence[int] | None = None,
+    full_scale_a: float = 1.0,
 ) -> RowsEstimate:
     """Estimate N vehicles from their evidence rows.
 
@@ -124,6 +144,10 @@ def estimate_rows(
         Moments of the measured currents, in fractions of full scale and their squares.
     usual : ndarray of shape (2, K)
         The same moments of the fleet's usual drive.
+    order : sequence of int or None
+        Branches of the rows: position of each in their own order; None: the same.
+    full_scale_a : float
+        Full scale of the junction; 1: the offsets of the estimate are fractions of it. [A]
 
     Returns
     -------
@@ -131,13 +155,15 @@ def estimate_rows(
         In the order of the rows.
     """
     N, K = mean.shape
+    order = tuple(range(K) if order is None else order)
+    place = np.argsort(order)
     explained = []
     for law in laws:
         draws = explain(rows, law, feed=feed)
         explained.append(Explained(law.probability, draws, weigh_law(draws, law), law.prior.group_centre))
     smallest = np.array([laws[0].prior.gain.smallest, laws[0].prior.offset.smallest])
     estimate, sd, confidence, harm = np.zeros((N, 2 * K)), np.zeros((N, 2 * K)), np.zeros(N), np.zeros((N, K))
-    fault, hardware, points, explanations = np.zeros((N, K)), np.zeros(N), [], []
+    fault, hardware, points, supports = np.zeros((N, K)), np.zeros(N), [], []
     for j in range(N):
         found = points_of(explained, j)
         estimate[j], confidence[j] = best_estimate(found, smallest)
@@ -151,29 +177,34 @@ def estimate_rows(
         faulty = found.faults != 0.0
         fault[j] = np.minimum(found.weight @ (faulty[:, :K] | faulty[:, K:]), 1.0)
         points.append(found)
-        explanations.append(_explanations(explained, found, j))
-        hardware[j] = sum(share for share, values in explanations[j] if values[:2].any())
-    first = np.array([_nearest(each, estimate[j]) for j, each in enumerate(explanations)])
+        supports.append(_supports(explained, found, j))
+        hardware[j] = sum(share for share, values in supports[j] if values[:2].any())
+    first = np.array([_nearest(each, estimate[j]) for j, each in enumerate(supports)])
+    load_probability, load, group_probability = _unmeasured(explained)
     return RowsEstimate(
-        drift=estimate[:, :K],
-        offset=estimate[:, K:],
-        drift_sd=sd[:, :K],
-        offset_sd=sd[:, K:],
+        drift=estimate[:, place],
+        offset_a=estimate[:, K + place] * full_scale_a,
+        drift_sd=sd[:, place],
+        offset_sd_a=sd[:, K + place] * full_scale_a,
         hardware_drift=first[:, 0, 0],
-        hardware_offset=first[:, 1],
+        hardware_offset_a=first[:, 1, place] * full_scale_a,
         hardware_probability=np.minimum(hardware, 1.0),
         confidence=confidence,
-        fault_probability=fault,
-        harm_probability=harm,
-        identifiable=_identifiable(rows),
-        **_unmeasured(explained),
-        explanations=explanations,
+        fault_probability=fault[:, place],
+        harm_probability=harm[:, place],
+        identifiable=_identifiable(rows)[:, place],
+        load_probability=load_probability,
+        load_a=load * full_scale_a,
+        group_probability=group_probability,
+        supports=supports,
         points=points,
+        order=order,
+        full_scale_a=full_scale_a,
     )
 
 
-def _unmeasured(laws: Sequence[Explained]) -> dict[str, Array]:
-    """Loads without a sensor, and groups, over all laws; these share their groups."""
+def _unmeasured(laws: Sequence[Explained]) -> tuple[Array, Array, Array]:
+    """Probability and size of a load without a sensor, probabilities of the groups, over all laws; these share them."""
     own, size, groups = [], [], []
     for law in laws:
         P = law.draws.values.shape[3]
@@ -183,11 +214,8 @@ def _unmeasured(laws: Sequence[Explained]) -> dict[str, Array]:
         groups.append(law.probability * _total(law.weight[..., 1:]))
     most = max(group.shape[1] for group in groups)
     load = np.sum(own, axis=0)
-    return {
-        "load_probability": load,
-        "load": np.sum(size, axis=0) / np.maximum(load, 1e-300),
-        "group_probability": np.sum([np.pad(group, [(0, 0), (0, most - group.shape[1])]) for group in groups], axis=0),
-    }
+    everywhere = [np.pad(group, [(0, 0), (0, most - group.shape[1])]) for group in groups]
+    return load, np.sum(size, axis=0) / np.maximum(load, 1e-300), np.sum(everywhere, axis=0)
 
 
 def _total(values: Array) -> Array:
@@ -208,7 +236,7 @@ def _central_sd(points: Points, estimate: Array) -> Array:
     return sd
 
 
-def _explanations(laws: Sequence[Explained], points: Points, j: int) -> list[tuple[float, Array]]:
+def _supports(laws: Sequence[Explained], points: Points, j: int) -> list[tuple[float, Array]]:
     """Supports of a vehicle with the signs of their parameters, over all laws; each with its mean parameters."""
     K = points.faults.shape[1] // 2
     share = np.bincount(points.explanation, points.weight)
@@ -230,12 +258,12 @@ def _explanations(laws: Sequence[Explained], points: Points, j: int) -> list[tup
     return sorted(found.values(), key=lambda item: -item[0])
 
 
-def _nearest(explanations: list[tuple[float, Array]], estimate: Array) -> Array:
+def _nearest(supports: list[tuple[float, Array]], estimate: Array) -> Array:
     """Parameters of the most probable explanation with sensor faults like the estimate's."""
     K = len(estimate) // 2
-    apart = [float(np.abs(np.concatenate(values[2:]) - estimate).max()) for _, values in explanations]
+    apart = [float(np.abs(np.concatenate(values[2:]) - estimate).max()) for _, values in supports]
     near = [i for i, distance in enumerate(apart) if distance < 0.1 * np.abs(estimate).max() + DOUBT]
-    return explanations[near[0]][1] if near else np.zeros((4, K))
+    return supports[near[0]][1] if near else np.zeros((4, K))
 
 
 def _identifiable(rows: EvidenceRows) -> Mask:
@@ -274,13 +302,13 @@ class FleetReference:
     load : UnmeasuredLoad or None
         Load that no branch measures, if it is known.
     vehicles : int
-        Number of vehicles learnt from, or trusted ones that carry the reference, whichever is more to be relied on.
+        Number of vehicles learnt from.
+    carried : bool
+        Whether enough trusted vehicles carry it, however few there are.
     agreeing : tuple of float
         Per branch in their own order: share of the vehicles whose slopes agree. [1]
     variants : tuple of float
         Logarithms of the factors on all currents of two variants of the vehicle; empty if there is only one. [1]
-    notices : tuple of str
-        What the user should know of the fleet.
     distrusted : mapping of int to str
         Vehicles called trusted that contradict it, by position among those learnt from, and how.
     differing : tuple of int
@@ -298,11 +326,21 @@ class FleetReference:
     full_scale_a: float
     load: UnmeasuredLoad | None
     vehicles: int
+    carried: bool
     agreeing: tuple[float, ...]
-    variants: tuple[float, ...] = ()
-    notices: tuple[str, ...] = ()
-    distrusted: Mapping[int, str] = field(default_factory=dict)
-    differing: tuple[int, ...] = ()
+    variants: tuple[float, ...]
+    distrusted: Mapping[int, str]
+    differing: tuple[int, ...]
+
+    @property
+    def ordered(self) -> list[str]:
+        """Names of the branches in the order worked with."""
+        return [self.branches[k] for k in self.order]
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether nothing may be corrected by it: a small fleet is compared with itself."""
+        return not self.carried and self.vehicles < FEWEST_VEHICLES
 
     @property
     def expected_a(self) -> float:
@@ -317,7 +355,7 @@ class FleetReference:
 
     def details(self) -> dict[str, object]:
         """What the run records of it."""
-        ordered, law = [self.branches[k] for k in self.order], self.laws[0]
+        ordered, law = self.ordered, self.laws[0]
         prior, spread = law.prior, np.sqrt(np.diag(law.spread.covariance))
         return {
             "reference": {
@@ -336,6 +374,45 @@ class FleetReference:
             },
         }
 
+    @property
+    def notices(self) -> list[str]:
+        """What may be wrong about the fleet as a whole, one line each."""
+        scale_a, ordered = self.full_scale_a, self.ordered
+        K, feed = len(ordered), ordered[self.feed]
+        notices = []
+        if self.in_doubt:
+            notices.append(
+                f"{self.vehicles} vehicles are few for a fleet that is compared with itself: nothing is corrected; at "
+                f"least {FEWEST_VEHICLES} are needed, or {FEWEST_TRUSTED} bench-checked vehicles (--trusted)"
+            )
+        best = self.laws[0]
+        constant = best.spread.mean[4 * K - 1]
+        if self.load is None and abs(constant) > DOUBT:
+            notices.append(
+                f"the currents of most vehicles sum to {constant * scale_a:+.1f} A: " + _causes(self.laws, ordered)
+            )
+        for share, centre in zip(best.prior.group_share, best.prior.group_centre, strict=True):
+            sensor = sum(law.probability for law in self.laws if law.spread.shared[-1])
+            notices.append(
+                f"about {share:.0%} of the vehicles share {centre * scale_a:+.1f} A in branch {feed} beside the others:"
+                f" a load without a sensor ({1.0 - sensor:.0%}), or an offset of a batch of sensors ({sensor:.0%})"
+            )
+        batches = [law for law in self.laws if law.spread.shared[K : 2 * K].any()]
+        gains = sum(law.probability for law in batches)
+        if gains > LEAST_SAID:
+            size = np.abs(batches[0].spread.shared[K : 2 * K]).max()
+            which = [name for k, name in enumerate(ordered) if any(law.spread.shared[K + k] for law in batches)]
+            notices.append(
+                f"most vehicles break the junction law by {size:.1%}: a gain error that a batch of sensors shares "
+                f"({gains:.0%}), in branch {' or '.join(which)}"
+            )
+        if self.variants:
+            notices.append(
+                f"the currents of some vehicles are all larger by {np.expm1(np.ptp(self.variants)):.1%} than those of "
+                f"others: two variants of the vehicle? calibrate them apart"
+            )
+        return notices
+
     def rows_of(
         self, summaries: Sequence[DriveSummary], readings: Readings | None, trusted: Mask
     ) -> tuple[EvidenceRows, FleetMoments]:
@@ -351,23 +428,15 @@ class FleetReference:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FleetEstimate:
-    """Estimate of N vehicles with K branches in their own order; NaN where a probability is not known.
+class FleetEstimate(RowsEstimate):
+    """Estimate of N vehicles with K branches in their own order, and what follows from it.
 
     Attributes
     ----------
-    drift, offset_a, drift_sd, offset_sd_a : ndarray of shape (N, K)
-        Sensor faults and their standard deviations. [1], [A]
-    fault_probability, harm_probability : ndarray of shape (N, K)
-        That the sensor is faulty; that its correction makes it worse. [1]
-    identifiable, corrected : ndarray of bool of shape (N, K)
-        Whether the branch moved enough for its gain to be known; whether the node is to correct it.
+    corrected : ndarray of bool of shape (N, K)
+        Whether the node is to correct the branch.
     held_back : ndarray of str of shape (N, K)
         Why a fault that was found is not corrected; empty where it is, or where none was found.
-    hardware_drift, hardware_probability, confidence : ndarray of shape (N,)
-        Of a hardware fault; probability that the estimate is recovered: within 10 % of the truth. [1]
-    hardware_offset_a : ndarray of shape (N, K)
-        Of a hardware fault. [A]
     verdicts : sequence of N str
         Of each vehicle.
     explanations : sequence of N sequences of Explanation
@@ -375,35 +444,15 @@ class FleetEstimate:
     findings : sequence of N sequences of Finding
         What no explanation fits.
     evidence : sequence of N VehicleEvidence
-        For the pages of a report; may be empty.
-    points : sequence of N Points
-        The posterior; branches in the order ``order``, offsets in fractions of full scale.
-    order : tuple of int
-        Branches of the points: position of each in their own order.
-    full_scale_a : float
-        Full scale of the junction. [A]
+        For the pages of a report.
     """
 
-    drift: Array
-    offset_a: Array
-    drift_sd: Array
-    offset_sd_a: Array
-    fault_probability: Array
-    harm_probability: Array
-    identifiable: Mask
     corrected: Mask
     held_back: NDArray[np.str_]
-    hardware_drift: Array
-    hardware_offset_a: Array
-    hardware_probability: Array
-    confidence: Array
     verdicts: Sequence[str]
     explanations: Sequence[Sequence[Explanation]]
     findings: Sequence[Sequence[Finding]]
-    evidence: Sequence[VehicleEvidence] = ()
-    points: Sequence[Points] = ()
-    order: tuple[int, ...] = ()
-    full_scale_a: float = 1.0
+    evidence: Sequence[VehicleEvidence]
 
     def pit(self, drift: Array, offset_a: Array) -> tuple[Array, Array]:
         """Probability integral transform of the truth: share of the posterior below it, each of shape (N, K).
@@ -466,12 +515,11 @@ def learn_fleet(
         raise FleetError("no vehicle to learn the fleet's reference from")
     plain = stack_summaries(summaries)
     order = tuple(np.argsort(-np.median(plain.variance_a2, axis=0), kind="stable").tolist())
-    fleet = stack_summaries(summaries, order)
-    _require_balance(fleet, [branches[k] for k in order])
+    fleet, ordered = stack_summaries(summaries, order), [branches[k] for k in order]
+    _require_balance(fleet, ordered)
     feed = int(np.argmax(np.median(fleet.mean_a, axis=0)))
     model = fit_fleet_model(fleet)
     measured, usual_correlation = collect_rows(fleet, model, full_scale_a=full_scale_a)
-    ordered = [branches[k] for k in order]
     carriers = np.zeros(len(fleet), bool) if trusted is None else trusted.copy()
     distrusted = untrusted_vehicles(measured, carriers, ordered, full_scale_a=full_scale_a, load=load)
     carriers[list(distrusted)] = False
@@ -487,21 +535,21 @@ def learn_fleet(
             expected_faults=expected_faults,
         )
 
-    laws = learn(carriers)
     mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
     usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
-    differing = np.zeros_like(carriers)
-    if np.count_nonzero(carriers) >= FEWEST_TRUSTED:
-        found = estimate_rows(
-            rows.take(carriers), laws, feed=feed, mean=mean[carriers], mean_square=square[carriers], usual=usual
-        )
-        differing[carriers] = found.hardware_probability > SUSPECTED
-        laws = learn(carriers & ~differing) if differing.any() else laws
-    carried = np.count_nonzero(carriers & ~differing) >= FEWEST_TRUSTED
-    everyone = estimate_rows(rows, laws, feed=feed, mean=mean, mean_square=square, usual=usual)
+
+    def estimate(laws: Sequence[Law]) -> RowsEstimate:
+        return estimate_rows(rows, laws, feed=feed, mean=mean, mean_square=square, usual=usual)
+
+    laws = learn(carriers)
+    everyone = estimate(laws)
+    differing = carriers & (everyone.hardware_probability > SUSPECTED) & (carriers.sum() >= FEWEST_TRUSTED)
+    if differing.any():
+        carriers &= ~differing
+        laws = learn(carriers)
+        everyone = estimate(laws)
     place = np.argsort(order)
-    own_read_out = model.read_out[:, place]
-    reference = FleetReference(
+    return FleetReference(
         branches=tuple(branches),
         order=order,
         feed=feed,
@@ -509,16 +557,16 @@ def learn_fleet(
         usual_correlation=usual_correlation,
         laws=tuple(laws),
         usual=usual,
-        misfits=learn_usual_misfits(summaries, own_read_out, full_scale_a=full_scale_a),
+        misfits=learn_usual_misfits(summaries, model.read_out[:, place], full_scale_a=full_scale_a),
         full_scale_a=full_scale_a,
         load=load,
-        vehicles=max(len(fleet), FEWEST_VEHICLES) if carried else len(fleet),
+        vehicles=len(fleet),
+        carried=int(carriers.sum()) >= FEWEST_TRUSTED,
         agreeing=tuple(_agreeing(rows, int(p)) for p in place),
-        variants=_variants(everyone),
+        variants=_variants(everyone.hardware_drift),
         distrusted=distrusted,
         differing=tuple(np.flatnonzero(differing).tolist()),
     )
-    return FleetReference(**{**vars(reference), "notices": tuple(_notices(reference))})
 
 
 def _require_balance(fleet: FleetMoments, branches: Sequence[str]) -> None:
@@ -581,9 +629,9 @@ def _agreeing(rows: EvidenceRows, branch: int) -> float:
     return densest_clusters(rows.relative[known, branch], sd, widest=1.0)[0].share
 
 
-def _variants(found: RowsEstimate) -> tuple[float, ...]:
+def _variants(hardware_drift: Array) -> tuple[float, ...]:
     """Two variants of the vehicle: groups in each of which a hardware drift is the same, as logarithms."""
-    eta = np.log1p(found.hardware_drift)
+    eta = np.log1p(hardware_drift)
     near = np.abs(eta[:, None] - eta[None, :]) < VARIANT_SPREAD
     centres: list[float] = []
     left = np.ones(len(eta), bool)
@@ -595,46 +643,6 @@ def _variants(found: RowsEstimate) -> tuple[float, ...]:
         centres.append(float(np.median(eta[near[best] & left])))
         left &= np.abs(eta - centres[-1]) > 2.0 * VARIANT_SPREAD
     return tuple(sorted(centres))
-
-
-def _notices(reference: FleetReference) -> list[str]:
-    """What may be wrong about the fleet as a whole, one line each."""
-    scale_a, ordered = reference.full_scale_a, [reference.branches[k] for k in reference.order]
-    K, feed = len(ordered), ordered[reference.feed]
-    notices = []
-    if reference.vehicles < FEWEST_VEHICLES:
-        notices.append(
-            f"{reference.vehicles} vehicles are few for a fleet that is compared with itself: nothing is corrected; at "
-            f"least {FEWEST_VEHICLES} are needed, or {FEWEST_TRUSTED} bench-checked vehicles (--trusted)"
-        )
-    best = reference.laws[0]
-    constant = best.spread.mean[4 * K - 1]
-    if reference.load is None and abs(constant) > DOUBT:
-        notices.append(
-            f"the currents of most vehicles sum to {constant * scale_a:+.1f} A: " + _causes(reference.laws, ordered)
-        )
-    for share, centre in zip(best.prior.group_share, best.prior.group_centre, strict=True):
-        sensor = sum(law.probability for law in reference.laws if law.spread.shared[-1])
-        notices.append(
-            f"about {share:.0%} of the vehicles share {centre * scale_a:+.1f} A in branch {feed} beside the others: a "
-            f"load without a sensor ({1.0 - sensor:.0%}), or an offset of a batch of sensors ({sensor:.0%})"
-        )
-    gains = sum(law.probability for law in reference.laws if law.spread.shared[K : 2 * K].any())
-    if gains > LEAST_SAID:
-        size = next(law.spread.shared[K : 2 * K] for law in reference.laws if law.spread.shared[K : 2 * K].any())
-        notices.append(
-            f"most vehicles break the junction law by {np.abs(size).max():.1%}: a gain error that a batch of sensors "
-            f"shares ({gains:.0%}), in branch "
-            + " or ".join(
-                name for k, name in enumerate(ordered) if any(law.spread.shared[K + k] != 0.0 for law in reference.laws)
-            )
-        )
-    if reference.variants:
-        notices.append(
-            f"the currents of some vehicles are all larger by {np.expm1(np.ptp(reference.variants)):.1%} than those of "
-            f"others: two variants of the vehicle? calibrate them apart"
-        )
-    return notices
 
 
 def _causes(laws: Sequence[Law], branches: Sequence[str]) -> str:
@@ -681,7 +689,7 @@ def estimate_vehicles(
     FleetEstimate
         In the order of the summaries.
     """
-    scale_a, names, place = reference.full_scale_a, reference.branches, np.argsort(reference.order)
+    scale_a, order = reference.full_scale_a, list(reference.order)
     trusted = np.zeros(len(summaries), bool) if trusted is None else trusted
     rows, fleet = reference.rows_of(summaries, readings, trusted)
     found = estimate_rows(
@@ -691,73 +699,48 @@ def estimate_vehicles(
         mean=fleet.mean_a / scale_a,
         mean_square=fleet.mean_square_a2 / scale_a**2,
         usual=reference.usual,
-    )
-    findings = check_fit(summaries, reference.read_out, reference.misfits, full_scale_a=scale_a, branches=list(names))
-    shared = _shared_findings(found, reference)
-    drift, offset_a = found.drift[:, place], found.offset[:, place] * scale_a
-    faulty = (drift != 0.0) | (offset_a != 0.0)
-    harm, identifiable = found.harm_probability[:, place], found.identifiable[:, place]
-    drift_limit, offset_limit_a = (np.inf, np.inf) if limits is None else limits
-    reasons = {  # the last that applies is told
-        "beyond the limits": (np.abs(drift) > drift_limit) | (np.abs(offset_a) > offset_limit_a),
-        "harm limit": ~(harm < harm_limit),
-        "moved too little": ~identifiable,
-        "reference in doubt": np.full(faulty.shape, reference.vehicles < FEWEST_VEHICLES) & ~trusted[:, None],
-        "does not fit": np.array([_unfit(each, names) for each in findings]).reshape(faulty.shape),
-    }
-    held_back = np.full(faulty.shape, "", f"<U{max(map(len, reasons))}")
-    for reason, applies in reasons.items():
-        held_back[faulty & applies] = reason
-    corrected = faulty & (held_back == "")
-    verdicts = [
-        "corrected"
-        if corrected[j].any()
-        else "no sensor fault"
-        if not faulty[j].any() and found.confidence[j] >= CONFIDENT and not findings[j]
-        else "cannot tell"
-        for j in range(len(summaries))
-    ]
-    law = reference.laws[0]
-    evidence = reported_evidence(
-        rows,
-        centre=law.spread.mean,
-        covariance=rows.dispersed(law.spread.dispersion)[0] + law.spread.covariance,
-        drift=found.drift,
-        offset_a=found.offset * scale_a,
-        hardware_drift=found.hardware_drift,
-        hardware_offset_a=found.hardware_offset * scale_a,
+        order=order,
         full_scale_a=scale_a,
     )
-    ordered = [names[k] for k in reference.order]
+    unfit = check_fit(
+        summaries, reference.read_out, reference.misfits, full_scale_a=scale_a, branches=reference.branches
+    )
+    drift_limit, offset_limit_a = (np.inf, np.inf) if limits is None else limits
+    reasons = {  # the first that applies is reported
+        "": ~found.faulty,
+        "does not fit": np.array([_unfit(each, reference.branches) for each in unfit]),
+        "reference in doubt": reference.in_doubt & ~trusted[:, None],
+        "moved too little": ~found.identifiable,
+        "harm limit": ~(found.harm_probability < harm_limit),
+        "beyond the limits": (np.abs(found.drift) > drift_limit) | (np.abs(found.offset_a) > offset_limit_a),
+    }
+    held_back = np.select(list(reasons.values()), list(reasons), "")
+    corrected = found.faulty & (held_back == "")
+    sound = ~found.faulty.any(axis=1) & (found.confidence >= CONFIDENT) & ~np.array(list(map(bool, unfit)))
+    law = reference.laws[0]
     return FleetEstimate(
-        drift=drift,
-        offset_a=offset_a,
-        drift_sd=found.drift_sd[:, place],
-        offset_sd_a=found.offset_sd[:, place] * scale_a,
-        fault_probability=found.fault_probability[:, place],
-        harm_probability=harm,
-        identifiable=identifiable,
+        **vars(found),
         corrected=corrected,
         held_back=held_back,
-        hardware_drift=found.hardware_drift,
-        hardware_offset_a=found.hardware_offset[:, place] * scale_a,
-        hardware_probability=found.hardware_probability,
-        confidence=found.confidence,
-        verdicts=verdicts,
-        explanations=[
-            [_explanation(share, values, ordered, scale_a) for share, values in each] for each in found.explanations
-        ],
-        findings=[(*each, *others) for each, others in zip(findings, shared, strict=True)],
-        evidence=evidence,
-        points=found.points,
-        order=reference.order,
-        full_scale_a=scale_a,
+        verdicts=np.select([corrected.any(axis=1), sound], ["corrected", "no sensor fault"], "cannot tell").tolist(),
+        explanations=[[_explanation(*each, reference) for each in mine] for mine in found.supports],
+        findings=[(*each, *others) for each, others in zip(unfit, _shared_findings(found, reference), strict=True)],
+        evidence=reported_evidence(
+            rows,
+            centre=law.spread.mean,
+            covariance=rows.dispersed(law.spread.dispersion)[0] + law.spread.covariance,
+            drift=found.drift[:, order],
+            offset_a=found.offset_a[:, order],
+            hardware_drift=found.hardware_drift,
+            hardware_offset_a=found.hardware_offset_a[:, order],
+            full_scale_a=scale_a,
+        ),
     )
 
 
 def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[list[Finding]]:
     """Loads without a sensor, batches and variants, of each vehicle: explained, and nothing of them is corrected."""
-    scale_a, feed = reference.full_scale_a, reference.branches[reference.order[reference.feed]]
+    scale_a, feed = reference.full_scale_a, reference.ordered[reference.feed]
     sensor = sum(law.probability for law in reference.laws if law.spread.shared[-1])
     cause, rival = ("batch", "load") if sensor > SUSPECTED else ("load", "batch")
     what = {"load": "a load without a sensor", "batch": "an offset of a batch of sensors"}
@@ -768,10 +751,10 @@ def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[lis
             text = f"{size_a:+.1f} A in branch {feed} as in other vehicles: {what[cause]}, or {what[rival]}"
             mine.append(_finding(feed, cause, found.group_probability[j, g], text))
         if found.load_probability[j] > SUSPECTED:
-            text = f"a load without a sensor of {found.load[j] * scale_a:.1f} A, or an offset of the {feed} sensor"
+            text = f"a load without a sensor of {found.load_a[j]:.1f} A, or an offset of the {feed} sensor"
             mine.append(_finding(feed, "load", found.load_probability[j], text))
     for j, mine in enumerate(findings):
-        eta = [(p, float(np.log1p(values[0, 0]))) for p, values in found.explanations[j]]
+        eta = [(p, float(np.log1p(values[0, 0]))) for p, values in found.supports[j]]
         of = [sum(p for p, each in eta if abs(each - centre) < VARIANT_SPREAD) for centre in reference.variants]
         if sum(of) > SUSPECTED:
             size = f"{np.expm1(np.ptp(reference.variants)):.1%}"
@@ -791,14 +774,16 @@ def _unfit(findings: Sequence[Finding], branches: Sequence[str]) -> list[bool]:
     return [everywhere or any(each.branch == name for each in findings) for name in branches]
 
 
-def _explanation(share: float, values: Array, branches: Sequence[str], full_scale_a: float) -> Explanation:
-    def nonzero(row: Array, unit: float) -> dict[str, float]:
-        return {name: float(value * unit) for name, value in zip(branches, row, strict=True) if abs(value) > 1e-9}
+def _explanation(share: float, values: Array, reference: FleetReference) -> Explanation:
+    names = reference.ordered
+
+    def nonzero(row: Array, unit: float = reference.full_scale_a) -> dict[str, float]:
+        return {name: float(value * unit) for name, value in zip(names, row, strict=True) if abs(value) > 1e-9}
 
     return Explanation(
         probability=min(share, 1.0),
         drift=nonzero(values[2], 1.0),
-        offset_a=nonzero(values[3], full_scale_a),
+        offset_a=nonzero(values[3]),
         hardware_drift=float(values[0, 0]),
-        hardware_offset_a=nonzero(values[1], full_scale_a),
+        hardware_offset_a=nonzero(values[1]),
     )

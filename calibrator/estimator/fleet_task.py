@@ -273,19 +273,17 @@ def _contradicted(task: FleetTask, vehicles: Sequence[VehicleSummary], bench: Be
     checked = [vehicle for vehicle in vehicles if vehicle.vehicle in named]
     if not checked:
         return {}
-    found = task.estimate(checked)
-    most = max(map(len, found.explanations))
-    weight, faults = np.zeros((len(checked), most)), np.zeros((2, len(checked), most, len(branches)))
-    for j, explanations in enumerate(found.explanations):
-        weight[j, : len(explanations)] = [each.probability for each in explanations]
-        faults[:, j, : len(explanations)] = np.stack([faults_of(each, branches) for each in explanations], axis=1)
-    return contradicted_readings(
-        bench,
-        [vehicle.vehicle for vehicle in checked],
-        branches,
-        weight=weight,
-        drift=faults[0],
-        drift_sd=np.repeat(found.drift_sd[:, None], most, axis=1),
-        offset_a=faults[1],
-        offset_sd_a=np.repeat(found.offset_sd_a[:, None], most, axis=1),
-    )
+    found, wrong = task.estimate(checked), dict[tuple[str, str], str]()
+    for j, vehicle in enumerate(checked):
+        drift, offset_a = np.stack([faults_of(each, branches) for each in found.explanations[j]], axis=1)[:, None]
+        wrong |= contradicted_readings(
+            bench,
+            [vehicle.vehicle],
+            branches,
+            weight=np.array([[each.probability for each in found.explanations[j]]]),
+            drift=drift,
+            drift_sd=found.drift_sd[j, None, None],
+            offset_a=offset_a,
+            offset_sd_a=found.offset_sd_a[j, None, None],
+        )
+    return {sensor: wrong[sensor] for sensor in bench if sensor in wrong}

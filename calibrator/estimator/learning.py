@@ -32,12 +32,12 @@ from calibrator.estimator.prior import (
     uniform_density,
     with_slabs,
 )
-from calibrator.estimator.rows import EvidenceRows, constant_design, relative_design
+from calibrator.estimator.rows import EvidenceRows, parameter_places, row_design, row_places
 
 __all__ = ["DOUBT", "Law", "Spread", "centre_rows", "explain", "learn_laws", "weigh_law"]
 
-MOST_LEARNT = 200
-"""Vehicles that a law is learnt from; more change it less than the faults themselves. [1]"""
+MOST_LEARNT, MOST_STARTED = 200, 60
+"""Vehicles that a law is learnt from, and that decide between its starts; more change it less than the faults. [1]"""
 START_ROUNDS, ROUNDS, PRIOR_STEPS = 2, 5, 6
 """Rounds of each start, of the best ones after that, and steps of the prior in each round."""
 MOST_COMMON = 3
@@ -133,8 +133,8 @@ class Law:
 
 def centre_rows(branches: int) -> Mask:
     """Rows whose centre the fleet shows, shape (5K,): slopes, intercepts, junction constant; ratios have none."""
-    free = np.zeros(5 * branches, bool)
-    free[:branches] = free[3 * branches - 1 : 4 * branches] = True
+    free, at = np.zeros(5 * branches, bool), row_places(branches)
+    free[at.slopes] = free[at.intercepts] = free[at.junction] = True
     return free
 
 
@@ -171,11 +171,15 @@ def learn_laws(
     """
     fixed = np.full(rows.values.shape[1], np.nan) if fixed is None else fixed.copy()
     if load is not None:
-        fixed[4 * rows.branches - 1] = load
+        fixed[rows.places.junction] = load
     order = np.lexsort(rows.values.T[::-1])  # the same whatever the order of the vehicles
-    some = order[np.linspace(0, len(rows) - 1, min(len(rows), MOST_LEARNT)).astype(np.int64)]
-    learner = _Learner(rows.take(np.sort(some)), feed, fixed, known, expected_faults)
-    climbed = [learner.climb(learner.start(centre), START_ROUNDS) for centre in learner.centres()]
+
+    def learner_of(most: int) -> _Learner:
+        some = order[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
+        return _Learner(rows.take(np.sort(some)), feed, fixed, known, expected_faults)
+
+    learner, starter = learner_of(MOST_LEARNT), learner_of(MOST_STARTED)
+    climbed = [starter.climb(starter.start(centre), START_ROUNDS) for centre in learner.centres()]
     climbed = sorted(climbed, key=lambda law: -law.log_evidence)[:KEPT_STARTS]
     best = max((learner.climb(law, ROUNDS, begun=True) for law in climbed), key=lambda law: law.log_evidence)
     laws = learner.variants(best)
@@ -226,26 +230,26 @@ class _Learner:
     ) -> None:
         K = rows.branches
         self.rows, self.feed, self.fixed, self.known = rows, feed, fixed, known
+        self.at, self.parameters = rows.places, parameter_places(K)
         self.expected_faults = expected_faults
         self.free = centre_rows(K) & np.isnan(fixed)
-        self.least = np.diag(np.repeat(LEAST_SPREAD, [3 * K - 1, 2 * K + 1]) ** 2)
+        least_sd = np.empty(5 * K)
+        least_sd[self.at.relative], least_sd[self.at.constant] = LEAST_SPREAD
+        self.least = np.diag(least_sd**2)
         self.guess = self._guessed_spread()
-        self.design = np.zeros((5 * K, 3 * K + 1))
-        self.design[: 3 * K - 1, : K + 1] = relative_design(K)
-        self.design[3 * K - 1 :, K + 1 : 3 * K] = constant_design(K)
-        self.design[[3 * K - 1 + feed, 4 * K - 1], 3 * K] = 1.0
+        self.design = row_design(K, feed)
 
     def _guessed_spread(self) -> Array:
         """A multiple of the usual sampling covariance, in rows that the fleet model or the junction law makes."""
-        rows, K = self.rows, self.rows.branches
+        rows, K, at = self.rows, self.rows.branches, self.at
         variance = np.diagonal(rows.covariance, axis1=1, axis2=2).copy()
-        variance[:, 3 * K - 1 : 4 * K - 1] = np.diagonal(rows.intercept_covariance(), axis1=1, axis2=2)
+        variance[:, at.intercepts] = np.diagonal(rows.intercept_covariance(), axis1=1, axis2=2)
         guess = np.zeros(5 * K)
-        for row in [*range(2 * K - 1), *range(3 * K - 1, 4 * K)]:
+        for row in at.measured:
             known = rows.known[:, row]
             guess[row] = np.median(variance[known, row]) if known.any() else 1.0
         factor = np.full(5 * K, SPREAD_OVER_SAMPLING)
-        factor[[*range(K, 2 * K - 1), 4 * K - 1]] = JUNCTION_SPREAD_OVER_SAMPLING
+        factor[at.ratios] = factor[at.junction] = JUNCTION_SPREAD_OVER_SAMPLING
         return np.diag(factor**2 * guess)
 
     def clusters(self, row: int, most: int = 1, farthest: float = np.inf) -> list[float]:
@@ -263,24 +267,25 @@ class _Learner:
         branch has clusters as well. Intercepts of a vehicle without faults add up to its junction constant, as do those
         of a centre.
         """
-        rows, K = self.rows, self.rows.branches
-        centre, junction, intercept = np.zeros(5 * K), 4 * K - 1, 3 * K - 1 + self.feed
+        rows, K, at = self.rows, self.rows.branches, self.at
+        centre, intercept = np.zeros(5 * K), at.intercept(self.feed)
+        first = at.slope(0)
         for k in range(1, K):
-            known = rows.known[:, [0, k, K + k - 1]].all(axis=1)
-            apart = rows.values[known, k] - rows.values[known, 0] + rows.values[known, K + k - 1]
-            centre[k] = np.median(apart) if known.any() else 0.0
-        known, sd = rows.known[:, :K], np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2)[:, :K])
-        common = densest_clusters((rows.values[:, :K] - centre[:K])[known], sd[known], most=MOST_COMMON)
-        for row in range(3 * K - 1, junction):
-            centre[row] = self.clusters(row)[0]
-        others = centre[3 * K - 1 : junction].sum() - centre[intercept]
+            slope, ratio = at.slope(k), at.ratio(k)
+            known = rows.known[:, [first, slope, ratio]].all(axis=1)
+            apart = rows.values[known, slope] - rows.values[known, first] + rows.values[known, ratio]
+            centre[slope] = np.median(apart) if known.any() else 0.0
+        known, sd = rows.known[:, at.slopes], np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2)[:, at.slopes])
+        common = densest_clusters((rows.values[:, at.slopes] - centre[at.slopes])[known], sd[known], most=MOST_COMMON)
+        centre[at.intercepts] = [self.clusters(at.intercept(k))[0] for k in range(K)]
+        others = centre[at.intercepts].sum() - centre[intercept]
         zeros = [zero + others for zero in self.clusters(intercept, 2, LARGEST_SHARED)]
         found: list[Array] = []
         # The junction shows its constant most exactly.
-        for constant, cluster in product((*self.clusters(junction, 2, LARGEST_SHARED), 0.0, *zeros), common):
+        for constant, cluster in product((*self.clusters(at.junction, 2, LARGEST_SHARED), 0.0, *zeros), common):
             start = centre.copy()
-            start[:K] += cluster.centre
-            start[intercept], start[junction] = constant - others, constant
+            start[at.slopes] += cluster.centre
+            start[intercept], start[at.junction] = constant - others, constant
             start = np.where(np.isnan(self.fixed), start, self.fixed)
             if not any(np.abs(start - other).max() < DOUBT for other in found):
                 found.append(start)
@@ -289,7 +294,7 @@ class _Learner:
     def start(self, centre: Array) -> Law:
         """Law before anything is known but a centre."""
         rows, K = self.rows, self.rows.branches
-        covariance, junction = self.guess + self.least, 4 * K - 1
+        covariance, junction = self.guess + self.least, self.at.junction
         clusters = densest_clusters(
             rows.values[:, junction], np.sqrt(rows.covariance[:, junction, junction]), farthest=LARGEST_SHARED
         )
@@ -319,26 +324,26 @@ class _Learner:
 
     def _recentred(self, law: Law) -> Law:
         """The law about the largest group, if it is not the vehicles of no group that are most."""
-        prior, spread, K = law.prior, law.spread, self.rows.branches
+        prior, spread, at = law.prior, law.spread, self.at
         shares = prior.group_share
-        if not shares.size or shares.max() <= 1.0 - shares.sum() or spread.shared.any() or not self.free[4 * K - 1]:
+        if not shares.size or shares.max() <= 1.0 - shares.sum() or spread.shared.any() or not self.free[at.junction]:
             return law
         mean = spread.mean.copy()
-        mean[[3 * K - 1 + self.feed, 4 * K - 1]] += prior.group_centre[int(np.argmax(shares))]
+        mean[[at.intercept(self.feed), at.junction]] += prior.group_centre[int(np.argmax(shares))]
         alone = replace(prior, group_share=np.zeros(0), group_centre=np.zeros(0), group_sd=np.zeros(0))
         return replace(law, spread=replace(spread, mean=mean), priors=((1.0, alone),), log_evidence=-np.inf)
 
     def variants(self, best: Law) -> list[Law]:
         """The same law with each cause of what vehicles share: loads, offsets or gains of the sensors of a branch."""
-        K, prior = self.rows.branches, best.prior
+        K, prior, at = self.rows.branches, best.prior, self.at
         found = [
             (plausible, replace(best, spread=replace(best.spread, shared=shared)))
-            for plausible, shared in self._shared_constants(float(best.spread.mean[4 * K - 1]), prior)
+            for plausible, shared in self._shared_constants(float(best.spread.mean[at.junction]), prior)
         ]
-        slopes = np.array([self.clusters(k)[0] for k in range(K)])  # with what the sensors of most vehicles share
+        slopes = np.array([self.clusters(at.slope(k))[0] for k in range(K)])  # with what most vehicles' sensors share
         for shared in self._shared_gains():
             mean = best.spread.mean.copy()
-            mean[:K] = np.where(self.free[:K], slopes - shared[K : 2 * K], mean[:K])
+            mean[at.slopes] = np.where(self.free[at.slopes], slopes - shared[K : 2 * K], mean[at.slopes])
             fresh = replace(self.start(mean), spread=replace(best.spread, mean=mean, shared=shared))
             found.append((0.0, self.climb(fresh, START_ROUNDS)))
         if len(found) > 1:
@@ -351,7 +356,7 @@ class _Learner:
             ]
         evidence = np.array([law.log_evidence for _, law in found])
         of_gains = np.array([law.spread.shared[K : 2 * K].any() for _, law in found])
-        if self.free[:K].all() and of_gains.any():
+        if self.free[at.slopes].all() and of_gains.any():
             # Which branch it is shows in the noise of the constants alone, seen through the gain: that is no evidence.
             evidence[of_gains] = evidence[of_gains].max()
         log_odds = evidence + [plausible for plausible, _ in found]
@@ -365,7 +370,7 @@ class _Learner:
         found: list[tuple[float, Array]] = []
         for of_sensor in (False, True) if len(prior.group_centre) else (False,):
             offsets = [(0.0, self.feed)]
-            if abs(c0) > DOUBT and np.isnan(self.fixed[4 * K - 1]):
+            if abs(c0) > DOUBT and np.isnan(self.fixed[self.at.junction]):
                 offsets += [(c0, k) for k in range(K)]
             if of_sensor:
                 others = [-float(centre) for centre in prior.group_centre]
@@ -382,8 +387,9 @@ class _Learner:
         rows, K = self.rows, self.rows.branches
         off = np.zeros(K)
         for k in range(1, K):
-            known = rows.known[:, K + k - 1]
-            value, sd = rows.relative[known, K + k - 1], np.sqrt(rows.covariance[known, K + k - 1, K + k - 1])
+            row = self.at.ratio(k)
+            known = rows.known[:, row]
+            value, sd = rows.values[known, row], np.sqrt(rows.covariance[known, row, row])
             clusters = densest_clusters(value, sd)
             if clusters and clusters[0].share > LEAST_SHARED_GAIN[0] and abs(clusters[0].centre) > LEAST_SHARED_GAIN[1]:
                 off[k] = clusters[0].centre
@@ -433,7 +439,7 @@ class _Learner:
     def _next_shares(self, draws: Draws, prior: Prior) -> Prior:
         """Numbers of faults, loads and groups from the weights of the draws."""
         weight, _ = weigh(draws, prior)
-        N, K = len(weight), prior.branches
+        N, load = len(weight), self.parameters.load
         of_fit = weight.sum(axis=(2, 3))
         tally = np.zeros(prior.counts.shape)
         np.add.at(tally, (draws.fits.hardware, draws.fits.sensor), of_fit)
@@ -442,13 +448,13 @@ class _Learner:
             sound, faulty = counts[:, :1], counts[:, 1:]
             expected = self.expected_faults
             counts = np.concatenate([(1.0 - expected) * sound / sound.sum(), expected * faulty / faulty.sum()], axis=1)
-        loaded = draws.fits.support[:, :, 3 * K]
+        loaded = draws.fits.support[:, :, load]
         share, centre, sd = prior.group_share.copy(), prior.group_centre.copy(), prior.group_sd.copy()
         for g in range(len(share)):
             share[g] = (weight[..., 1 + g].sum() + 0.02) / (N + 1.0)
             w = (weight[..., 1 + g] * loaded[:, :, None]).ravel()
             if w.sum() > 0.5:
-                x = draws.values[..., 3 * K].ravel()
+                x = draws.values[..., load].ravel()
                 centre[g] = w @ x / w.sum()
                 sd[g] = np.sqrt((w @ (x - centre[g]) ** 2 + 2.0 * DOUBT**2) / (w.sum() + 2.0))
         return replace(
@@ -462,10 +468,10 @@ class _Learner:
 
     def _with_group(self, draws: Draws, prior: Prior) -> Prior:
         """The prior with one group more, if vehicles that share a constant of the feeding branch make it likelier."""
-        K, N, fits = prior.branches, len(draws.values), draws.fits
+        N, fits = len(draws.values), draws.fits
         weight = weigh(draws, prior)[0][..., 0].sum(axis=2)
         found = []
-        for column in (2 * K + self.feed, 3 * K):
+        for column in (self.parameters.offset(self.feed), self.parameters.load):
             on = fits.support[:, :, column] & (weight > 0.05)
             sd = np.sqrt((fits.root[:, :, column] ** 2).sum(axis=2))
             found.append(np.stack([fits.theta[:, :, column][on], sd[on], weight[on]]))
@@ -492,7 +498,7 @@ class _Learner:
 
     def _next_spread(self, draws: Draws, weight: Array, spread: Spread) -> Spread:
         """Centre, covariance and dispersion of what the explanations leave of the rows."""
-        rows, K, N = self.rows, self.rows.branches, len(self.rows)
+        rows, b, N = self.rows, self.at.intercepts, len(self.rows)
         of_fit = weight.sum(axis=(2, 3))
         top = np.argsort(-of_fit, axis=1, kind="stable")[:, :USED_FITS]
         share = np.take_along_axis(of_fit, top, axis=1)
@@ -527,7 +533,6 @@ class _Learner:
         apart = root_count * (mean - shift)
         scatter = np.einsum("nqa,nqb->ab", apart, apart)
         scatter += np.einsum("nqa,nqb,nqab->ab", root_count, root_count, covariance)
-        b = slice(3 * K - 1, 4 * K - 1)
         gain = added @ P[:, b]
         error, doubt = expected((added - gain[:, :, b] @ added)[:, None], gain)
         stated = np.diagonal(rows.intercept_covariance(), axis1=1, axis2=2)[:, None]

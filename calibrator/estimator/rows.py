@@ -13,15 +13,20 @@ are what a vehicle and its drives differ from the fleet without any fault: the m
 value 0 and a variance of :data:`UNKNOWN_VARIANCE`.
 
 b and c are where lines meet zero. If a ratio is wrong, its line pivots about the mean of its data, which is known far
-better, and b or c follows: (M10). The covariance holds this to first order, :meth:`EvidenceRows.constant_seen` exactly.
+better, and b or c follows: (M10). The covariance holds this to first order, the residuals of an explanation (M11)
+exactly: :func:`calibrator.estimator.explanations.row_residuals`.
+
+:class:`RowPlaces` and :class:`ParameterPlaces` name the rows and the parameters in the order in which arrays hold them.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
@@ -33,16 +38,17 @@ from calibrator.faults import Index
 __all__ = [
     "UNKNOWN_VARIANCE",
     "EvidenceRows",
+    "ParameterPlaces",
+    "RowPlaces",
     "collect_rows",
-    "constant_design",
     "evidence_names",
-    "relative_design",
+    "parameter_places",
+    "row_design",
+    "row_places",
 ]
 
 UNKNOWN_VARIANCE = 100.0
 """Of an unknown row: ten times full scale, or a factor of 20 000. [1]"""
-MOST_TURN = 3.0
-"""Largest logarithm by which a ratio can be off. [1]"""
 LEAST_GAIN = 0.3
 """Slopes and gain ratios below are no sensor's, but those of a branch that hardly moved. [1]"""
 FEWEST_BLOCKS = 4
@@ -51,6 +57,109 @@ FLEET_BLOCKS = 20.0
 """Weight of the fleet's usual correlation of rows against that of one vehicle, in blocks."""
 LEAST_SD = np.array([5e-5, 1e-5])
 """Least deviation of relative and constant rows: resolution of the signals and of their interpolation. [1]"""
+
+
+class RowPlaces(NamedTuple):
+    """Where an array of 5K rows holds each kind of row, for K branches.
+
+    Attributes
+    ----------
+    slopes : slice
+        K, log a. [1]
+    ratios : slice
+        K - 1, log(-g) of every branch but the first. [1]
+    gain_reads : slice
+        K, bench readings of log(1 + d). [1]
+    intercepts : slice
+        K, b, in fractions of full scale.
+    junction : int
+        c, in fractions of full scale.
+    offset_reads : slice
+        K, readings of the offsets, in fractions of full scale.
+    relative, constant : slice
+        The 3K - 1 rows of the first three kinds, and the 2K + 1 of the others.
+    """
+
+    slopes: slice
+    ratios: slice
+    gain_reads: slice
+    intercepts: slice
+    junction: int
+    offset_reads: slice
+    relative: slice
+    constant: slice
+
+    def slope(self, branch: int) -> int:
+        """Row of the slope of a branch, counted from 0."""
+        return int(self.slopes.start) + branch
+
+    def ratio(self, branch: int) -> int:
+        """Row of the gain ratio of a branch, counted from 0; the first branch has none."""
+        return int(self.ratios.start) + branch - 1
+
+    def intercept(self, branch: int) -> int:
+        """Row of the intercept of a branch, counted from 0."""
+        return int(self.intercepts.start) + branch
+
+    @property
+    def measured(self) -> NDArray[np.int64]:
+        """Places of the 3K rows that drives show; the others are readings."""
+        return np.asarray(np.r_[self.slopes, self.ratios, self.intercepts, self.junction])
+
+
+class ParameterPlaces(NamedTuple):
+    """Where an array of 3K + 1 parameters holds each kind, for K branches, in the symbols above.
+
+    Attributes
+    ----------
+    eta : int
+        Hardware gain. [1]
+    gains : slice
+        lambda of K sensors. [1]
+    hardware_offsets : slice
+        o_h of all branches but the last, which is minus their sum, in fractions of full scale.
+    offsets : slice
+        omega of K sensors, in fractions of full scale.
+    load : int
+        l, in fractions of full scale.
+    """
+
+    eta: int
+    gains: slice
+    hardware_offsets: slice
+    offsets: slice
+    load: int
+
+    def offset(self, branch: int) -> int:
+        """Place of omega of the sensor of a branch, counted from 0."""
+        return int(self.offsets.start) + branch
+
+
+def row_places(branches: int) -> RowPlaces:
+    """Where the rows of so many branches are."""
+    K = branches
+    return RowPlaces(
+        slopes=slice(0, K),
+        ratios=slice(K, 2 * K - 1),
+        gain_reads=slice(2 * K - 1, 3 * K - 1),
+        intercepts=slice(3 * K - 1, 4 * K - 1),
+        junction=4 * K - 1,
+        offset_reads=slice(4 * K, 5 * K),
+        relative=slice(0, 3 * K - 1),
+        constant=slice(3 * K - 1, 5 * K),
+    )
+
+
+def parameter_places(branches: int) -> ParameterPlaces:
+    """Where the parameters of so many branches are."""
+    K = branches
+    return ParameterPlaces(
+        eta=0,
+        gains=slice(1, K + 1),
+        hardware_offsets=slice(K + 1, 2 * K),
+        offsets=slice(2 * K, 3 * K),
+        load=3 * K,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +205,11 @@ class EvidenceRows:
         return int(self.relative.shape[1] + 1) // 3
 
     @property
+    def places(self) -> RowPlaces:
+        """Where :attr:`values`, :attr:`known` and the covariance hold each kind of row."""
+        return row_places(self.branches)
+
+    @property
     def values(self) -> Array:
         """All rows, relative ones first, shape (N, 5K)."""
         return np.concatenate([self.relative, self.constant], axis=1)
@@ -109,39 +223,10 @@ class EvidenceRows:
         """Return the evidence of some of the vehicles."""
         return EvidenceRows(**{name: values[index] for name, values in vars(self).items()})
 
-    def constant_seen(self, parameters: Array, residual: Array) -> Array:
-        """Constant rows as seen in true currents, if the relative parameters are known.
-
-        Parameters
-        ----------
-        parameters : ndarray of shape (N, S, K + 1)
-            d_h, d_1 .. d_K of S explanations. [1]
-        residual : ndarray of shape (N, S, 3K - 1)
-            What these leave of the relative rows. [1]
-
-        Returns
-        -------
-        ndarray of shape (N, S, 2K + 1)
-            Linear in the errors of the relative rows, as the covariance expects.
-        """
-        K, R = self.branches, 2 * self.branches - 1
-        factor = 1.0 + parameters[:, :, 1:]
-        seen = self.constant[:, None] / np.concatenate([factor, factor[:, :, :1], factor], axis=2)
-        error = residual[:, :, :R]
-        relative_error = np.expm1(np.minimum(error, MOST_TURN))
-        model, measured = self.means[:, None, 0], self.means[:, None, 1]
-        # exact change of b / (1 + d) = (1 + d_h) f (a / a_true - 1), and of c / (1 + d_1) likewise ...
-        seen[:, :, :K] += (1.0 + parameters[:, :, :1]) * model * relative_error[:, :, :K]
-        seen[:, :, K] -= np.sum(relative_error[:, :, K:] * measured[:, :, 1:] / factor[:, :, 1:], axis=2)
-        # ... less the part that is linear in the errors, which the covariance holds
-        seen[:, :, : K + 1] += error @ np.swapaxes(_pivot(self.means, self.relative), 1, 2)
-        return np.asarray(seen)
-
     def intercept_covariance(self) -> Array:
         """Covariance of b + a mean(f), which does not depend on errors of the slopes a, shape (N, K, K)."""
-        K = self.branches
-        at_means = _shifted(self.covariance, -_pivot(self.means, self.relative), first=3 * K - 1)
-        return at_means[:, 3 * K - 1 : 4 * K - 1, 3 * K - 1 : 4 * K - 1]
+        b = self.places.intercepts
+        return _shifted(self.covariance, -_pivot(self.means, self.relative), first=b.start)[:, b, b]
 
     def dispersed(self, dispersion: Array | float) -> tuple[Array, Array]:
         """Covariance if that of the intercepts at their means is larger.
@@ -158,16 +243,16 @@ class EvidenceRows:
         added : ndarray of shape (N, K, K)
             What of it is added to the intercepts, independent of everything else.
         """
-        K = self.branches
-        more = np.sqrt(np.broadcast_to(np.asarray(dispersion) - 1.0, K))
+        b = self.places.intercepts
+        more = np.sqrt(np.broadcast_to(np.asarray(dispersion) - 1.0, self.branches))
         added = self.intercept_covariance() * np.outer(more, more)
         whole = self.covariance.copy()
-        whole[:, 3 * K - 1 : 4 * K - 1, 3 * K - 1 : 4 * K - 1] += added
+        whole[:, b, b] += added
         return whole, added
 
     def with_load_spread(self, sd: float) -> "EvidenceRows":
         """Return the evidence if loads that no branch measures differ by a standard deviation, over full scale [1]."""
-        covariance, junction = self.covariance.copy(), 4 * self.branches - 1
+        covariance, junction = self.covariance.copy(), self.places.junction
         covariance[:, junction, junction] += sd**2
         return replace(self, covariance=covariance)
 
@@ -197,7 +282,7 @@ def collect_rows(
         The one that was used.
     """
     M, K, N = fleet.inputs, fleet.branches, len(fleet)
-    R = 2 * K - 1  # number of ratios
+    R = 2 * K - 1  # number of slopes and gain ratios: the first of the rows that are measured, before b and c
     fits = [*regress_on_fleet(fleet, model.read_out), junction_law(fleet)]
     influence = np.concatenate([fit.influence for fit in fits], axis=1)
     covariance = fleet.blocks.total(influence[:, :, None] * influence[:, None, :])
@@ -244,7 +329,7 @@ def collect_rows(
     unread = np.zeros((N, K))
     relative = np.concatenate([np.log(safe), unread], axis=1)
     whole = np.tile(np.diag(np.full(5 * K, UNKNOWN_VARIANCE)), (N, 1, 1))
-    place = np.array([*range(R), *range(3 * K - 1, 4 * K)])
+    place = row_places(K).measured
     whole[:, place[:, None], place] = _shifted(covariance, _pivot(means, relative), first=R)
     constant = np.concatenate([constant, unread], axis=1)
     return EvidenceRows(relative=relative, constant=constant, covariance=whole, means=means), usual
@@ -266,21 +351,31 @@ def _shifted(covariance: Array, by: Array, *, first: int) -> Array:
     return np.asarray(turn @ covariance @ np.swapaxes(turn, 1, 2))
 
 
-def relative_design(branches: int) -> Array:
-    """Relative rows over (eta, lambda_1 .. lambda_K), shape (3K - 1, K + 1)."""
-    K = branches
-    slopes = np.hstack([np.ones((K, 1)), np.eye(K)])
-    ratios = np.hstack([np.zeros((K - 1, 1)), np.ones((K - 1, 1)), -np.eye(K - 1)])
-    readings = np.hstack([np.zeros((K, 1)), np.eye(K)])
-    return np.vstack([slopes, ratios, readings])
+def row_design(branches: int, feed: int) -> Array:
+    """Rows over parameters, linear as they are in true currents.
 
+    Parameters
+    ----------
+    branches : int
+        Number of branches K.
+    feed : int
+        Branch that carries a load without a sensor, counted from 0.
 
-def constant_design(branches: int) -> Array:
-    """Constant rows over (o_h,1 .. o_h,K-1, omega_1 .. omega_K), shape (2K + 1, 2K - 1); o_h,K is minus the others."""
-    K = branches
-    hardware = np.vstack([np.eye(K - 1), -np.ones((1, K - 1)), np.zeros((K + 1, K - 1))])
-    sensors = np.vstack([np.eye(K), np.ones((1, K)), np.eye(K)])
-    return np.hstack([hardware, sensors])
+    Returns
+    -------
+    ndarray of shape (5K, 3K + 1)
+        Rows as :func:`row_places`, columns as :func:`parameter_places` names them. [1]
+    """
+    K, row, column = branches, row_places(branches), parameter_places(branches)
+    design = np.zeros((5 * K, 3 * K + 1))
+    design[row.slopes, column.eta] = 1.0
+    design[row.slopes, column.gains] = design[row.gain_reads, column.gains] = np.eye(K)
+    design[row.ratios, column.gains] = np.hstack([np.ones((K - 1, 1)), -np.eye(K - 1)])
+    design[row.intercepts, column.hardware_offsets] = np.vstack([np.eye(K - 1), -np.ones((1, K - 1))])
+    design[row.intercepts, column.offsets] = design[row.offset_reads, column.offsets] = np.eye(K)
+    design[row.junction, column.offsets] = 1.0
+    design[[row.intercept(feed), row.junction], column.load] = 1.0
+    return design
 
 
 def evidence_names(branches: Sequence[str]) -> list[str]:

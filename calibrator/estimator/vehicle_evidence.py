@@ -70,8 +70,8 @@ def reported_evidence(
     relative = np.concatenate([gain * (1.0 + hardware_drift[:, None]), first / gain[:, 1:], gain], axis=1)
     junction = first * (offset_a / gain).sum(axis=1, keepdims=True)
     constant = np.concatenate([offset_a + gain * hardware_offset_a, junction, offset_a], axis=1)
-    R = ratios.shape[1]
-    made = np.concatenate([relative * np.exp(centre[:R]), constant + seen * centre[R:]], axis=1)
+    at = rows.places
+    made = np.concatenate([relative * np.exp(centre[at.relative]), constant + seen * centre[at.constant]], axis=1)
     value[~rows.known], sd[~rows.known] = np.nan, np.nan
 
     def told(values: Array) -> list[list[float | None]]:

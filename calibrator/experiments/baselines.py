@@ -22,9 +22,10 @@ from sklearn.linear_model import LassoLarsIC
 
 from calibrator.drive import Array, Mask
 from calibrator.estimator.clusters import densest_clusters
+from calibrator.estimator.explanations import evidence_of, row_residuals
 from calibrator.estimator.fleet_model import fit_fleet_model
 from calibrator.estimator.moments import stack_summaries
-from calibrator.estimator.rows import EvidenceRows, collect_rows, constant_design, relative_design
+from calibrator.estimator.rows import EvidenceRows, collect_rows, parameter_places, row_design
 from calibrator.experiments.methods import Estimate
 from calibrator.experiments.trial import CommonEvidence, Trial
 from calibrator.faults import Faults
@@ -96,13 +97,13 @@ def _lasso(trial: Trial) -> Faults:
 def _median_regression(trial: Trial) -> Faults:
     """Slopes and intercepts that differ from the fleet's median; all of it is the sensor's."""
     rows, order = _evidence_rows(trial)
-    K = rows.branches
+    at = rows.places
 
     def apart(values: Array) -> Array:
         deviation = values - np.median(values, axis=0)
         return np.where(np.abs(deviation) > BEYOND * median_abs_deviation(values, scale="normal"), deviation, 0.0)
 
-    drift, offset = apart(np.exp(rows.relative[:, :K])), apart(rows.constant[:, :K])
+    drift, offset = apart(np.exp(rows.values[:, at.slopes])), apart(rows.values[:, at.intercepts])
     return _sensors_alone(drift[:, np.argsort(order)], offset[:, np.argsort(order)] * trial.full_scale_a)
 
 
@@ -158,7 +159,7 @@ def _evidence_rows(trial: Trial) -> tuple[EvidenceRows, NDArray[np.int64]]:
 
 
 class _Linear:
-    """Evidence rows as a linear model: 3K rows over eta, lambda (K), o_h (K - 1), omega (K), see docs/method.md.
+    """Measured evidence rows as a linear model: 3K rows over the 3K parameters without a load, see docs/method.md.
 
     The densest cluster of each row over the fleet says what vehicles without faults show, and how much they differ.
     """
@@ -167,25 +168,24 @@ class _Linear:
         self.rows, self.order = _evidence_rows(trial)
         self.full_scale_a = trial.full_scale_a
         K = self.rows.branches
-        self.design = np.zeros((3 * K, 3 * K))
-        self.design[: 2 * K - 1, : K + 1] = relative_design(K)[: 2 * K - 1]
-        self.design[2 * K - 1 :, K + 1 :] = constant_design(K)[: K + 1]
-        told = np.array([*range(2 * K - 1), *range(3 * K - 1, 4 * K)])
+        told = self.rows.places.measured
+        self.design = row_design(K, feed=0)[told, : parameter_places(K).load]
         covariance = self.rows.covariance[:, told[:, None], told]
         sd = np.sqrt(np.einsum("nii->ni", covariance))
-        raw = np.hstack([self.rows.relative[:, : 2 * K - 1], self.rows.constant[:, : K + 1]])
-        clusters = [densest_clusters(raw[:, i], sd[:, i])[0] for i in range(3 * K)]
-        self.centre = np.array([cluster.centre for cluster in clusters])
+        clusters = [densest_clusters(self.rows.values[:, row], sd[:, i])[0] for i, row in enumerate(told)]
+        centre = np.zeros(5 * K)
+        centre[told] = [cluster.centre for cluster in clusters]
+        self.evidence = evidence_of(
+            self.rows.values, self.rows.covariance, self.rows.means, centre=centre, shared=np.zeros(2 * K + 1), feed=0
+        )
         whole = WIDER * (covariance + np.diag([cluster.spread**2 for cluster in clusters]))
         self.whiten = np.linalg.inv(np.linalg.cholesky(whole))
 
     def values(self, theta: Array) -> Array:
-        """Rows (N, 3K) as they would be if the gains were those of theta (N, 3K)."""
-        K = self.rows.branches
-        relative = self.rows.relative - theta[:, : K + 1] @ relative_design(K).T
-        relative[:, : 2 * K - 1] -= self.centre[: 2 * K - 1]
-        seen = self.rows.constant_seen(np.expm1(theta[:, None, : K + 1]), relative[:, None])[:, 0, : K + 1]
-        return np.asarray(np.hstack([self.rows.relative[:, : 2 * K - 1], seen]) - self.centre)
+        """Rows (N, 3K) less their centre, as they would be if the gains were those of theta (N, 3K)."""
+        without_load = np.pad(theta, ((0, 0), (0, 1)))
+        left = row_residuals(self.evidence, without_load[:, None])[:, 0, self.rows.places.measured]
+        return np.asarray(left + theta @ self.design.T)
 
     def fit(self, support: Mask) -> tuple[Array, Array]:
         """Parameters (N, 3K) and chi2 (N,) of least squares with a support (N, 3K) for each vehicle."""
@@ -200,14 +200,14 @@ class _Linear:
 
     def faults(self, theta: Array) -> Faults:
         """Faults of parameters (N, 3K), branches in the vehicles' own order."""
-        K, own = self.rows.branches, np.argsort(self.order)
-        gain = np.exp(theta[:, 1 : K + 1])
-        hardware = np.column_stack([theta[:, K + 1 : 2 * K], -theta[:, K + 1 : 2 * K].sum(axis=1)])
+        at, own = parameter_places(self.rows.branches), np.argsort(self.order)
+        gain, hardware = np.exp(theta[:, at.gains]), theta[:, at.hardware_offsets]
+        hardware = np.column_stack([hardware, -hardware.sum(axis=1)])
         return Faults(
-            hardware_drift=np.expm1(theta[:, 0]),
+            hardware_drift=np.expm1(theta[:, at.eta]),
             hardware_offset_a=hardware[:, own] * self.full_scale_a,
             drift=gain[:, own] - 1.0,
-            offset_a=(theta[:, 2 * K :] * gain)[:, own] * self.full_scale_a,
+            offset_a=(theta[:, at.offsets] * gain)[:, own] * self.full_scale_a,
         )
 
 

@@ -1,14 +1,14 @@
 """Methods that experiments compare: a trial in, estimated faults out."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
 import numpy as np
 
 from calibrator.drive import Array, Mask
-from calibrator.estimator.fleet_estimate import HARM_LIMIT, estimate_rows, estimate_vehicles, learn_fleet
+from calibrator.estimator.fleet_estimate import HARM_LIMIT, RowsEstimate, estimate_rows, estimate_vehicles, learn_fleet
 from calibrator.estimator.learning import learn_laws
 from calibrator.estimator.prior import Prior, known_prior
 from calibrator.experiments.trial import CommonEvidence, FaultDistribution, Trial
@@ -126,22 +126,10 @@ def _estimate(trial: Trial, known: FaultDistribution | None) -> Estimate:
     names = [f"{k + 1}" for k in range(trial.truth.drift.shape[1])]
     reference = learn_fleet(trial.recorded, full_scale_a=trial.full_scale_a, branches=names, known=prior)
     found = estimate_vehicles(trial.recorded, reference)
-    return Estimate(
-        faults=Faults(
-            hardware_drift=found.hardware_drift,
-            hardware_offset_a=found.hardware_offset_a,
-            drift=found.drift,
-            offset_a=found.offset_a,
-        ),
-        hardware=found.hardware_probability > 0.5,
-        corrected=found.corrected,
-        confidence=found.confidence,
-        failed=0,
-        drift_sd=found.drift_sd,
-        offset_sd_a=found.offset_sd_a,
+    return replace(
+        _estimated(found, found.corrected, reference.laws[0].prior),
         pit=lambda truth: found.pit(truth.drift, truth.offset_a),
         findings=[[finding.cause for finding in findings] for findings in found.findings],
-        redraw=partial(_learnt(reference.laws[0].prior).draw, full_scale_a=trial.full_scale_a),
     )
 
 
@@ -152,29 +140,30 @@ def _of_rows(recorded: CommonEvidence, known: Prior | None, full_scale_a: float)
     mean = recorded.mean_a / full_scale_a
     square = np.einsum("nkk->nk", recorded.covariance_a2) / full_scale_a**2 + mean**2
     usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
-    found = estimate_rows(recorded.rows, laws, feed=feed, mean=mean, mean_square=square, usual=usual)
-    faulty = (found.drift != 0.0) | (found.offset != 0.0)
+    found = estimate_rows(
+        recorded.rows, laws, feed=feed, mean=mean, mean_square=square, usual=usual, full_scale_a=full_scale_a
+    )
+    return _estimated(found, found.faulty & found.identifiable & (found.harm_probability < HARM_LIMIT), laws[0].prior)
+
+
+def _estimated(found: RowsEstimate, corrected: Mask, prior: Prior) -> Estimate:
+    learnt = FaultDistribution(
+        counts=prior.counts, gain=(prior.gain.low, prior.gain.high), offset=(prior.offset.low, prior.offset.high)
+    )
     return Estimate(
         faults=Faults(
             hardware_drift=found.hardware_drift,
-            hardware_offset_a=found.hardware_offset * full_scale_a,
+            hardware_offset_a=found.hardware_offset_a,
             drift=found.drift,
-            offset_a=found.offset * full_scale_a,
+            offset_a=found.offset_a,
         ),
         hardware=found.hardware_probability > 0.5,
-        corrected=faulty & found.identifiable & (found.harm_probability < HARM_LIMIT),
+        corrected=corrected,
         confidence=found.confidence,
         failed=0,
         drift_sd=found.drift_sd,
-        offset_sd_a=found.offset_sd * full_scale_a,
-        redraw=partial(_learnt(laws[0].prior).draw, full_scale_a=full_scale_a),
-    )
-
-
-def _learnt(prior: Prior) -> FaultDistribution:
-    """Distribution of the faults that was learnt, for drawing from it."""
-    return FaultDistribution(
-        counts=prior.counts, gain=(prior.gain.low, prior.gain.high), offset=(prior.offset.low, prior.offset.high)
+        offset_sd_a=found.offset_sd_a,
+        redraw=partial(learnt.draw, full_scale_a=found.full_scale_a),
     )
 
 

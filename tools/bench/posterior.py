@@ -18,7 +18,7 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.estimator.fleet_estimate import estimate_rows
 from calibrator.estimator.learning import Law, learn_laws
-from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows, constant_design, relative_design
+from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows, row_design, row_places
 from calibrator.published.basis_pursuit import BasisPursuit
 from calibrator.published.enumeration import l1_optimum
 
@@ -162,9 +162,10 @@ def _simulated(branches: int, vehicles: int, sparsity: float) -> _Fleet:
     unknown = [np.sqrt(UNKNOWN_VARIANCE)] * K
     sd = np.array([SLOPE_SD] * K + [RATIO_SD] * (K - 1) + unknown + [INTERCEPT_SD] * K + [JUNCTION_SD] + unknown)
     error = np.where(sd < 1.0, sd, 0.0) * rng.normal(size=(vehicles, 5 * K))
-    first = np.log1p(relative) @ relative_design(K).T + error[:, : 3 * K - 1]
-    second = seen @ constant_design(K).T + error[:, 3 * K - 1 :]
-    first[:, 2 * K - 1 :], second[:, K + 1 :] = 0.0, 0.0
+    at = row_places(K)
+    made = np.column_stack([np.log1p(relative), seen, np.zeros(vehicles)]) @ row_design(K, feed=0).T + error
+    made[:, at.gain_reads] = made[:, at.offset_reads] = 0.0
+    first, second = made[:, at.relative], made[:, at.constant]
     second *= np.concatenate([factor, factor[:, :1], factor], axis=1)
     covariance = np.tile(np.diag(sd**2), (vehicles, 1, 1))
     rows = EvidenceRows(relative=first, constant=second, covariance=covariance, means=np.zeros((vehicles, 2, K)))

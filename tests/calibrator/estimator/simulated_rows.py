@@ -1,4 +1,8 @@
-"""Evidence rows of fleets whose faults are known, in fractions of full scale: fault offsets [A] at 1 A full scale."""
+"""Evidence rows of fleets whose faults are known, in fractions of full scale: fault offsets [A] at 1 A full scale.
+
+What the rows are, and what parameters leave of them, is written here once more from the equations, without the code
+that it is compared with: :func:`rows_of` and :func:`plain_residual`.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,7 +13,7 @@ import numpy as np
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.estimator.explanations import WIDE_SD, Evidence, evidence_of
-from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows, constant_design, relative_design
+from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows
 from calibrator.faults import Faults
 
 SCALE_A = 1.0
@@ -74,7 +78,8 @@ def rows_of(
     true = (1.0 + faults.hardware_drift[:, None]) * ideal + faults.hardware_offset_a
     true[:, 0] += load
     measured = gain * true + faults.offset_a
-    relative = np.log1p(np.column_stack([faults.hardware_drift, faults.drift])) @ relative_design(K).T + error[:, :c]
+    slope, ratio = gain * (1.0 + faults.hardware_drift[:, None]), gain[:, :1] / gain[:, 1:]
+    relative = np.log(np.column_stack([slope, ratio, gain])) + error[:, :c]
     b = measured - np.exp(relative[:, :K]) * ideal + gain * error[:, c : c + K]
     junction = measured[:, 0] + np.sum(np.exp(relative[:, K : 2 * K - 1]) * measured[:, 1:], axis=1)
     junction += gain[:, 0] * error[:, c + K]
@@ -126,13 +131,28 @@ def plain_evidence(rows: EvidenceRows, *, centre: Array | None = None, shared: A
 
 
 def plain_residual(rows: EvidenceRows, theta: Array) -> Array:
-    """Rows (S, 5K) of a vehicle (N = 1) less what parameters (S, 3K + 1) make of them, by the equations of the rows."""
+    """Rows (S, 5K) of a vehicle (N = 1) less what parameters (S, 3K + 1) make of them, by the equations of the rows.
+
+    The first branch feeds. Every line is turned about its mean from the measured ratio to that of the parameters; the
+    part of this that is linear in the logarithm is left in, as the covariance holds it (M10).
+    """
     K = rows.branches
-    relative = rows.relative[0] - theta[:, : K + 1] @ relative_design(K).T
-    seen = rows.constant_seen(np.expm1(theta[None, :, : K + 1]), relative[None])[0]
-    loads = np.zeros((len(theta), 2 * K + 1))
-    loads[:, [0, K]] = theta[:, 3 * K :]
-    return np.concatenate([relative, seen - theta[:, K + 1 : 3 * K] @ constant_design(K).T - loads], axis=1)
+    log_a, log_g, gain_read, b, c, offset_read = np.split(rows.values[0], np.cumsum([K, K - 1, K, K, 1]))
+    model, measured = rows.means[0]
+    eta, log_gain, hardware, omega, load = np.split(theta, np.cumsum([1, K, K - 1, K]), axis=1)
+    hardware = np.column_stack([hardware, -hardware.sum(axis=1)])
+    gain = np.exp(log_gain)
+    slope, ratio = np.exp(eta) * gain, gain[:, :1] / gain[:, 1:]
+    slope_error, ratio_error = log_a - np.log(slope), log_g - np.log(ratio)
+    intercept = (b + (np.exp(log_a) - slope) * model) / gain - model * slope_error
+    intercept -= hardware + omega
+    intercept[:, :1] -= load
+    turned = np.sum((np.exp(log_g) - ratio) * measured[1:], axis=1, keepdims=True)
+    junction = (c - turned) / gain[:, :1] + (ratio_error @ (measured[1:] / np.exp(log_a[1:])))[:, None]
+    junction -= omega.sum(axis=1, keepdims=True) + load
+    return np.column_stack(
+        [slope_error, ratio_error, gain_read - log_gain, intercept, junction, offset_read / gain - omega]
+    )
 
 
 def all_supports(branches: int) -> Iterator[tuple[int, ...]]:

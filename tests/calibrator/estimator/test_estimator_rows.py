@@ -9,23 +9,25 @@ import pytest
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.errors import FleetError
+from calibrator.estimator.explanations import evidence_of, row_residuals
 from calibrator.estimator.fleet_model import FleetModel, fit_fleet_model
 from calibrator.estimator.moments import stack_summaries
 from calibrator.estimator.rows import (
     UNKNOWN_VARIANCE,
     EvidenceRows,
     collect_rows,
-    constant_design,
     evidence_names,
-    relative_design,
+    row_design,
+    row_places,
 )
 from calibrator.faults import Faults
 from calibrator.summaries.moments import DriveSummary
 from tests.calibrator.estimator.simulated_drives import Conditions, no_faults, read_out_of, summaries_of
+from tests.calibrator.estimator.simulated_rows import parameters_of, plain_evidence, plain_residual
 
 K, FULL_SCALE_A = 3, 400.0
-MEASURED = [*range(2 * K - 1), *range(3 * K - 1, 4 * K)]
-"""Rows that drives show; the others are readings."""
+AT = row_places(K)
+MEASURED = AT.measured
 TRUE_MODEL = FleetModel(read_out=np.vstack([read_out_of(K), np.zeros(K)]))
 BRANCHES = pytest.mark.parametrize("branches", [2, 3, 5])
 
@@ -50,12 +52,10 @@ def rows_of(
 
 def errors(rows: EvidenceRows, faults: Faults) -> Array:
     """Rows less what they are without error, as seen in true currents, shape (N, 5K)."""
-    parameters = np.column_stack([faults.hardware_drift, faults.drift])
-    omega = faults.offset_a / (1.0 + faults.drift)
-    constant = np.concatenate([faults.hardware_offset_a[:, :-1], omega], axis=1) / FULL_SCALE_A
-    relative = rows.relative - np.log1p(parameters) @ relative_design(K).T
-    seen = rows.constant_seen(parameters[:, None], relative[:, None])[:, 0]
-    return np.concatenate([relative, seen - constant @ constant_design(K).T], axis=1)
+    hardware_offset, offset = faults.hardware_offset_a / FULL_SCALE_A, faults.offset_a / FULL_SCALE_A
+    theta = parameters_of(replace(faults, hardware_offset_a=hardware_offset, offset_a=offset))
+    vehicles = [slice(j, j + 1) for j in range(len(rows))]
+    return np.concatenate([plain_residual(rows.take(one), theta[one]) for one in vehicles])
 
 
 @pytest.mark.parametrize(
@@ -77,10 +77,12 @@ def test_standardised_errors_are_standard_normal(conditions: Conditions) -> None
 def test_rows_are_as_right_over_the_model_learnt_from_the_fleet() -> None:
     faults = random_faults(2, 100)
     summaries = summaries_of(faults, seed=2)
-    error = errors(rows_of(summaries, fit_fleet_model(stack_summaries(summaries))), faults)[:, MEASURED]
-    assert np.abs(np.median(error[:, : 2 * K - 1], axis=0)).max() < 0.003
-    assert np.abs(np.median(error[:, 2 * K - 1 :], axis=0)).max() < 0.002
-    assert np.abs(error).max() < 0.05
+    error = errors(rows_of(summaries, fit_fleet_model(stack_summaries(summaries))), faults)
+    assert np.abs(np.median(error[:, AT.slopes], axis=0)).max() < 0.003
+    assert np.abs(np.median(error[:, AT.ratios], axis=0)).max() < 0.003
+    assert np.abs(np.median(error[:, AT.intercepts], axis=0)).max() < 0.002
+    assert abs(np.median(error[:, AT.junction])) < 0.002
+    assert np.abs(error[:, MEASURED]).max() < 0.05
 
 
 def test_full_scale_is_only_the_unit_of_the_constant_rows() -> None:
@@ -113,7 +115,7 @@ def test_readings_and_reversed_branches_are_unknown() -> None:
     faults.drift[2, 1] = -2.0
     rows = rows_of(summaries_of(faults))
     assert rows.known[0].tolist() == [row in MEASURED for row in range(5 * K)]
-    assert np.flatnonzero(rows.known[0] != rows.known[2]).tolist() == [1, K]
+    assert np.flatnonzero(rows.known[0] != rows.known[2]).tolist() == [AT.slope(1), AT.ratio(1)]
     assert rows.covariance[2, 1, 1] == pytest.approx(UNKNOWN_VARIANCE)
     assert (rows.values[~rows.known] == 0.0).all()
 
@@ -124,18 +126,54 @@ def test_covariances_are_positive_definite_with_few_blocks() -> None:
 
 
 @BRANCHES
-def test_designs_are_logarithms_and_true_currents_of_what_is_measured(branches: int) -> None:
+def test_every_row_stands_where_its_name_says(branches: int) -> None:
+    at, names = row_places(branches), evidence_names([f"{k}" for k in range(branches)])
+    assert names[at.slopes] == [f"slope {k}" for k in range(branches)]
+    assert names[at.ratios] == [f"gain ratio 0 / {k}" for k in range(1, branches)]
+    assert names[at.gain_reads] == [f"gain read {k}" for k in range(branches)]
+    assert names[at.intercepts] == [f"intercept {k}" for k in range(branches)]
+    assert names[at.junction] == "junction constant"
+    assert names[at.offset_reads] == [f"offset read {k}" for k in range(branches)]
+    assert [names[row] for row in at.measured] == [name for name in names if "read" not in name]
+    assert names[at.relative] + names[at.constant] == names
+    assert names[at.constant][0] == "intercept 0"
+    for k in range(1, branches):
+        assert names[at.slope(k)] == f"slope {k}"
+        assert names[at.ratio(k)] == f"gain ratio 0 / {k}"
+        assert names[at.intercept(k)] == f"intercept {k}"
+
+
+@pytest.mark.parametrize("feed", [0, 1])
+@BRANCHES
+def test_design_is_logarithms_and_true_currents_of_what_is_measured(branches: int, feed: int) -> None:
     rng = np.random.default_rng(branches)
     d, o, o_h = rng.uniform(-0.2, 0.2, (3, branches))
-    d_h, o_h = 0.1, o_h - o_h.mean()
+    d_h, o_h, load = 0.1, o_h - o_h.mean(), 0.03
+    carried = load * (np.arange(branches) == feed)
     slopes, ratios = (1.0 + d) * (1.0 + d_h), (1.0 + d[0]) / (1.0 + d[1:])
-    relative = relative_design(branches) @ np.log1p(np.append(d_h, d))
-    np.testing.assert_allclose(relative, np.log(np.concatenate([slopes, ratios, 1.0 + d])), atol=1e-12)
-    b, c = (1.0 + d) * o_h + o, (1.0 + d[0]) * np.sum(o / (1.0 + d))
-    constant = constant_design(branches) @ np.append(o_h[:-1], o / (1.0 + d))
-    expected = np.concatenate([b / (1.0 + d), [c / (1.0 + d[0])], o / (1.0 + d)])
-    np.testing.assert_allclose(constant, expected, atol=1e-12)
-    assert len(evidence_names([f"{k}" for k in range(branches)])) == len(relative) + len(constant)
+    b, c = (1.0 + d) * (o_h + carried) + o, (1.0 + d[0]) * (np.sum(o / (1.0 + d)) + load)
+    relative = np.log(np.concatenate([slopes, ratios, 1.0 + d]))
+    constant = np.concatenate([b / (1.0 + d), [c / (1.0 + d[0])], o / (1.0 + d)])
+    theta = np.concatenate([np.log1p([d_h, *d]), o_h[:-1], o / (1.0 + d), [load]])
+    made = row_design(branches, feed) @ theta
+    np.testing.assert_allclose(made, np.append(relative, constant), atol=1e-12)
+
+
+@pytest.mark.parametrize("feed", [0, 1])
+@BRANCHES
+def test_rows_without_currents_leave_what_the_design_says(branches: int, feed: int) -> None:
+    """The compiled residuals count rows and parameters as the design does."""
+    n = branches
+    evidence = evidence_of(
+        np.zeros((1, 5 * n)),
+        np.eye(5 * n)[None],
+        np.zeros((1, 2, n)),
+        centre=np.zeros(5 * n),
+        shared=np.zeros(2 * n + 1),
+        feed=feed,
+    )
+    left = row_residuals(evidence, np.eye(3 * n + 1)[None])[0]
+    np.testing.assert_array_equal(left, -row_design(n, feed).T)
 
 
 @BRANCHES
@@ -145,8 +183,8 @@ def test_constants_pivot_with_their_ratios_about_the_means(branches: int) -> Non
     d_h, d, o, o_h, true = 0.1, *rng.uniform(-0.2, 0.2, (4, n))
     o_h, true = o_h - o_h.mean(), true - true.mean()
     measured = (1.0 + d) * ((1.0 + d_h) * true + o_h) + o
-    exact = relative_design(n) @ np.log1p(np.append(d_h, d))
-    expected = np.append(o_h + o / (1.0 + d), np.sum(o / (1.0 + d)))
+    exact = np.log(np.concatenate([(1.0 + d) * (1.0 + d_h), (1.0 + d[0]) / (1.0 + d[1:]), 1.0 + d]))
+    theta = np.concatenate([np.log1p([d_h, *d]), o_h[:-1], o / (1.0 + d), [0.0]])
 
     def off(error: Array) -> Array:
         """Constants as seen less what they are, for errors of the ratios."""
@@ -155,12 +193,14 @@ def test_constants_pivot_with_their_ratios_about_the_means(branches: int) -> Non
         c = measured[0] + np.exp(relative[n : 2 * n - 1]) @ measured[1:]
         rows = EvidenceRows(
             relative=relative[None],
-            constant=np.concatenate([b, [c], np.zeros(n)])[None],
+            constant=np.concatenate([b, [c], o])[None],
             covariance=np.eye(5 * n)[None],
             means=np.stack([true, measured])[None],
         )
-        seen = rows.constant_seen(np.append(d_h, d)[None, None], (relative - exact)[None, None])
-        return np.asarray(seen[0, 0, : n + 1] - expected)
+        left = row_residuals(plain_evidence(rows), theta[None, None])[0, 0]
+        np.testing.assert_allclose(left[: 3 * n - 1], relative - exact, atol=1e-12)
+        np.testing.assert_allclose(left[4 * n :], 0.0, atol=1e-12)
+        return np.asarray(left[3 * n - 1 : 4 * n])
 
     np.testing.assert_allclose(off(np.zeros(2 * n - 1)), 0.0, atol=1e-12)
     slope_error, ratio_error = rng.normal(0.0, 0.3, (2, 2 * n - 1))
@@ -174,20 +214,20 @@ def test_constants_pivot_with_their_ratios_about_the_means(branches: int) -> Non
 def test_dispersion_widens_intercepts_at_their_means_alone_and_a_load_the_constant() -> None:
     rows = rows_of(summaries_of(random_faults(3, 10), seed=3))
     whole, added = rows.dispersed(np.array([4.0, 1.0, 1.0]))
-    b = slice(3 * K - 1, 4 * K - 1)
+    b = AT.intercepts
     np.testing.assert_allclose(whole[:, b, b] - rows.covariance[:, b, b], added, atol=1e-15)
     np.testing.assert_allclose(added[:, 0, 0], 3.0 * rows.intercept_covariance()[:, 0, 0])
     assert not added[:, 1:].any()
     wider = rows.with_load_spread(0.01).covariance - rows.covariance
-    np.testing.assert_allclose(wider[:, 4 * K - 1, 4 * K - 1], 1e-4)
+    np.testing.assert_allclose(wider[:, AT.junction, AT.junction], 1e-4)
     assert np.count_nonzero(wider) == len(rows)
 
 
 def test_intercepts_at_the_means_do_not_depend_on_the_slopes() -> None:
     model, own = np.array([0.3, -0.2, -0.1]), np.diag([4e-6, 9e-6, 1e-6]) + 1e-6
     pivot, at_means = np.eye(5 * K), np.diag(np.full(5 * K, 1e-4))
-    pivot[range(3 * K - 1, 4 * K - 1), range(K)] = -model
-    at_means[3 * K - 1 : 4 * K - 1, 3 * K - 1 : 4 * K - 1] = own
+    pivot[AT.intercepts, AT.slopes] = -np.diag(model)
+    at_means[AT.intercepts, AT.intercepts] = own
     rows = EvidenceRows(
         relative=np.zeros((1, 3 * K - 1)),
         constant=np.zeros((1, 2 * K + 1)),

@@ -49,6 +49,14 @@ def test_trusted_vehicles_carry_the_reference_where_most_of_the_fleet_share_an_o
     assert np.median(found.offset_a[3:, 0]) == pytest.approx(12.0, abs=1.0)
 
 
+def test_trusted_vehicles_carry_the_reference_of_a_fleet_however_small() -> None:
+    few = drives("none")[:4]
+    for trusted, doubt in ((None, True), (np.arange(4) < 2, True), (np.arange(4) < 3, False)):
+        learnt = learn_fleet(few, full_scale_a=FULL_SCALE_A, branches=NAMES, trusted=trusted)
+        assert (learnt.vehicles, learnt.in_doubt) == (4, doubt)
+        assert any("few for a fleet" in text for text in learnt.notices) == doubt
+
+
 def test_offset_that_most_vehicles_share_is_reported_and_makes_the_others_no_worse() -> None:
     reference, found = calibrated(drives("batch"))
     assert reference.notices

@@ -10,7 +10,7 @@ from calibrator.estimator import learning
 from calibrator.estimator.learning import Law, Spread, explain, learn_laws, weigh_law
 from calibrator.estimator.posterior import weigh
 from calibrator.estimator.prior import TAIL_RANGE, Prior, first_prior, known_prior
-from calibrator.estimator.rows import EvidenceRows
+from calibrator.estimator.rows import EvidenceRows, row_places
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
 from tests.calibrator.estimator.simulated_rows import Errors, random_faults, rows_of
@@ -84,14 +84,14 @@ def test_scatter_of_sound_vehicles_is_not_learned_as_tiny_faults(seed: int) -> N
 
 
 def test_what_vehicles_without_faults_differ_by_is_learned() -> None:
-    K, rng = 2, np.random.default_rng(3)
+    K, rng, b = 2, np.random.default_rng(3), row_places(2).intercept(0)
     rows = rows_of(random_faults(3, vehicles=80, branches=K), seed=3)
     more = np.zeros((80, 5 * K))
-    more[:, [0, 3 * K - 1]] = rng.normal(0.0, [0.01, 0.004], (80, 2))
+    more[:, [0, b]] = rng.normal(0.0, [0.01, 0.004], (80, 2))
     spread = learned(moved(rows, more)).spread
     sd = np.sqrt(np.diag(spread.covariance))
     assert sd[0] == pytest.approx(0.01, rel=0.35)
-    assert np.hypot(sd[3 * K - 1], 0.001 * np.sqrt(spread.dispersion[0])) == pytest.approx(0.004, rel=0.35)
+    assert np.hypot(sd[b], 0.001 * np.sqrt(spread.dispersion[0])) == pytest.approx(0.004, rel=0.35)
     assert sd[1] < 0.005
     assert np.linalg.eigvalsh(spread.covariance).min() > 0.0
 
@@ -100,7 +100,7 @@ def test_intercepts_that_err_more_than_their_blocks_show_are_trusted_less() -> N
     K = 2
     rows = rows_of(random_faults(4, vehicles=60, branches=K), seed=4, errors=Errors(intercept=0.004))
     stated = rows.covariance.copy()
-    at = slice(3 * K - 1, 4 * K - 1)
+    at = row_places(K).intercepts
     stated[:, at, at] -= np.diag([0.004**2 - 0.001**2] * K)
     wide, plain = (learned(each).spread for each in (replace(rows, covariance=stated), rows))
     variance = 0.001**2 * wide.dispersion + np.diag(wide.covariance)[at]
@@ -109,9 +109,9 @@ def test_intercepts_that_err_more_than_their_blocks_show_are_trusted_less() -> N
 
 
 def test_error_of_the_reference_that_all_vehicles_share_is_its_centre() -> None:
-    K = 2
+    K, at = 2, row_places(2)
     rows, by = rows_of(random_faults(5, vehicles=40, branches=K), seed=5), np.zeros(5 * K)
-    by[:K], by[3 * K - 1] = (0.02, -0.015), 0.006
+    by[at.slopes], by[at.intercept(0)] = (0.02, -0.015), 0.006
     plain, shifted = learned(rows), learned(moved(rows, np.tile(by, (40, 1))))
     np.testing.assert_allclose(shifted.spread.mean - plain.spread.mean, by, atol=0.0012)
     np.testing.assert_allclose(shifted.prior.counts, plain.prior.counts, atol=0.03)
@@ -148,24 +148,25 @@ def test_share_of_faulty_vehicles_is_as_expected() -> None:
 
 
 def test_centre_that_trusted_vehicles_carry_is_kept() -> None:
-    K = 2
+    K, at = 2, row_places(2)
     rows, fixed = rows_of(random_faults(10, vehicles=25, branches=K), seed=10), np.full(5 * K, np.nan)
-    fixed[[0, 3 * K - 1]] = 0.001, -0.0005
+    trusted = [at.slope(0), at.intercept(0)]
+    fixed[trusted] = 0.001, -0.0005
     law = learn_laws(rows, feed=0, fixed=fixed)[0]
-    np.testing.assert_array_equal(law.spread.mean[[0, 3 * K - 1]], fixed[[0, 3 * K - 1]])
-    assert np.isnan(fixed[4 * K - 1]), "what the caller gave is not changed"
+    np.testing.assert_array_equal(law.spread.mean[trusted], fixed[trusted])
+    assert np.isnan(fixed[at.junction]), "what the caller gave is not changed"
 
 
 @pytest.mark.parametrize("declared", [None, 0.0125])
 def test_load_of_all_vehicles_is_found_or_taken_as_declared(declared: float | None) -> None:
-    K = 3
+    K, at = 3, row_places(3)
     rows = rows_of(random_faults(11, vehicles=40, branches=K), seed=11, load=0.0125)
     laws = learn_laws(rows, feed=0, load=declared)
-    assert laws[0].spread.mean[4 * K - 1] == pytest.approx(0.0125, abs=3e-4)
+    assert laws[0].spread.mean[at.junction] == pytest.approx(0.0125, abs=3e-4)
     assert not laws[0].spread.shared[:K].any()
     assert laws[0].prior.counts[0].sum() == pytest.approx(0.7, abs=0.2)
     if declared is not None:
-        assert laws[0].spread.mean[4 * K - 1] == declared
+        assert laws[0].spread.mean[at.junction] == declared
 
 
 @pytest.mark.parametrize("K", [2, 3])
@@ -245,7 +246,8 @@ def test_one_vehicle_and_a_branch_that_nobody_used_are_learned_from_without_fail
     rows = rows_of(Faults(**{name: values[:1] for name, values in vars(no_faults(2, K)).items()}), seed=17)
     assert len(learn_laws(rows, feed=0)) >= 1
     rows = rows_of(no_faults(8, K), seed=17, currents=np.array([0.1, -0.1, 0.0]))
-    for row in (K - 1, 2 * K - 2):
+    at = row_places(K)
+    for row in (at.slope(K - 1), at.ratio(K - 1)):
         rows.covariance[:, row], rows.covariance[:, :, row] = 0.0, 0.0
         rows.covariance[:, row, row] = 100.0
         rows.relative[:, row] = 0.0

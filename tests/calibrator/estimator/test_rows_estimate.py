@@ -1,6 +1,7 @@
 """From evidence rows to estimates: right where they are sure, each vehicle by itself, harmless in odd worlds."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ VARIANCE = 0.04
 """Of the currents, in squares of full scale."""
 
 
-def moments(rows: EvidenceRows) -> dict[str, Array]:
+def moments(rows: EvidenceRows) -> dict[str, Any]:
     mean, ideal = rows.means[:, 1], rows.means[0, 0]
     return {"mean": mean, "mean_square": mean**2 + VARIANCE, "usual": np.stack([ideal, ideal**2 + VARIANCE])}
 
@@ -29,7 +30,7 @@ def estimated(faults: Faults, *, seed: int, load: Array | float = 0.0) -> tuple[
     found = estimate_rows(rows, learn_laws(rows, feed=0), feed=0, **moments(rows))
     deployed = found.identifiable & (found.harm_probability < HARM_LIMIT)
     none = no_faults(*faults.drift.shape)
-    return found, replace(none, drift=found.drift * deployed, offset_a=found.offset * deployed)
+    return found, replace(none, drift=found.drift * deployed, offset_a=found.offset_a * deployed)
 
 
 def worse(deployed: Faults, faults: Faults) -> Mask:
@@ -43,7 +44,7 @@ def worse(deployed: Faults, faults: Faults) -> Mask:
 def test_faults_are_recovered_and_corrected_whatever_their_size(K: int, magnitude: tuple[float, float]) -> None:
     faults = random_faults(1, vehicles=40, branches=K, magnitude=magnitude)
     found, deployed = estimated(faults, seed=1)
-    estimate = replace(no_faults(40, K), drift=found.drift, offset_a=found.offset)
+    estimate = replace(no_faults(40, K), drift=found.drift, offset_a=found.offset_a)
     right = recovered(estimate, faults, full_scale_a=1.0, smallest_fault=magnitude[0])
     assert right.mean() >= 0.9
     assert not worse(deployed, faults).any()
@@ -60,7 +61,7 @@ def test_batch_of_sensors_with_a_common_offset_makes_no_vehicle_worse(offset: fl
     faults.offset_a[: round(30 * share), 0] += offset
     found, deployed = estimated(faults, seed=2)
     assert not worse(deployed, faults).any()
-    assert np.abs(found.offset[:, 1] - faults.offset_a[:, 1]).max() < 0.01
+    assert np.abs(found.offset_a[:, 1] - faults.offset_a[:, 1]).max() < 0.01
 
 
 @pytest.mark.parametrize(("load", "share"), [(0.0125, 0.3), (0.025, 0.15), (0.0125, 1.0)])
@@ -68,7 +69,7 @@ def test_load_without_a_sensor_makes_no_vehicle_worse(load: float, share: float)
     faults = random_faults(3, vehicles=30, branches=3)
     found, deployed = estimated(faults, seed=3, load=load * (np.arange(30) < 30 * share))
     assert not worse(deployed, faults).any()
-    assert np.abs(found.offset[:, 1:] - faults.offset_a[:, 1:]).max() < 0.01
+    assert np.abs(found.offset_a[:, 1:] - faults.offset_a[:, 1:]).max() < 0.01
 
 
 @pytest.mark.parametrize("gain", [0.04, -0.04])
@@ -91,7 +92,7 @@ def test_standard_deviations_are_those_of_the_errors() -> None:
     faults = random_faults(6, vehicles=120, branches=2)
     found, _ = estimated(faults, seed=6)
     truth = np.hstack([faults.drift, faults.offset_a])
-    error, sd = np.hstack([found.drift, found.offset]) - truth, np.hstack([found.drift_sd, found.offset_sd])
+    error, sd = np.hstack([found.drift, found.offset_a]) - truth, np.hstack([found.drift_sd, found.offset_sd_a])
     sure = (found.confidence > 0.95)[:, None] & (truth != 0.0)
     within = np.abs(error[sure]) / sd[sure]
     assert 0.55 < (within < 1.0).mean() < 0.95
@@ -110,14 +111,14 @@ def test_vehicle_is_estimated_alike_to_the_bit_alone_and_in_any_fleet(K: int) ->
         for name, values in vars(alone).items():
             if isinstance(values, np.ndarray):
                 np.testing.assert_array_equal(values[0], getattr(together, name)[j], err_msg=name)
-        for found, other in zip(alone.explanations[0], together.explanations[j], strict=True):
+        for found, other in zip(alone.supports[0], together.supports[j], strict=True):
             assert found[0] == other[0]
             np.testing.assert_array_equal(found[1], other[1])
 
 
 def test_probabilities_of_the_explanations_are_those_of_the_posterior() -> None:
     found, _ = estimated(random_faults(8, vehicles=20, branches=2, sparsity=60.0), seed=8)
-    for j, explanations in enumerate(found.explanations):
+    for j, explanations in enumerate(found.supports):
         shares = [share for share, _ in explanations]
         assert shares == sorted(shares, reverse=True)
         assert sum(shares) == pytest.approx(1.0, abs=0.001)

@@ -57,6 +57,14 @@ def estimate(
         verdicts=("cannot tell",),
         explanations=[explanations],
         findings=[findings],
+        evidence=[],
+        load_probability=np.zeros(1),
+        load_a=np.zeros(1),
+        group_probability=np.zeros((1, 0)),
+        supports=[],
+        points=[],
+        order=(0, 1),
+        full_scale_a=FULL_SCALE_A,
     )
 
 
