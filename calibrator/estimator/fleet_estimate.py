@@ -58,6 +58,8 @@ CENTRAL = 0.6827
 """Share of a normal distribution within one standard deviation. [1]"""
 LEFT_OUT_CAUSES = ("spikes", "outliers")
 """Findings whose samples are not in the sums: the other branches of the vehicle are not concerned."""
+LINEAR_CAUSES = (*LEFT_OUT_CAUSES, "noise", "switching")
+"""Findings of sensors that have a gain and an offset all the same."""
 VARIANT_SHARE, VARIANT_SPREAD, FEWEST_VARIANT = 0.15, 0.012, 4
 """Share of the fleet, half width of the hardware drift, and number of vehicles of a variant. [1]"""
 
@@ -717,9 +719,12 @@ def estimate_vehicles(
     held_back = np.select(list(reasons.values()), list(reasons), "")
     corrected = found.faulty & (held_back == "")
     sound = ~found.faulty.any(axis=1) & (found.confidence >= CONFIDENT) & ~np.array(list(map(bool, unfit)))
+    linear = [
+        1.0 - max((each.probability for each in mine if each.cause not in LINEAR_CAUSES), default=0.0) for mine in unfit
+    ]
     law = reference.laws[0]
     return FleetEstimate(
-        **vars(found),
+        **{**vars(found), "confidence": found.confidence * linear},
         corrected=corrected,
         held_back=held_back,
         verdicts=np.select([corrected.any(axis=1), sound], ["corrected", "no sensor fault"], "cannot tell").tolist(),

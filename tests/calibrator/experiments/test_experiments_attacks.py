@@ -5,6 +5,7 @@ import pytest
 
 from calibrator.experiments.attacks import WORLDS
 from calibrator.experiments.baselines import BASELINES
+from calibrator.experiments.methods import POSTERIOR
 from calibrator.experiments.outcome import figures_of, judge
 from calibrator.experiments.recorded_fleet import RecordedFleet
 from calibrator.experiments.recorded_trial import NOISE, RecordedCase, record_vehicles, recorded_trial
@@ -44,6 +45,16 @@ def test_truth_and_unseen_drive_are_those_of_the_world(fleet: RecordedFleet) -> 
     quadratic = recorded_trial(fleet, RecordedCase(sparsity=100.0, world="quadratic 5-20 %"), 3)
     assert quadratic.attacked is not None
     np.testing.assert_array_equal(np.any(quadratic.unseen.error_mean_square_a2 > 1e-6, axis=1), quadratic.attacked)
+
+
+def test_nothing_is_sure_of_a_vehicle_with_an_inverted_sensor(fleet: RecordedFleet) -> None:
+    trial = recorded_trial(fleet, RecordedCase(sparsity=100.0, world="inverted in 10%"), 3)
+    found = POSTERIOR.estimate(trial)
+    assert trial.attacked is not None
+    assert found.confidence is not None
+    assert trial.attacked.any()
+    assert found.confidence[trial.attacked].max() < 0.1
+    assert np.median(found.confidence[~trial.attacked]) > 0.9
 
 
 def test_step_is_half_way_and_over_on_the_unseen_drive(fleet: RecordedFleet) -> None:
