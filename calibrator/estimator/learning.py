@@ -299,7 +299,8 @@ class _Learner:
             rows.values[:, junction], np.sqrt(rows.covariance[:, junction, junction]), farthest=LARGEST_SHARED
         )
         if clusters:  # loads without a sensor differ between vehicles
-            covariance[junction, junction] += min(clusters[0].spread, MOST_LOAD_SPREAD) ** 2
+            carrying = [self.at.intercept(self.feed), junction]  # a load shows in both alike
+            covariance[np.ix_(carrying, carrying)] += min(clusters[0].spread, MOST_LOAD_SPREAD) ** 2
         spread = Spread(
             mean=centre,
             covariance=covariance,
