@@ -299,8 +299,8 @@ class _Learner:
             rows.values[:, junction], np.sqrt(rows.covariance[:, junction, junction]), farthest=LARGEST_SHARED
         )
         if clusters:  # loads without a sensor differ between vehicles
-            carrying = [self.at.intercept(self.feed), junction]  # a load shows in both alike
-            covariance[np.ix_(carrying, carrying)] += min(clusters[0].spread, MOST_LOAD_SPREAD) ** 2
+            load = self.design[:, self.parameters.load]
+            covariance += min(clusters[0].spread, MOST_LOAD_SPREAD) ** 2 * np.outer(load, load)
         spread = Spread(
             mean=centre,
             covariance=covariance,
