@@ -170,6 +170,16 @@ def test_load_of_all_vehicles_is_found_or_taken_as_declared(declared: float | No
 
 
 @pytest.mark.parametrize("K", [2, 3])
+def test_loads_that_differ_between_vehicles_are_no_offsets_of_sensors(K: int) -> None:
+    load = np.random.default_rng(15).normal(0.0075, 0.0025, 30).clip(0.0)
+    errors = Errors(intercept=0.0003, junction=0.0001)  # as on recorded trips
+    law = learned(rows_of(random_faults(15, vehicles=30, branches=K), seed=15, errors=errors, load=load))
+    carried = [law.spread.covariance[row, 4 * K - 1] for row in (3 * K - 1, 4 * K - 1)]
+    np.testing.assert_allclose(np.sqrt(carried), load.std(), rtol=0.3)
+    assert not law.spread.shared.any()
+
+
+@pytest.mark.parametrize("K", [2, 3])
 def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K: int) -> None:
     """Currents that sum to less than zero: no load gives current."""
     faults = random_faults(12, vehicles=40, branches=K)
