@@ -8,7 +8,7 @@ TRIPS ?= ../shared/data/bmw_i3_summer
 PYTHONS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test coverage bench bench-quick experiments soak fuzz release-check mutants lint types docs dist \
+.PHONY: help setup demo test coverage bench bench-quick experiments soak fuzz release-check mutants lint types docs notebook dist \
 	package sbom licences schema constraints clean
 
 help:                    ## this list
@@ -21,6 +21,7 @@ $(VENV)/.installed: constraints.txt pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	$(BIN)/python examples/twelve_vehicles.py >/dev/null # compiles the estimator, once
 	@touch $@
 
 demo: setup              ## a fleet, its calibration, and the Kirchhoff sum before and after (DRIVES=folder: real drives)
@@ -71,9 +72,12 @@ types: setup             ## mypy --strict
 	$(BIN)/mypy
 
 docs: setup              ## the documentation, in build/docs; its examples are run
-	rm -rf build/docs docs/reference/api
+	rm -rf build/docs docs/reference/api docs/gallery
 	PYTHONPATH=tools $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --fresh-env --conf-dir docs \
 		--doctree-dir build/doctrees . build/docs
+
+notebook: setup          ## run the notebook of the examples, and keep its outputs in it
+	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m docs_site.run_notebook examples/fleet_to_node.ipynb
 
 dist: setup              ## wheel and source distribution, in dist/, checked
 	rm -rf dist
@@ -98,4 +102,4 @@ constraints:             ## pin the newest versions of all dependencies, with ha
 		--all-extras --upgrade pyproject.toml --output-file constraints.txt
 
 clean:                   ## what the other targets made
-	rm -rf $(VENV) build dist docs/reference/api
+	rm -rf $(VENV) build dist docs/reference/api docs/gallery

@@ -9,15 +9,19 @@ Twelve vehicles from data frames (currents positive into the junction, in A) to 
     found = FleetCalibrator().fit(fleet)
     found.parameters_
 
+One car with a sensor that is trusted needs no fleet:
+
+    JunctionCalibrator(trusted=["battery"]).fit(frame, junction).parameters_
+
 Importing the package is quick; what takes time is imported when it is used.
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calibrator.estimator.fleet import Fleet, FleetCalibrator, Junction, read_log
+    from calibrator.estimator.fleet import Fleet, FleetCalibrator, Junction, JunctionCalibrator, read_log
 
-__all__ = ["Fleet", "FleetCalibrator", "Junction", "read_log"]
+__all__ = ["Fleet", "FleetCalibrator", "Junction", "JunctionCalibrator", "read_log"]
 
 
 def __getattr__(name: str) -> Any:

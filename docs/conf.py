@@ -9,13 +9,21 @@ project = "hv-current-correction"
 author = "the authors of hv-current-correction"
 version = release = __version__
 root_doc = "docs/index"
-include_patterns = ["*.md", "deploy/README.md", "docs/**.md", "docs/reference/api/*.rst", "examples/*.ipynb"]
+include_patterns = [
+    "*.md",
+    "deploy/README.md",
+    "docs/**.md",
+    "docs/reference/api/*.rst",
+    "docs/gallery/*.rst",
+    "examples/*.ipynb",
+]
 
 extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
+    "sphinx_gallery.gen_gallery",
     "docs_site.command_reference",
     "docs_site.docstrings",
     "docs_site.mathml",
@@ -31,6 +39,18 @@ nb_execution_timeout = 1800  # s for a cell; on a busy machine, with the estimat
 nb_merge_streams = True
 nb_output_stderr = "remove"  # progress; warnings are errors
 os.environ["PYTHONWARNINGS"] = "error,ignore::PendingDeprecationWarning"  # in examples; the latter is of their kernel
+
+sphinx_gallery_conf = {
+    "examples_dirs": "examples",
+    "gallery_dirs": "docs/gallery",
+    "within_subsection_order": "docs_site.GalleryOrder",
+    "default_thumb_file": "docs/images/kirchhoff.png",
+    "filename_pattern": r"\.py$",  # all of them run
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_signature": False,
+    "write_computation_times": False,
+}
 
 autodoc_typehints = "none"  # types stand in the docstrings, with shapes and units
 autodoc_preserve_defaults = True

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from ecu_node.branch_plans import branch_plan
-from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.database import VehicleDatabase, node_database
 from ecu_node.errors import printable
 from ecu_node.guard import Mode, needs_fd
 from ecu_node.in_force import InForce, not_published, sensor_fault
-from ecu_node.layout import Branch, read_layout
+from ecu_node.layout import Branch
 from ecu_node.parameter_file import choose_parameters
 from ecu_node.wiring import wire
 
@@ -45,7 +45,7 @@ def check_report(params: Path, layout: Path, vehicle: str | None, mode: Mode = M
     LayoutError, DatabaseError
         If layout or DBC cannot be used at all, by which ``ecu-node run`` would be refused too.
     """
-    database = read_database(read_layout(layout))
+    database = node_database(layout)
     in_force, why_not = choose_parameters(params, database, vehicle)
     wire(database, in_force, start_s=0.0, mode=mode)
     parameters = in_force.parameters

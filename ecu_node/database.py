@@ -1,17 +1,22 @@
 """The DBC as the layout uses it: every named signal found, with its unit turned into A, V or W."""
 
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import cantools
 from cantools.database.can import Database, Message, Signal
+from cantools.database.conversion import BaseConversion
 
 from ecu_node.codes import impossible_values
 from ecu_node.errors import DatabaseError, LayoutError
-from ecu_node.layout import Layout, split_signal
+from ecu_node.layout import Layout, read_layout, split_signal
 from ecu_node.units import AMPERE, VOLT, WATT, unit_factor
 from ecu_node.user_files import UnsuitableFileError, read_user_file, text_digest
 
-__all__ = ["MAX_DBC_BYTES", "VehicleDatabase", "look_everything_up", "read_database"]
+__all__ = ["MAX_DBC_BYTES", "VehicleDatabase", "look_everything_up", "node_database", "read_database"]
 
 MAX_DBC_BYTES = 16_000_000
 """The largest DBCs have some megabytes; to read one takes a hundred times its size in memory."""
@@ -19,25 +24,58 @@ MAX_DBC_BYTES = 16_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleDatabase:
-    """The messages of one DBC, with look-ups whose errors name file, message and signal."""
+    """The messages of a layout's DBC, with look-ups whose errors name file, message and signal."""
 
     layout: Layout
     database: Database
+    """That of the only bus; empty where there is none or several."""
     digest: str
-    """SHA-256 of the DBC file."""
+    """SHA-256 of the DBC file; see :attr:`.Layout.dbc_digest`."""
+    buses: Mapping[str, Database] = field(default_factory=dict)
+    """By name of the bus, where the layout names buses."""
 
     def message(self, name: str, place: str = "") -> Message:
         """Return the message of this name, which stands at this place of the layout, or raise DatabaseError."""
-        try:
-            return self.database.get_message_by_name(name)
-        except KeyError:
-            where = f" in {place}" if place else ""
+        return self._found(name, place)[1]
+
+    def channel_of(self, name: str) -> str | None:
+        """Channel that a message ``Message`` or ``bus:Message`` comes on; None where the layout names no buses."""
+        bus = self._found(name, "")[0]
+        return next((item.channel for item in self.layout.bus if item.name == bus), None)
+
+    def _found(self, name: str, place: str) -> tuple[str, Message]:
+        """Bus and message of this name."""
+        wanted, _, bare = name.rpartition(":")
+        buses = self.buses or {"": self.database}
+        found = []
+        for bus in [wanted] if wanted in buses else buses:
+            with suppress(KeyError):
+                found.append((bus, buses[bus].get_message_by_name(bare)))
+        if len(found) == 1:
+            return found[0]
+        where = f" in {place}" if place else ""
+        if found:
             raise DatabaseError(
-                f"{self.layout.dbc_path}: no message {name!r}, which {self.layout.path} names{where}"
-            ) from None
+                f"{self.layout.path}: message {bare!r}{where} is in the DBCs of the buses "
+                f"{' and '.join(bus for bus, _ in found)}; write '{found[0][0]}:{bare}'"
+            )
+        paths = self.layout.dbc_paths
+        if not paths:
+            raise DatabaseError(
+                f"{self.layout.path}: no 'dbc', so that it fits tables only; give the DBC of the frames"
+            )
+        path = paths.get(wanted) or ", ".join(map(str, paths.values()))
+        raise DatabaseError(f"{path}: no message {bare!r}, which {self.layout.path} names{where}")
 
     def signal(self, name: str) -> tuple[Message, Signal]:
-        """Return message and signal of ``Message.Signal``, or raise :class:`DatabaseError`."""
+        """Return message and signal of ``Message.Signal``, or raise :class:`DatabaseError`.
+
+        Without a DBC the name is that of a column, and its signal any number in the unit that the layout gives.
+        """
+        if not self.layout.dbc_files:
+            unit = next((item.unit for item in self.layout.branch if item.source == name), None)
+            column = Signal(name, 0, 64, conversion=BaseConversion.factory(is_float=True), unit=unit)
+            return Message(0, name, 8, [column]), column
         message_name, signal_name = split_signal(name)
         message = self.message(message_name)
         for signal in message.signals:
@@ -50,16 +88,16 @@ class VehicleDatabase:
         )
 
     def current_step_a(self, branch: str) -> float:
-        """Step of the signal of a branch [A]; 0 where its current is a quotient of two signals."""
+        """Step of the signal of a branch [A]; 0 where its current is computed of several, or any number."""
         name = self.layout.find_branch(branch).signal
         if name is None:
             return 0.0
         _, signal = self.signal(name)
-        return float(signal.scale) * unit_factor(signal, AMPERE, f"branch {branch}")
+        return 0.0 if signal.is_float else float(signal.scale) * unit_factor(signal, AMPERE, f"branch {branch}")
 
 
 def read_database(layout: Layout) -> VehicleDatabase:
-    """Load the DBC of a layout and look every signal up that the layout names.
+    """Load the DBC of a layout, or those of its buses, and look every signal up that the layout names.
 
     Parameters
     ----------
@@ -69,7 +107,7 @@ def read_database(layout: Layout) -> VehicleDatabase:
     Returns
     -------
     VehicleDatabase
-        The database, with all names of the layout known to exist.
+        The database, with all names of the layout known to exist; without a DBC names are those of columns.
 
     Raises
     ------
@@ -78,18 +116,71 @@ def read_database(layout: Layout) -> VehicleDatabase:
     LayoutError
         If the layout names a value of an input that its signal can never have.
     """
-    path = layout.dbc_path
+    loaded = {bus: _load(layout, file) for bus, file in layout.dbc_files.items()}
+    digests = [digest for _, digest in loaded.values()]
+    databases = {bus: database for bus, (database, _) in loaded.items()}
+    vehicle = VehicleDatabase(
+        layout=layout,
+        database=next(iter(databases.values())) if len(databases) == 1 else Database(),
+        digest=digests[0] if len(digests) == 1 else text_digest("".join(digests).encode()),
+        buses=databases if layout.bus else {},
+    )
+    if databases:
+        for branch in layout.branch:
+            if branch.unit is not None:
+                vehicle.signal(branch.source)[1].unit = branch.unit
+        for name in layout.wrong_ranges:
+            signal = vehicle.signal(name)[1]
+            signal.minimum = signal.maximum = None
+        look_everything_up(vehicle)
+    return vehicle
+
+
+def node_database(path: Path) -> VehicleDatabase:
+    """Read a layout and its DBC for a node, which corrects the signals of one bus; raises as both readers do.
+
+    Parameters
+    ----------
+    path : Path
+        The layout.
+
+    Returns
+    -------
+    VehicleDatabase
+        Layout and DBC.
+
+    Raises
+    ------
+    LayoutError
+        If the layout is one for tables, for several buses, or has a branch that no signal carries.
+    """
+    layout = read_layout(path)
+    computed = [branch.name for branch in layout.branch if branch.computed]
+    if len(layout.dbc_files) != 1:
+        what = "names several buses" if layout.bus else "has no 'dbc', so that it fits tables only"
+        raise LayoutError(f"{path}: {what}; the node corrects the signals of one bus: write a layout with its 'dbc'")
+    if computed:
+        raise LayoutError(
+            f"{path}: branch {computed[0]} is computed by a formula; the node corrects only what a signal carries: "
+            f"leave the branch out of the node's layout"
+        )
+    return read_database(layout)
+
+
+def _load(layout: Layout, file: str) -> tuple[Database, str]:
+    """Messages of a DBC, and its digest."""
+    path = layout.path.parent / file
     try:
         content = read_user_file(path, largest_bytes=MAX_DBC_BYTES)
         if not content.strip():
             raise DatabaseError(f"{path}: the DBC is empty, it has no message; copy it again")
-        database = cantools.database.load_file(path, strict=False)
+        database = _parsed(path, content)
         if read_user_file(path, largest_bytes=MAX_DBC_BYTES) != content:
             raise DatabaseError(f"{path}: the DBC was changed while it was read; try again")
     except (OSError, UnsuitableFileError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise DatabaseError(
-            f'{path}: cannot read the DBC: {why}; it is named by the line dbc = "{layout.dbc}" of {layout.path}'
+            f'{path}: cannot read the DBC: {why}; it is named by the line dbc = "{file}" of {layout.path}'
         ) from None
     except (cantools.Error, ValueError, KeyError, TypeError) as error:
         first_line = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -98,9 +189,39 @@ def read_database(layout: Layout) -> VehicleDatabase:
         raise DatabaseError(f"{path}: a diagnostics database; a CAN database (DBC) is needed")
     if not database.messages:
         raise DatabaseError(f"{path}: the DBC has no message; check that it is the one that {layout.path} needs")
-    vehicle = VehicleDatabase(layout=layout, database=database, digest=text_digest(content))
-    look_everything_up(vehicle)
-    return vehicle
+    return database, text_digest(content)
+
+
+def _parsed(path: Path, content: bytes) -> cantools.database.Database | object:
+    """What cantools makes of a file; two slips that many public DBCs have are put right.
+
+    Identifiers of 29 bits that are not marked as extended, and names for values of signals that are not there.
+    """
+    try:
+        return cantools.database.load_file(path, strict=False)
+    except (cantools.Error, ValueError) as error:
+        if path.suffix.lower() != ".dbc" or not re.search("more than 11 bits|unused VAL_", str(error)):
+            raise
+    signals: dict[str, set[str]] = {}
+    lines, message = [], ""
+    for line in content.decode("cp1252").splitlines():
+        if found := _OF_MESSAGE.match(line):
+            number = int(found[2])
+            message = str(number | _EXTENDED if _STANDARD_BITS < number < _EXTENDED else number)
+            line = f"{found[1]}{message}{line[found.end() :]}"  # noqa: PLW2901
+        if found := re.match(r"\s*SG_ (\w+)", line):
+            signals.setdefault(message, set()).add(found[1])
+        lines.append(line)
+    known = [
+        line
+        for line in lines
+        if not (found := re.match(r"VAL_ (\d+) (\w+)", line)) or found[2] in signals.get(found[1], ())
+    ]
+    return cantools.database.load_string("\n".join(known) + "\n", "dbc", strict=False)
+
+
+_OF_MESSAGE = re.compile(r'(\s*(?:BO_|VAL_|BO_TX_BU_|CM_ (?:BO_|SG_)|SIG_VALTYPE_|BA_ "\w+" (?:BO_|SG_)) )(\d+)')
+_STANDARD_BITS, _EXTENDED = 0x7FF, 1 << 31
 
 
 def look_everything_up(vehicle: VehicleDatabase) -> None:

@@ -207,8 +207,8 @@ def _count_words(number: int, *, is_text: bool) -> str:
 
 def _pattern_words(text: str) -> str:
     """Words for the patterns of names, of signals and of digests, each known by a part of its own."""
-    if r"\\." in text:
-        return "'Message.Signal' as in the DBC"
+    if "x1f" in text:
+        return "'Message.Signal' as in the DBC, or a column without blanks at its ends,"
     return "a name of letters, digits and _" if "A-Za-z_" in text else "a text of 64 digits 0-9 and a-f"
 
 

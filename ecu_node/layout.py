@@ -1,4 +1,4 @@
-"""Layout: a TOML file that says what the signals of one DBC mean.
+"""Layout: a TOML file that says what the signals of a DBC, or the columns of tables, mean.
 
 It names the branches of the junction with their sign, the inputs, where corrected values go, timeouts and limits.
 All later steps use the names given here; the DBC's own names appear nowhere else.
@@ -20,6 +20,7 @@ from ecu_node.user_files import UnsuitableFileError, read_user_file, text_digest
 __all__ = [
     "MAX_LAYOUT_BYTES",
     "Branch",
+    "Bus",
     "Contactor",
     "Derived",
     "Input",
@@ -32,6 +33,7 @@ __all__ = [
     "UnmeasuredLoad",
     "Watch",
     "file_digest",
+    "layout_of",
     "read_layout",
     "split_signal",
 ]
@@ -42,8 +44,18 @@ MAX_LAYOUT_BYTES = 1_000_000
 _Positive = Annotated[float, msgspec.Meta(gt=0.0, le=1e6)]
 
 
+class Bus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One of the buses that a log holds."""
+
+    name: Name
+    channel: str
+    """As the log calls it, such as ``can0``."""
+    dbc: str
+    """Path of its DBC, relative to the layout file."""
+
+
 class Branch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One HV current at the junction: a current signal, or a power signal divided by a voltage signal."""
+    """One HV current at the junction: a current, a power divided by a voltage, or computed by a formula [A]."""
 
     name: Name
     sign: Literal[1, -1]
@@ -51,6 +63,12 @@ class Branch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     signal: SignalName | None = None
     power: SignalName | None = None
     voltage: SignalName | None = None
+    formula: str | None = None
+    """Of inputs and derived inputs, and without a DBC of columns; its value is the current. [A]"""
+    unit: str | None = None
+    """Of the current or power, where DBC or header do not say it or are wrong."""
+    uncertainty: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
+    """Relative standard deviation of what a formula gives. [1]"""
     timeout_s: _Positive = 0.5
     """Without a frame for this long the branch is stale. [s]"""
     balance: bool = False
@@ -61,9 +79,14 @@ class Branch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Raw codes of the signal that are no values, beyond those that the DBC names."""
 
     @property
+    def computed(self) -> bool:
+        """Whether a formula gives the current: a poor reference for sensors."""
+        return self.formula is not None
+
+    @property
     def source(self) -> SignalName:
-        """The signal whose frames carry this branch."""
-        source = self.signal or self.power
+        """The signal whose frames carry this branch; of a computed one the formula."""
+        source = self.signal or self.power or self.formula
         assert source is not None
         return source
 
@@ -155,14 +178,18 @@ class LayoutKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     schema: Literal[1]
     name: Name
-    dbc: str
-    """Path of the DBC, relative to the layout file."""
+    dbc: str | None = None
+    """Path of the DBC, relative to the layout file; not given where the recordings are tables."""
+    bus: list[Bus] = []
+    """In place of the DBC, where logs hold several buses."""
     full_scale_a: _Positive
     branch: Annotated[list[Branch], msgspec.Meta(min_length=2, max_length=16)]
     period_s: Annotated[float, msgspec.Meta(gt=0.0, le=10.0)] = 0.1
     max_age_s: _Positive = 1.0
     """An input without a frame for this long is stale. [s]"""
     input: list[Input] = []
+    wrong_ranges: list[SignalName] = []
+    """Signals whose [minimum|maximum] in the DBC is wrong: it is not applied to them."""
     temperature: Name | None = None
     """Input that is the temperature of the current sensors. [degC]"""
     contactor: Contactor | None = None
@@ -181,6 +208,11 @@ class LayoutKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """What the node makes of a frame that fails its check: nothing, or one that is seen to be invalid."""
     watch: Watch = Watch()
     activation: Activation = Activation()
+
+    @property
+    def dbc_files(self) -> dict[str, str]:
+        """DBC files as written, by bus; ``""`` where the layout names none."""
+        return {bus.name: bus.dbc for bus in self.bus} or ({} if self.dbc is None else {"": self.dbc})
 
     @property
     def branch_names(self) -> tuple[str, ...]:
@@ -229,8 +261,19 @@ class Layout(LayoutKeys, frozen=True, kw_only=True):
 
     @property
     def dbc_path(self) -> Path:
-        """Path of the DBC file."""
-        return self.path.parent / self.dbc
+        """Path of the DBC file, of several the first; no file's name where there is none."""
+        return next(iter(self.dbc_paths.values()), Path("no DBC"))
+
+    @property
+    def dbc_paths(self) -> dict[str, Path]:
+        """Paths of the DBC files by bus, ``""`` where the layout names none."""
+        return {bus: self.path.parent / file for bus, file in self.dbc_files.items()}
+
+    @property
+    def dbc_digest(self) -> str:
+        """SHA-256 of the DBC file, of several of their digests one after the other, without one of nothing."""
+        digests = [file_digest(path) for path in self.dbc_paths.values()]
+        return digests[0] if len(digests) == 1 else text_digest("".join(digests).encode())
 
     def find_branch(self, name: str) -> Branch:
         """Return the branch of this name; LayoutError lists the known ones if there is none."""
@@ -268,6 +311,31 @@ def read_layout(path: Path) -> Layout:
         raise LayoutError(f"{path}: not a layout: the file is not UTF-8 text; see docs/layout.md") from None
     except (ValueError, RecursionError) as error:  # not only TOMLDecodeError: numbers and nesting have limits, too
         raise LayoutError(f"{path}: not TOML: {error}; a layout is expected, see docs/layout.md") from None
+    return layout_of(document, path, text_digest(content))
+
+
+def layout_of(document: dict[str, Any], path: Path, digest: str | None = None) -> Layout:
+    """Check a layout.
+
+    Parameters
+    ----------
+    document : dict
+        What a layout file says.
+    path : Path
+        Where it stands, for messages and for the DBC.
+    digest : str, optional
+        Of the file; of the document where it stands in none.
+
+    Returns
+    -------
+    Layout
+        The checked layout.
+
+    Raises
+    ------
+    LayoutError
+        If a field is missing, unknown or contradictory.
+    """
     _require_profiles(document, path)
     try:
         keys = msgspec.convert(document, LayoutKeys)
@@ -275,7 +343,9 @@ def read_layout(path: Path) -> Layout:
         why = field_error(error, document, LayoutKeys, toml_place)
         raise LayoutError(f"{path}: {why}; see docs/layout.md") from None
     check_layout(keys, path)
-    return Layout(**msgspec.structs.asdict(keys), path=path, digest=text_digest(content))
+    return Layout(
+        **msgspec.structs.asdict(keys), path=path, digest=digest or text_digest(msgspec.json.encode(document))
+    )
 
 
 def file_digest(path: Path) -> str:

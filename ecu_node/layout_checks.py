@@ -1,5 +1,6 @@
 """What the keys of a layout must not say together, which their types alone cannot express."""
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -8,9 +9,10 @@ from ecu_node.errors import LayoutError
 from ecu_node.formula import formula_names, parse_formula
 from ecu_node.layout_e2e import ProfileP02
 from ecu_node.signal_names import split_signal
+from ecu_node.units import AMPERE, WATT, usual_unit
 
 if TYPE_CHECKING:
-    from ecu_node.layout import Branch, LayoutKeys
+    from ecu_node.layout import Branch, Input, LayoutKeys
 
 __all__ = ["check_layout"]
 
@@ -42,6 +44,7 @@ def check_layout(layout: "LayoutKeys", path: Path) -> None:
         _check_branch(branch, refuse)
     if sum(branch.balance for branch in layout.branch) > 1:
         refuse("more than one branch has 'balance = true'; at most one can take what the others leave")
+    _check_buses(layout, refuse)
     _check_signals(layout, refuse)
     _check_inputs(layout, refuse)
     _check_protection(layout, refuse)
@@ -61,6 +64,35 @@ def _check_protection(layout: "LayoutKeys", refuse: Callable[[str], NoReturn]) -
             refuse(f"{place}, {key}: {', '.join(unknown)} is not in 'messages'; add it there, or leave its {key} out")
         if isinstance(entry, ProfileP02) and (missing := [name for name in entry.messages if name not in given]):
             refuse(f"{place}, {key}: {', '.join(missing)} has none; profile P02 needs 16 numbers per message")
+
+
+def _check_buses(layout: "LayoutKeys", refuse: Callable[[str], NoReturn]) -> None:
+    """Refuse names of signals that the databases of the layout, or their absence, do not allow."""
+    if layout.dbc is not None and layout.bus:
+        refuse("give either 'dbc', or [[bus]] with a 'dbc' each")
+    for what in ("name", "channel"):
+        if twice := _repeated([getattr(bus, what) for bus in layout.bus]):
+            refuse(f"[[bus]] {what}: {', '.join(twice)} stands there twice; each bus needs one of its own")
+    if not layout.dbc_files:
+        outputs = [f"branch {item.name}: 'corrected'" for item in layout.branch if item.corrected is not None]
+        outputs += ["[e2e]"] if layout.protections else []
+        outputs += ["[status]"] if layout.status is not None else []
+        if outputs:
+            refuse(f"{outputs[0]} names messages, but the layout has no 'dbc'; give it, or leave this out")
+        return
+    known = {bus.name for bus in layout.bus}
+    items: list[Branch | Input] = [*layout.branch, *layout.input]
+    for item in items:
+        for key in ("signal", "power", "voltage", "corrected", "quality"):
+            name = getattr(item, key, None)
+            if name is None:
+                continue
+            bus, has_bus, bare = name.rpartition(":")
+            place = f"[[{'branch' if item in layout.branch else 'input'}]] {item.name!r}, {key}"
+            if re.fullmatch(r"[^.\s]+\.[^.\s]+", bare) is None:
+                refuse(f"{place}: 'Message.Signal' as in the DBC is expected, found \"{name}\"; see docs/layout.md")
+            if has_bus and bus not in known:
+                refuse(f"{place}: no [[bus]] is named {bus!r}; known are {', '.join(sorted(known)) or 'none'}")
 
 
 def _repeated(names: Sequence[str]) -> list[str]:
@@ -87,14 +119,17 @@ def _check_signals(layout: "LayoutKeys", refuse: Callable[[str], NoReturn]) -> N
 def _check_inputs(layout: "LayoutKeys", refuse: Callable[[str], NoReturn]) -> None:
     known = {item.name for item in layout.input}
     for item in layout.derived:
-        try:
-            names = formula_names(parse_formula(item.formula))
-        except LayoutError as error:
-            refuse(f"derived input {item.name}: {error}")
-        unknown = [name for name in names if name not in known]
-        if unknown:
+        if unknown := _unknown_names(item.formula, known, f"derived input {item.name}", refuse):
             refuse(f"derived input {item.name}: {', '.join(unknown)} is no input or derived input declared above it")
         known.add(item.name)
+    for branch in layout.branch:
+        if branch.formula is None:
+            continue
+        unknown = _unknown_names(branch.formula, known, f"branch {branch.name}", refuse)
+        if unknown and layout.dbc_files:
+            refuse(
+                f"branch {branch.name}: {', '.join(unknown)} is no [[input]] or [[derived]]; declare the signal as one"
+            )
     if layout.contactor is not None and layout.contactor.input not in {item.name for item in layout.input}:
         refuse(f"[contactor] input: {layout.contactor.input!r} is no [[input]]; declare the signal as one")
     if layout.temperature is not None and layout.temperature not in {item.name for item in layout.input}:
@@ -110,9 +145,26 @@ def _check_inputs(layout: "LayoutKeys", refuse: Callable[[str], NoReturn]) -> No
             refuse(f"{key}: {', '.join(unknown)} is no [[input]] or [[derived]]")
 
 
+def _unknown_names(formula: str, known: set[str], where: str, refuse: Callable[[str], NoReturn]) -> list[str]:
+    """Names in a formula that are not known."""
+    try:
+        names = formula_names(parse_formula(formula))
+    except LayoutError as error:
+        refuse(f"{where}: {error}")
+    return [name for name in names if name not in known]
+
+
 def _check_branch(branch: "Branch", refuse: Callable[[str], NoReturn]) -> None:
-    if (branch.signal is None) == (branch.power is None) or (branch.power is None) != (branch.voltage is None):
-        refuse(f"branch {branch.name}: give either 'signal' (a current), or 'power' and 'voltage'")
+    ways = (branch.signal, branch.power, branch.formula)
+    if sum(way is not None for way in ways) != 1 or (branch.power is None) != (branch.voltage is None):
+        refuse(f"branch {branch.name}: give either 'signal' (a current), 'power' and 'voltage', or 'formula'")
+    if branch.formula is not None and (branch.corrected is not None or branch.unit is not None):
+        refuse(f"branch {branch.name}: 'formula' gives A and is not written; leave out 'corrected' and 'unit'")
+    if branch.formula is None and branch.uncertainty:
+        refuse(f"branch {branch.name}: 'uncertainty' is that of a 'formula'; a sensor's is what is estimated")
+    known = {*AMPERE} if branch.signal is not None else {*WATT}
+    if branch.unit is not None and usual_unit(branch.unit) not in known:
+        refuse(f"branch {branch.name}: unit {branch.unit!r} is unknown; expected {', '.join(sorted(known))}")
     if branch.quality is not None and branch.corrected is None:
         refuse(f"branch {branch.name}: 'quality' without 'corrected'")
     if branch.quality and branch.corrected and split_signal(branch.quality)[0] != split_signal(branch.corrected)[0]:

@@ -14,11 +14,10 @@ import can
 from ecu_node.buses import open_bus
 from ecu_node.clocks import steady_time_s
 from ecu_node.counters import Counters
-from ecu_node.database import read_database
+from ecu_node.database import node_database
 from ecu_node.errors import UserError
 from ecu_node.failures import say_error
 from ecu_node.guard import Mode
-from ecu_node.layout import read_layout
 from ecu_node.monitor_model import BusMonitor
 from ecu_node.monitor_table import picture
 from ecu_node.monitor_text import as_json, plain_block
@@ -84,7 +83,7 @@ def run_monitor(options: MonitorOptions) -> int:
     UserError
         If layout, DBC or bus cannot be used, or rich is missing for a live table.
     """
-    database = read_database(read_layout(options.layout))
+    database = node_database(options.layout)
     where = f"{options.interface} {options.channel}"
     requests = Requests()
     was_hung_up = False

@@ -12,11 +12,10 @@ import can
 from ecu_node.buses import carries_fd, open_bus
 from ecu_node.check import warnings_of
 from ecu_node.corrector import Corrector
-from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.database import VehicleDatabase, node_database
 from ecu_node.gateway_node import GatewayNode
 from ecu_node.guard import Mode
 from ecu_node.in_force import not_published
-from ecu_node.layout import read_layout
 from ecu_node.overlay_node import OverlayNode
 from ecu_node.parameter_file import ParameterFile, ParameterSource
 from ecu_node.service import Log, Requests, ServiceManager
@@ -89,7 +88,7 @@ def run_node(options: RunOptions, vehicle_hint: str) -> int:
     """
     say, manager = Log().say, ServiceManager()
     mode = Mode.OVERLAY if options.gateway is None else Mode.GATEWAY
-    database = read_database(read_layout(options.layout))
+    database = node_database(options.layout)
     file = _source(options, database, mode, say)
     corrector = wire(database, file.in_force, time.monotonic(), mode=mode, shadow=options.shadow)
     buses = []

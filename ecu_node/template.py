@@ -53,10 +53,9 @@ def _vehicle(text: str) -> str:
 
 
 def _template(options: argparse.Namespace) -> int:
-    from ecu_node.database import read_database  # noqa: PLC0415  # takes time to import
-    from ecu_node.layout import read_layout  # noqa: PLC0415
+    from ecu_node.database import node_database  # noqa: PLC0415  # takes time to import
 
-    write_output(template_text(read_database(read_layout(options.layout)), options.vehicle, datetime.now(UTC)))
+    write_output(template_text(node_database(options.layout), options.vehicle, datetime.now(UTC)))
     return 0
 
 

@@ -42,7 +42,7 @@ MISTAKES = [
     ("ecu-node inspect folder --keys v1.json", 2, "a state has keys of its own; leave --keys out"),
     # fleets, results, truth
     ("calibrator calibrate none LAYOUT --out x", 1, "none: no such folder, store of drives or store of summaries"),
-    ("calibrator calibrate empty LAYOUT --out x", 1, "empty: is a file; give a store of drives or of summaries"),
+    ("calibrator calibrate empty LAYOUT --out x", 1, "empty: not a known log format; expected .log"),
     ("calibrator calibrate folder LAYOUT --out folder/x --since folder", 1, "folder: "),
     ("calibrator params folder v1 --out x", 1, "run.json: not a result of 'calibrator calibrate': No such file"),
     ("calibrator params folder v1 --out x", 1, "; name a folder that 'calibrator calibrate --out' wrote"),

@@ -18,9 +18,12 @@ from pathlib import Path
 from typing import Annotated
 
 import can
+import pandas as pd
 import typer
+from matplotlib.figure import Figure
 
 from calibrator.errors import FleetError
+from calibrator.estimator.vehicle_report import explained
 from calibrator.fleet_truth import FleetTruth, read_truth
 from calibrator.recordings.replay import messages_of, read_log, replay
 from calibrator.terminal.command_line import command_app, run_tool
@@ -38,12 +41,12 @@ from ecu_node.wiring import wire
 
 ROOT = Path(__file__).resolve().parent.parent
 LAYOUT = "dbc/hv_powertrain.toml"
-VEHICLES, BRANCHES = 44, 3
-HELD_OUT = 4
-"""Vehicles from which the fleet learns nothing; the first that may be corrected drives at the end."""
-MINUTES = 8
+VEHICLES, BRANCHES = 24, 3
+HELD_OUT = 3
+"""Vehicles with most faults, from which the fleet learns nothing; the first that is corrected drives at the end."""
+MINUTES = 4
 """Length of the trip that each vehicle is calibrated on. [min]"""
-SECONDS = 40.0
+SECONDS = 20.0
 """Length of the live drive. [s]"""
 MARKER = ".made-by-demo"
 
@@ -74,29 +77,31 @@ def show(drives: str, out: Path) -> None:
     step(1, f"{VEHICLES} identical vehicles with faulty sensors drive, and log their CAN buses")
     run(
         *("calibrator", "simulate", "--drives", source, "--vehicles", VEHICLES, "--currents", BRANCHES),
-        *("--sparsity", 80, "--balanced", "--minutes", MINUTES, "--unseen-minutes", 2),
+        *("--sparsity", 80, "--balanced", "--minutes", MINUTES, "--unseen-minutes", 1),
         *("--layout", LAYOUT, "--out", fleet),
     )
     truth = read_truth(fleet / "truth.json")
     held_out = faulty_vehicles(truth)
-    step(2, f"the calibrator learns each vehicle's sensors from these logs ({', '.join(held_out)} are held out)")
+    step(2, f"the calibrator learns what each sensor does wrong ({', '.join(held_out)} are held out of the learning)")
     options = [part for name in held_out for part in ("--hold-out", name)]
     run("calibrator", "calibrate", fleet, "--layout", LAYOUT, *options, "--out", result)
     vehicle = corrected_vehicle(result, held_out)
     step(3, "because this fleet is artificial, the truth is known")
     run("calibrator", "score", result, "--truth", fleet / "truth.json")
     run("calibrator", "report", result, "--out", out / "report.html")
-    step(4, f"vehicle {vehicle} drives a trip that nobody has seen, with its node on the bus")
+    step(4, f"vehicle {vehicle} drives a trip that was not used before, with its node on the bus")
     parameters = result / "params" / f"{vehicle}.json"
+    say(explained(read_parameters(parameters)))
+    say(f"put into {vehicle}: {put_in(truth, vehicle)}")
     run("ecu-node", "check", "--params", parameters, "--layout", LAYOUT, "--vehicle", vehicle)
     record_live_drive(parameters, vehicle, log=fleet / "unseen" / vehicle / "drive.log.gz", recording=out / "live.log")
-    step(5, "the Kirchhoff sum of its currents, before and after")
+    step(5, "the Kirchhoff sum of its currents on that trip, before and after")
     run(
         *("calibrator", "kirchhoff", out / "live.log"),
-        *("--layout", LAYOUT, "--plot", out / "kirchhoff.png"),
+        *("--layout", LAYOUT, "--plot", out / "kirchhoff.png", "--table", out / "kirchhoff.csv"),
     )
-    say(f"picture: {out / 'kirchhoff.png'}")
-    tell_the_truth(truth, vehicle)
+    draw_side_by_side(out / "kirchhoff.csv", out / "before_after.png")
+    say(f"pictures: {out / 'before_after.png'}, {out / 'kirchhoff.png'}; report: {out / 'report.html'}")
 
 
 def make_empty(out: Path) -> None:
@@ -123,11 +128,14 @@ def import_recordings(folder: str, out: Path) -> str:
 
 
 def faulty_vehicles(truth: FleetTruth) -> list[str]:
-    """First vehicles with a faulty sensor."""
-    faulty = [name for name, v in truth.vehicles.items() if any(v.drift.values()) or any(v.offset_a.values())]
-    if not faulty:
+    """First vehicles with most faulty sensors."""
+    faulty = {
+        name: sum(bool(v.drift[branch] or v.offset_a[branch]) for branch in v.drift)
+        for name, v in truth.vehicles.items()
+    }
+    if not any(faulty.values()):
         raise FleetError("no vehicle of the fleet has a faulty sensor; choose another seed")
-    return faulty[:HELD_OUT]
+    return sorted(faulty, key=lambda name: -faulty[name])[:HELD_OUT]
 
 
 def corrected_vehicle(result: Path, held_out: list[str]) -> str:
@@ -230,12 +238,27 @@ def play(log: Path, bus: can.BusABC) -> None:
         replay(frames, bus, progress=lambda _, age_s: progress(int(age_s) + 1))
 
 
-def tell_the_truth(truth: FleetTruth, vehicle: str) -> None:
-    """Print what had been put into the vehicle."""
-    put_in = truth.vehicles[vehicle]
-    faults = [f"{name} drift {value:+.3f}" for name, value in put_in.drift.items() if value]
-    faults += [f"{name} offset {value:+.1f} A" for name, value in put_in.offset_a.items() if value]
-    say(f"put into {vehicle}: {', '.join(faults)}")
+def put_in(truth: FleetTruth, vehicle: str) -> str:
+    """Faults that were put into the sensors of a vehicle."""
+    faults = truth.vehicles[vehicle]
+    gains = [f"{name} gain error {100.0 * value:+.2f}%" for name, value in faults.drift.items() if value]
+    return ", ".join(gains + [f"{name} offset {value:+.2f} A" for name, value in faults.offset_a.items() if value])
+
+
+def draw_side_by_side(table: Path, picture: Path) -> None:
+    """Draw the currents and their sum, as measured and as corrected: the picture of the README."""
+    found = pd.read_csv(table, index_col="time_s")
+    figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+    for axis, after in zip(figure.subplots(1, 2, sharey=True), ("", "_corrected"), strict=True):
+        for name in found.loc[:, :"sum_a"].columns.str.removesuffix("_a"):
+            is_sum = name == "sum"
+            axis.plot(found[f"{name}{after}_a"], label=name, color="black" if is_sum else None, linewidth=1 + is_sum)
+        rms_a = (found[f"sum{after}_a"] ** 2).mean() ** 0.5
+        axis.set(title=f"{after[1:] or 'measured'}: sum {rms_a:.1f} A RMS", xlabel="time [s]")
+        axis.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("current into the junction [A]")
+    figure.axes[1].legend(loc="lower left")
+    figure.savefig(picture, dpi=120)
 
 
 def run(*command: object, shown: str | None = None, may_fail: bool = False) -> None:

@@ -14,9 +14,9 @@ from calibrator.drives.store import has_drive, write_drive
 from calibrator.errors import LogError
 from calibrator.files.folders import require_possible_folder
 from calibrator.recordings.bmw_i3 import BRANCHES, INPUTS, ImportedTrip, trip_from_table
-from calibrator.recordings.csv_table import read_csv_table
 from calibrator.recordings.drive_log import write_drive_log
 from calibrator.recordings.signal_range import signal_ranges
+from calibrator.recordings.tables import read_table
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import told_once
@@ -112,8 +112,7 @@ def _import_trip(
     in_store = has_drive(out, name, name, database.layout)
     if in_store and (log is None or log.exists()):
         return None
-    table = read_csv_table(paths[0], delimiter=";", encoding="latin-1")
-    trip = trip_from_table(table, vehicle=name, name=name, ranges=signal_ranges(database))
+    trip = trip_from_table(read_table(paths[0]), vehicle=name, name=name, ranges=signal_ranges(database))
     if not in_store:
         write_drive(out, trip.drive, database.layout)
     if log is not None and not log.exists():

@@ -1,24 +1,57 @@
-"""What the junction sum tells of the branches: signs, slips of units, delays, gains, and what no branch measures.
+"""What the junction sum tells of the branches: signs, slips of units, delays, gains.
 
-Signs and units first, on currents in which neither a mean nor a delay matters; then, with these put right, the delays
-between the branches as the calibrator estimates them; then, without the delays, gains and the mean of the sum.
+Signs and units come first, from currents without means and slow changes, and too smooth for a delay to matter: a load
+that no sensor sees, and offsets, would be taken for faults of a branch; fast changes because of a delay, too. With x_k
+such a band of the current of branch k and m_k = +-10^n, the sum V = mean (sum_k m_k x_k)^2 should be small beside
+N = sum_k m_k^2 mean x_k^2. Both scale alike, so the ratio V / N tells nothing of a factor that all branches share, and
+nothing of a sign that all share; what else is known of the branches must tell those. Then, with signs and units put
+right, come the delays as the calibrator estimates them, and without the delays the gains.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calibrator.doctor.bands import Bands, branch_bands
-from calibrator.doctor.multipliers import Explanation, Known, explanations
 from calibrator.drive import Array, Drive
-from calibrator.drives.align import align_channels
+from calibrator.drives.charge import Band, charge_curve
+from calibrator.drives.delay_search import covered
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
-from ecu_node.layout import Layout
 
-__all__ = ["Gain", "JunctionFacts", "SumFigures", "junction_facts", "multiplied", "orientation_of", "peaks"]
+__all__ = ["Bands", "Explanation", "JunctionFacts", "Known", "branch_bands", "explanations", "junction_facts"]
 
+BAND = Band(short_s=0.75, long_s=10.0)
+"""Half widths of the averages: several times the delays of real cars, and as long as driving keeps its pace. [s]"""
+STEP_S = 0.25
+"""Distance of the instants: a third of the shorter window. [s]"""
+BLOCK_S = 10.0
+"""Blocks count as independent: as long as the longer window reaches. [s]"""
+
+FACTORS = (1.0, 1e-1, 1e-2, 1e-3, 1e1, 1e2, 1e3)
+"""Slips of units and scales. [1]"""
+LEAST_RATIO = 1e-4
+"""V / N below this is as good as nothing: sensors are not better than 1 %. [1]"""
+CHANGE_PRICE = 0.7
+"""Each branch that is changed must halve V / N: its variation must then be above that of the sum's rest. [1]"""
+UNIT_PRICE = 0.3
+"""What a slip of a unit costs beyond a wrong sign: where both explain the same, the sign is wrong. [1]"""
+RIVAL_PRICE = 1.5 * CHANGE_PRICE
+"""An explanation that costs less than this beyond the best one is a rival: one change for next to nothing. [1]"""
+PLAUSIBLE_PRICE = 2.0
+"""For each branch whose current would be beyond what the layout calls full scale, or almost nothing of it. [1]"""
+ORIENTATION_PRICE = 1.5
+"""For energy that would flow into a battery while its voltage falls: more than for one more change. [1]"""
+LARGEST_SHARE, LEAST_SHARE = 1.2, 0.002
+"""Of full scale: beyond it, and almost nothing of it for the greatest current. [1]"""
+SURE = 3.0
+"""So many standard errors, from block to block of time, a change must make the sum smaller. [1]"""
+OVERWHELMING = 3.0
+"""A price lower by this: V / N falls twentyfold, as where a branch that is rarely used drowns all others. [1]"""
+FEWEST_BLOCKS = 4
+"""Fewer give no standard error worth the name: half a minute."""
 WELL_CORRELATED = 0.5
 """Of battery current and voltage, below which the sag of the voltage tells nothing. [1]"""
 PEAK_QUANTILE = 0.999
@@ -26,152 +59,191 @@ PEAK_QUANTILE = 0.999
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gain:
-    """Of one branch relative to the first one.
-
-    Attributes
-    ----------
-    ratio, sd : float
-        By which its current must be multiplied so that the sum varies least, and the standard deviation. [1]
-    """
-
-    ratio: float
-    sd: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class SumFigures:
-    """Of the sum of all branches as the layout has them, means included. [A]"""
-
-    mean_a: float
-    sd_a: float
-    instants: int
-    valid: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class JunctionFacts:
-    """What the sum of some branches tells.
+class Bands:
+    """Comparable currents of the branches of one vehicle.
 
     Attributes
     ----------
     branches : tuple of str
-        The K branches, the one that moves most first.
-    rms_a : ndarray of shape (K,)
-        How much each varies, as the layout has it. [A]
-    bands : Bands
-        As the layout has them, but for the delays.
-    best : Explanation
-        Multipliers with which the sum varies least, in the order of `branches`.
-    rivals : tuple of Explanation
-        What would explain the sum nearly as well.
-    delays : BranchDelays or None
-        With the signs and units of `best`; None without a usable stretch of time.
-    gains : mapping of str to Gain
-        Of the branches after the first, with all that taken into account; empty without a usable stretch.
-    total : SumFigures or None
-        None if no instant is valid for all.
+        Names of the K branches.
+    current_a : ndarray of shape (T, K)
+        Band of each current, positive into the junction as the layout has it. [A]
+    block : ndarray of int, shape (T,)
+        Number of the block of time of each instant, from 0 on.
     """
 
     branches: tuple[str, ...]
-    rms_a: Array
-    bands: Bands
-    best: Explanation
-    rivals: tuple[Explanation, ...]
-    delays: BranchDelays | None
-    gains: Mapping[str, Gain]
-    total: SumFigures | None
+    current_a: Array
+    block: NDArray[np.intp]
+
+    @property
+    def moments(self) -> Array:
+        """Second moments of each of B >= 1 blocks, shape (B, K, K). [A^2]"""
+        parts = [self.current_a[self.block == b] for b in range(int(self.block.max(initial=0)) + 1)]
+        return np.stack([part.T @ part for part in parts])
+
+    def rms_a(self, multipliers: Array) -> float:
+        """Root mean square of the sum with each branch multiplied by a number. [A]"""
+        total = self.current_a @ multipliers
+        return float(np.sqrt(np.mean(total**2))) if len(total) else 0.0
 
 
-def junction_facts(
-    drives: Sequence[Drive], layout: Layout, branches: Sequence[str], *, battery: str | None, voltage: str
-) -> JunctionFacts:
-    """Look at the sum of some branches.
+def branch_bands(drives: Sequence[Drive], branches: Sequence[str]) -> Bands:
+    """Compute the bands of some branches over all drives of one vehicle.
 
     Parameters
     ----------
     drives : sequence of Drive
-        Of one vehicle.
-    layout : Layout
-        Says full scale, period and time-outs.
+        A drive that lacks one of the branches adds nothing.
     branches : sequence of str
-        At least two, with good samples.
-    battery : str or None
-        The branch that feeds the others, if it is known.
-    voltage : str
-        Input that is its voltage; drives may lack it.
+        Names of the K branches.
 
     Returns
     -------
-    JunctionFacts
-        What was found.
+    Bands
+        Of no instant where no drive is long enough.
     """
-    known = Known(
-        peak_share=peaks(drives, branches) / layout.full_scale_a,
-        source=branches.index(battery) if battery is not None else None,
-        orientation=orientation_of(drives, battery, voltage),
+    parts, blocks, count = [np.zeros((0, len(branches)))], [np.zeros(0, np.intp)], 0
+    for drive in drives:
+        found = [charge_curve(drive.branches[name]) for name in branches if name in drive.branches]
+        curves = [curve for curve in found if curve is not None]
+        if len(curves) < len(branches):
+            continue
+        start_s, stop_s = max(curve.time_s[0] for curve in curves), min(curve.time_s[-1] for curve in curves)
+        time_s = np.arange(start_s, max(stop_s, start_s), STEP_S)
+        time_s = time_s[covered(curves, time_s, BAND.long_s)]
+        if len(time_s):
+            _, block = np.unique(np.floor(time_s / BLOCK_S), return_inverse=True)
+            parts.append(np.stack([curve.band(time_s, BAND)[0] for curve in curves], axis=1))
+            blocks.append(np.asarray(block, np.intp) + count)
+            count = int(blocks[-1][-1]) + 1
+    return Bands(branches=tuple(branches), current_a=np.concatenate(parts), block=np.concatenate(blocks))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """What is known of the branches besides their sum.
+
+    Attributes
+    ----------
+    peak_share : ndarray of shape (K,)
+        Greatest magnitude of each current, as a share of full scale. [1]
+    source : int or None
+        Number of the branch that feeds the others: the battery.
+    orientation : float
+        Evidence, from -1 to 1, that its sign is right as the layout has it (1) or inverted (-1). [1]
+    """
+
+    peak_share: Array
+    source: int | None = None
+    orientation: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explanation:
+    """One set of multipliers.
+
+    Attributes
+    ----------
+    multipliers : ndarray of shape (K,)
+        +-10^n per branch; 1 where nothing is wrong. [1]
+    price : float
+        Logarithm of V / N, and what is held against these multipliers. [1]
+    """
+
+    multipliers: Array
+    price: float
+
+    @property
+    def changed(self) -> tuple[int, ...]:
+        """Numbers of the branches that are not as the layout has them."""
+        return tuple(int(k) for k in np.flatnonzero(self.multipliers != 1.0))
+
+
+def explanations(bands: Bands, known: Known) -> list[Explanation]:
+    """Find what would explain the junction sum best, and what else would as well.
+
+    The search changes one branch, or two at a time, as long as V / N falls by much more than chance.
+
+    Parameters
+    ----------
+    bands : Bands
+        Currents of the K branches.
+    known : Known
+        What else is known of them.
+
+    Returns
+    -------
+    list of Explanation
+        The best one first, and after it those of one more or less changed branch that are nearly as good.
+    """
+    moments = bands.moments
+    best = _rated(np.ones(len(bands.branches)), moments, known)
+    while True:
+        tried = [_rated(m, moments, known) for m in _neighbours(best.multipliers)]
+        found = min(tried, key=lambda each: each.price)
+        only_turned = np.array_equal(found.multipliers, -best.multipliers)  # of which the sum tells nothing
+        if found.price >= best.price - 1e-9 or not (only_turned or _is_sure(best, found, moments)):
+            break
+        best = found
+    near = {tuple(each.multipliers.tolist()): each for each in tried if each.price < best.price + RIVAL_PRICE}
+    near.pop(tuple(best.multipliers.tolist()), None)
+    return [best, *sorted(near.values(), key=lambda each: each.price)]
+
+
+def _rated(multipliers: Array, moments: Array, known: Known) -> Explanation:
+    total = moments.sum(axis=0)
+    share = np.abs(multipliers) * known.peak_share
+    changes = min(np.sum(multipliers != 1.0), 1 + np.sum(multipliers != -1.0))  # all signs turned are one change
+    sign = 0.0 if known.source is None else float(np.sign(multipliers[known.source]))
+    price = (
+        float(np.log(_ratios(total[None], multipliers)[0]))
+        + CHANGE_PRICE * changes
+        + UNIT_PRICE * np.sum(np.abs(multipliers) != 1.0)
+        + PLAUSIBLE_PRICE * (np.sum(share > LARGEST_SHARE) + (share.max() < LEAST_SHARE))
+        + ORIENTATION_PRICE * max(-sign * known.orientation, 0.0)
     )
-    bands = branch_bands(drives, branches)
-    best = explanations(bands, known)[0]
-    right = [multiplied(drive, dict(zip(branches, best.multipliers.tolist(), strict=True))) for drive in drives]
-    delays = _delays(right, bands, best)
-    gains: Mapping[str, Gain] = {}
-    if delays is not None:
-        aligned = [without_delays(drive, delays.by_branch()) for drive in drives if _has(drive, branches)]
-        bands = branch_bands(aligned, branches)
-    found = explanations(bands, known)
-    if delays is not None:
-        gains = _gains(bands.multiplied(found[0].multipliers).in_order(delays.branches))
-    return JunctionFacts(
-        branches=tuple(branches),
-        rms_a=np.sqrt(np.mean(bands.current_a**2, axis=0)) if len(bands.block) else np.zeros(len(branches)),
-        bands=bands,
-        best=found[0],
-        rivals=tuple(found[1:]),
-        delays=delays,
-        gains=gains,
-        total=_sum_figures(drives, layout, branches),
-    )
+    return Explanation(multipliers=multipliers, price=float(price))
 
 
-def multiplied(drive: Drive, multipliers: Mapping[str, float]) -> Drive:
-    """A drive with some of its branch currents multiplied by a number."""
-    branches = {
-        name: replace(channel, value=multipliers.get(name, 1.0) * channel.value)
-        for name, channel in drive.branches.items()
-    }
-    return replace(drive, branches=branches)
+def _ratios(moments: Array, multipliers: Array) -> Array:
+    """V / N of each block."""
+    power = np.einsum("bkk,k->b", moments, multipliers**2)
+    values = np.einsum("bij,i,j->b", moments, multipliers, multipliers)
+    return np.asarray(np.maximum(np.divide(values, power, out=np.ones(len(moments)), where=power > 0.0), LEAST_RATIO))
 
 
-def peaks(drives: Sequence[Drive], branches: Sequence[str]) -> Array:
-    """Greatest magnitude of each current but for wild samples, shape (K,). [A]"""
-    return np.array([_peak(drives, name) for name in branches])
+def _neighbours(multipliers: Array) -> Iterator[Array]:
+    """Multipliers that differ in one branch or two, and those with all signs turned."""
+    yield -multipliers
+    alternatives = [sign * factor for sign, factor in product((1.0, -1.0), FACTORS)]
+    for group in combinations(range(len(multipliers)), min(2, len(multipliers))):
+        for values in product(alternatives, repeat=len(group)):
+            tried = multipliers.copy()
+            tried[list(group)] = values
+            yield tried
 
 
-def _peak(drives: Sequence[Drive], name: str) -> float:
-    channels = [drive.branches[name] for drive in drives if name in drive.branches]
-    value = np.concatenate([np.zeros(0), *(channel.value[channel.good] for channel in channels)])
-    return float(np.quantile(np.abs(value), PEAK_QUANTILE)) if len(value) else 0.0
+def _is_sure(before: Explanation, after: Explanation, moments: Array) -> bool:
+    """Whether the sum gets far smaller, or does so in one block of time after the other."""
+    if len(moments) < FEWEST_BLOCKS:
+        return False
+    gain = np.log(_ratios(moments, before.multipliers) / _ratios(moments, after.multipliers))
+    often = gain.mean() > SURE * gain.std(ddof=1) / np.sqrt(len(gain))
+    return bool(often or before.price - after.price > OVERWHELMING)
 
 
-def orientation_of(drives: Sequence[Drive], battery: str | None, voltage: str) -> float:
+def _values(drives: Sequence[Drive], branch: str) -> Array:
+    """Good values of a branch over all drives. [A]"""
+    channels = [drive.branches[branch] for drive in drives if branch in drive.branches]
+    return np.concatenate([np.zeros(0), *(channel.value[channel.good] for channel in channels)])
+
+
+def _orientation(drives: Sequence[Drive], battery: str | None, voltage: str) -> float:
     """Tell from the battery's voltage whether its current is positive into the junction.
 
-    Parameters
-    ----------
-    drives : sequence of Drive
-        Of one vehicle.
-    battery : str or None
-        The branch.
-    voltage : str
-        Input that is its voltage.
-
-    Returns
-    -------
-    float
-        Near 1 if the voltage falls when the current rises, near -1 if it rises; without a voltage that follows the
-        current, a third of that by the sign of the mean current, since driving takes energy out of a battery; 0 if
-        nothing can be told.
+    Near 1 if the voltage falls when the current rises, near -1 if it rises; without a voltage that follows the current,
+    a third of that by the sign of the mean current, since driving takes energy out of a battery; 0 if nothing tells.
     """
     if battery is None:
         return 0.0
@@ -185,62 +257,127 @@ def orientation_of(drives: Sequence[Drive], battery: str | None, voltage: str) -
         correlation = float(np.corrcoef(band[:, 0], band[:, 1])[0, 1])
         if abs(correlation) > WELL_CORRELATED:
             return -correlation
-    values = [drive.branches[battery] for drive in drives if battery in drive.branches]
-    value = np.concatenate([np.zeros(0), *(channel.value[channel.good] for channel in values)])
+    value = _values(drives, battery)
     spread = float(np.sqrt(np.mean(value**2))) if len(value) else 0.0
     return float(np.mean(value)) / spread / 3.0 if spread > 0.0 else 0.0
 
 
-def _has(drive: Drive, branches: Sequence[str]) -> bool:
-    return set(branches) <= drive.branches.keys()
+@dataclass(frozen=True, kw_only=True)
+class JunctionFacts:
+    """What the sum of some branches tells.
+
+    Attributes
+    ----------
+    branches : tuple of str
+        The K branches.
+    rms_a : ndarray of shape (K,)
+        How much each varies, as the layout has it. [A]
+    bands : Bands
+        As the layout has them, but for the delays.
+    best : Explanation
+        Multipliers with which the sum varies least, in the order of `branches`.
+    rivals : tuple of Explanation
+        What would explain the sum nearly as well.
+    delays : BranchDelays or None
+        With the signs and units of `best`; None where too little was recorded.
+    gains : mapping of str to (float, float)
+        Number by which each branch must be multiplied so that the sum varies least, and its standard deviation; 1 and 0
+        for the one that moves most; empty where too little was recorded. [1]
+    """
+
+    branches: tuple[str, ...]
+    rms_a: Array
+    bands: Bands
+    best: Explanation
+    rivals: tuple[Explanation, ...]
+    delays: BranchDelays | None
+    gains: Mapping[str, tuple[float, float]]
 
 
-def _delays(drives: Sequence[Drive], bands: Bands, best: Explanation) -> BranchDelays | None:
-    """Delays with the branch that moves most as the reference; None where too little was recorded."""
-    whole = [drive for drive in drives if _has(drive, bands.branches)]
-    if not whole or not len(bands.block):
-        return None
-    power = np.mean((bands.current_a * best.multipliers) ** 2, axis=0)
-    order = [bands.branches[k] for k in np.argsort(-power, kind="stable")]
+def junction_facts(
+    drives: Sequence[Drive],
+    branches: Sequence[str],
+    *,
+    full_scale_a: float,
+    least_a: float,
+    battery: str | None,
+    voltage: str,
+) -> JunctionFacts:
+    """Look at the sum of some branches.
+
+    Parameters
+    ----------
+    drives : sequence of Drive
+        Of one vehicle.
+    branches : sequence of str
+        At least two, with good samples.
+    full_scale_a : float
+        Of the junction. [A]
+    least_a : float
+        A sum that varies by no more than this is right: it is what quantisation leaves. [A]
+    battery : str or None
+        The branch that feeds the others, if it is known.
+    voltage : str
+        Input that is its voltage; drives may lack it.
+
+    Returns
+    -------
+    JunctionFacts
+        What was found.
+    """
+    peaks_a = [np.quantile(np.abs(_values(drives, name)), PEAK_QUANTILE) for name in branches]
+    known = Known(
+        peak_share=np.array(peaks_a) / full_scale_a,
+        source=branches.index(battery) if battery is not None else None,
+        orientation=_orientation(drives, battery, voltage),
+    )
+    bands, whole = branch_bands(drives, branches), [drive for drive in drives if set(branches) <= drive.branches.keys()]
+
+    def explained() -> list[Explanation]:
+        ones = np.ones(len(branches))
+        return explanations(bands, known) if bands.rms_a(ones) > least_a else [_rated(ones, bands.moments, known)]
+
+    best, delays = explained()[0], None
+    right = [multiplied(drive, dict(zip(branches, best.multipliers.tolist(), strict=True))) for drive in whole]
+    power = np.sum((bands.current_a * best.multipliers) ** 2, axis=0)
     try:
-        return estimate_delays(whole, order)
+        order = [branches[k] for k in np.argsort(-power, kind="stable")]
+        delays = estimate_delays(right, order) if len(bands.block) else None
+        if delays is not None:
+            late_s = delays.by_branch()
+            bands = branch_bands([without_delays(drive, late_s) for drive in whole], branches)
     except DriveError:
-        return None
+        delays = None
+    best, *rivals = explained()
+    return JunctionFacts(
+        branches=tuple(branches),
+        rms_a=np.sqrt(np.mean(bands.current_a**2, axis=0)) if len(bands.block) else np.zeros(len(branches)),
+        bands=bands,
+        best=best,
+        rivals=tuple(rivals),
+        delays=delays,
+        gains={} if delays is None else _gains(bands, best.multipliers, branches.index(delays.branches[0])),
+    )
 
 
-def _gains(bands: Bands) -> dict[str, Gain]:
-    """Least squares of the first branch on the others, standard deviations from blocks left out."""
-    moments = bands.moments
-    total = moments.sum(axis=0)
-    if len(moments) < 2 or np.any(np.diagonal(total) <= 0.0):
+def multiplied(drive: Drive, multipliers: Mapping[str, float]) -> Drive:
+    """A drive with some of its branch currents multiplied by a number."""
+    branches = {
+        name: replace(channel, value=multipliers.get(name, 1.0) * channel.value)
+        for name, channel in drive.branches.items()
+    }
+    return replace(drive, branches=branches)
+
+
+def _gains(bands: Bands, multipliers: Array, first: int) -> dict[str, tuple[float, float]]:
+    """Least squares of one branch on the others, standard deviations from blocks left out."""
+    moments = bands.moments * np.outer(multipliers, multipliers)
+    total, count = moments.sum(axis=0), len(moments)
+    if count < 2 or np.any(np.diagonal(total) <= 0.0):
         return {}
-    rest = np.stack([_regression(total - block) for block in moments])
-    count = len(moments)
-    sd = np.sqrt((count - 1) / count * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0))
-    ratio = _regression(total)
-    return {name: Gain(ratio=float(ratio[k]), sd=float(sd[k])) for k, name in enumerate(bands.branches[1:])}
-
-
-def _regression(moments: Array) -> Array:
-    return np.asarray(-np.linalg.pinv(moments[1:, 1:]) @ moments[1:, 0])
-
-
-def _sum_figures(drives: Sequence[Drive], layout: Layout, branches: Sequence[str]) -> SumFigures | None:
-    limits_s = {branch.name: branch.timeout_s for branch in layout.branch if branch.name in branches}
-    sums: list[Array] = []
-    instants = 0
-    for drive in drives:
-        channels = {name: drive.branches[name] for name in branches if name in drive.branches}
-        if len(channels) < len(branches):
-            continue
-        try:
-            _, values, reasons = align_channels(channels, limits_s, period_s=layout.period_s, where=drive.name)
-        except DriveError:
-            continue
-        valid = ~np.any(list(reasons.values()), axis=0)
-        instants += len(valid)
-        sums.append(np.sum([values[name] for name in branches], axis=0)[valid])
-    total = np.concatenate([np.zeros(0), *sums])
-    if not len(total):
-        return None
-    return SumFigures(mean_a=float(total.mean()), sd_a=float(total.std()), instants=instants, valid=len(total))
+    others = [k for k in range(len(multipliers)) if k != first]
+    cases = np.concatenate([total[None], total - moments])
+    ratio = -np.linalg.pinv(cases[:, others][:, :, others]) @ cases[:, others, first, None]
+    sd = np.sqrt((count - 1) * np.var(ratio[1:, :, 0], axis=0))
+    found = {bands.branches[k]: (float(ratio[0, j, 0]), float(sd[j])) for j, k in enumerate(others)}
+    return {bands.branches[first]: (1.0, 0.0)} | found

@@ -20,7 +20,7 @@ from calibrator.errors import DriveError
 from ecu_node.formula import formula_names, parse_formula
 from ecu_node.layout import Layout
 
-__all__ = ["Samples", "align", "align_channels", "base_inputs", "choose_inputs"]
+__all__ = ["Samples", "align", "align_channels", "at_instants", "base_inputs", "choose_inputs"]
 
 TIME_RESOLUTION_S = 1e-3
 """Logs round time stamps up to this; samples exactly one limit apart must pass. [s]"""
@@ -197,6 +197,30 @@ def align_channels(
         reasons[_NOT_GOOD] |= spoilt
         reasons[_STALE] |= far & ~spoilt
     return time_s, values, reasons
+
+
+def at_instants(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array, Mask]:
+    """Interpolate a channel, and say where it can be.
+
+    Parameters
+    ----------
+    channel : Channel
+        With at least one good sample.
+    time_s : ndarray of shape (T,)
+        Instants. [s]
+    limit_s : float
+        Longest distance of neighbouring good samples. [s]
+
+    Returns
+    -------
+    value : ndarray of shape (T,)
+        Interpolated values.
+    known : ndarray of bool, shape (T,)
+        False where the good samples beside the instant are too far apart, or are not on both sides.
+    """
+    good = _good_part(channel)
+    value, far = _interpolated(good, time_s, limit_s)
+    return value, ~far & (time_s >= good.time_s[0]) & (time_s <= good.time_s[-1])
 
 
 def _require(drive: Drive, branches: Sequence[str], inputs: Sequence[str]) -> None:

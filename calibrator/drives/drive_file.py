@@ -19,9 +19,9 @@ import pyarrow.parquet as pq
 
 from calibrator.drive import Channel, Drive
 from calibrator.errors import DriveError
-from ecu_node.layout import Layout, file_digest
+from ecu_node.layout import Layout
 
-__all__ = ["drive_digest", "drive_outline", "encode_drive", "read_drive_file", "require_made_with"]
+__all__ = ["drive_digest", "drive_outline", "encode_drive", "is_drive_file", "read_drive_file", "require_made_with"]
 
 SCHEMA_VERSION = 1
 _METADATA = b"calibrator.drive"
@@ -34,6 +34,18 @@ _SCHEMA = pa.schema(
         pa.field("good", pa.list_(pa.bool_()), nullable=False),
     ]
 )
+
+
+def is_drive_file(path: Path) -> bool:
+    """Whether a file is one of a store: Parquet, but no table of somebody else's. A damaged one counts."""
+    if path.suffix != ".parquet":
+        return False
+    try:
+        return _METADATA in (pq.read_schema(path).metadata or {})
+    except NotADirectoryError:  # in an archive, where no store is
+        return False
+    except (OSError, pa.ArrowException):
+        return True
 
 
 def encode_drive(drive: Drive, layout: Layout) -> bytes:
@@ -56,7 +68,7 @@ def _table(drive: Drive, layout: Layout) -> pa.Table:
         "drive": drive.name,
         "layout": layout.name,
         "layout_sha256": layout.digest,
-        "dbc_sha256": file_digest(layout.dbc_path),
+        "dbc_sha256": layout.dbc_digest,
     }
     table = pa.Table.from_pylist(rows, schema=_SCHEMA)
     return table.replace_schema_metadata({_METADATA: json.dumps(about)})
@@ -185,7 +197,7 @@ def _check_identity(about: Mapping[str, object], path: Path, layout: Layout) -> 
             f"{path}: made with layout {about['layout']} ({str(about['layout_sha256'])[:12]}), this is {layout.path} "
             f"({layout.digest[:12]}); import the logs again with this layout"
         )
-    if about.get("dbc_sha256") != file_digest(layout.dbc_path):
+    if about.get("dbc_sha256") != layout.dbc_digest:
         raise DriveError(f"{path}: made with another DBC than {layout.dbc_path}; import the logs again with this DBC")
 
 

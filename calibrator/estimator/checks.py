@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import t as student_t
 
 from calibrator.drive import Array
-from calibrator.estimator.junction_law import MOST_NOISE, NOISE_ROUNDS
-from calibrator.estimator.moments import FleetMoments, products, stack_summaries
+from calibrator.estimator.moments import MOST_NOISE, NOISE_ROUNDS, FleetMoments, products, stack_summaries
 from calibrator.summaries.moments import DriveSummary
 from ecu_node.parameters import Finding
 
@@ -709,9 +708,8 @@ class _Vehicle:
             likelihood = n * (rate * (np.log(rate / usual) - 1.0) + usual) - 0.5 * np.log(rate * n)
             one_sided = min(up, down) <= ONE_SIDED * rate
             cause = "spikes" if one_sided else "noise" if rate > NOISE_RATE else "outliers"
-            text = (
-                f"sensor {name}: spikes{' to one side' if one_sided else ''} in {100.0 * rate:.2f} % of the samples, "
-            )
-            text += "which are left out; check its plug and its shield"
+            side = " to one side" if one_sided else ""
+            text = f"sensor {name}: spikes{side} in {100.0 * rate:.2f} % of the samples, which are left out; check its "
+            text += "plug and its shield"
             found.append(_finding(name, cause, float(_posterior(PRIOR * np.exp(min(likelihood, 500.0)))), text))
         return [each for each in found if each.probability >= LEAST_PROBABILITY]

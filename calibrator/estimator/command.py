@@ -1,18 +1,22 @@
-"""``calibrator calibrate`` and ``calibrator params``: a fleet's parameter files."""
+"""``calibrator calibrate``, ``params`` and ``identify``: parameter files of a fleet or junction, and a filter bank."""
 
+import math
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibrator.files.folders import require_possible_folder
+from calibrator.files.folders import require_possible_file, require_possible_folder
 from calibrator.files.layout_files import vehicle_database
 from calibrator.options import Classifier, Method
 from calibrator.processes.interrupts import importing
 from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.terminal.options import (
+    BankOption,
     BranchesOption,
+    FleetArgument,
     FleetOrSummariesArgument,
     JsonOption,
     LayoutOption,
@@ -27,21 +31,35 @@ from calibrator.terminal.options import (
 )
 from calibrator.terminal.text import counted, dumps, print_report, told_once
 from ecu_node.failures import INTERNAL_ERROR, say_error
+from ecu_node.layout import UnmeasuredLoad
 from ecu_node.standard_output import write_output
 from ecu_node.user_files import write_atomically
 
 if TYPE_CHECKING:
     from calibrator.fleet_truth import FleetTruth
 
-__all__ = ["calibrate", "params"]
+__all__ = ["calibrate", "identify", "params"]
 
 OWN_OPTIONS = {
-    Method.POSTERIOR: ("harm_limit", "trusted", "readings", "expected_faults", "scheduler", "since"),
+    Method.POSTERIOR: (
+        "harm_limit",
+        "trusted",
+        "readings",
+        "load",
+        "charge",
+        "meter",
+        "expected_faults",
+        "scheduler",
+        "since",
+    ),
     Method.PUBLISHED: ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity", "seed"),
 }
 """What only one method heeds."""
 SCHEDULER = re.compile(r"(tcp|tls)://([^\s/?#@:\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})")
 MAX_PORT = 65_535
+SHORTEST_POLE_S, LONGEST_POLE_S = 0.01, 600.0
+"""Time constants of low-passes: from below the time base of any layout to ten minutes. [s]"""
+POLES_HELP = f"Low-passes to use: time constants with commas, each {SHORTEST_POLE_S:g} to {LONGEST_POLE_S:g} [s]."
 MOST_NAMED = 5
 """Internal errors that are named one by one."""
 
@@ -69,7 +87,12 @@ def calibrate(
     ] = 0.001,
     trusted: Annotated[
         list[str] | None,
-        typer.Option("--trusted", help="Vehicles with bench-checked sensors; three carry the reference (posterior)."),
+        typer.Option(
+            "--trusted",
+            metavar="NAME",
+            help="Vehicles with bench-checked sensors, three carry the reference; or branches whose sensor is right: "
+            "each vehicle is then calibrated by itself (posterior).",
+        ),
     ] = None,
     readings: Annotated[
         Path | None,
@@ -77,6 +100,28 @@ def calibrate(
             "--readings",
             help="Bench readings: CSV with columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a "
             "(posterior).",
+        ),
+    ] = None,
+    load: Annotated[
+        str | None,
+        typer.Option(
+            "--load", metavar="A[:SD]", help="Load that no branch measures, and its standard deviation [A] (posterior)."
+        ),
+    ] = None,
+    charge: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--charge",
+            metavar="BRANCH=AH:SD",
+            help="Charge into the junction through a branch over the recordings of one vehicle [Ah] (posterior).",
+        ),
+    ] = None,
+    meter: Annotated[
+        str | None,
+        typer.Option(
+            "--meter",
+            metavar="BRANCH",
+            help="Branch with another sensor in each folder of one car's recordings, such as a charger (posterior).",
         ),
     ] = None,
     expected_faults: Annotated[
@@ -93,7 +138,7 @@ def calibrate(
     branches: BranchesOption = None,
     hold_out: Annotated[
         list[str] | None,
-        typer.Option("--hold-out", help="Vehicles to calibrate, but to learn nothing from for others."),
+        typer.Option("--hold-out", metavar="NAME", help="Vehicle to calibrate, but to learn nothing from for others."),
     ] = None,
     unity: Annotated[
         str | None, typer.Option("--unity", help="Vehicle whose held-out data is the unity drive (published).")
@@ -126,7 +171,7 @@ def calibrate(
         from calibrator.estimator.results import internal_errors
         from calibrator.estimator.run import calibrate_fleet
         from calibrator.estimator.settings import CalibrationSettings
-        from calibrator.estimator.workers import Workers
+        from calibrator.processes.computing import Workers
 
     _require_truth_where_used(classifier, truth, method)
     for other, names in OWN_OPTIONS.items():
@@ -141,6 +186,9 @@ def calibrate(
         harm_limit=harm_limit,
         trusted=_named(trusted),
         readings=readings,
+        load=None if load is None else UnmeasuredLoad(mean_a=_value(load, "--load")[0], sd_a=_value(load, "--load")[1]),
+        charge_ah=dict(_charge(item) for item in charge or ()),
+        meter=meter,
         expected_faults=expected_faults,
         classifier=classifier,
         truth=_truth_of(Path(fleet), truth) if truth is not None else None,
@@ -186,6 +234,32 @@ def _named(values: list[str] | None) -> frozenset[str]:
     return frozenset(name.strip() for value in values or () for name in value.split(","))
 
 
+def _value(text: str, option: str) -> tuple[float, float]:
+    """A number with its standard deviation, MEAN:SD; without one it is exact."""
+    mean, _, sd = text.partition(":")
+    try:
+        found = float(mean), float(sd or 0.0)
+    except ValueError:
+        found = math.nan, math.nan
+    if not (math.isfinite(found[0]) and 0.0 <= found[1] < math.inf):
+        raise typer.BadParameter(
+            f"{text!r}: expected a number and its standard deviation, such as 1.5:0.3", param_hint=option
+        )
+    return found
+
+
+def _charge(text: str) -> tuple[str, tuple[float, float]]:
+    branch, equals, value = text.partition("=")
+    if not (equals and branch.strip()):
+        raise typer.BadParameter(
+            f"{text!r}: expected a branch with its charge, such as battery=-12.5:0.2", param_hint="--charge"
+        )
+    mean, sd = _value(value, "--charge")
+    if not sd:
+        raise typer.BadParameter(f"{text!r}: give its standard deviation as well, {text}:0.1", param_hint="--charge")
+    return branch.strip(), (mean, sd)
+
+
 def _require_truth_where_used(classifier: Classifier, truth: Path | None, method: Method) -> None:
     """Refuse a truth that nothing uses, and the perfect classifier without one."""
     if (classifier is Classifier.PERFECT) == (truth is not None):
@@ -214,3 +288,46 @@ def _truth_of(fleet: Path, path: Path) -> "FleetTruth":
     require_same_fleet(source.fleet_ids, truth.fleet_id, drives=fleet, truth=path)
     faults_of(truth, list(source.vehicles))
     return truth
+
+
+def _time_constants_s(value: str) -> list[float]:
+    """Read the option ``--poles``."""
+    with suppress(ValueError):
+        numbers = [float(number) for number in value.split(",")]
+        if all(SHORTEST_POLE_S <= number <= LONGEST_POLE_S for number in numbers):  # nor is not-a-number
+            return numbers
+    expected = f"time constants with commas, each from {SHORTEST_POLE_S:g} to {LONGEST_POLE_S:g} s"
+    raise typer.BadParameter(f"{value}: expected {expected}", param_hint="'--poles'")
+
+
+def identify(
+    fleet: FleetArgument,
+    layout: LayoutOption,
+    bank: BankOption = None,
+    poles: Annotated[str | None, typer.Option("--poles", help=POLES_HELP)] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="File to write the filter bank to (JSON).")] = None,
+    workers: WorkersOption = 2,
+    json: JsonOption = False,
+) -> None:
+    """Choose the filter bank that a fleet's vehicles share, and tell how well it simulates each of them.
+
+    Without --bank or --poles it is chosen from some vehicles, by how well it simulates blocks of their drives that were
+    held out.
+    """
+    if bank is not None and poles is not None:
+        raise typer.BadParameter("a bank has its own poles; give --bank or --poles", param_hint="--poles")
+    time_constants_s = [] if poles is None else _time_constants_s(poles)
+    if out is not None:
+        require_possible_file(out)
+    with importing():
+        from calibrator.estimator.fleet_identification import identify_fleet
+        from calibrator.summaries.filter_bank import read_bank
+
+    given = None if bank is None else read_bank(bank)
+    report = identify_fleet(
+        fleet, vehicle_database(layout), bank=given, time_constants_s=time_constants_s, workers=workers
+    )
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(out, report.bank.to_json())
+    print_report(report, json=json)

@@ -1,4 +1,7 @@
-"""What to say of a vehicle: estimate, confidence, and whether correction could make a branch worse.
+"""What to say of vehicles: estimate, confidence, and whether correction could make a branch worse.
+
+:func:`estimate_rows` does it for N vehicles: laws of the fleet -> weighted draws (:class:`Explained`) -> one posterior
+per vehicle (:class:`Points`) -> :class:`RowsEstimate`.
 
 The estimate is the point near which, within the tolerance of "recovered", most of the posterior lies; that share is
 the confidence (M18). Correction with d_hat, o_hat makes a branch worse on a drive with the moments E[i], E[i^2] where
@@ -9,6 +12,7 @@ with alpha = (1 + d) / (1 + d_hat) - 1 and beta = (o - o_hat) / (1 + d_hat); its
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import exp, sqrt
 from typing import NamedTuple
 
@@ -16,11 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrator.compiled import compiled_with_notice
-from calibrator.drive import Array
+from calibrator.drive import Array, Mask
+from calibrator.estimator.learning import Law, explain, weigh_law
 from calibrator.estimator.posterior import Draws
+from calibrator.estimator.rows import EvidenceRows, parameter_places
 from calibrator.score import TOLERANCE
 
-__all__ = ["Explained", "Points", "best_estimate", "harm_probability", "points_of"]
+__all__ = ["Explained", "Points", "RowsEstimate", "best_estimate", "estimate_rows", "harm_probability", "points_of"]
 
 NEGLIGIBLE = 1e-8
 """Weight of a draw below which it is left out. [1]"""
@@ -32,6 +38,15 @@ SAME = 1e-3
 """Difference of two offsets that cancel, in fractions of full scale: neither is known better. [1]"""
 RESOLUTION = 3e-4
 """Drift [1] and offset in fractions of full scale that are taken for zero: no sensor's resolution is finer."""
+MOST_GAIN_SD = 0.1
+"""Standard deviation from which on a gain is not known: smaller than the faults that matter. [1]"""
+LEAST_EXPLANATION = 1e-5
+"""Probability of an explanation that is reported. [1]"""
+CENTRAL = 0.6827
+"""Share of a normal distribution within one standard deviation. [1]"""
+LIKE_ESTIMATE = (0.1, 0.001)
+"""Share of the estimate's largest fault, and drift [1] or offset over full scale beside it, within which the faults of
+an explanation are those of the estimate. [1]"""
 
 
 class Explained(NamedTuple):
@@ -214,3 +229,216 @@ def _harm(faults: Array, weight: Array, estimate: Array, mean: Array, square: Ar
                 if with_it > without:
                     harm[k] += weight[i]
                     break
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowsEstimate:
+    """What the evidence rows of N vehicles with K branches say, branches in their own order.
+
+    Attributes
+    ----------
+    drift, offset_a, drift_sd, offset_sd_a : ndarray of shape (N, K)
+        Sensor faults and their standard deviations. [1], [A]
+    hardware_drift, hardware_probability, confidence : ndarray of shape (N,)
+        Of a hardware fault; probability that the estimate is recovered: within 10 % of the truth. [1]
+    hardware_offset_a : ndarray of shape (N, K)
+        Of a hardware fault. [A]
+    fault_probability, harm_probability : ndarray of shape (N, K)
+        That the sensor is faulty; that its correction makes the branch worse. [1]
+    identifiable : ndarray of bool of shape (N, K)
+        Whether the branch moved enough for its gain to be known: some row shows it.
+    load_probability, load_a : ndarray of shape (N,)
+        That a load without a sensor is carried by the feeding branch in this vehicle alone, and its expected size. [1],
+        [A]
+    group_probability : ndarray of shape (N, g)
+        That the vehicle is one of each group that shares a constant of the feeding branch. [1]
+    supports : sequence of N sequences of (float, ndarray of shape (4, K))
+        Explanations by falling probability: this; hardware drift (first column), hardware offsets, drifts and offsets.
+    points : sequence of N Points
+        The posterior.
+    order : tuple of int
+        Branches of supports and points, whose offsets are in fractions of full scale: position of each in their own
+        order.
+    full_scale_a : float
+        Full scale of the junction. [A]
+    """
+
+    drift: Array
+    offset_a: Array
+    drift_sd: Array
+    offset_sd_a: Array
+    hardware_drift: Array
+    hardware_offset_a: Array
+    hardware_probability: Array
+    confidence: Array
+    fault_probability: Array
+    harm_probability: Array
+    identifiable: Mask
+    load_probability: Array
+    load_a: Array
+    group_probability: Array
+    supports: Sequence[Sequence[tuple[float, Array]]]
+    points: Sequence[Points]
+    order: tuple[int, ...]
+    full_scale_a: float
+
+    @property
+    def faulty(self) -> Mask:
+        """Branches that would be corrected if nothing spoke against it, shape (N, K)."""
+        return np.asarray((self.drift != 0.0) | (self.offset_a != 0.0))
+
+
+def estimate_rows(
+    rows: EvidenceRows,
+    laws: Sequence[Law],
+    *,
+    feed: int,
+    mean: Array,
+    mean_square: Array,
+    usual: Array,
+    order: Sequence[int] | None = None,
+    full_scale_a: float = 1.0,
+) -> RowsEstimate:
+    """Estimate N vehicles from their evidence rows.
+
+    Parameters
+    ----------
+    rows : EvidenceRows
+        Of the vehicles.
+    laws : sequence of Law
+        That explain their fleet.
+    feed : int
+        Branch that carries loads without a sensor.
+    mean, mean_square : ndarray of shape (N, K)
+        Moments of the measured currents, in fractions of full scale and their squares.
+    usual : ndarray of shape (2, K)
+        The same moments of the fleet's usual drive.
+    order : sequence of int or None
+        Branches of the rows: position of each in their own order; None: the same.
+    full_scale_a : float
+        Full scale of the junction; 1: the offsets of the estimate are fractions of it. [A]
+
+    Returns
+    -------
+    RowsEstimate
+        In the order of the rows.
+    """
+    N, K = mean.shape
+    order = tuple(range(K) if order is None else order)
+    place = np.argsort(order)
+    explained = []
+    for law in laws:
+        draws = explain(rows, law, feed=feed)
+        explained.append(Explained(law.probability, draws, weigh_law(draws, law), law.prior.group_centre))
+    smallest = np.array([laws[0].prior.gain.smallest, laws[0].prior.offset.smallest])
+    estimate, sd, confidence, harm = np.zeros((N, 2 * K)), np.zeros((N, 2 * K)), np.zeros(N), np.zeros((N, K))
+    fault, hardware, points, supports = np.zeros((N, K)), np.zeros(N), [], []
+    for j in range(N):
+        found = points_of(explained, j)
+        estimate[j], confidence[j] = best_estimate(found, smallest)
+        drift, offset = estimate[j, :K], estimate[j, K:]
+        own = (mean[j] - offset) / (1.0 + drift)
+        own_square = np.maximum((mean_square[j] - 2.0 * offset * mean[j] + offset**2) / (1.0 + drift) ** 2, own**2)
+        harm[j] = harm_probability(
+            found, estimate[j], np.stack([own, usual[0]]), np.stack([own_square, np.maximum(usual[1], usual[0] ** 2)])
+        )
+        sd[j] = _central_sd(found, estimate[j])
+        faulty = found.faults != 0.0
+        fault[j] = np.minimum(found.weight @ (faulty[:, :K] | faulty[:, K:]), 1.0)
+        points.append(found)
+        supports.append(_supports(explained, found, j))
+        hardware[j] = sum(share for share, values in supports[j] if values[:2].any())
+    first = np.array([_nearest(each, estimate[j]) for j, each in enumerate(supports)])
+    load_probability, load, group_probability = _unmeasured(explained)
+    return RowsEstimate(
+        drift=estimate[:, place],
+        offset_a=estimate[:, K + place] * full_scale_a,
+        drift_sd=sd[:, place],
+        offset_sd_a=sd[:, K + place] * full_scale_a,
+        hardware_drift=first[:, 0, 0],
+        hardware_offset_a=first[:, 1, place] * full_scale_a,
+        hardware_probability=np.minimum(hardware, 1.0),
+        confidence=confidence,
+        fault_probability=fault[:, place],
+        harm_probability=harm[:, place],
+        identifiable=_identifiable(rows)[:, place],
+        load_probability=load_probability,
+        load_a=load * full_scale_a,
+        group_probability=group_probability,
+        supports=supports,
+        points=points,
+        order=order,
+        full_scale_a=full_scale_a,
+    )
+
+
+def _unmeasured(laws: Sequence[Explained]) -> tuple[Array, Array, Array]:
+    """Probability and size of a load without a sensor, probabilities of the groups, over all laws; these share them."""
+    own, size, groups = [], [], []
+    for law in laws:
+        place = parameter_places(law.draws.values.shape[3] // 3).load
+        alone = law.weight[..., 0] * law.draws.fits.support[:, :, None, place]
+        own.append(law.probability * _total(alone))
+        size.append(law.probability * _total(alone * law.draws.values[..., place]))
+        groups.append(law.probability * _total(law.weight[..., 1:]))
+    most = max(group.shape[1] for group in groups)
+    load = np.sum(own, axis=0)
+    everywhere = [np.pad(group, [(0, 0), (0, most - group.shape[1])]) for group in groups]
+    return load, np.sum(size, axis=0) / np.maximum(load, 1e-300), np.sum(everywhere, axis=0)
+
+
+def _total(values: Array) -> Array:
+    """Sum over draws (N, Q, M, ...), one after the other: the same however many explanations other vehicles have."""
+    N, Q, M = values.shape[:3]
+    return np.asarray(np.cumsum(values.reshape(N, Q * M, *values.shape[3:]), axis=1)[:, -1])
+
+
+def _central_sd(points: Points, estimate: Array) -> Array:
+    """Distance from the estimate within which 68 % of the posterior lies, shape (2K,)."""
+    sd, total = np.zeros(len(estimate)), points.weight.sum()
+    exactly = points.weight @ (points.faults == estimate)
+    for i in np.flatnonzero(exactly < CENTRAL * total):
+        away = np.abs(points.faults[:, i] - estimate[i])
+        order = np.argsort(away, kind="stable")
+        inside = np.cumsum(points.weight[order])
+        sd[i] = away[order[min(int(np.searchsorted(inside, CENTRAL * inside[-1])), len(order) - 1)]]
+    return sd
+
+
+def _supports(laws: Sequence[Explained], points: Points, j: int) -> list[tuple[float, Array]]:
+    """Supports of a vehicle with the signs of their parameters, over all laws; each with its mean parameters."""
+    K = points.faults.shape[1] // 2
+    at, share = parameter_places(K), np.bincount(points.explanation, points.weight)
+    order = np.argsort(-share, kind="stable")
+    order = order[share[order] >= LEAST_EXPLANATION]
+    theta = np.array([laws[points.law[i]].draws.fits.theta[j, points.fit[i]] for i in order.tolist()])
+    values = np.zeros((len(order), 4, K))
+    values[:, 0, 0] = np.expm1(theta[:, at.eta])
+    values[:, 1, :-1] = theta[:, at.hardware_offsets]
+    values[:, 1, -1] = -theta[:, at.hardware_offsets].sum(axis=1)
+    for i in range(2 * K):
+        total = np.bincount(points.explanation, points.weight * points.faults[:, i])
+        values[:, 2 + i // K, i % K] = total[order] / share[order]
+    signs = np.sign(np.where(np.abs(values) < 1e-9, 0.0, values))
+    found: dict[bytes, tuple[float, Array]] = {}
+    for each, sign, part in zip(values, signs, share[order].tolist(), strict=True):
+        before, kept = found.get(sign.tobytes(), (0.0, each))
+        found[sign.tobytes()] = (before + part, kept)
+    return sorted(found.values(), key=lambda item: -item[0])
+
+
+def _nearest(supports: list[tuple[float, Array]], estimate: Array) -> Array:
+    """Parameters of the most probable explanation with sensor faults like the estimate's."""
+    K = len(estimate) // 2
+    apart = [float(np.abs(np.concatenate(values[2:]) - estimate).max()) for _, values in supports]
+    share, least = LIKE_ESTIMATE
+    near = [i for i, distance in enumerate(apart) if distance < share * np.abs(estimate).max() + least]
+    return supports[near[0]][1] if near else np.zeros((4, K))
+
+
+def _identifiable(rows: EvidenceRows) -> Mask:
+    """Branches whose gain some row shows better than :data:`MOST_GAIN_SD`: slope, gain ratio, or a bench reading."""
+    at, sd = rows.places, np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
+    best = np.minimum(sd[:, at.slopes], sd[:, at.gain_reads])
+    best[:, 1:] = np.minimum(best[:, 1:], sd[:, at.ratios])
+    return np.asarray(best < MOST_GAIN_SD)

@@ -47,6 +47,8 @@ MOST_TURN = 3.0
 """Largest logarithm by which a measured ratio can be off. [1]"""
 LOWEST, HIGHEST, STEP = -2.5, 1.2, 0.5
 """Range of a parameter, and the longest step of one iteration: gains from 0.08 to 3.3. [1]"""
+MOST_STEPS, LAST_STEP = 7, 1e-7
+"""Gauss-Newton steps, and the size of a step that is the last one: far below what any row shows. [1]"""
 
 
 class Evidence(NamedTuple):
@@ -187,14 +189,8 @@ def _all_residuals(evidence: Evidence, theta: Array, left: Array) -> None:
 @inner
 def residual(theta: Array, evidence: Evidence, j: int, e: Array) -> None:
     """Fill e with the rows of vehicle j less what parameters make of them, (M11)."""
-    y, means, centre, shared, feed = (
-        evidence.values[j],
-        evidence.means[j],
-        evidence.centre,
-        evidence.shared,
-        evidence.feed,
-    )
-    K = len(y) // 5
+    y, means, centre = evidence.values[j], evidence.means[j], evidence.centre
+    shared, feed, K = evidence.shared, evidence.feed, len(evidence.values[j]) // 5
     c, oh_last = 3 * K - 1, 0.0  # first of the intercepts; hardware offset of the last branch
     first = theta[1] + shared[K]
     for k in range(K):
@@ -304,6 +300,18 @@ def _append(H: Array, g: Array, order: Integers, n: int, L: Array, w: Array) -> 
     return float(0.5 * w[n] ** 2)
 
 
+@inner
+def _solve(H: Array, g: Array, order: Integers, n: int, L: Array, w: Array) -> None:
+    """Fill w with the solution of H w = g, and L with the Cholesky factor of H; order becomes 0 .. n - 1."""
+    for a in range(n):
+        order[a] = a
+        _append(H, g, order, a, L, w)
+    for a in range(n - 1, -1, -1):
+        for b in range(a + 1, n):
+            w[a] -= L[b, a] * w[b]
+        w[a] /= L[a, a]
+
+
 @compiled_with_notice
 def _fit_all(evidence: Evidence, log_prior: Array, log_load: float, fits: Fits) -> None:
     P = fits.theta.shape[2]
@@ -352,13 +360,8 @@ def _score(
         residual(theta, evidence, j, e)
         _design(theta, evidence, j, e, A)
         _normal_equations(evidence.precision_relative[j], A[:R], e[:R], theta, chosen, n, H, g, work)
+        _solve(H, g, order, n, L, w)
         for a in range(n):
-            order[a] = a
-            _append(H, g, order, a, L, w)
-        for a in range(n - 1, -1, -1):
-            for b in range(a + 1, n):
-                w[a] -= L[b, a] * w[b]
-            w[a] /= L[a, a]
             theta[chosen[a]] = min(max(w[a], LOWEST), HIGHEST)
         residual(theta, evidence, j, e)
         _design(theta, evidence, j, e, A)
@@ -435,29 +438,17 @@ def _refine(evidence: Evidence, j: int, support: Mask, theta: Array, root: Array
     P = 3 * K + 1
     e, A = np.zeros(5 * K), np.zeros((5 * K, P))
     H, g, work = np.zeros((P, P)), np.zeros(P), np.zeros((2, 5 * K))
-    L, w, chosen, order = np.zeros((P, P)), np.zeros(P), np.zeros(P, np.int64), np.arange(P)
-    n = 0
-    for p in range(P):
-        if support[p]:
-            chosen[n] = p
-            n += 1
+    L, w, chosen, order = np.zeros((P, P)), np.zeros(P), np.flatnonzero(support), np.arange(P)
+    n, chi2 = len(chosen), 0.0
     theta[:] = 0.0
     root[:] = 0.0
-    chi2 = 0.0
-    for _ in range(7):
+    for _ in range(MOST_STEPS):
         residual(theta, evidence, j, e)
         if n:
             _design(theta, evidence, j, e, A)
         chi2 = _normal_equations(evidence.precision[j], A, e, theta, chosen, n, H, g, work)
-        for a in range(n):
-            _append(H, g, order, a, L, w)
-        largest = 0.0
-        for a in range(n - 1, -1, -1):
-            for b in range(a + 1, n):
-                w[a] -= L[b, a] * w[b]
-            w[a] /= L[a, a]
-            largest = max(largest, abs(w[a]))
-        if largest < 1e-7:
+        _solve(H, g, order, n, L, w)
+        if n == 0 or np.abs(w[:n]).max() < LAST_STEP:
             break
         for a in range(n):
             p = chosen[a]

@@ -27,6 +27,8 @@ from ecu_node.errors import UserError
 from ecu_node.layout import Branch, Input, Layout
 
 if TYPE_CHECKING:
+    from typing import Self, TypeAlias
+
     import pandas as pd
 
     from calibrator.drive import Drive
@@ -35,7 +37,10 @@ if TYPE_CHECKING:
     from ecu_node.database import VehicleDatabase
     from ecu_node.parameters import VehicleParameters
 
-__all__ = ["Fleet", "FleetCalibrator", "Junction", "Log", "Vehicle", "read_log"]
+    Frames: TypeAlias = pd.DataFrame | Sequence[pd.DataFrame]
+    Recordings: TypeAlias = Frames | Mapping[str, Frames] | str | Path
+
+__all__ = ["Fleet", "FleetCalibrator", "Junction", "JunctionCalibrator", "Log", "Vehicle", "read_log"]
 
 MOST_BRANCHES = 16
 MOST_MISSED, LEAST_AGE_S = 2.5, 0.5
@@ -98,9 +103,9 @@ def _names(given: Any, what: str, *, sets: bool = False) -> tuple[str, ...]:
 
 def _in_python(text: str) -> str:
     """A text of the command with arguments instead of its options."""
-    for name in inspect.signature(FleetCalibrator).parameters:
+    for name in (*inspect.signature(FleetCalibrator).parameters, "load", "meter"):
         text = text.replace(f"--{name.replace('_', '-')}", name)
-    return text.replace("another --out", "another folder")
+    return text.replace("--charge", "charge_ah").replace("another --out", "another folder")
 
 
 @contextmanager
@@ -195,7 +200,6 @@ class Junction:
         layout = Layout(
             schema=1,
             name="frames",
-            dbc="none",
             full_scale_a=float(self.full_scale_a),
             branch=[Branch(name=name, sign=1, timeout_s=age_s) for name in self.branches],
             input=[Input(name=name, signal=f"frame.{name}") for name in inputs],
@@ -359,72 +363,13 @@ class Vehicle:
         return f"<pre>{html.escape(self.explain())}</pre>"
 
 
-class FleetCalibrator:
-    """Learns from a fleet of identical vehicles what each one's current sensors do wrong.
-
-    Parameters
-    ----------
-    harm_limit : float
-        A branch is corrected if the correction does harm with a probability below this. [1]
-    trusted : collection of str
-        Vehicles with bench-checked sensors; three or more carry the reference.
-    readings : path or DataFrame or None
-        Bench readings of single sensors: columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a.
-    hold_out : collection of str
-        Vehicles to calibrate, but to learn nothing from for others.
-    expected_faults : float or None
-        Share of vehicles with a sensor fault, if it is known. [1]
-    workers : int
-        Number of processes; the result does not depend on it.
-    scheduler : str or None
-        Address of a Dask scheduler that is used instead.
-    verbose : bool
-        Whether progress is shown on standard error.
-
-    Attributes
-    ----------
-    parameters_ : DataFrame
-        One row per vehicle and branch: ``vehicle``, ``branch``, ``gain_error`` and ``gain_error_sd`` [1], ``offset_a``
-        and ``offset_sd_a`` [A], ``fault_probability``, ``harm_probability``, ``corrected``, ``reason_not_corrected``,
-        and of the vehicle ``verdict``, ``confidence``, ``hardware_probability``.
-    vehicles_ : dict of str to Vehicle
-        By name: corrects recordings, explains what was found.
-    left_out_ : dict of str to str
-        Vehicles that could not be calibrated, and why.
-    notices_ : list of str
-        What to know of the fleet as a whole.
-
-    Examples
-    --------
-    >>> FleetCalibrator(harm_limit=0.01)
-    FleetCalibrator(harm_limit=0.01)
-    """
+class _Calibrator:
+    """What both calibrators share: scikit-learn's conventions, and what was learned in attributes that end in ``_``."""
 
     parameters_: "pd.DataFrame"
     vehicles_: dict[str, Vehicle]
     left_out_: dict[str, str]
     notices_: list[str]
-
-    def __init__(
-        self,
-        *,
-        harm_limit: float = 0.001,
-        trusted: Collection[str] = (),
-        readings: "str | Path | pd.DataFrame | None" = None,
-        hold_out: Collection[str] = (),
-        expected_faults: float | None = None,
-        workers: int = 2,
-        scheduler: str | None = None,
-        verbose: bool = False,
-    ) -> None:
-        self.harm_limit = harm_limit
-        self.trusted = trusted
-        self.readings = readings
-        self.hold_out = hold_out
-        self.expected_faults = expected_faults
-        self.workers = workers
-        self.scheduler = scheduler
-        self.verbose = verbose
 
     # scikit-learn's BaseEstimator does the next three as well, but takes more than a second to import
 
@@ -432,7 +377,7 @@ class FleetCalibrator:
         """Parameters of the constructor by name."""
         return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
 
-    def set_params(self, **parameters: Any) -> "FleetCalibrator":
+    def set_params(self, **parameters: Any) -> "Self":
         """Set parameters of the constructor, and return the calibrator."""
         for name, value in parameters.items():
             if name not in self.get_params():
@@ -446,68 +391,6 @@ class FleetCalibrator:
             f"{name}={value!r}" for name, value in self.get_params().items() if repr(value) != repr(defaults[name])
         )
         return f"{type(self).__name__}({', '.join(changed)})"
-
-    def fit(self, fleet: Fleet, y: None = None) -> "FleetCalibrator":  # noqa: ARG002 (scikit-learn's signature)
-        """Learn from a fleet, and estimate the sensor faults of every vehicle.
-
-        Parameters
-        ----------
-        fleet : Fleet
-            Recordings of two vehicles or more.
-        y : None
-            Not used.
-
-        Returns
-        -------
-        FleetCalibrator
-            This one.
-
-        Raises
-        ------
-        UserError
-            If the fleet as a whole cannot be calibrated, or a parameter makes no sense.
-        """
-        from calibrator.estimator.run import calibrate_fleet
-        from calibrator.estimator.workers import Workers
-        from calibrator.terminal.progress import no_progress
-
-        _require(isinstance(fleet, Fleet), "fleet", fleet, "Fleet.from_frames(...) or Fleet.from_folder(...)")
-        progress = nullcontext() if self.verbose else no_progress()
-        with TemporaryDirectory(prefix="calibrator-") as folder, progress, _errors_in_python():
-            settings, out = self._settings(Path(folder)), Path(folder) / "result"
-            # frames are so few that another process takes longer to start than they take here
-            workers = Workers(processes=1 if fleet.in_memory else self.workers, scheduler=self.scheduler)
-            report = calibrate_fleet(fleet.place, fleet.database, out, settings, workers=workers)
-            self._keep(out, report, has_layout=fleet.has_layout)
-        return self
-
-    def _settings(self, folder: Path) -> "CalibrationSettings":
-        """Parameters of the constructor as the command takes them; FleetError if one makes no sense."""
-        from calibrator.estimator.settings import CalibrationSettings
-
-        faults = 0.0 if self.expected_faults is None else self.expected_faults
-        _require(_is_number(self.harm_limit, 0, 1), "harm_limit", self.harm_limit, "a number from 0 to 1")
-        _require(_is_number(faults, 0, 1), "expected_faults", faults, "a number from 0 to 1")
-        _require(_is_number(self.workers, 1, 256, Integral), "workers", self.workers, "a whole number from 1 to 256")
-        _require(isinstance(self.scheduler, str | None), "scheduler", self.scheduler, "the address of a Dask scheduler")
-        trusted, hold_out = (
-            frozenset(_names([given] if isinstance(given, str) else () if given is None else given, name, sets=True))
-            for name, given in (("trusted", self.trusted), ("hold_out", self.hold_out))
-        )
-        readings: Any = self.readings
-        if hasattr(readings, "to_csv"):
-            readings.to_csv(folder / "readings.csv", index=False)
-            readings = folder / "readings.csv"
-        if readings is not None:
-            path = _path(readings, "readings", "a DataFrame or the path of a CSV table")
-            _require(path.is_file(), "readings", readings, "a file that exists")
-        return CalibrationSettings(
-            harm_limit=self.harm_limit,
-            readings=None if readings is None else Path(readings),
-            expected_faults=self.expected_faults,
-            trusted=trusted,
-            hold_out=hold_out,
-        )
 
     def _keep(self, out: Path, report: "CalibrationReport", *, has_layout: bool) -> None:
         """Take over what stands in a result folder."""
@@ -544,7 +427,7 @@ class FleetCalibrator:
 
     def _require_fitted(self) -> None:
         if not hasattr(self, "parameters_"):
-            raise FleetError("this FleetCalibrator has learned nothing yet; call fit(fleet) first")
+            raise FleetError(f"this {type(self).__name__} has learned nothing yet; call fit first")
 
     def summary(self) -> str:
         """What was found, as ``calibrator calibrate`` prints it."""
@@ -587,6 +470,256 @@ class FleetCalibrator:
         if not self._has_layout:
             warnings.warn(NO_NODE_FILES, stacklevel=2)
         return Path(folder)
+
+    def _readings(self, folder: Path) -> Path | None:
+        """Path of the bench readings, which may be given as a data frame."""
+        readings: Any = self.get_params()["readings"]
+        if hasattr(readings, "to_csv"):
+            readings.to_csv(folder / "readings.csv", index=False)
+            readings = folder / "readings.csv"
+        if readings is None:
+            return None
+        path = _path(readings, "readings", "a DataFrame or the path of a CSV table")
+        _require(path.is_file(), "readings", readings, "a file that exists")
+        return path
+
+
+class FleetCalibrator(_Calibrator):
+    """Learns from a fleet of identical vehicles what each one's current sensors do wrong.
+
+    Parameters
+    ----------
+    harm_limit : float
+        A branch is corrected if the correction does harm with a probability below this. [1]
+    trusted : collection of str
+        Vehicles with bench-checked sensors; three or more carry the reference.
+    readings : path or DataFrame or None
+        Bench readings of single sensors: columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a.
+    hold_out : collection of str
+        Vehicles to calibrate, but to learn nothing from for others.
+    expected_faults : float or None
+        Share of vehicles with a sensor fault, if it is known. [1]
+    workers : int
+        Number of processes; the result does not depend on it.
+    scheduler : str or None
+        Address of a Dask scheduler that is used instead.
+    verbose : bool
+        Whether progress is shown on standard error.
+
+    Attributes
+    ----------
+    parameters_ : DataFrame
+        One row per vehicle and branch: ``vehicle``, ``branch``, ``gain_error`` and ``gain_error_sd`` [1], ``offset_a``
+        and ``offset_sd_a`` [A], ``fault_probability``, ``harm_probability``, ``corrected``, ``reason_not_corrected``,
+        and of the vehicle ``verdict``, ``confidence``, ``hardware_probability``.
+    vehicles_ : dict of str to Vehicle
+        By name: corrects recordings, explains what was found.
+    left_out_ : dict of str to str
+        Vehicles that could not be calibrated, and why.
+    notices_ : list of str
+        What to know of the fleet as a whole.
+
+    Examples
+    --------
+    >>> FleetCalibrator(harm_limit=0.01)
+    FleetCalibrator(harm_limit=0.01)
+    """
+
+    def __init__(
+        self,
+        *,
+        harm_limit: float = 0.001,
+        trusted: Collection[str] = (),
+        readings: "str | Path | pd.DataFrame | None" = None,
+        hold_out: Collection[str] = (),
+        expected_faults: float | None = None,
+        workers: int = 2,
+        scheduler: str | None = None,
+        verbose: bool = False,
+    ) -> None:
+        self.harm_limit = harm_limit
+        self.trusted = trusted
+        self.readings = readings
+        self.hold_out = hold_out
+        self.expected_faults = expected_faults
+        self.workers = workers
+        self.scheduler = scheduler
+        self.verbose = verbose
+
+    def fit(self, fleet: Fleet, y: None = None) -> "FleetCalibrator":  # noqa: ARG002 (scikit-learn's signature)
+        """Learn from a fleet, and estimate the sensor faults of every vehicle.
+
+        Parameters
+        ----------
+        fleet : Fleet
+            Recordings of two vehicles or more.
+        y : None
+            Not used.
+
+        Returns
+        -------
+        FleetCalibrator
+            This one.
+
+        Raises
+        ------
+        UserError
+            If the fleet as a whole cannot be calibrated, or a parameter makes no sense.
+        """
+        from calibrator.estimator.run import calibrate_fleet
+        from calibrator.processes.computing import Workers
+        from calibrator.terminal.progress import no_progress
+
+        _require(isinstance(fleet, Fleet), "fleet", fleet, "Fleet.from_frames(...) or Fleet.from_folder(...)")
+        progress = nullcontext() if self.verbose else no_progress()
+        with TemporaryDirectory(prefix="calibrator-") as folder, progress, _errors_in_python():
+            settings, out = self._settings(Path(folder)), Path(folder) / "result"
+            # frames are so few that another process takes longer to start than they take here
+            workers = Workers(processes=1 if fleet.in_memory else self.workers, scheduler=self.scheduler)
+            report = calibrate_fleet(fleet.place, fleet.database, out, settings, workers=workers)
+            self._keep(out, report, has_layout=fleet.has_layout)
+        return self
+
+    def _settings(self, folder: Path) -> "CalibrationSettings":
+        """Parameters of the constructor as the command takes them; FleetError if one makes no sense."""
+        from calibrator.estimator.settings import CalibrationSettings
+
+        faults = 0.0 if self.expected_faults is None else self.expected_faults
+        _require(_is_number(self.harm_limit, 0, 1), "harm_limit", self.harm_limit, "a number from 0 to 1")
+        _require(_is_number(faults, 0, 1), "expected_faults", faults, "a number from 0 to 1")
+        _require(_is_number(self.workers, 1, 256, Integral), "workers", self.workers, "a whole number from 1 to 256")
+        _require(isinstance(self.scheduler, str | None), "scheduler", self.scheduler, "the address of a Dask scheduler")
+        trusted, hold_out = (
+            frozenset(_names([given] if isinstance(given, str) else () if given is None else given, name, sets=True))
+            for name, given in (("trusted", self.trusted), ("hold_out", self.hold_out))
+        )
+        return CalibrationSettings(
+            harm_limit=self.harm_limit,
+            readings=self._readings(folder),
+            expected_faults=self.expected_faults,
+            trusted=trusted,
+            hold_out=hold_out,
+        )
+
+
+class JunctionCalibrator(_Calibrator):
+    """Learns from recordings of one junction, and what is known of it, what its current sensors do wrong.
+
+    No fleet is needed. The junction law gives every ratio of gains; a sensor that is known gives their scale, and a
+    zero-current window, a bench reading or a declared load the offsets. What stays open is said, with its deviation.
+
+    Parameters
+    ----------
+    trusted : collection of str
+        Branches whose sensor is right, to 0.2 % and 0.05 % of full scale; others by ``readings``.
+    readings : path or DataFrame or None
+        Bench readings of single sensors: columns vehicle, branch, drift, drift_sd, offset_a, offset_sd_a.
+    load : tuple of (float, float), or None
+        Load that no branch measures and its standard deviation; None: as the layout says, else not known. [A]
+    charge_ah : mapping of str to (float, float), or None
+        Charge into the junction through a branch over the recordings of one vehicle, and its standard deviation. [Ah]
+    meter : str or None
+        Branch that has another sensor in each "vehicle": these are recordings of one car, as at different chargers.
+    harm_limit : float
+        A branch is corrected if the correction does harm with a probability below this. [1]
+
+    Attributes
+    ----------
+    parameters_, vehicles_, left_out_, notices_
+        As of :class:`FleetCalibrator`; gain errors and offsets are reported of all sensors.
+
+    Examples
+    --------
+    >>> JunctionCalibrator(trusted=["battery"])
+    JunctionCalibrator(trusted=['battery'])
+    """
+
+    def __init__(
+        self,
+        *,
+        trusted: Collection[str] = (),
+        readings: "str | Path | pd.DataFrame | None" = None,
+        load: tuple[float, float] | None = None,
+        charge_ah: Mapping[str, tuple[float, float]] | None = None,
+        meter: str | None = None,
+        harm_limit: float = 0.001,
+    ) -> None:
+        self.trusted = trusted
+        self.readings = readings
+        self.load = load
+        self.charge_ah = charge_ah
+        self.meter = meter
+        self.harm_limit = harm_limit
+
+    def fit(self, recordings: "Recordings", junction: Junction | str | Path, y: None = None) -> "JunctionCalibrator":  # noqa: ARG002 (scikit-learn's signature)
+        """Estimate the sensor faults of one junction, or of several, each by itself.
+
+        Parameters
+        ----------
+        recordings : DataFrame, sequence of DataFrame, mapping of str to these, or path
+            Index: seconds or a DatetimeIndex; columns: every branch, positive into the junction [A]. A mapping is of
+            vehicles. A path is a log, a table, or a folder of them.
+        junction : Junction, or path of a layout
+            Says which columns or signals are branches; recordings on disk need a layout.
+        y : None
+            Not used.
+
+        Returns
+        -------
+        JunctionCalibrator
+            This one.
+
+        Raises
+        ------
+        UserError
+            If the recordings are none of this junction, or a parameter makes no sense.
+        """
+        import pandas as pd
+
+        from calibrator.estimator.frames import store_frames
+        from calibrator.estimator.run import calibrate_fleet
+        from calibrator.processes.computing import Workers
+        from calibrator.terminal.progress import no_progress
+
+        if not isinstance(junction, Junction):
+            junction = Junction.from_layout(_path(junction, "junction", "a Junction, or the path of a layout (TOML)"))
+        with TemporaryDirectory(prefix="calibrator-") as folder, no_progress(), _errors_in_python():
+            place, out = Path(folder) / "recordings", Path(folder) / "result"
+            settings = self._settings(Path(folder))
+            if isinstance(recordings, (str, os.PathLike)):
+                _require(junction.database is not None, "junction", junction, "a layout, as the recordings are on disk")
+                place, database = Path(recordings), junction.as_database((), 0.1)
+            else:
+                several = isinstance(recordings, Mapping) and not isinstance(recordings, pd.DataFrame)
+                named: Any = recordings if several else {"vehicle": recordings}
+                database = store_frames(place, named, junction)
+            report = calibrate_fleet(place, database, out, settings, workers=Workers(processes=1))
+            self._keep(out, report, has_layout=junction.layout is not None)
+        return self
+
+    def _settings(self, folder: Path) -> "CalibrationSettings":
+        from calibrator.estimator.settings import CalibrationSettings
+        from ecu_node.layout import UnmeasuredLoad
+
+        def pair(given: Any, name: str) -> tuple[float, float]:
+            good = isinstance(given, Sequence) and len(given) == 2 and _is_number(given[0], -1e6, 1e6)
+            _require(good and _is_number(given[1], 0.0, 1e6), name, given, "a value with its standard deviation")
+            return float(given[0]), float(given[1])
+
+        _require(_is_number(self.harm_limit, 0, 1), "harm_limit", self.harm_limit, "a number from 0 to 1")
+        _require(self.meter is None or isinstance(self.meter, str), "meter", self.meter, "the name of a branch")
+        _require(isinstance(self.charge_ah or {}, Mapping), "charge_ah", self.charge_ah, "charges by branch")
+        load = None if self.load is None else pair(self.load, "load")
+        names = [self.trusted] if isinstance(self.trusted, str) else () if self.trusted is None else self.trusted
+        return CalibrationSettings(
+            alone=True,
+            harm_limit=self.harm_limit,
+            readings=self._readings(folder),
+            trusted=frozenset(_names(names, "trusted", sets=True)),
+            load=None if load is None else UnmeasuredLoad(mean_a=load[0], sd_a=load[1]),
+            charge_ah={str(name): pair(given, "charge_ah") for name, given in (self.charge_ah or {}).items()},
+            meter=self.meter,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,266 +15,41 @@ from numpy.typing import NDArray
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.checks import UsualMisfits, check_fit, learn_usual_misfits
-from calibrator.estimator.clusters import densest_clusters
-from calibrator.estimator.decision import Explained, Points, best_estimate, harm_probability, points_of
-from calibrator.estimator.fleet_model import FleetModel, fit_fleet_model
-from calibrator.estimator.learning import DOUBT, Law, centre_rows, explain, learn_laws, weigh_law
+from calibrator.estimator.decision import RowsEstimate, estimate_rows
+from calibrator.estimator.fleet_model import FleetModel, densest_clusters, fit_fleet_model
+from calibrator.estimator.learning import LEAST_SHARED, Law, centre_rows, learn_laws
 from calibrator.estimator.moments import FleetMoments, stack_summaries
 from calibrator.estimator.prior import Prior
 from calibrator.estimator.readings import FEWEST_TRUSTED, Readings, untrusted_vehicles, with_readings
-from calibrator.estimator.rows import EvidenceRows, collect_rows, evidence_names
-from calibrator.estimator.vehicle_evidence import VehicleEvidence, reported_evidence
+from calibrator.estimator.rows import (
+    EvidenceRows,
+    VehicleEvidence,
+    collect_rows,
+    evidence_names,
+    reported_evidence,
+    row_places,
+)
+from calibrator.estimator.settings import FEWEST_VEHICLES, HARM_LIMIT
 from calibrator.summaries.moments import DriveSummary
 from ecu_node.layout import UnmeasuredLoad
 from ecu_node.parameters import Explanation, Finding
 
-__all__ = [
-    "HARM_LIMIT",
-    "FleetEstimate",
-    "FleetReference",
-    "RowsEstimate",
-    "estimate_rows",
-    "estimate_vehicles",
-    "learn_fleet",
-]
+__all__ = ["HARM_LIMIT", "FleetEstimate", "FleetReference", "estimate_vehicles", "learn_fleet"]
 
-HARM_LIMIT = 0.001
-"""Default probability of making a branch worse up to which it is corrected. [1]"""
 CONFIDENT, SUSPECTED = 0.95, 0.5
 """Confidence from which on a vehicle counts as sound, and probability from which on hardware is suspected. [1]"""
-FEWEST_VEHICLES = 5
-"""Of a fleet that is compared with itself: in a smaller one it is not clear who differs from whom."""
 MOST_RATIO, SURE = 3.0, 0.9
 """Gain ratio that no two sensors have, and partial correlation from which on noise does not make it. [1]"""
 LEAST_OWN = 1e-9
 """Share of a current's variance that is its own at least. [1]"""
-MOST_GAIN_SD = 0.1
-"""Standard deviation from which on a gain is not known: smaller than the faults that matter. [1]"""
-LEAST_EXPLANATION = 1e-5
-"""Probability of an explanation that is reported. [1]"""
 LEAST_SAID = 0.005
 """Probability of a cause that a notice names. [1]"""
-CENTRAL = 0.6827
-"""Share of a normal distribution within one standard deviation. [1]"""
 LEFT_OUT_CAUSES = ("spikes", "outliers")
 """Findings whose samples are not in the sums: the other branches of the vehicle are not concerned."""
 LINEAR_CAUSES = (*LEFT_OUT_CAUSES, "noise", "switching")
 """Findings of sensors that have a gain and an offset all the same."""
 VARIANT_SHARE, VARIANT_SPREAD, FEWEST_VARIANT = 0.15, 0.012, 4
 """Share of the fleet, half width of the hardware drift, and number of vehicles of a variant. [1]"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RowsEstimate:
-    """What the evidence rows of N vehicles with K branches say, branches in their own order.
-
-    Attributes
-    ----------
-    drift, offset_a, drift_sd, offset_sd_a : ndarray of shape (N, K)
-        Sensor faults and their standard deviations. [1], [A]
-    hardware_drift, hardware_probability, confidence : ndarray of shape (N,)
-        Of a hardware fault; probability that the estimate is recovered: within 10 % of the truth. [1]
-    hardware_offset_a : ndarray of shape (N, K)
-        Of a hardware fault. [A]
-    fault_probability, harm_probability : ndarray of shape (N, K)
-        That the sensor is faulty; that its correction makes the branch worse. [1]
-    identifiable : ndarray of bool of shape (N, K)
-        Whether the branch moved enough for its gain to be known: some row shows it.
-    load_probability, load_a : ndarray of shape (N,)
-        That a load without a sensor is carried by the feeding branch in this vehicle alone, and its expected size. [1],
-        [A]
-    group_probability : ndarray of shape (N, g)
-        That the vehicle is one of each group that shares a constant of the feeding branch. [1]
-    supports : sequence of N sequences of (float, ndarray of shape (4, K))
-        Explanations by falling probability: this; hardware drift (first column), hardware offsets, drifts and offsets.
-    points : sequence of N Points
-        The posterior.
-    order : tuple of int
-        Branches of supports and points, whose offsets are in fractions of full scale: position of each in their own
-        order.
-    full_scale_a : float
-        Full scale of the junction. [A]
-    """
-
-    drift: Array
-    offset_a: Array
-    drift_sd: Array
-    offset_sd_a: Array
-    hardware_drift: Array
-    hardware_offset_a: Array
-    hardware_probability: Array
-    confidence: Array
-    fault_probability: Array
-    harm_probability: Array
-    identifiable: Mask
-    load_probability: Array
-    load_a: Array
-    group_probability: Array
-    supports: Sequence[Sequence[tuple[float, Array]]]
-    points: Sequence[Points]
-    order: tuple[int, ...]
-    full_scale_a: float
-
-    @property
-    def faulty(self) -> Mask:
-        """Branches that would be corrected if nothing spoke against it, shape (N, K)."""
-        return np.asarray((self.drift != 0.0) | (self.offset_a != 0.0))
-
-
-def estimate_rows(
-    rows: EvidenceRows,
-    laws: Sequence[Law],
-    *,
-    feed: int,
-    mean: Array,
-    mean_square: Array,
-    usual: Array,
-    order: Sequence[int] | None = None,
-    full_scale_a: float = 1.0,
-) -> RowsEstimate:
-    """Estimate N vehicles from their evidence rows.
-
-    Parameters
-    ----------
-    rows : EvidenceRows
-        Of the vehicles.
-    laws : sequence of Law
-        That explain their fleet.
-    feed : int
-        Branch that carries loads without a sensor.
-    mean, mean_square : ndarray of shape (N, K)
-        Moments of the measured currents, in fractions of full scale and their squares.
-    usual : ndarray of shape (2, K)
-        The same moments of the fleet's usual drive.
-    order : sequence of int or None
-        Branches of the rows: position of each in their own order; None: the same.
-    full_scale_a : float
-        Full scale of the junction; 1: the offsets of the estimate are fractions of it. [A]
-
-    Returns
-    -------
-    RowsEstimate
-        In the order of the rows.
-    """
-    N, K = mean.shape
-    order = tuple(range(K) if order is None else order)
-    place = np.argsort(order)
-    explained = []
-    for law in laws:
-        draws = explain(rows, law, feed=feed)
-        explained.append(Explained(law.probability, draws, weigh_law(draws, law), law.prior.group_centre))
-    smallest = np.array([laws[0].prior.gain.smallest, laws[0].prior.offset.smallest])
-    estimate, sd, confidence, harm = np.zeros((N, 2 * K)), np.zeros((N, 2 * K)), np.zeros(N), np.zeros((N, K))
-    fault, hardware, points, supports = np.zeros((N, K)), np.zeros(N), [], []
-    for j in range(N):
-        found = points_of(explained, j)
-        estimate[j], confidence[j] = best_estimate(found, smallest)
-        drift, offset = estimate[j, :K], estimate[j, K:]
-        own = (mean[j] - offset) / (1.0 + drift)
-        own_square = np.maximum((mean_square[j] - 2.0 * offset * mean[j] + offset**2) / (1.0 + drift) ** 2, own**2)
-        harm[j] = harm_probability(
-            found, estimate[j], np.stack([own, usual[0]]), np.stack([own_square, np.maximum(usual[1], usual[0] ** 2)])
-        )
-        sd[j] = _central_sd(found, estimate[j])
-        faulty = found.faults != 0.0
-        fault[j] = np.minimum(found.weight @ (faulty[:, :K] | faulty[:, K:]), 1.0)
-        points.append(found)
-        supports.append(_supports(explained, found, j))
-        hardware[j] = sum(share for share, values in supports[j] if values[:2].any())
-    first = np.array([_nearest(each, estimate[j]) for j, each in enumerate(supports)])
-    load_probability, load, group_probability = _unmeasured(explained)
-    return RowsEstimate(
-        drift=estimate[:, place],
-        offset_a=estimate[:, K + place] * full_scale_a,
-        drift_sd=sd[:, place],
-        offset_sd_a=sd[:, K + place] * full_scale_a,
-        hardware_drift=first[:, 0, 0],
-        hardware_offset_a=first[:, 1, place] * full_scale_a,
-        hardware_probability=np.minimum(hardware, 1.0),
-        confidence=confidence,
-        fault_probability=fault[:, place],
-        harm_probability=harm[:, place],
-        identifiable=_identifiable(rows)[:, place],
-        load_probability=load_probability,
-        load_a=load * full_scale_a,
-        group_probability=group_probability,
-        supports=supports,
-        points=points,
-        order=order,
-        full_scale_a=full_scale_a,
-    )
-
-
-def _unmeasured(laws: Sequence[Explained]) -> tuple[Array, Array, Array]:
-    """Probability and size of a load without a sensor, probabilities of the groups, over all laws; these share them."""
-    own, size, groups = [], [], []
-    for law in laws:
-        P = law.draws.values.shape[3]
-        alone = law.weight[..., 0] * law.draws.fits.support[:, :, None, P - 1]
-        own.append(law.probability * _total(alone))
-        size.append(law.probability * _total(alone * law.draws.values[..., P - 1]))
-        groups.append(law.probability * _total(law.weight[..., 1:]))
-    most = max(group.shape[1] for group in groups)
-    load = np.sum(own, axis=0)
-    everywhere = [np.pad(group, [(0, 0), (0, most - group.shape[1])]) for group in groups]
-    return load, np.sum(size, axis=0) / np.maximum(load, 1e-300), np.sum(everywhere, axis=0)
-
-
-def _total(values: Array) -> Array:
-    """Sum over draws (N, Q, M, ...), one after the other: the same however many explanations other vehicles have."""
-    N, Q, M = values.shape[:3]
-    return np.asarray(np.cumsum(values.reshape(N, Q * M, *values.shape[3:]), axis=1)[:, -1])
-
-
-def _central_sd(points: Points, estimate: Array) -> Array:
-    """Distance from the estimate within which 68 % of the posterior lies, shape (2K,)."""
-    sd, total = np.zeros(len(estimate)), points.weight.sum()
-    exactly = points.weight @ (points.faults == estimate)
-    for i in np.flatnonzero(exactly < CENTRAL * total):
-        away = np.abs(points.faults[:, i] - estimate[i])
-        order = np.argsort(away, kind="stable")
-        inside = np.cumsum(points.weight[order])
-        sd[i] = away[order[min(int(np.searchsorted(inside, CENTRAL * inside[-1])), len(order) - 1)]]
-    return sd
-
-
-def _supports(laws: Sequence[Explained], points: Points, j: int) -> list[tuple[float, Array]]:
-    """Supports of a vehicle with the signs of their parameters, over all laws; each with its mean parameters."""
-    K = points.faults.shape[1] // 2
-    share = np.bincount(points.explanation, points.weight)
-    order = np.argsort(-share, kind="stable")
-    order = order[share[order] >= LEAST_EXPLANATION]
-    theta = np.array([laws[points.law[i]].draws.fits.theta[j, points.fit[i]] for i in order.tolist()])
-    values = np.zeros((len(order), 4, K))
-    values[:, 0, 0] = np.expm1(theta[:, 0])
-    values[:, 1, :-1] = theta[:, K + 1 : 2 * K]
-    values[:, 1, -1] = -theta[:, K + 1 : 2 * K].sum(axis=1)
-    for i in range(2 * K):
-        total = np.bincount(points.explanation, points.weight * points.faults[:, i])
-        values[:, 2 + i // K, i % K] = total[order] / share[order]
-    signs = np.sign(np.where(np.abs(values) < 1e-9, 0.0, values))
-    found: dict[bytes, tuple[float, Array]] = {}
-    for each, sign, part in zip(values, signs, share[order].tolist(), strict=True):
-        before, kept = found.get(sign.tobytes(), (0.0, each))
-        found[sign.tobytes()] = (before + part, kept)
-    return sorted(found.values(), key=lambda item: -item[0])
-
-
-def _nearest(supports: list[tuple[float, Array]], estimate: Array) -> Array:
-    """Parameters of the most probable explanation with sensor faults like the estimate's."""
-    K = len(estimate) // 2
-    apart = [float(np.abs(np.concatenate(values[2:]) - estimate).max()) for _, values in supports]
-    near = [i for i, distance in enumerate(apart) if distance < 0.1 * np.abs(estimate).max() + DOUBT]
-    return supports[near[0]][1] if near else np.zeros((4, K))
-
-
-def _identifiable(rows: EvidenceRows) -> Mask:
-    """Branches whose gain some row shows better than :data:`MOST_GAIN_SD`: slope, gain ratio, or a bench reading."""
-    K = rows.branches
-    sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
-    best = np.minimum(sd[:, :K], sd[:, 2 * K - 1 : 3 * K - 1])
-    best[:, 1:] = np.minimum(best[:, 1:], sd[:, K : 2 * K - 1])
-    return np.asarray(best < MOST_GAIN_SD)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -347,8 +122,8 @@ class FleetReference:
     @property
     def expected_a(self) -> float:
         """Mean junction sum that right sensors show: the load that none of them sees. [A]"""
-        law, K = self.laws[0], len(self.branches)
-        return float((law.spread.mean[4 * K - 1] - law.spread.shared[:K].sum()) * self.full_scale_a)
+        spread, K = self.laws[0].spread, len(self.branches)
+        return float((spread.mean[row_places(K).junction] - spread.shared[:K].sum()) * self.full_scale_a)
 
     @property
     def read_out(self) -> Array:
@@ -388,8 +163,8 @@ class FleetReference:
                 f"least {FEWEST_VEHICLES} are needed, or {FEWEST_TRUSTED} bench-checked vehicles (--trusted)"
             )
         best = self.laws[0]
-        constant = best.spread.mean[4 * K - 1]
-        if self.load is None and abs(constant) > DOUBT:
+        constant = best.spread.mean[row_places(K).junction]
+        if self.load is None and abs(constant) > LEAST_SHARED:
             notices.append(
                 f"the currents of most vehicles sum to {constant * scale_a:+.1f} A: " + _causes(self.laws, ordered)
             )
@@ -527,29 +302,25 @@ def learn_fleet(
     carriers[list(distrusted)] = False
     rows = _with_knowledge(measured, readings, carriers, order=order, full_scale_a=full_scale_a, load=load)
 
-    def learn(carrying: Mask) -> list[Law]:
-        return learn_laws(
+    mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
+    usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
+
+    def learn() -> tuple[list[Law], RowsEstimate]:
+        laws = learn_laws(
             rows,
             feed=feed,
-            fixed=_carried_centre(rows, carrying),
+            fixed=_carried_centre(rows, carriers),
             load=None if load is None else load.mean_a / full_scale_a,
             known=known,
             expected_faults=expected_faults,
         )
+        return laws, estimate_rows(rows, laws, feed=feed, mean=mean, mean_square=square, usual=usual)
 
-    mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
-    usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
-
-    def estimate(laws: Sequence[Law]) -> RowsEstimate:
-        return estimate_rows(rows, laws, feed=feed, mean=mean, mean_square=square, usual=usual)
-
-    laws = learn(carriers)
-    everyone = estimate(laws)
+    laws, everyone = learn()
     differing = carriers & (everyone.hardware_probability > SUSPECTED) & (carriers.sum() >= FEWEST_TRUSTED)
     if differing.any():
         carriers &= ~differing
-        laws = learn(carriers)
-        everyone = estimate(laws)
+        laws, everyone = learn()
     place = np.argsort(order)
     return FleetReference(
         branches=tuple(branches),
@@ -624,11 +395,8 @@ def _carried_centre(rows: EvidenceRows, carriers: Mask) -> Array:
 
 def _agreeing(rows: EvidenceRows, branch: int) -> float:
     """Share of the vehicles whose slopes of a branch agree."""
-    known = rows.known[:, branch]
-    if not known.any():
-        return 0.0
-    sd = np.sqrt(rows.covariance[known, branch, branch])
-    return densest_clusters(rows.relative[known, branch], sd, widest=1.0)[0].share
+    found = densest_clusters(*rows.shown(rows.places.slope(branch)), widest=1.0)
+    return found[0].share if found else 0.0
 
 
 def _variants(hardware_drift: Array) -> tuple[float, ...]:
@@ -653,7 +421,7 @@ def _causes(laws: Sequence[Law], branches: Sequence[str]) -> str:
     for law in laws:
         offsets = law.spread.shared[: len(branches)]
         cause = "a load without a sensor"
-        if np.abs(offsets).max() > DOUBT:
+        if np.abs(offsets).max() > LEAST_SHARED:
             cause = f"an offset that the sensors of branch {branches[int(np.argmax(np.abs(offsets)))]} share"
         share[cause] = share.get(cause, 0.0) + law.probability
     said = sorted(((p, cause) for cause, p in share.items() if p > LEAST_SAID), reverse=True)
@@ -749,10 +517,11 @@ def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[lis
     sensor = sum(law.probability for law in reference.laws if law.spread.shared[-1])
     cause, rival = ("batch", "load") if sensor > SUSPECTED else ("load", "batch")
     what = {"load": "a load without a sensor", "batch": "an offset of a batch of sensors"}
+    groups = max((law.prior.group_centre for law in reference.laws), key=len)  # those of the first law, if it has any
     findings: list[list[Finding]] = [[] for _ in found.load_probability]
     for j, mine in enumerate(findings):
         for g in np.flatnonzero(found.group_probability[j] > SUSPECTED):
-            size_a = reference.laws[0].prior.group_centre[g] * scale_a
+            size_a = groups[g] * scale_a
             text = f"{size_a:+.1f} A in branch {feed} as in other vehicles: {what[cause]}, or {what[rival]}"
             mine.append(_finding(feed, cause, found.group_probability[j, g], text))
         if found.load_probability[j] > SUSPECTED:

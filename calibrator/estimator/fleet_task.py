@@ -20,27 +20,22 @@ from calibrator.estimator.fleet_estimate import (
     estimate_vehicles,
     learn_fleet,
 )
-from calibrator.estimator.readings import BenchTable, contradicted_readings, merge_readings, trust_notices
+from calibrator.estimator.readings import CONTRADICTION, BenchTable, Readings, merge_readings, trust_notices
 from calibrator.estimator.results import internal_error
+from calibrator.estimator.rows import VehicleEvidence
 from calibrator.estimator.settings import CalibrationSettings, require_learning
-from calibrator.estimator.vehicle_evidence import VehicleEvidence
 from calibrator.estimator.vehicle_report import deciding_evidence, faults_of, impossible
 from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.errors import UserError
-from ecu_node.parameters import (
-    BranchParameters,
-    Explanation,
-    HardwareFault,
-    HeldBack,
-    VehicleParameters,
-    Verdict,
-)
+from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, HeldBack, VehicleParameters, Verdict
 
-__all__ = ["Calibrated", "FleetTask", "learn_task"]
+__all__ = ["Calibrated", "FleetTask", "learn_task", "parameters_of"]
 
 MOST_REPORTED, LEAST_REPORTED = 3, 0.02
 """Explanations that are reported, and the least probability of one after the first. [1]"""
+LEAST_PROBABILITY = 1e-4
+"""Of the explanations near a bench reading: below, the drives contradict it. [1]"""
 
 
 @dataclass(kw_only=True)
@@ -111,7 +106,15 @@ class FleetTask:
                 if why := impossible(estimate, j, self.branches):
                     found.left_out[vehicle.vehicle] = why
                 else:
-                    found.parameters[vehicle.vehicle] = self._parameters(vehicle, estimate, j)
+                    found.parameters[vehicle.vehicle] = parameters_of(
+                        vehicle,
+                        estimate,
+                        j,
+                        identity=self.identity,
+                        branches=self.branches,
+                        expected_a=self.reference.expected_a,
+                        fleet_size=self.fleet_size,
+                    )
                     found.evidence[vehicle.vehicle] = estimate.evidence[j]
         except Exception as error:  # noqa: BLE001 (a fault of the program is reported with its vehicle)
             if len(vehicles) > 1:
@@ -121,46 +124,83 @@ class FleetTask:
             advice = f"its evidence cannot be used: {error}; look at its recordings"
             found.left_out[vehicles[0].vehicle] = advice if isinstance(error, UserError) else internal_error(error)
 
-    def _parameters(self, vehicle: VehicleSummary, estimate: FleetEstimate, j: int) -> VehicleParameters:
-        """Write down what was found for vehicle j of an estimate."""
-        identity, branches, corrected = self.identity, self.branches, estimate.corrected[j]
-        unsettled = estimate.verdicts[j] == "cannot tell" or not estimate.confidence[j] >= CONFIDENT
-        reported: list[Explanation] = []
-        decisive = ""
-        if unsettled or (estimate.held_back[j] != "").any():
-            first, *others = estimate.explanations[j][:MOST_REPORTED]
-            reported = [first, *(each for each in others if each.probability >= LEAST_REPORTED)]
-            layout = identity.database.layout
-            decisive = deciding_evidence(
+
+def parameters_of(
+    vehicle: VehicleSummary,
+    estimate: FleetEstimate,
+    j: int,
+    *,
+    identity: RunIdentity,
+    branches: Sequence[str],
+    expected_a: float,
+    fleet_size: int,
+    decisive: str | None = None,
+) -> VehicleParameters:
+    """Write down what was found for vehicle j of an estimate.
+
+    Parameters
+    ----------
+    vehicle, estimate, j : VehicleSummary, FleetEstimate, int
+        The vehicle, and which of the estimate it is.
+    identity : RunIdentity
+        Of the run.
+    branches : sequence of str
+        Names of the K branches.
+    expected_a : float
+        Mean junction sum that right sensors show. [A]
+    fleet_size : int
+        Vehicles that can be used.
+    decisive : str or None
+        What would decide; None: found from the explanations.
+
+    Returns
+    -------
+    VehicleParameters
+        Content of its parameter file.
+    """
+    corrected = estimate.corrected[j]
+    reported: list[Explanation] = []
+    deciding = decisive or ""
+    if (
+        estimate.verdicts[j] == "cannot tell"
+        or not estimate.confidence[j] >= CONFIDENT
+        or (estimate.held_back[j] != "").any()
+    ):
+        first, *others = estimate.explanations[j][:MOST_REPORTED]
+        reported = [first, *(each for each in others if each.probability >= LEAST_REPORTED)]
+        layout = identity.database.layout
+        if decisive is None:
+            deciding, rival = deciding_evidence(
                 estimate, j, branches, full_scale_a=layout.full_scale_a, layout=layout.path.name
             )
-        hardware = _probability(estimate.hardware_probability[j])
-        return VehicleParameters(
-            vehicle=vehicle.vehicle,
-            layout=identity.layout,
-            dbc=identity.dbc,
-            verdict=cast("Verdict", estimate.verdicts[j]),
-            confidence=_probability(estimate.confidence[j]),
-            branches={name: _branch(vehicle.delays, estimate, (j, k), name) for k, name in enumerate(branches)},
-            hardware_fault=HardwareFault(
-                suspected=hardware is not None and hardware > SUSPECTED,
-                drift=float(estimate.hardware_drift[j]),
-                offset_a=by_branch(branches, estimate.hardware_offset_a[j]),
-                probability=hardware,
-            ),
-            explanations=reported,
-            deciding_evidence=decisive,
-            findings=list(estimate.findings[j]),
-            junction_residual=junction_residual(
-                current_moments(vehicle.summary.mean_a, vehicle.summary.mean_product_a2),
-                gain=np.where(corrected, 1.0 + estimate.drift[j], 1.0)[None],
-                offset_a=np.where(corrected, estimate.offset_a[j], 0.0),
-                expected_a=self.reference.expected_a,
-            ),
-            provenance=identity.provenance(
-                fleet_size=self.fleet_size, drives=vehicle.drives, duration_s=vehicle.summary.duration_s
-            ),
-        )
+            reported += [rival] if rival is not None and rival not in reported else []
+    hardware = _probability(estimate.hardware_probability[j])
+    return VehicleParameters(
+        vehicle=vehicle.vehicle,
+        layout=identity.layout,
+        dbc=identity.dbc,
+        verdict=cast("Verdict", estimate.verdicts[j]),
+        confidence=_probability(estimate.confidence[j]),
+        branches={name: _branch(vehicle.delays, estimate, (j, k), name) for k, name in enumerate(branches)},
+        hardware_fault=HardwareFault(
+            suspected=hardware is not None and hardware > SUSPECTED,
+            drift=float(estimate.hardware_drift[j]),
+            offset_a=by_branch(branches, estimate.hardware_offset_a[j]),
+            probability=hardware,
+        ),
+        explanations=reported,
+        deciding_evidence=deciding,
+        findings=list(estimate.findings[j]),
+        junction_residual=junction_residual(
+            current_moments(vehicle.summary.mean_a, vehicle.summary.mean_product_a2),
+            gain=np.where(corrected, 1.0 + estimate.drift[j], 1.0)[None],
+            offset_a=np.where(corrected, estimate.offset_a[j], 0.0),
+            expected_a=expected_a,
+        ),
+        provenance=identity.provenance(
+            fleet_size=fleet_size, drives=vehicle.drives, duration_s=vehicle.summary.duration_s
+        ),
+    )
 
 
 def _branch(delays: BranchDelays, estimate: FleetEstimate, place: tuple[int, int], name: str) -> BranchParameters:
@@ -237,7 +277,7 @@ def learn_task(
             branches=branches,
             readings=readings.take(learning),
             trusted=trusted,
-            load=layout.unmeasured_load,
+            load=settings.load or layout.unmeasured_load,
             expected_faults=settings.expected_faults,
         )
         task = FleetTask(
@@ -268,22 +308,22 @@ def learn_task(
 
 
 def _contradicted(task: FleetTask, vehicles: Sequence[VehicleSummary], bench: BenchTable) -> dict[tuple[str, str], str]:
-    """Bench readings that the drives contradict, by vehicle and branch, and what to say of them."""
+    """Bench readings that the drives contradict (of another vehicle, or a slip), and what to say of them."""
     named, branches = {vehicle for vehicle, _ in bench}, task.branches
     checked = [vehicle for vehicle in vehicles if vehicle.vehicle in named]
     if not checked:
         return {}
-    found, wrong = task.estimate(checked), dict[tuple[str, str], str]()
+    found, wrong = task.estimate(checked), set[tuple[str, str]]()
+    value, sd = Readings.of_bench(bench, [vehicle.vehicle for vehicle in checked], branches).values
     for j, vehicle in enumerate(checked):
-        drift, offset_a = np.stack([faults_of(each, branches) for each in found.explanations[j]], axis=1)[:, None]
-        wrong |= contradicted_readings(
-            bench,
-            [vehicle.vehicle],
-            branches,
-            weight=np.array([[each.probability for each in found.explanations[j]]]),
-            drift=drift,
-            drift_sd=found.drift_sd[j, None, None],
-            offset_a=offset_a,
-            offset_sd_a=found.offset_sd_a[j, None, None],
-        )
-    return {sensor: wrong[sensor] for sensor in bench if sensor in wrong}
+        faults = np.array([faults_of(each, branches) for each in found.explanations[j]])
+        apart = np.abs(value[:, j] - faults) / np.hypot(sd[:, j], [found.drift_sd[j], found.offset_sd_a[j]])
+        near = ~(apart > CONTRADICTION).any(axis=1)  # what was not read is not far
+        probability = np.array([each.probability for each in found.explanations[j]]) @ near
+        wrong |= {(vehicle.vehicle, branches[k]) for k in np.flatnonzero(probability < LEAST_PROBABILITY)}
+    return {
+        (vehicle, branch): f"vehicle {vehicle}: the bench reading of its {branch} sensor is not what its drives show, "
+        f"and is not used; check it again, and whether it is of this vehicle"
+        for vehicle, branch in bench
+        if (vehicle, branch) in wrong
+    }

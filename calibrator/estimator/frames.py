@@ -14,7 +14,9 @@ import pandas as pd
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.align import TIME_RESOLUTION_S, base_inputs, choose_inputs
 from calibrator.drives.plain_names import require_plain_name
+from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError, FleetError
+from calibrator.estimator.settings import FEWEST_VEHICLES
 from calibrator.files.storage import open_storage
 from calibrator.recordings.log_time import CLOCK_GAP_S
 from calibrator.sources.fleet_source import Equipment
@@ -28,7 +30,7 @@ from ecu_node.database import VehicleDatabase
 if TYPE_CHECKING:
     from calibrator.estimator.fleet import Junction
 
-__all__ = ["column_values", "named_columns", "require_columns", "summarise_frames"]
+__all__ = ["column_values", "named_columns", "require_columns", "store_frames", "summarise_frames"]
 
 FINEST_PERIOD_S, COARSEST_PERIOD_S = 0.1, 5.0
 """Time base of data frames without a layout: that of logs, or slower; still several rows per block of 30 s. [s]"""
@@ -84,8 +86,50 @@ def summarise_frames(
     return database
 
 
-def _vehicles(frames: Mapping[str, Any]) -> dict[str, list[pd.DataFrame]]:
-    """Frames by vehicle, at least two vehicles with at least one frame each."""
+def store_frames(folder: Path, frames: Mapping[str, Any], junction: "Junction") -> VehicleDatabase:
+    """Make a drive store of data frames of single junctions.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the store.
+    frames : mapping of str to DataFrame, or to a sequence of them
+        Drives by vehicle, with the branches of the junction; inputs are not needed, but the contactor's is used.
+    junction : Junction
+        Says which columns are branches.
+
+    Returns
+    -------
+    VehicleDatabase
+        Layout of the store.
+
+    Raises
+    ------
+    FleetError, DriveError
+        If the frames are no recordings of this junction.
+    """
+    vehicles = _vehicles(frames, fewest=1)
+    labelled = [
+        (f"vehicle {vehicle}, frame {number}", frame)
+        for vehicle, drives in vehicles.items()
+        for number, frame in enumerate(drives, start=1)
+    ]
+    for where, frame in labelled:
+        require_columns(frame, list(junction.branches), where)
+    times = {where: _seconds(frame, where) for where, frame in labelled}
+    database = junction.as_database((), _period_s(times, junction))
+    contactor = database.layout.contactor
+    there = contactor is not None and all(contactor.input in frame.columns for _, frame in labelled)
+    columns = (*junction.branches, *([contactor.input] if contactor is not None and there else []))
+    drives = _drives(vehicles, times, junction.branches, columns)
+    _require_amperes(drives, junction, alone=True)
+    for drive in (drive for mine in drives.values() for drive in mine):
+        write_drive(folder, drive, database.layout)
+    return database
+
+
+def _vehicles(frames: Mapping[str, Any], *, fewest: int = 2) -> dict[str, list[pd.DataFrame]]:
+    """Frames by vehicle, so many vehicles at least with at least one frame each."""
     if not isinstance(frames, Mapping) or not frames:
         raise FleetError(f"{type(frames).__name__} without vehicles: expected data frames by vehicle, {{'V1': frame}}")
     found: dict[str, list[pd.DataFrame]] = {}
@@ -99,8 +143,11 @@ def _vehicles(frames: Mapping[str, Any]) -> dict[str, list[pd.DataFrame]]:
         if not drives:
             raise FleetError(f"vehicle {vehicle}: no frame in its list; leave the vehicle out")
         found[vehicle] = [named_columns(frame, f"vehicle {vehicle}") for frame in drives]
-    if len(found) < 2:
-        raise FleetError(f"a single vehicle, {vehicle}: at least 2 are needed, as each is compared with its fleet")
+    if len(found) < fewest:
+        raise FleetError(
+            f"a single vehicle, {vehicle}: a fleet that is compared with itself needs {FEWEST_VEHICLES} or more; "
+            f"JunctionCalibrator takes one, with a sensor that you trust"
+        )
     return found
 
 
@@ -262,21 +309,23 @@ def _channel(time_s: Array, value: Array, name: str, where: str) -> Channel:
     return Channel(time_s=time_s, value=value, good=good)
 
 
-def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: "Junction") -> None:
-    """Refuse branches that stand still, and values that cannot be amperes."""
+def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: "Junction", *, alone: bool = False) -> None:
+    """Refuse values that cannot be amperes, and in a fleet branches that stand still; alone, a heater may be off."""
     branches, scale_a = list(junction.branches), float(junction.full_scale_a)
     largest = np.zeros((len(drives), len(branches)))
     for j, (vehicle, parts) in enumerate(drives.items()):
         for k, name in enumerate(branches):
             values = np.concatenate([part.branches[name].value[part.branches[name].good] for part in parts])
             largest[j, k] = np.abs(values).max()
-            if not np.ptp(values):
+            if not alone and not np.ptp(values):
                 raise DriveError(
                     f"vehicle {vehicle}: branch {name} is {values[0]:g} A throughout: stuck, or not connected; leave "
                     f"the vehicle out, or the branch if the junction has none"
                 )
     small = largest < LEAST_OF_SCALE * scale_a
-    strange = small & (small.all(axis=0) | small.all(axis=1, keepdims=True))
+    strange = small & small.all(axis=1, keepdims=True)
+    if not alone:
+        strange |= small & small.all(axis=0)
     strange |= small & (np.median(largest, axis=0) > OTHER_UNIT * largest)
     strange |= largest > MOST_OF_SCALE * scale_a
     if strange.any():

@@ -18,8 +18,8 @@ from itertools import product
 import numpy as np
 
 from calibrator.drive import Array, Mask
-from calibrator.estimator.clusters import densest_clusters
-from calibrator.estimator.explanations import Fits, evidence_of, fit_explanations, row_residuals
+from calibrator.estimator.explanations import evidence_of, fit_explanations, row_residuals
+from calibrator.estimator.fleet_model import densest_clusters
 from calibrator.estimator.posterior import GAIN, OFFSET, Draws, draw_explanations, size_evidence, weigh
 from calibrator.estimator.prior import (
     LARGEST_SHARED,
@@ -34,7 +34,7 @@ from calibrator.estimator.prior import (
 )
 from calibrator.estimator.rows import EvidenceRows, parameter_places, row_design, row_places
 
-__all__ = ["DOUBT", "Law", "Spread", "centre_rows", "explain", "learn_laws", "weigh_law"]
+__all__ = ["LEAST_SHARED", "Law", "Spread", "centre_rows", "explain", "learn_laws", "weigh_law"]
 
 MOST_LEARNT, MOST_STARTED = 200, 60
 """Vehicles that a law is learnt from, and that decide between its starts; more change it less than the faults. [1]"""
@@ -48,8 +48,12 @@ SAME_DENSITY = 0.2
 """Logarithm of densities of sizes up to which two priors count as one."""
 KEPT_LOG_ODDS = 7.0
 """Logarithm of the odds against the best law up to which another one is kept."""
-DOUBT = 0.001
-"""Shared constant below which it does not matter what makes it, in fractions of full scale. [1]"""
+SAME_START = 0.001
+"""Difference of two starts in every row, in fractions of full scale, below which they are one."""
+LEAST_SHARED = 0.001
+"""Constant that vehicles share below which it does not matter what makes it, in fractions of full scale."""
+GROUP_SD = 0.001
+"""How far vehicles of a group are from what they share, before they are looked at, in fractions of full scale."""
 SPREAD_VEHICLES = 5.0
 """Weight of the guessed model spread, in vehicles."""
 SPREAD_OVER_SAMPLING, JUNCTION_SPREAD_OVER_SAMPLING = 2.0, 1.0
@@ -198,14 +202,12 @@ def explain(rows: EvidenceRows, law: Law, *, feed: int) -> Draws:
     log_load = float(np.log(prior.load_share + prior.group_share.sum())) + 2.0
     covariance = rows.dispersed(spread.dispersion)[0] + spread.covariance
 
-    def fitted(chosen: EvidenceRows, covariance: Array) -> tuple[Fits, Draws]:
-        evidence = evidence_of(
-            chosen.values, covariance, chosen.means, centre=spread.mean, shared=spread.shared, feed=feed
-        )
-        fits = fit_explanations(evidence, rough, log_load)
-        return fits, draw_explanations(fits, evidence)
+    def fitted(covariance: Array) -> Draws:
+        evidence = evidence_of(rows.values, covariance, rows.means, centre=spread.mean, shared=spread.shared, feed=feed)
+        return draw_explanations(fit_explanations(evidence, rough, log_load), evidence)
 
-    fits, draws = fitted(rows, covariance)
+    draws = fitted(covariance)
+    fits = draws.fits
     score = fits.log_evidence + rough[fits.hardware, fits.sensor] + log_load * fits.support[:, :, -1]
     best = np.argmax(np.where(np.arange(score.shape[1]) < fits.number[:, None], score, -np.inf), axis=1)
     picked = (np.arange(len(rows)), best)
@@ -214,7 +216,7 @@ def explain(rows: EvidenceRows, law: Law, *, feed: int) -> Draws:
     if not bad.any():
         return draws
     wider = (fits.chi2[picked] / free)[:, None, None]
-    return fitted(rows, np.where(bad[:, None, None], wider, 1.0) * covariance)[1]
+    return fitted(np.where(bad[:, None, None], wider, 1.0) * covariance)
 
 
 def weigh_law(draws: Draws, law: Law) -> Array:
@@ -254,9 +256,7 @@ class _Learner:
 
     def clusters(self, row: int, most: int = 1, farthest: float = np.inf) -> list[float]:
         """Centres of the densest clusters of a row, 0 if there is none."""
-        rows, known = self.rows, self.rows.known[:, row]
-        sd = np.sqrt(rows.covariance[known, row, row])
-        found = densest_clusters(rows.values[known, row], sd, most=most, farthest=farthest)
+        found = densest_clusters(*self.rows.shown(row), most=most, farthest=farthest)
         return [cluster.centre for cluster in found] or [0.0]
 
     def centres(self) -> list[Array]:
@@ -287,7 +287,7 @@ class _Learner:
             start[at.slopes] += cluster.centre
             start[intercept], start[at.junction] = constant - others, constant
             start = np.where(np.isnan(self.fixed), start, self.fixed)
-            if not any(np.abs(start - other).max() < DOUBT for other in found):
+            if not any(np.abs(start - other).max() < SAME_START for other in found):
                 found.append(start)
         return found
 
@@ -302,10 +302,7 @@ class _Learner:
             load = self.design[:, self.parameters.load]
             covariance += min(clusters[0].spread, MOST_LOAD_SPREAD) ** 2 * np.outer(load, load)
         spread = Spread(
-            mean=centre,
-            covariance=covariance,
-            dispersion=np.full(K, FIRST_DISPERSION),
-            shared=np.zeros(2 * K + 1),
+            mean=centre, covariance=covariance, dispersion=np.full(K, FIRST_DISPERSION), shared=np.zeros(2 * K + 1)
         )
         return Law(spread=spread, priors=((1.0, self.known or first_prior(K)),))
 
@@ -371,11 +368,11 @@ class _Learner:
         found: list[tuple[float, Array]] = []
         for of_sensor in (False, True) if len(prior.group_centre) else (False,):
             offsets = [(0.0, self.feed)]
-            if abs(c0) > DOUBT and np.isnan(self.fixed[self.at.junction]):
+            if abs(c0) > LEAST_SHARED and np.isnan(self.fixed[self.at.junction]):
                 offsets += [(c0, k) for k in range(K)]
-            if of_sensor:
-                others = [-float(centre) for centre in prior.group_centre]
-                offsets += [(z, self.feed) for z in others if all(abs(z - known) > DOUBT for known, _ in offsets)]
+            for z in [-float(centre) for centre in prior.group_centre] if of_sensor else []:
+                if all(abs(z - known) > LEAST_SHARED for known, _ in offsets):
+                    offsets.append((z, self.feed))
             for offset, k in offsets:
                 shared: Array = np.zeros(2 * K + 1)
                 shared[k], shared[-1] = offset, of_sensor
@@ -385,15 +382,12 @@ class _Learner:
 
     def _shared_gains(self) -> list[Array]:
         """Gains that the sensors of a branch may share: most vehicles break the junction law alike."""
-        rows, K = self.rows, self.rows.branches
+        K = self.rows.branches
         off = np.zeros(K)
         for k in range(1, K):
-            row = self.at.ratio(k)
-            known = rows.known[:, row]
-            value, sd = rows.values[known, row], np.sqrt(rows.covariance[known, row, row])
-            clusters = densest_clusters(value, sd)
-            if clusters and clusters[0].share > LEAST_SHARED_GAIN[0] and abs(clusters[0].centre) > LEAST_SHARED_GAIN[1]:
-                off[k] = clusters[0].centre
+            for cluster in densest_clusters(*self.rows.shown(self.at.ratio(k))):  # at most one
+                if cluster.share > LEAST_SHARED_GAIN[0] and abs(cluster.centre) > LEAST_SHARED_GAIN[1]:
+                    off[k] = cluster.centre
         if not off.any():
             return []
         # lambda_1 - lambda_k is off: by the sensors of the first branch if all are alike, else by those of branch k
@@ -457,14 +451,14 @@ class _Learner:
             if w.sum() > 0.5:
                 x = draws.values[..., load].ravel()
                 centre[g] = w @ x / w.sum()
-                sd[g] = np.sqrt((w @ (x - centre[g]) ** 2 + 2.0 * DOUBT**2) / (w.sum() + 2.0))
+                sd[g] = np.sqrt((w @ (x - centre[g]) ** 2 + 2.0 * GROUP_SD**2) / (w.sum() + 2.0))
         return replace(
             prior,
             counts=counts,
             load_share=float((weight[..., 0][loaded].sum() + 0.02) / (N + 2.0)),
             group_share=share,
             group_centre=centre,
-            group_sd=np.maximum(sd, 0.7 * DOUBT),
+            group_sd=np.maximum(sd, 0.7 * GROUP_SD),
         )
 
     def _with_group(self, draws: Draws, prior: Prior) -> Prior:
@@ -477,12 +471,12 @@ class _Learner:
             sd = np.sqrt((fits.root[:, :, column] ** 2).sum(axis=2))
             found.append(np.stack([fits.theta[:, :, column][on], sd[on], weight[on]]))
         value, sd, share = np.concatenate(found, axis=1)
-        near = (np.abs(value) > 4.0 * DOUBT) & (np.abs(value) < LARGEST_SHARED) & (sd < 10.0 * DOUBT)
+        near = (np.abs(value) > 4.0 * GROUP_SD) & (np.abs(value) < LARGEST_SHARED) & (sd < 10.0 * GROUP_SD)
         value, sd, share = value[near], sd[near], share[near]
-        width = np.hypot(sd, DOUBT)
+        width = np.hypot(sd, GROUP_SD)
         vehicles = np.exp(-0.5 * ((value[:, None] - value) / width) ** 2) @ share
         for centre in prior.group_centre:
-            vehicles[np.abs(value - centre) < 4.0 * DOUBT] = 0.0
+            vehicles[np.abs(value - centre) < 4.0 * GROUP_SD] = 0.0
         if not vehicles.size or vehicles.max() < LEAST_GROUP:
             return prior
         first = int(np.argmax(vehicles))
@@ -490,7 +484,7 @@ class _Learner:
             prior,
             group_share=np.append(prior.group_share, min(vehicles[first] / N, 0.7)),
             group_centre=np.append(prior.group_centre, value[first]),
-            group_sd=np.append(prior.group_sd, 1.5 * DOUBT),
+            group_sd=np.append(prior.group_sd, 1.5 * GROUP_SD),
         )
         for _ in range(PRIOR_STEPS):
             prior, grouped = self._next_shares(draws, prior), self._next_shares(draws, grouped)
@@ -508,12 +502,7 @@ class _Learner:
         root = np.take_along_axis(draws.fits.root, top[:, :, None, None], axis=1)
         whole, added = rows.dispersed(spread.dispersion)
         evidence = evidence_of(
-            rows.values,
-            whole + spread.covariance,
-            rows.means,
-            centre=spread.mean,
-            shared=spread.shared,
-            feed=self.feed,
+            rows.values, whole + spread.covariance, rows.means, centre=spread.mean, shared=spread.shared, feed=self.feed
         )
         left = row_residuals(evidence, theta)
 
@@ -582,10 +571,10 @@ def _log_plausible(c0: float, offset: float, prior: Prior, *, of_sensor: bool) -
     levels = c0 + np.append(0.0, prior.group_centre)  # what the currents of the vehicles of each group sum to
     shares = np.append(1.0 - prior.group_share.sum(), prior.group_share)
     sensors = offset + np.append(0.0, prior.group_centre if of_sensor else 0.0 * prior.group_centre)
-    loads, affected = levels - sensors, np.abs(sensors) > DOUBT
+    loads, affected = levels - sensors, np.abs(sensors) > LEAST_SHARED
     value = 3.0 * np.log(max(1.0 - shares[affected].sum(), 0.3))
-    if (loads < -DOUBT).any() or (loads > LARGEST_SHARED).any():
+    if (loads < -LEAST_SHARED).any() or (loads > LARGEST_SHARED).any():
         value -= 7.0
-    if (affected & (np.abs(levels) < DOUBT)).any():
+    if (affected & (np.abs(levels) < LEAST_SHARED)).any():
         value -= 4.0
     return float(value)

@@ -89,15 +89,11 @@ def _place(size: float) -> int:
 def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: NDArray[np.int16], base: Array) -> None:
     N, P, M = fits.theta.shape[0], fits.theta.shape[2], len(normal)
     K = P // 3
-    e, chosen = np.zeros(5 * K), np.zeros(P, np.int64)
+    e = np.zeros(5 * K)
     for j in range(N):
         for q in range(fits.number[j]):
-            theta, root = fits.theta[j, q], fits.root[j, q]
-            n, widest = 0, 0.0
-            for p in range(P):
-                if fits.support[j, q, p]:
-                    chosen[n] = p
-                    n += 1
+            theta, root, chosen = fits.theta[j, q], fits.root[j, q], np.flatnonzero(fits.support[j, q])
+            n, widest = len(chosen), 0.0
             for a in range(n):
                 variance = 0.0
                 for b in range(a, n):
@@ -105,7 +101,6 @@ def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: N
                 widest = max(widest, variance)
             for m in range(M):
                 x = values[j, q, m]
-                x[:] = 0.0
                 weight = fits.log_evidence[j, q]  # of the rows under the wide Gaussian ...
                 fitted = fits.chi2[j, q]
                 for a in range(n):
@@ -239,7 +234,7 @@ def _weigh(draws: Draws, prior: _Tables, weight: Array, log_evidence: Array) -> 
     P = draws.values.shape[3]
     places, kinds = np.empty(P, np.int64), np.empty(P, np.int64)
     for j in range(N):
-        count, best, total = draws.fits.number[j], -np.inf, 0.0
+        count, best = draws.fits.number[j], -np.inf
         for q in range(count):
             for m in range(M):
                 common, n = _terms(draws, prior, j, q, m, places, kinds)
@@ -250,15 +245,9 @@ def _weigh(draws: Draws, prior: _Tables, weight: Array, log_evidence: Array) -> 
                         value += prior.log_density[kinds[i], places[i]]
                     weight[j, q, m, g] = value
                     best = max(best, value)
-        for q in range(count):
-            for m in range(M):
-                for g in range(G):
-                    weight[j, q, m, g] = exp(weight[j, q, m, g] - best)
-                    total += weight[j, q, m, g]
-        for q in range(count):
-            for m in range(M):
-                for g in range(G):
-                    weight[j, q, m, g] /= total
+        weight[j, :count] = np.exp(weight[j, :count] - best)
+        total = weight[j, :count].sum()
+        weight[j, :count] /= total
         log_evidence[j] = best + log(total / M)
 
 

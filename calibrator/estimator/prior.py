@@ -21,9 +21,11 @@ GRID: Array = np.geomspace(1e-4, 4.0, 500)
 TAIL_RANGE = (0.002, 1.5)
 """Of the log-uniform tail: from the resolution of sensors to what no layout would correct. [1]"""
 LOAD_RANGE = (0.002, 0.04)
-"""Of a load without a sensor, in fractions of full scale: from the resolution of the junction's sum to some kW. [1]"""
+"""Of a load without a sensor in one vehicle, in fractions of full scale: from the resolution of the junction's sum to
+some kW, the largest consumer that is fitted to single vehicles. [1]"""
 LARGEST_SHARED = 0.08
-"""Largest offset or load that vehicles share, in fractions of full scale: larger ones stop a vehicle. [1]"""
+"""Largest offset or load that vehicles share, in fractions of full scale: larger ones stop a vehicle. More than one
+vehicle's load (:data:`LOAD_RANGE`), as the sensors of a batch are off by more than what is fitted takes. [1]"""
 EDGE = 0.03
 """Relative width of the edges of a slab, so that its evidence is smooth in its bounds. [1]"""
 GUESSED_LOAD_SHARE = 0.01

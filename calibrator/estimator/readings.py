@@ -34,7 +34,6 @@ __all__ = [
     "BenchTable",
     "Readings",
     "check_bench_table",
-    "contradicted_readings",
     "merge_readings",
     "read_bench_table",
     "trust_notices",
@@ -50,12 +49,11 @@ FEWEST_TRUSTED = 3
 """Trusted vehicles from which on they carry the reference."""
 CONTRADICTION = 4.0
 """Standard deviations from which on two readings of one sensor contradict each other. [1]"""
-LEAST_PROBABILITY = 1e-4
-"""Of the explanations near a bench reading: below, the drives contradict it. [1]"""
 LEAST_GAIN, LEAST_OFFSET = 0.003, 0.001
 """What else than its sensors may bend a gain ratio or move the constant: the latter in fractions of full scale. [1]"""
 MOST_LOAD = 0.015
-"""Largest load without a sensor that is taken for granted, over full scale. [1]"""
+"""Largest load without a sensor that a trusted vehicle may have, over full scale: a DC/DC converter or a cooler that
+always runs. What a fleet may share (``prior.LARGEST_SHARED``) is more, but trust shall not hide that much. [1]"""
 
 PAIRS = (("drift", "drift_sd"), ("offset_a", "offset_sd_a"))
 COLUMNS = ("vehicle", "branch", *PAIRS[0], *PAIRS[1])
@@ -112,15 +110,14 @@ class Readings:
 
 def with_readings(rows: EvidenceRows, readings: Readings, *, full_scale_a: float) -> EvidenceRows:
     """Evidence rows of N vehicles with direct readings of the same vehicles and branches; full scale in A."""
-    K, ((drift, offset_a), (drift_sd, offset_sd_a)) = rows.branches, readings.values
+    at, ((drift, offset_a), (drift_sd, offset_sd_a)) = rows.places, readings.values
     value = np.array([np.log1p(drift), offset_a / full_scale_a])
     sd = np.array([drift_sd / (1.0 + drift), offset_sd_a / full_scale_a])
     known = np.isfinite(value) & np.isfinite(sd)
-    relative, constant, covariance = rows.relative.copy(), rows.constant.copy(), rows.covariance.copy()
-    relative[:, 2 * K - 1 :], constant[:, K + 1 :] = np.where(known, value, 0.0)
-    row = np.r_[2 * K - 1 : 3 * K - 1, 4 * K : 5 * K]
+    values, covariance, row = rows.values, rows.covariance.copy(), np.r_[at.gain_reads, at.offset_reads]
+    values[:, row] = np.hstack([*np.where(known, value, 0.0)])
     covariance[:, row, row] = np.hstack([*np.where(known, sd**2, UNKNOWN_VARIANCE)])
-    return replace(rows, relative=relative, constant=constant, covariance=covariance)
+    return replace(rows, relative=values[:, at.relative], constant=values[:, at.constant], covariance=covariance)
 
 
 class BenchReading(NamedTuple):
@@ -291,47 +288,6 @@ def merge_readings(
     return merged, notices
 
 
-def contradicted_readings(
-    bench: BenchTable,
-    vehicles: Sequence[str],
-    branches: Sequence[str],
-    *,
-    weight: Array,
-    drift: Array,
-    drift_sd: Array,
-    offset_a: Array,
-    offset_sd_a: Array,
-) -> dict[tuple[str, str], str]:
-    """Find bench readings that a vehicle's drives contradict: those of another vehicle, or a slip.
-
-    Parameters
-    ----------
-    bench : mapping
-        The readings.
-    vehicles, branches : sequence of str
-        Names of the N vehicles and K branches.
-    weight : ndarray of shape (N, S)
-        Probabilities of the explanations of each vehicle, found without these readings. [1]
-    drift, drift_sd, offset_a, offset_sd_a : ndarray of shape (N, S, K)
-        Their sensor faults and standard deviations. [1], [A]
-
-    Returns
-    -------
-    dict of (str, str) to str
-        What to say of each such sensor.
-    """
-    read = Readings.of_bench(bench, vehicles, branches).values[:, :, :, None]
-    apart = np.abs(read[0] - np.array([drift, offset_a])) / np.hypot(read[1], np.array([drift_sd, offset_sd_a]))
-    near = ~(apart > CONTRADICTION).any(axis=0)  # what was not read is not far
-    wrong = np.einsum("js,jsk->jk", weight, near) < LEAST_PROBABILITY
-    return {
-        (vehicle, branch): f"vehicle {vehicle}: the bench reading of its {branch} sensor is not what its drives show, "
-        f"and is not used; check it again, and whether it is of this vehicle"
-        for vehicle, branch in bench
-        if vehicle in vehicles and wrong[vehicles.index(vehicle), branches.index(branch)]
-    }
-
-
 def untrusted_vehicles(
     rows: EvidenceRows,
     trusted: Mask,
@@ -362,18 +318,18 @@ def untrusted_vehicles(
     dict of int to str
         How each such vehicle breaks it, by position.
     """
-    K = rows.branches
+    K, at = rows.branches, rows.places
     sd = np.sqrt(np.diagonal(rows.covariance, axis1=1, axis2=2))
-    ratio, sum_a = rows.relative[:, K : 2 * K - 1], rows.constant[:, K] * full_scale_a
+    ratio, sum_a = rows.values[:, at.ratios], rows.values[:, at.junction] * full_scale_a
     accuracy = np.sqrt(2.0 * TRUSTED_DRIFT_SD**2 + LEAST_GAIN**2)
-    off = np.where(np.abs(ratio) > CONTRADICTION * np.hypot(sd[:, K : 2 * K - 1], accuracy), np.abs(ratio), 0.0)
+    off = np.where(np.abs(ratio) > CONTRADICTION * np.hypot(sd[:, at.ratios], accuracy), np.abs(ratio), 0.0)
     low_a, high_a, spread_a, why = 0.0, MOST_LOAD * full_scale_a, 0.0, "no load without a sensor explains"
     if load is not None:
         low_a, high_a, spread_a = load.mean_a, load.mean_a, load.sd_a
         why = f"the declared load of {load.mean_a:g} A does not explain"
     accuracy_a = np.hypot(np.sqrt(K * TRUSTED_OFFSET_SD**2 + LEAST_OFFSET**2) * full_scale_a, spread_a)
     away_a = np.maximum(low_a - sum_a, sum_a - high_a)
-    sum_off = away_a > CONTRADICTION * np.hypot(sd[:, 4 * K - 1] * full_scale_a, accuracy_a)
+    sum_off = away_a > CONTRADICTION * np.hypot(sd[:, at.junction] * full_scale_a, accuracy_a)
     found = {}
     for j in np.flatnonzero(trusted & (off.any(axis=1) | sum_off)).tolist():
         k = int(np.argmax(off[j]))

@@ -9,7 +9,6 @@ a million files is of no use.
 import io
 import shutil
 import traceback
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -24,7 +23,7 @@ import pyarrow.parquet as pq
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
-from calibrator.estimator.vehicle_evidence import VehicleEvidence
+from calibrator.estimator.rows import VehicleEvidence
 from calibrator.summaries.buckets import bucket_of
 from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
 from ecu_node.errors import ParameterError
@@ -37,10 +36,8 @@ __all__ = [
     "SCHEMA",
     "CalibrationReport",
     "ChunkResult",
-    "Counts",
     "RunRecord",
     "Written",
-    "count_rows",
     "deployed_rms_a",
     "encode_chunk",
     "internal_error",
@@ -206,9 +203,8 @@ def encode_chunk(
         except ParameterError as error:
             reasons[name] = f"{error}; look at its recordings"
             continue
-        columns = (
-            {f"evidence_{key}": values for key, values in vars(evidence[name]).items()} if name in evidence else {}
-        )
+        found = vars(evidence[name]) if name in evidence else {}
+        columns = {f"evidence_{key}": values for key, values in found.items()}
         texts.append({"vehicle": name, "drives": drives.get(name, ""), "parameters": text, **columns})
         rows += [{**row, "moved": moved.get((name, row["branch"]))} for row in _rows_of(item)]
     rows += _left_out_rows(reasons)
@@ -402,38 +398,6 @@ def read_run(result: Path) -> RunRecord:
         raise FleetError(f"{path}: not a run of 'calibrator calibrate': {error}; calibrate again") from None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Counts:
-    """Numbers of a result."""
-
-    verdicts: Counter[str]
-    """Vehicles per verdict, in the order in which verdicts first come."""
-    held_back: Counter[str]
-    """Branches in which a fault was found that is not applied, by reason, in the same order."""
-    hardware_suspected: int
-    """Vehicles of which a hardware fault is suspected."""
-    moved_vehicles: int
-    moved_sensors: int
-    """Sensors that have moved since an earlier result."""
-
-
-def count_rows(rows: pa.Table, branches: Sequence[str]) -> Counts:
-    """Count rows of ``results.parquet`` that have a branch: all rows of each of some vehicles, one per branch."""
-    vehicles = rows.filter(pc.field("branch") == branches[0])  # each has what is said of its vehicle as a whole
-    moved = rows.filter(pc.field("moved").is_valid())
-    verdicts, held_back = (
-        Counter({item["values"]: item["counts"] for item in pc.value_counts(column).to_pylist()})
-        for column in (vehicles["verdict"], rows["held_back"].drop_null())
-    )
-    return Counts(
-        verdicts=verdicts,
-        held_back=held_back,
-        hardware_suspected=vehicles.filter(pc.field("hardware_fault")).num_rows,
-        moved_vehicles=len(pc.unique(moved["vehicle"])),
-        moved_sensors=moved.num_rows,
-    )
-
-
 def deployed_rms_a(applied: Mask, *, measured_a: Array, corrected_a: Array) -> Array:
     """Root mean square of the Kirchhoff sum with what the node applies, shape (N,): as measured where it is nothing.
 
@@ -529,10 +493,13 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
         Of all its vehicles.
     """
     rows = pq.read_table(result / ROWS, use_threads=False).filter(pc.field("branch").is_valid())
-    vehicles, counts = rows.filter(pc.field("branch") == run.branches[0]), count_rows(rows, run.branches)
+    vehicles = rows.filter(pc.field("branch") == run.branches[0])  # each has what is said of its vehicle as a whole
     measured_a, corrected_a = (vehicles[f"junction_rms_{name}_a"].to_numpy() for name in ("measured", "corrected"))
-    applied = rows["applied"].to_numpy().reshape(-1, len(run.branches))
+    applied, moved = rows["applied"].to_numpy().reshape(-1, len(run.branches)), pc.field("moved").is_valid()
     deployed_a = deployed_rms_a(applied, measured_a=measured_a, corrected_a=corrected_a)
+
+    def counts(column: pa.ChunkedArray) -> dict[str, int]:
+        return {item["values"]: item["counts"] for item in pc.value_counts(column).to_pylist()}
 
     def corrected(rows: Rows) -> str:
         names, confidence = ", ".join(row["branch"] for row in rows), rows[0]["confidence"]
@@ -547,18 +514,14 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
         result=str(shown),
         parameters=parameters,
         run=run,
-        verdicts=dict(counts.verdicts),
+        verdicts=counts(vehicles["verdict"]),
         undecided=_said(vehicles, pc.field("verdict") == "cannot tell", lambda rows: rows[0]["reason"] or ""),
         corrected=_said(rows, (pc.field("verdict") == "corrected") & pc.field("applied"), corrected),
         hardware_suspected=_said(vehicles, pc.field("hardware_fault"), suspected),
-        hardware_count=counts.hardware_suspected,
-        held_back=dict(counts.held_back),
-        moved=_said(
-            rows,
-            pc.field("moved").is_valid(),
-            lambda rows: "; ".join(f"{row['branch']} {row['moved']}" for row in rows),
-        ),
-        moved_count=counts.moved_vehicles,
+        hardware_count=vehicles.filter(pc.field("hardware_fault")).num_rows,
+        held_back=counts(rows["held_back"].drop_null()),
+        moved=_said(rows, moved, lambda rows: "; ".join(f"{row['branch']} {row['moved']}" for row in rows)),
+        moved_count=len(pc.unique(rows.filter(moved)["vehicle"])),
         junction_rms_measured_a=float(np.median(measured_a)),
         junction_rms_deployed_a=float(np.median(deployed_a)),
     )

@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from calibrator.drive import Drive
 from calibrator.errors import ContradictionError, DriveError, FleetError
 from calibrator.estimator.fleet_estimate import FleetEstimate
 from calibrator.estimator.fleet_task import Calibrated, FleetTask, learn_task
@@ -49,11 +50,11 @@ from calibrator.estimator.results import (
 from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.estimator.unfinished import Unfinished, unfinished_run
 from calibrator.estimator.vehicle_report import faults_of
-from calibrator.estimator.workers import Workers
 from calibrator.files.folders import require_new_folder
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.files.storage import Storage, open_storage
 from calibrator.options import Method
+from calibrator.processes.computing import Workers
 from calibrator.sources.copies import without_copies
 from calibrator.sources.fleet_source import (
     LOGS_FOLDER,
@@ -61,6 +62,7 @@ from calibrator.sources.fleet_source import (
     Equipment,
     FleetSource,
     find_fleet,
+    load_drive,
     probe_equipment,
 )
 from calibrator.summaries.add_drives import add_drives
@@ -76,7 +78,7 @@ from calibrator.time_of_run import time_of_run
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
-from ecu_node.layout import file_digest
+from ecu_node.layout import Layout, file_digest
 from ecu_node.parameters import VehicleParameters, decode_parameters
 from ecu_node.user_files import write_atomically
 
@@ -98,6 +100,8 @@ MOVED_SD = 4.0
 """Standard deviations within which earlier and new faults of a sensor are the same. [1]"""
 LEAST_PROBABILITY = 1e-3
 """Of the explanations near the earlier faults: below, a sensor has moved. [1]"""
+MOST_READ_HERE = 5
+"""Vehicles of single junctions that are read in this process."""
 NOT_THERE = "it is not in this store; its earlier parameters are in the earlier result"
 
 
@@ -145,8 +149,13 @@ def calibrate_fleet(
     storage = open_storage(place)
     identity = require_fleet(storage, place, database)
     if identity is None:
-        fleet = _find_drives(Path(storage.url), settings, everyone=since is None)
-        passes = 3 if settings.method is Method.PUBLISHED else 5
+        fleet = _find_drives(Path(storage.url))
+        alone = _stands_alone(fleet, settings, database.layout)
+        if alone:
+            _require_alone(settings, since)
+        elif since is None:
+            _require_vehicles(fleet, settings)
+        passes = 3 if alone or settings.method is Method.PUBLISHED else 5
     else:
         _require_summaries_enough(storage, settings)
         passes = 4  # look, learn, calibrate, write
@@ -154,18 +163,17 @@ def calibrate_fleet(
         run = _Run(unfinished=unfinished, database=database, settings=settings, workers=workers, since=since)
         if identity is not None:
             return run.summaries(SummaryStore(storage=storage, identity=identity), identity, {})
+        if alone:
+            return run.junctions(fleet)
         return run.published(fleet) if settings.method is Method.PUBLISHED else run.drives(fleet)
 
 
 def require_fleet(storage: Storage, place: str | Path, database: VehicleDatabase) -> StoreIdentity | None:
     """Identity of the store of summaries at a place, None if there are drives; FleetError if it can be neither."""
     path = Path(storage.url)
+    if storage.is_local and path.is_file():
+        return None
     if storage.is_local and not path.is_dir():
-        if path.exists():
-            raise FleetError(
-                f"{place}: is a file; give a store of drives or of summaries, or a folder with one folder of logs per "
-                f"vehicle"
-            )
         raise FleetError(f"{place}: no such folder, store of drives or store of summaries")
     identity = read_identity(storage, database)
     if identity is None and not storage.is_local:
@@ -186,20 +194,43 @@ def _require_summaries_enough(storage: Storage, settings: CalibrationSettings) -
         raise FleetError(f"{storage.url}: a store of summaries, and {option} needs the drives; give the drive store")
 
 
-def _find_drives(path: Path, settings: CalibrationSettings, *, everyone: bool) -> FleetSource:
-    """Drives of a fleet; if they are everyone's, vehicles that the settings name must be among them."""
+def _find_drives(path: Path) -> FleetSource:
     fleet = without_copies(find_fleet(path))
     if not fleet.vehicles:
         raise FleetError(f"{path}: no drive that is one vehicle's alone{few_reasons(fleet.left_out)}")
-    if not everyone:
-        return fleet
+    return fleet
+
+
+def _stands_alone(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) -> bool:
+    """Whether each vehicle is calibrated by itself: there is but one, or what is known is of branches."""
+    if settings.method is Method.PUBLISHED:
+        return False
+    of_branches = bool(settings.trusted) and not settings.trusted & fleet.vehicles.keys()
+    of_branches = of_branches and settings.trusted <= set(layout.branch_names)
+    alone = settings.alone or settings.meter is not None or bool(settings.charge_ah)
+    return alone or len(fleet.vehicles) == 1 or of_branches
+
+
+def _require_alone(settings: CalibrationSettings, since: Path | None) -> None:
+    """Refuse what only a fleet heeds."""
+    fleets = {
+        "--hold-out": bool(settings.hold_out),
+        "--expected-faults": settings.expected_faults is not None,
+        "--since": since is not None,
+    }
+    for option in (option for option, given in fleets.items() if given):
+        raise ContradictionError(f"{option} is for a fleet that is compared with itself, not for single junctions")
+
+
+def _require_vehicles(fleet: FleetSource, settings: CalibrationSettings) -> None:
+    """Refuse names of vehicles that there are not, and too few to learn from."""
+    path = fleet.path
     for names, what in ((settings.hold_out, "hold out"), (settings.trusted, "trust")):
         if unknown := sorted(names - fleet.vehicles.keys()):
             reasons = few_reasons({name: fleet.left_out[name] for name in unknown if name in fleet.left_out})
             there = few(sorted(fleet.vehicles))
             raise FleetError(f"{path}: no vehicle {few(unknown)} to {what}{reasons}; there are {there}")
     require_learning(list(fleet.vehicles), settings, fleet.left_out)
-    return fleet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,6 +333,32 @@ class _Run:
         identity = self._identity(about, None)
         chunk, details, notices = calibrate_fleet_published(
             fleet, equipment, identity, self.settings, workers=self.workers.processes
+        )
+        self.unfinished.put(0, chunk)
+        return self._result(about, identity, {}, details=details, notices=notices)
+
+    def junctions(self, fleet: FleetSource) -> CalibrationReport:
+        """Calibrate each vehicle by what is known of its own junction; the result is one chunk."""
+        from calibrator.estimator.junction import calibrate_junctions  # noqa: PLC0415 (a fleet does not need it)
+
+        drives: dict[str, list[Drive]] = {}
+        if len(fleet.vehicles) <= MOST_READ_HERE:  # other processes would take longer to start
+            with progress_bar("read drives", len(fleet.vehicles), "vehicles") as progress:
+                for number, (vehicle, entries) in enumerate(fleet.vehicles.items(), start=1):
+                    drives[vehicle] = [load_drive(entry, self.database) for entry in entries]
+                    progress(number)
+        equipment = probe_equipment(
+            fleet,
+            self.database,
+            self.settings.branches,
+            limit_s=self.settings.time_limit_s,
+            modelled=False,
+            drives=[mine[0] for mine in drives.values()],
+        )
+        about = self._about(fleet, equipment)
+        identity = self._identity(about, None)
+        chunk, details, notices = calibrate_junctions(
+            fleet, drives, equipment.branches, identity, self.settings, workers=self.workers.processes
         )
         self.unfinished.put(0, chunk)
         return self._result(about, identity, {}, details=details, notices=notices)

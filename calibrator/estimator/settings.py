@@ -10,12 +10,12 @@ from calibrator.fleet_truth import FleetTruth
 from calibrator.options import Classifier, Method
 from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.terminal.text import counted, few, few_reasons
-from ecu_node.layout import file_digest
+from ecu_node.layout import UnmeasuredLoad, file_digest
 
-__all__ = ["HARM_LIMIT", "LEAST_VEHICLES", "CalibrationSettings", "require_learning"]
+__all__ = ["FEWEST_VEHICLES", "HARM_LIMIT", "CalibrationSettings", "require_learning"]
 
-LEAST_VEHICLES = 2
-"""A single vehicle would be its own reference."""
+FEWEST_VEHICLES = 5
+"""Of a fleet that is compared with itself: in a smaller one it is not clear who differs from whom."""
 HARM_LIMIT = 0.001
 """Default probability of making a branch worse up to which it is corrected. [1]"""
 
@@ -33,9 +33,19 @@ class CalibrationSettings:
     hold_out : frozenset of str
         Vehicles that are calibrated, but from which nothing is learnt for the others.
     trusted : frozenset of str
-        Vehicles whose sensors were found faultless on a bench; they carry the reference of the posterior.
+        Vehicles whose sensors were found faultless on a bench; they carry the reference of the posterior. Of single
+        junctions: branches whose sensor is right.
     readings : Path or None
         Table of bench readings (CSV).
+    alone : bool
+        Whether each vehicle is calibrated by itself in any case.
+    load : UnmeasuredLoad or None
+        What no branch measures; None: as the layout says, if it does.
+    charge_ah : mapping of str to (float, float)
+        Of single junctions: charge into the junction through a branch during the recordings, and its standard
+        deviation. [Ah]
+    meter : str or None
+        Of single junctions: branch that has another sensor in each folder of recordings of one car.
     harm_limit : float
         Largest posterior probability of making a branch worse with which it is corrected. [1]
     expected_faults : float or None
@@ -68,6 +78,10 @@ class CalibrationSettings:
     hold_out: frozenset[str] = field(default_factory=frozenset)
     trusted: frozenset[str] = field(default_factory=frozenset)
     readings: Path | None = None
+    alone: bool = False
+    load: UnmeasuredLoad | None = None
+    charge_ah: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    meter: str | None = None
     harm_limit: float = HARM_LIMIT
     expected_faults: float | None = None
     classifier: Classifier = Classifier.TREE
@@ -96,6 +110,9 @@ class CalibrationSettings:
             "trusted": sorted(self.trusted),
             "readings": None if self.readings is None else [self.readings.name, file_digest(self.readings)],
             "expected_faults": self.expected_faults,
+            "load": None if self.load is None else [self.load.mean_a, self.load.sd_a],
+            "charge_ah": dict(self.charge_ah),
+            "meter": self.meter,
         }
 
 
@@ -111,11 +128,11 @@ def require_learning(
     ``left_out`` says why others cannot be used; of many the first ones, ``left_out_count`` being how many there are.
     """
     learning = [name not in settings.hold_out for name in names]
-    if sum(learning) < LEAST_VEHICLES:
+    if sum(learning) < 2:
         reasons = few_reasons(left_out, count=left_out_count)
         raise FleetError(
-            f"{counted(sum(learning), 'usable vehicle')} to learn from, at least {LEAST_VEHICLES} are needed, "
-            f"as every vehicle is compared with its fleet ('calibrator kirchhoff' shows the sum of one, 'ecu-node "
-            f"template' begins a parameter file by hand){reasons}"
+            f"{counted(sum(learning), 'usable vehicle')} to learn from; a fleet that is compared with itself needs "
+            f"{FEWEST_VEHICLES} or more, the drives of a single vehicle a sensor that is right (--trusted BRANCH)"
+            f"{reasons}"
         )
     return learning

@@ -17,7 +17,7 @@ RESOLVED = 0.002
 REASONS: dict[HeldBack, str] = {
     "beyond the limits": "it is beyond the limits of the layout: replace the sensor",
     "does not fit": "no gain error and offset explain what the sensor shows",
-    "reference in doubt": "the fleet may be wrong about this branch as a whole",
+    "reference in doubt": "what it is compared with, the fleet or a known sensor, is in doubt",
     "moved too little": "its current moved too little for the gain to be known",
     "harm limit": "the correction might do harm",
 }
@@ -43,7 +43,7 @@ def faults_of(explanation: Explanation, branches: Sequence[str]) -> Array:
 
 def deciding_evidence(
     estimate: FleetEstimate, j: int, branches: Sequence[str], *, full_scale_a: float, layout: str = "the layout"
-) -> str:
+) -> tuple[str, Explanation | None]:
     """What would decide where it cannot be told what is faulty, or where a correction is held back.
 
     Parameters
@@ -59,8 +59,10 @@ def deciding_evidence(
 
     Returns
     -------
-    str
+    text : str
         One sentence.
+    rival : Explanation or None
+        The explanation that it tells from the most probable one, if it is about one.
     """
     held_back, drift, offset_a = estimate.held_back[j], estimate.drift[j], estimate.offset_a[j]
 
@@ -72,18 +74,20 @@ def deciding_evidence(
         return (
             f"the {branches[k]} sensor is off by {drift[k]:+.1%} and {offset_a[k]:+.1f} A, beyond the limits of "
             f"{layout}: replace the sensor"
-        )
-    if unfit := those("does not fit"):
-        texts = [finding.text for finding in estimate.findings[j] if finding.branch == unfit[0]]
-        return texts[0] if texts else f"a check of the {unfit[0]} sensor would decide: {REASONS['does not fit']}"
+        ), None
+    if unfit := those("does not fit"):  # a finding of such a branch, else of no branch, else of another one
+        found = sorted(estimate.findings[j], key=lambda each: (each.branch not in unfit, each.branch is not None))
+        check = f"a check of the {unfit[0]} sensor would decide: {REASONS['does not fit']}"
+        return found[0].text if found else check, None
     doubtful = those("reference in doubt")
     if doubtful and not those("harm limit"):
         return (
             f"bench-checked vehicles would decide: the fleet's reference is in doubt for branch {', '.join(doubtful)}; "
             f"name at least three with --trusted"
-        )
-    if rival := _rival(estimate.explanations[j], branches, held_back != "", full_scale_a):
-        return rival
+        ), None
+    text, rival = _rival(estimate.explanations[j], branches, held_back != "", full_scale_a)
+    if text:
+        return text, rival
     # One explanation is left, and known too little: which sensor least, in parts of the faults that were found?
     sd = np.array([estimate.drift_sd[j], estimate.offset_sd_a[j] / full_scale_a])
     size = np.linalg.norm([drift, offset_a / full_scale_a], axis=1, keepdims=True)
@@ -92,10 +96,12 @@ def deciding_evidence(
     return (
         f"more drives would decide: the {branches[k]} sensor's drift is known to +-{estimate.drift_sd[j, k]:.2%} and "
         f"its offset to +-{estimate.offset_sd_a[j, k]:.2f} A only; record drives in which that current varies"
-    )
+    ), None
 
 
-def _rival(found: Sequence[Explanation], branches: Sequence[str], held: Mask, full_scale_a: float) -> str:
+def _rival(
+    found: Sequence[Explanation], branches: Sequence[str], held: Mask, full_scale_a: float
+) -> tuple[str, Explanation | None]:
     """What would tell the most probable explanation from the one that stands most in its way; empty if none does."""
     least = LEAST_IN_THE_WAY if held.any() else LEAST_RIVAL
     others = [each for each in found[1:] if each.probability >= least]
@@ -104,16 +110,17 @@ def _rival(found: Sequence[Explanation], branches: Sequence[str], held: Mask, fu
     in_the_way = [each.probability * a[a > RESOLVED].sum() for each, a in zip(others, apart, strict=True)]
     if not any(in_the_way):
         same = "the explanations differ in the vehicle, not in its sensors: inspect the hardware"
-        return same if rivals and not held.any() else ""
-    rival = rivals[int(np.argmax(in_the_way))]
+        return same if rivals and not held.any() else "", None
+    most = int(np.argmax(in_the_way))
+    rival, explanation = rivals[most], others[most]
     drift, offset = np.abs(rival - best)
     k = int(np.argmax(offset))
     if offset[k] > RESOLVED:
-        readings = f"{best[1, k] * full_scale_a:+.1f} A or {rival[1, k] * full_scale_a:+.1f} A"
-        return f"a zero-current window (contactors open) would decide: the {branches[k]} sensor then shows {readings}"
+        what = f"a zero-current window (contactors open) would decide: the {branches[k]} sensor then shows"
+        return f"{what} {best[1, k] * full_scale_a:+.1f} A or {rival[1, k] * full_scale_a:+.1f} A", explanation
     k = int(np.argmax(drift))
-    readings = f"{best[0, k]:+.1%} or {rival[0, k]:+.1%}"
-    return f"a check of the {branches[k]} sensor against a reference would decide: its gain is off by {readings}"
+    what = f"a check of the {branches[k]} sensor against a reference would decide: its gain is off by"
+    return f"{what} {best[0, k]:+.1%} or {rival[0, k]:+.1%}", explanation
 
 
 def explained(parameters: VehicleParameters) -> str:
@@ -122,6 +129,9 @@ def explained(parameters: VehicleParameters) -> str:
     sure = "" if confidence is None else f" (confidence {confidence:.2f})"
     lines = [f"{parameters.vehicle}: {parameters.verdict}{sure}"]
     lines += [f"  {name}: {_sensor_text(branch)}" for name, branch in parameters.branches.items()]
+    for reason, why in REASONS.items():
+        held_back = [name for name, branch in parameters.branches.items() if branch.held_back == reason]
+        lines += [f"  {', '.join(held_back)} not corrected, because {why}"] if held_back else []
     if hardware.suspected:
         offset_a = {name: value for name, value in hardware.offset_a.items() if value}
         changes = Explanation(probability=1.0, hardware_drift=hardware.drift, hardware_offset_a=offset_a)
@@ -133,7 +143,8 @@ def explained(parameters: VehicleParameters) -> str:
     if parameters.findings:
         lines.append("for the workshop:")
         lines += [f"  {each.probability:.2f}  {each.text}" for each in parameters.findings]
-    lines += [parameters.deciding_evidence] if parameters.deciding_evidence else []
+    said = {"", *(each.text for each in parameters.findings)}
+    lines += [] if parameters.deciding_evidence in said else [parameters.deciding_evidence]
     lines.append(f"junction sum: {residual.measured_a:.2f} A RMS as measured, {residual.corrected_a:.2f} A corrected")
     return "\n".join(lines)
 
@@ -144,8 +155,7 @@ def _sensor_text(branch: BranchParameters) -> str:
         return f"no fault found{probability}"
     drift_sd = "" if branch.drift_sd is None else f" +- {branch.drift_sd:.2%}"
     offset_sd = "" if branch.offset_sd_a is None else f" +- {branch.offset_sd_a:.2f} A"
-    reason = "" if branch.held_back is None else f", because {REASONS[branch.held_back]}"
-    fate = "corrected" if branch.apply else f"not corrected{reason}"
+    fate = "corrected" if branch.apply else "not corrected"
     return f"gain error (drift) {branch.drift:+.2%}{drift_sd}, offset {branch.offset_a:+.2f} A{offset_sd}: {fate}"
 
 

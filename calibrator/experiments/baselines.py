@@ -21,9 +21,8 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LassoLarsIC
 
 from calibrator.drive import Array, Mask
-from calibrator.estimator.clusters import densest_clusters
 from calibrator.estimator.explanations import evidence_of, row_residuals
-from calibrator.estimator.fleet_model import fit_fleet_model
+from calibrator.estimator.fleet_model import densest_clusters, fit_fleet_model
 from calibrator.estimator.moments import stack_summaries
 from calibrator.estimator.rows import EvidenceRows, collect_rows, parameter_places, row_design
 from calibrator.experiments.methods import Estimate

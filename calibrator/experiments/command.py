@@ -67,7 +67,9 @@ ResultsFolderOption = Annotated[
 
 def experiment(
     context: typer.Context,
-    name: Annotated[ExperimentName, typer.Argument(help="Which experiment, or all.")],
+    name: Annotated[
+        ExperimentName, typer.Argument(show_choices=False, help=f"Experiment: {', '.join(ExperimentName)}.")
+    ],
     quick: QuickOption = False,
     repetitions: RepetitionsOption = None,
     seed: SeedOption = 0,

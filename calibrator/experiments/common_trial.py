@@ -20,7 +20,7 @@ from functools import partial
 import numpy as np
 
 from calibrator.drive import Array
-from calibrator.estimator.clusters import densest_clusters
+from calibrator.estimator.fleet_model import densest_clusters
 from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows
 from calibrator.estimator.state_space import choose_order, identify
 from calibrator.experiments.common_drive import CommonDrive

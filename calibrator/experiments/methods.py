@@ -8,7 +8,8 @@ from typing import Protocol
 import numpy as np
 
 from calibrator.drive import Array, Mask
-from calibrator.estimator.fleet_estimate import HARM_LIMIT, RowsEstimate, estimate_rows, estimate_vehicles, learn_fleet
+from calibrator.estimator.decision import RowsEstimate, estimate_rows
+from calibrator.estimator.fleet_estimate import HARM_LIMIT, estimate_vehicles, learn_fleet
 from calibrator.estimator.learning import learn_laws
 from calibrator.estimator.prior import Prior, known_prior
 from calibrator.experiments.trial import CommonEvidence, FaultDistribution, Trial

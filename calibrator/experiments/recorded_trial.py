@@ -14,7 +14,7 @@ from calibrator.artificial.ground_truth import GroundTruth
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
-from calibrator.estimator.fleet_identification import identify_vehicle
+from calibrator.estimator.published_fleet import identify_vehicle
 from calibrator.experiments.attacks import WORLDS, Attack, draw_attack
 from calibrator.experiments.methods import Method
 from calibrator.experiments.recorded_fleet import RecordedFleet

@@ -14,12 +14,12 @@ from calibrator.export.checked import Checked, read_checked
 from calibrator.export.csv_table import csv_text
 from calibrator.export.dcm import dcm_text
 from calibrator.files.folders import require_possible_file, require_possible_folder
-from calibrator.files.layout_files import vehicle_database
 from calibrator.files.whole_files import made_folder, remove_abandoned, require_own_file, write_files
 from calibrator.options import ExportFormat
 from calibrator.terminal.options import JsonOption, LayoutOption
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps
+from ecu_node.database import node_database
 from ecu_node.errors import printable
 from ecu_node.failures import say_error
 from ecu_node.standard_output import write_output
@@ -41,7 +41,7 @@ def export(
     dcm (DCM 2.0) and cdfx (ASAM CDF 2.0) are for calibration tools, csv is one row per branch, and c99 a header and a
     source that correct as 'ecu-node run' does as a gateway. Parameters that the node would not apply are refused.
     """
-    database = vehicle_database(layout)
+    database = node_database(layout)
     reading = shown(params, "read parameters", len(params), "files") if len(params) > 1 else params
     tables = [read_checked(path, database, vehicle) for path in reading]
     files = exported_files(tables, format_, output)

@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.errors import DatabaseError
+from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import Layout, read_layout
 
 __all__ = ["chosen_layout", "vehicle_database"]
@@ -18,7 +18,10 @@ def chosen_layout(layout: Path, dbc: Path | None = None) -> Layout:
         return settings
     if not dbc.is_file():
         raise DatabaseError(f"{dbc}: no such DBC; check --dbc")
-    changed: Layout = msgspec.structs.replace(settings, dbc=str(dbc.absolute()))
+    if len(settings.bus) > 1:
+        raise LayoutError(f"{layout}: names several buses with a DBC each; leave --dbc out")
+    buses = [msgspec.structs.replace(bus, dbc=str(dbc.absolute())) for bus in settings.bus]
+    changed: Layout = msgspec.structs.replace(settings, dbc=None if buses else str(dbc.absolute()), bus=buses)
     return changed
 
 

@@ -1,48 +1,100 @@
-"""``calibrator kirchhoff``: the sum of the branch currents, from a log or a live bus."""
+"""``calibrator kirchhoff``: the sum of the branch currents, from a log, a table or a live bus."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
-from calibrator.terminal.options import DbcOption, JsonOption, LayoutOption, number_option
-from ecu_node.standard_output import write_output
+from calibrator.terminal.options import DbcOption, JsonOption, number_option
+from ecu_node.standard_output import write_text
 
 __all__ = ["kirchhoff"]
 
 
+def _file(*suffixes: str) -> Callable[[Path | None], Path | None]:
+    """See that a file to be written has one of these suffixes."""
+
+    def check(path: Path | None) -> Path | None:
+        if path is not None and path.suffix.lower() not in suffixes:
+            raise typer.BadParameter(f"{path}: expected a file name that ends with {', '.join(suffixes)}")
+        return path
+
+    return check
+
+
+def _option(help_text: str, *suffixes: str) -> Any:
+    return typer.Option(help=f"{help_text} ({' '.join(suffixes)}).", callback=_file(*suffixes))
+
+
 def kirchhoff(
     *,
-    layout: LayoutOption,
-    log: Annotated[Path | None, typer.Argument(metavar="LOG", help="Log: .log .asc .blf .trc .mf4, also .gz.")] = None,
+    log: Annotated[
+        Path | None, typer.Argument(metavar="LOG", help="Log of frames, or table of currents (.csv, .parquet ...).")
+    ] = None,
+    layout: Annotated[Path | None, typer.Option(help="Layout (TOML) that says what the signals mean.")] = None,
     dbc: DbcOption = None,
+    branches: Annotated[
+        str | None,
+        typer.Option(
+            help="Without a layout: columns of the table, NAME=COLUMN with commas, a minus before a column that is "
+            "positive out of the junction: battery=Ibat,-motor=Imot."
+        ),
+    ] = None,
+    full_scale: Annotated[
+        float | None,
+        number_option("--full-scale", 0.001, 1e5, "Nominal maximum of the junction, with --branches [A]"),
+    ] = None,
+    parameters: Annotated[
+        Path | None, typer.Option(help="Parameter file of this vehicle: correct with it, instead of corrected frames.")
+    ] = None,
     interface: Annotated[str | None, typer.Option(help="Listen to a bus of this python-can interface.")] = None,
     channel: Annotated[str | None, typer.Option(help="Channel of the bus, such as vcan0.")] = None,
     duration: Annotated[
         float, number_option("--duration", 0.1, 86400.0, "How long to listen, or until Ctrl-C [s]")
     ] = 30.0,
-    plot: Annotated[Path | None, typer.Option(help="Draw the currents into this picture (.png, .pdf, .svg).")] = None,
+    plot: Annotated[
+        Path | None, _option("Draw the currents into this picture", ".png", ".pdf", ".svg", ".html")
+    ] = None,
+    table: Annotated[Path | None, _option("Write the currents for a spreadsheet", ".csv", ".parquet")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Print RMSE, maximum, mean and spread of every branch current and of their sum, before and after correction."""
+    """Print the branch currents and their sum, before and after correction, and what is expected of right sensors."""
     if (log is None) == (interface is None):
         raise typer.BadParameter("give either a LOG, or --interface and --channel of a live bus")
+    if (layout is None) == (branches is None):
+        raise typer.BadParameter("give either --layout, or --branches with the columns of a table")
+    if full_scale is not None and branches is None:
+        raise typer.BadParameter("--full-scale goes with --branches; a layout has its own full_scale_a")
     with importing():
-        from calibrator.kirchhoff.sums import compare_kirchhoff
-        from calibrator.kirchhoff.view import kirchhoff_json, kirchhoff_text, plot_kirchhoff
-        from calibrator.recordings.frames import read_frames
+        from calibrator.kirchhoff.sums import compare_kirchhoff, with_voltages
+        from calibrator.kirchhoff.view import draw_kirchhoff, kirchhoff_json, kirchhoff_text, save_table
         from calibrator.recordings.live import listen
-        from calibrator.recordings.readers import drive_from_frames
+        from calibrator.recordings.readers import drive_from_frames, read_recording
+        from calibrator.recordings.tables import is_table, layout_from_branches, read_table
+        from ecu_node.parameters import read_parameters
 
-    database = vehicle_database(layout, dbc)
-    where = str(log) if log is not None else f"{interface}:{channel}"
-    frames = read_frames(log) if log is not None else listen(str(interface), channel, duration)
-    name = log.name.partition(".")[0] if log is not None else "live"
-    recording = drive_from_frames(frames, database, vehicle=database.layout.name, name=name, where=where)
-    comparison = compare_kirchhoff(recording, database.layout)
+    found = None if parameters is None else read_parameters(parameters)
+    if layout is not None:
+        database = with_voltages(vehicle_database(layout, dbc))
+    elif log is not None and (is_table(log) or not log.exists()):
+        database = layout_from_branches(str(branches), full_scale_a=full_scale, table=read_table(log))
+    else:
+        raise typer.BadParameter("--branches names columns of a table; a log of frames and a bus need --layout")
+    vehicle = database.layout.name
+    if log is not None:
+        recording = read_recording(log, database, vehicle=vehicle, name=log.name.partition(".")[0])
+    else:
+        frames = listen(str(interface), channel, duration)
+        where = f"{interface}:{channel}"
+        recording = drive_from_frames(frames, database, vehicle=vehicle, name="live", where=where)
+    comparison = compare_kirchhoff(recording.drive, database, recording.corrected, found)
     if plot is not None:
-        plot_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {Path(where).name}")
+        name = log.name if log is not None else f"{interface}:{channel}"
+        draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {name}")
+    if table is not None:
+        save_table(comparison, table)
     notices = recording.report.log_notices() + comparison.notices()
-    write_output(kirchhoff_json(comparison, notices) if json else kirchhoff_text(comparison, notices))
+    write_text(kirchhoff_json(comparison, notices) if json else kirchhoff_text(comparison, notices))

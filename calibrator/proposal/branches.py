@@ -1,132 +1,454 @@
-"""Which signals of a DBC are probably the branches of the junction."""
+"""Which candidates are the branches of the junction: a score with its reasons for each, a choice, and the signs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
-from calibrator.doctor.bands import branch_bands
-from calibrator.drive import Channel, Drive
-from calibrator.proposal.rating import FITS, branch_points, position_of
-from calibrator.proposal.signals import Candidate
-from ecu_node.units import AMPERE, WATT
+from calibrator.doctor.words import CURRENT, PLACES, POWER, places_of, word_set, words_of
+from calibrator.drive import Array, Channel
+from calibrator.proposal.candidates import Candidate
 
-__all__ = ["PLACES_OF_BRANCHES", "ProposedBranch", "propose_branches"]
+__all__ = ["TAKEN", "Verdict", "choose_branches", "closure", "current_of", "find_signs", "judge", "with_usual_sign"]
 
-PLACES_OF_BRANCHES = ("battery", "motor", "auxiliary", "heater", "aircon", "dcdc")
-"""In the order in which a layout lists them."""
-MOST_ALTERNATIVES = 2
-"""Per branch: a layout is to be read."""
-FOLLOWS = 3.0
-"""Points of a motor whose current is that of the battery turned round. [1]"""
-CLEARLY = 0.8
-"""Correlation above which a reason tells of it. [1]"""
-NEARLY = 3.0
-"""Fewer points than the best one by which another signal is worth naming."""
+TAKEN = 50.0
+"""Score from which on a candidate is a branch: names, comments or sender say where it flows."""
+POSITIONS = ("front", "rear", "left", "right")
+"""Of branches that a vehicle has twice; numbers count where two signals differ in nothing else."""
+NOT_MEASURED = word_set(
+    "limit limits lim max maximum min minimum mx mn available avail target tgt request requested req rq command cmd "
+    "soll grenze demand setpoint desired allowed budget capability predicted pred est optimal regen reg error "
+    "deviation phase iq id ia ib ic flux peak history avg average corrected quality checksum counter waste dissipation "
+    "heat qdot dbg debug rejection load reserve inst reserved limite maxi mini consigne threshold isolation leakage "
+    "energy over"
+)
+"""Words of limits, demands, statistics and parts of a phase current, which are no measured flow."""
+LIMITS = word_set("limit limits request command max charging")
+"""The same in the name of a message."""
+ELSEWHERE = word_set(
+    "lv 12 12v 24 24v ulo lo fan pump blower cell brick sleep seat mirror lock brake brk steering eps epb epbm "
+    "liftgate window wiper tpms solenoid valve radar line evse ac1 fc trailer igbt gate bulkhead strut ibs ekat scr "
+    "generator alternator kupplung kompressorkupplung"
+)
+"""Words of other circuits than the high-voltage junction."""
+_OTHER_SIDE = {"dcdc": word_set("output out secondary")}
+"""The converter's low-voltage side is named by these words, not by *lv*."""
+HIGH_VOLTAGE = word_set("hv high traction trac hvb hvem bms becm pack pck lb lbc sme ess ress isolation isolationres")
+"""Words that a database of a low-voltage battery does not have beside it."""
+MAIN = ("battery", "motor")
+NOWHERE = ""
+"""The place of what no word gives one."""
+NAMED, NAMED_AROUND, HV, MEASURED, BESIDE = 35.0, 40.0, 15.0, 10.0, 20.0
+AGAINST, WEAK, STEADY, NEVER = -65.0, -30.0, -40.0, -150.0
+"""Points: for a place in the name, in message or sender, ...; against a word, a range, and for what decides alone."""
+LEAST = {"current": 30.0, "power": 20e3}
+"""Ranges that a database gives to currents and powers of battery and motor. [A, W]"""
+LEAST_OF_LOADS = {"current": 3.0, "power": 500.0}
+"""The same of heaters, converters and chargers: valves and clutches have less. [A, W]"""
+PLAUSIBLE = {"current": (1.0, 3000.0), "power": (300.0, 1.5e6)}
+"""What these reach in a recording. [A, W]"""
+CELL_V, LOW_V, HIGH_V = 6.0, 40.0, 60.0
+"""A voltage beside a current is of a cell, of 12 or 24 V, of neither, or of a junction. [V]"""
+STEADY_SHARE = 0.1
+"""Of its peak: a current that varies by less is steady, and how the sum varies says little. [1]"""
+ROUGH = 0.5
+"""Roughness above which values jump about as no current does. [1]"""
+FOLLOWS, IGNORES = 0.3, 0.15
+"""Correlation with the battery's current from which on a motor's speaks for it, and below which against it. [1]"""
+CLEAR, SAG = 2.0, 0.5
+"""By so much more the sum must vary with the other sign, and correlation with the voltage that tells the battery's."""
+MEANS = 50
+"""One row of means for so many instants: loads that no branch measures are in them."""
+MOST_TURNED = 12
+"""Branches of which all combinations of signs are tried."""
+ONLY_CHARGING = "carries nothing while the car drives, which a log of charging would show (--log)"
+BIN_S, SLOW_S, LOST_S = 0.5, 10.0, 2.0
+"""Currents are compared as means over the first, less those over the second; longer gaps are left out. [s]"""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProposedBranch:
-    """One branch as it is guessed.
+class Verdict:
+    """What is thought of one candidate.
 
     Attributes
     ----------
-    name : str
-        In the layout.
+    candidate : Candidate
+        The signal or column.
     place : str
-        Of :data:`PLACES_OF_BRANCHES`.
-    signal : Candidate
-        Its current or power.
-    reason : str
-        Why it was taken.
-    alternatives : tuple of Candidate
-        Others that it could be, the best first.
+        Where it probably flows, of :data:`calibrator.doctor.words.PLACES`.
+    score : float
+        From 0 on it is worth looking at; from :data:`TAKEN` on it can be a branch.
+    why : str
+        What speaks for it if it is taken, else why it is not.
+    branch : str
+        Name of the branch that it is; empty if it is not taken.
+    sign : int
+        1 if it is positive into the junction, -1 if out of it; of a branch.
+    sign_reason : str
+        How that is known.
     """
 
-    name: str
+    candidate: Candidate
     place: str
-    signal: Candidate
-    reason: str
-    alternatives: tuple[Candidate, ...]
+    score: float
+    why: str
+    branch: str = ""
+    sign: int = 1
+    sign_reason: str = ""
 
 
-def propose_branches(found: Sequence[Candidate]) -> list[ProposedBranch]:
-    """Choose branches among signals.
+@dataclass(frozen=True)
+class _Around:
+    """The candidates of the same message and of the same sender."""
+
+    found: Sequence[Candidate]
+    everything: Sequence[Candidate]
+    words: dict[str, set[str]] = field(default_factory=dict)
+    volts: dict[str, list[Candidate]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for item in self.everything:
+            if item.message is not None:
+                for sender in {*item.message.senders, item.message.name} - {"XXX", "Vector__XXX"}:
+                    self.words.setdefault(sender, set()).update(item.words)
+        for item in self.found:
+            if item.message is not None and item.quantity == "voltage" and not {"cell", "brick", "ref"} & set(item.own):
+                self.volts.setdefault(item.message.name, []).append(item)
+
+    def says_high_voltage(self, item: Candidate) -> bool:
+        assert item.message is not None
+        near = [self.words.get(name, set()) for name in (item.message.name, *item.message.senders)]
+        return bool(HIGH_VOLTAGE & set().union(set(item.words), *near))
+
+    def volts_beside(self, item: Candidate) -> tuple[float, str]:
+        """Greatest voltage of the same message and its name; NaN without any."""
+        beside = self.volts.get(item.message.name, []) if item.message is not None else []
+        rated = [(float(np.median(v.good)) if len(v.good) else max(abs(v.low), abs(v.high)), v.name) for v in beside]
+        return max(rated, default=(np.nan, ""))
+
+
+def judge(item: Candidate, place: str, around: _Around, battery: Array | None = None) -> tuple[float, str]:
+    """Score of a candidate as the branch at a place, and what speaks most against it, or for it.
+
+    Parameters
+    ----------
+    item : Candidate
+        A current or power.
+    place : str
+        Where it may flow.
+    around : _Around
+        All candidates.
+    battery : ndarray of shape (2, T), optional
+        Comparable currents of the battery and this candidate.
+
+    Returns
+    -------
+    score : float
+        See :class:`Verdict`.
+    why : str
+        In words.
+    """
+    own, near = set(item.own), set(item.words)
+    named = PLACES.get(place, frozenset())
+    points = [(NAMED * bool(own & named) + NAMED_AROUND * bool(near & named), "")]
+    points.append((5.0 * bool(named & set(words_of(item.name.rpartition(".")[2]))), ""))
+    if not near & named:
+        points.append((-20.0, "neither name, comment nor sender says where it flows"))
+    points.append((HV * bool(near & {"hv", "high", "dc", "traction", "trac"}), ""))
+    points.append((MEASURED * bool(own & (CURRENT | POWER)) + MEASURED * (item.quantity == "current"), ""))
+    points.append((-5.0 * item.multiplexed - 0.3 * len(item.name), ""))
+    points.append((-15.0 * ("raw" in own), "raw"))
+    if words := own & NOT_MEASURED:
+        points.append((AGAINST * len(words), f"{_quoted(words)}: a limit, demand, estimate or part of one"))
+    elif words := (near - own) & LIMITS:
+        points.append((AGAINST, f"its message has {_quoted(words)}: no measured flow"))
+    away = ELSEWHERE | PLACES["charger"] if place in {*MAIN, "auxiliary"} else ELSEWHERE
+    if words := near & (_OTHER_SIDE.get(place, away) - named) - ({"charge"} if place == "battery" else set()):
+        points.append((AGAINST, f"{_quoted(words)}: another circuit"))
+    points += _of_range(item, place) if item.channel is None else _of_recording(item, place)
+    points += _of_voltage(item, place, around)
+    if battery is not None and place == "motor":
+        points.append(_of_company(battery))
+    score = sum(value for value, _ in points)
+    worst, best = min(points, key=lambda point: point[0]), max(points, key=lambda point: point[0] * bool(point[1]))
+    return score, worst[1] if worst[0] < 0.0 and score < TAKEN else best[1]
+
+
+def _of_range(item: Candidate, place: str) -> list[tuple[float, str]]:
+    reach = max(abs(item.low), abs(item.high))
+    if place not in MAIN:
+        too_small = reach < LEAST_OF_LOADS[item.quantity]
+        return [(AGAINST, f"its range ends at {reach:g} {_unit(item)}: no load of a junction")] if too_small else []
+    ranged = item.signal is not None and bool(item.signal.minimum or item.signal.maximum)
+    points = [(0.0, "")]
+    if item.low >= 0.0:
+        points.append((WEAK if ranged else 0.5 * WEAK, "in the database it cannot be negative"))
+    if reach < LEAST[item.quantity]:
+        points.append((0.5 * WEAK, f"its range ends at {reach:g} {_unit(item)}"))
+    return points
+
+
+def _unit(item: Candidate) -> str:
+    return "A" if item.quantity == "current" else "W"
+
+
+def _of_recording(item: Candidate, place: str) -> list[tuple[float, str]]:
+    assert item.channel is not None
+    value, unit = item.good, _unit(item)
+    if len(value) < 0.5 * len(item.channel.value):
+        return [(NEVER, f"{1.0 - len(value) / len(item.channel.value):.0%} of its values are not usable")]
+    if np.ptp(value) == 0.0:
+        empty = 0.0 if item.signal is None else item.factor * float(item.signal.offset)
+        against = NEVER if value[0] in {0.0, empty} else STEADY
+        return [(against, f"reads {value[0]:g} {unit} throughout the recording")]
+    points = [(5.0, f"{value.min():.4g} to {value.max():.4g} {unit}")]
+    least, greatest = PLAUSIBLE[item.quantity]
+    least = least if place in MAIN else 0.02 * least
+    if not least <= item.peak <= greatest:
+        points.append((NEVER, f"reaches {item.peak:.3g} {unit} in the recording: no current of a junction"))
+    if item.roughness > ROUGH:
+        points.append((-50.0, "jumps about as no current does"))
+    if place == "battery" and value.min() < 0.0 < value.max():
+        points.append((MEASURED, f"{value.min():.4g} to {value.max():.4g} {unit}, both signs"))
+    return points
+
+
+def _of_voltage(item: Candidate, place: str, around: _Around) -> list[tuple[float, str]]:
+    volts, name = around.volts_beside(item)
+    if CELL_V < volts < LOW_V and place != "dcdc":
+        return [(NEVER, f"{name.rpartition('.')[2]} beside it is at most {volts:.3g} V: not at the junction")]
+    if place not in {"battery", "charger"} or item.message is None:
+        return []
+    if volts >= HIGH_V:
+        return [(BESIDE, "")]
+    if place == "charger":
+        setting = item.channel is None and item.quantity == "current"
+        return [(1.5 * WEAK, "no voltage is beside it: perhaps a setting")] if setting else []
+    if around.says_high_voltage(item):
+        return []
+    return [(AGAINST, "nothing says that it is of a high-voltage battery")]
+
+
+def _of_company(bands: Array) -> tuple[float, str]:
+    if bands.shape[1] < 20 or np.any(np.ptp(bands, axis=1) == 0.0):
+        return 0.0, ""
+    spread = bands.std(axis=1)
+    r = abs(_correlation(bands.T))
+    if r < IGNORES and spread[1] > 0.1 * spread[0]:
+        return 2.0 * AGAINST, f"does not follow the battery's current (correlation {r:.2f})"
+    return (BESIDE + 20.0 * r if r > FOLLOWS else 0.0), f"follows the battery's current (correlation {r:.2f})"
+
+
+def _quoted(words: set[str]) -> str:
+    return ", ".join(f"'{word}'" for word in sorted(words))
+
+
+def choose_branches(
+    found: Sequence[Candidate], voltage: Candidate | None, everything: Sequence[Candidate]
+) -> list[Verdict]:
+    """Judge all currents and powers, and choose branches among them.
 
     Parameters
     ----------
     found : sequence of Candidate
-        Of the DBC; with a log those that are in it.
+        Of a database, of what a log holds of it, or of a table.
+    voltage : Candidate or None
+        What powers are divided by.
+    everything : sequence of Candidate
+        Also what the log does not hold: it says whose signals these are.
 
     Returns
     -------
-    list of ProposedBranch
-        Empty if nothing looks like a branch.
+    list of Verdict
+        The branches first, in the order of a layout; then the rest, the best first. Signs are not looked at.
     """
+    around = _Around(found, everything)
     flows = [item for item in found if item.quantity in {"current", "power"}]
-    rated: dict[str, list[tuple[float, Candidate]]] = {place: [] for place in PLACES_OF_BRANCHES}
+    batteries = {item.name: judge(item, "battery", around) for item in flows}
+    best = max(flows, key=lambda item: batteries[item.name][0], default=None)
+    battery = current_of(best, voltage) if best is not None and batteries[best.name][0] >= TAKEN else None
+    verdicts = []
     for item in flows:
-        points = {place: branch_points(item, place) for place in PLACES_OF_BRANCHES}
-        place = max(points, key=lambda name: points[name])
-        if points[place] >= FITS - NEARLY:
-            rated[place].append((points[place], item))
-    batteries = _best_first(rated["battery"], 0.0)
-    if batteries:
-        following = [(p + FOLLOWS * _follows(item, batteries[0][1]), item) for p, item in rated["motor"]]
-        rated["motor"] = following
-    return [branch for place in PLACES_OF_BRANCHES for branch in _of_place(place, rated[place], batteries)]
+        channel = current_of(item, voltage)
+        both = bands([battery, channel]).T if battery is not None and channel is not None else None
+        rated = {place: judge(item, place, around, both) for place in places_of(item.words) or [NOWHERE]}
+        place = max(rated, key=lambda name: rated[name][0])
+        verdicts.append(Verdict(candidate=item, place=place, score=rated[place][0], why=rated[place][1]))
+    verdicts.sort(key=lambda verdict: -verdict.score)
+    taken = _named_branches(verdicts)
+    for k, verdict in enumerate(verdicts):
+        if k in taken:
+            verdicts[k] = replace(verdict, branch=taken[k])
+        elif verdict.score >= TAKEN:
+            rival = next((v for j, v in enumerate(verdicts) if j in taken and v.place == verdict.place), None)
+            why = f"{rival.candidate.name.rpartition('.')[2]} fits better" if rival is not None else ONLY_CHARGING
+            verdicts[k] = replace(verdict, why=why)
+    order = list(PLACES)
+    chosen = [verdict for verdict in verdicts if verdict.branch]
+    chosen.sort(key=lambda verdict: (order.index(verdict.place), -verdict.score))
+    return [*chosen, *(verdict for verdict in verdicts if not verdict.branch)]
 
 
-def _of_place(
-    place: str, rated: Sequence[tuple[float, Candidate]], batteries: Sequence[tuple[float, Candidate]]
-) -> list[ProposedBranch]:
-    """The best signal for each position that is named at a place."""
-    groups: dict[str, list[tuple[float, Candidate]]] = {}
-    for points, item in _best_first(rated, -np.inf):
-        groups.setdefault("" if place == "battery" else position_of(item), []).append((points, item))
-    positions = [position for position, group in groups.items() if group[0][0] >= FITS]
-    if len([position for position in positions if position]) > 1 and "" in positions:
-        positions.remove("")  # one for both
-    proposed = []
-    for position in positions:
-        (_, best), *others = groups[position]
-        near = [item for points, item in others if points >= groups[position][0][0] - NEARLY]
-        reference = batteries[0][1] if batteries and place == "motor" else None
-        proposed.append(
-            ProposedBranch(
-                name=f"{place}_{position}" if position else place,
-                place=place,
-                signal=best,
-                reason=_reason(best, reference),
-                alternatives=tuple(near[:MOST_ALTERNATIVES]),
-            )
-        )
-    return proposed
+def _named_branches(verdicts: Sequence[Verdict]) -> dict[int, str]:
+    """The best verdict for each position that is named at a place, by number."""
+    taken: dict[int, str] = {}
+    for place in PLACES:
+        if place == "charger" and any(name.startswith("motor") for name in taken.values()) and not _seen(verdicts):
+            continue  # it carries nothing while the motor does
+        good = [k for k, v in enumerate(verdicts) if v.place == place and v.score >= TAKEN]
+        positions = {k: "" if place == "battery" else _position(verdicts[k], verdicts) for k in good}
+        if len({position for position in positions.values() if position}) > 1:
+            good = [k for k in good if positions[k]]  # one for all of them is no branch beside them
+        best = {positions[k]: k for k in reversed(good)}
+        several = len(best) > 1
+        for position, k in best.items():
+            is_number = position.isdigit() and not several
+            taken[k] = f"{place}_{position}" if position and not is_number else place
+    return taken
 
 
-def _best_first(rated: Sequence[tuple[float, Candidate]], least: float) -> list[tuple[float, Candidate]]:
-    return sorted((pair for pair in rated if pair[0] >= least), key=lambda pair: -pair[0])
+def _seen(verdicts: Sequence[Verdict]) -> bool:
+    return any(verdict.candidate.channel is not None for verdict in verdicts)
 
 
-def _reason(candidate: Candidate, battery: Candidate | None) -> str:
-    reasons = [candidate.about]
-    if candidate.seen is not None:
-        scale = 1e-3 if candidate.quantity == "power" else 1.0
-        unit = {"current": "A", "power": "kW"}[candidate.quantity]
-        factor = scale * {**AMPERE, **WATT}[candidate.signal.unit or ""]
-        reasons.append(f"{factor * candidate.seen.low:.4g} to {factor * candidate.seen.high:.4g} {unit} in the log")
-    if battery is not None and _follows(candidate, battery) > CLEARLY:
-        reasons.append("follows the battery's current")
-    return ", ".join(reasons)
+def _position(verdict: Verdict, verdicts: Sequence[Verdict]) -> str:
+    """Front, rear, left, right or a number, as name, comment or message say; empty if none."""
+    item = verdict.candidate
+    for words in (item.own, item.words):
+        if found := [position for position in POSITIONS if position in words]:
+            return found[0]
+    if verdict.place != "motor":
+        return ""
+    letters = [word for word in item.own if not word.isdigit()]
+    alike = [v for v in verdicts if [w for w in v.candidate.own if not w.isdigit()] == letters and v.score >= TAKEN]
+    return next((word for word in item.own if word.isdigit()), "") if len(alike) > 1 else ""
 
 
-def _follows(candidate: Candidate, battery: Candidate) -> float:
-    """Magnitude of the correlation with the battery's current; 0 without a log."""
-    if candidate.seen is None or battery.seen is None or candidate is battery:
+def with_usual_sign(verdict: Verdict) -> Verdict:
+    """The verdict with the sign that a comment tells, or that of convention: discharge and consumption are positive."""
+    gives = verdict.place in {"battery", "charger"}
+    words = set(words_of(verdict.candidate.comment))
+    out, into = ("discharge", "charge") if gives else ("recuperation", "consumption")
+    if "positive" in words and (out in words) != (into in words):
+        said = out if out in words else into
+        return replace(verdict, sign=1 if said == out else -1, sign_reason=f"its comment says that {said} is positive")
+    what = {"battery": "discharge", "charger": "feeding the junction"}.get(verdict.place, "consumption")
+    sign = 1 if gives else -1
+    return replace(verdict, sign=sign, sign_reason=f"if {what} counts as positive; else {-sign}")
+
+
+def current_of(item: Candidate | None, voltage: Candidate | None) -> Channel | None:
+    """Current of a candidate in a recording, a power divided by the voltage [A]; None without what it takes."""
+    if item is None or item.channel is None or item.quantity == "current":
+        return item.channel if item is not None else None
+    if voltage is None or voltage.channel is None or not voltage.channel.good.any():
+        return None
+    by = voltage.channel
+    volts = np.interp(item.channel.time_s, by.time_s[by.good], by.value[by.good])
+    good = item.channel.good & (np.abs(volts) > 1.0)
+    return replace(item.channel, value=np.divide(item.channel.value, volts, out=np.zeros_like(volts), where=good))
+
+
+def bands(channels: Sequence[Channel]) -> Array:
+    """Comparable currents: means over half a second without their slow part, shape (T, K).
+
+    Means are left out because a load that no sensor sees would be taken for a wrong sign; fast changes because a delay
+    between two branches would.
+    """
+    parts = [(c.time_s[c.good], c.value[c.good]) for c in channels]
+    if min(len(time_s) for time_s, _ in parts) < 2:
+        return np.zeros((0, len(parts)))
+    start, stop = max(t[0] for t, _ in parts), min(t[-1] for t, _ in parts)
+    edges = np.arange(start, max(stop, start), BIN_S)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    columns, near = [], np.ones(len(middle), np.bool_)
+    for time_s, value in parts:
+        charge = np.concatenate([[0.0], np.cumsum(np.diff(time_s) * 0.5 * (value[1:] + value[:-1]))])
+        columns.append(np.diff(np.interp(edges, time_s, charge)) / BIN_S)
+        after = np.clip(np.searchsorted(time_s, middle), 1, len(time_s) - 1)
+        near &= time_s[after] - time_s[after - 1] <= LOST_S
+    current = np.stack(columns, axis=1)[near]
+    window = np.ones(int(SLOW_S / BIN_S) + 1)
+    if len(current) < len(window):
+        return np.zeros((0, len(parts)))
+    count = np.convolve(np.ones(len(current)), window, "same")
+    slow = [np.convolve(column, window, "same") / count for column in current.T]
+    return np.asarray(current - np.stack(slow, axis=1))
+
+
+def find_signs(chosen: Sequence[Verdict], voltage: Candidate | None) -> list[Verdict]:
+    """Give branches the signs with which the sum of all varies least, and the battery's voltage sags under its load.
+
+    Parameters
+    ----------
+    chosen : sequence of Verdict
+        The branches, with the usual signs.
+    voltage : Candidate or None
+        The battery's.
+
+    Returns
+    -------
+    list of Verdict
+        The same with signs and how they are known; the usual ones where the recording does not tell.
+    """
+    channels = [current_of(verdict.candidate, voltage) for verdict in chosen]
+    known = [channel for channel in channels if channel is not None and channel.good.any()]
+    battery = next((k for k, verdict in enumerate(chosen) if verdict.place == "battery"), None)
+    if battery is None or len(known) < len(chosen) or len(chosen) > MOST_TURNED:
+        return list(chosen)
+    current = _with_means(known)
+    usual = np.array([verdict.sign for verdict in chosen], np.float64)
+    sag = _sag(known[battery], voltage)
+    charger = next((k for k, verdict in enumerate(chosen) if verdict.place == "charger"), battery)
+    sure = battery if abs(sag) >= SAG else charger  # which only feeds
+    usual[sure] = -np.sign(sag) if abs(sag) >= SAG else usual[sure]
+    tried = [np.array(signs) for signs in product((1.0, -1.0), repeat=len(chosen)) if signs[sure] == usual[sure]]
+    best = min(tried, key=lambda signs: (_rms(current @ signs), -float(signs @ usual)))
+    told = []
+    for k, verdict in enumerate(chosen):
+        other = best * np.where(np.arange(len(chosen)) == k, -1.0, 1.0)
+        with_it, without = _rms(current @ best), _rms(current @ other)
+        sign, reason = int(best[k]), f"with it the sum of all varies by {with_it:.2g} A, else by {without:.2g} A"
+        if k == sure:
+            reason = "with it the voltage falls when the current rises" if abs(sag) >= SAG else verdict.sign_reason
+        elif without < CLEAR * with_it or without == 0.0:
+            sign, reason = verdict.sign, f"{verdict.sign_reason}; too little current for the sum to tell"
+        told.append(replace(verdict, sign=sign, sign_reason=reason))
+    return told
+
+
+def _with_means(channels: Sequence[Channel]) -> Array:
+    """Comparable currents, and their means for a share of the rows: they tell where the currents are steady."""
+    current = bands(channels)
+    mean = [float(channel.value[channel.good].mean()) for channel in channels]
+    return np.concatenate([current, np.tile(mean, (len(current) // MEANS + 1, 1))])
+
+
+def closure(chosen: Sequence[Verdict], voltage: Candidate | None) -> float:
+    """How much the sum of all varies, as a share of the greatest current [1]; NaN where no recording tells."""
+    channels = [current_of(verdict.candidate, voltage) for verdict in chosen]
+    known = [channel for channel in channels if channel is not None]
+    if len(known) < len(channels) or not known:
+        return float("nan")
+    current = bands(known) * np.array([verdict.sign for verdict in chosen])
+    steady = [STEADY_SHARE * float(np.abs(channel.value[channel.good]).max(initial=0.0)) for channel in known]
+    greatest = max(float(current.std(axis=0).max()), *steady) if len(current) else 0.0
+    return _rms(current.sum(axis=1)) / greatest if greatest > 0.0 else float("nan")
+
+
+def _sag(battery: Channel | None, voltage: Candidate | None) -> float:
+    """Correlation of the battery's current with its voltage; 0 without one."""
+    if battery is None or voltage is None or voltage.channel is None:
         return 0.0
-    channels: dict[str, Channel] = {"battery": battery.seen.channel, "other": candidate.seen.channel}
-    drive = Drive(vehicle="", name="", branches=channels, inputs={})
-    band = branch_bands([drive], ("battery", "other")).current_a
-    if not len(band) or not np.all(band.std(axis=0) > 0.0):
-        return 0.0
-    return abs(float(np.corrcoef(band[:, 0], band[:, 1])[0, 1]))
+    both = bands([battery, voltage.channel])
+    return _correlation(both) if len(both) and np.all(both.std(axis=0) > 0.0) else 0.0
+
+
+def _correlation(both: Array) -> float:
+    """Of two columns. [1]"""
+    return float(np.asarray(np.corrcoef(both.T))[0, 1])
+
+
+def _rms(value: Array) -> float:
+    return float(np.sqrt(np.mean(value**2)))

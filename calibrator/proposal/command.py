@@ -1,14 +1,18 @@
-"""``calibrator layout init``: a layout to begin with, from a DBC and a log."""
+"""``calibrator layout init``: a layout to begin with, from a database and a log, or from a table."""
 
 import shlex
+import sys
+from collections.abc import Sequence
+from os import environ
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calibrator.errors import ProposalError
 from calibrator.files.folders import require_possible_file
 from calibrator.processes.interrupts import importing
+from calibrator.terminal.command_line import example
 from calibrator.terminal.options import JsonOption
 from calibrator.terminal.text import dumps
 from ecu_node.errors import printable
@@ -16,56 +20,105 @@ from ecu_node.failures import say_error
 from ecu_node.standard_output import write_output
 from ecu_node.user_files import write_atomically
 
+if TYPE_CHECKING:
+    from calibrator.proposal.branches import Verdict
+
 __all__ = ["layout"]
 
-layout = typer.Typer(help="Layouts: which signals of a DBC mean what.", no_args_is_help=True)
+layout = typer.Typer(help="Layouts: which signals or columns mean what.", no_args_is_help=True)
 
 
 @layout.callback()
 def _layout() -> None:
-    """Layouts: which signals of a DBC mean what."""
+    """Layouts: which signals or columns mean what."""
 
 
-@layout.command("init")
+@layout.command("init", epilog=example("calibrator layout init my_car.dbc --log drive.log --out my_car.toml"))
 def init(
-    dbc: Annotated[Path, typer.Argument(help="DBC of the vehicle.", metavar="DBC")],
+    source: Annotated[
+        Path, typer.Argument(help="Database of the vehicle (DBC, KCD, SYM, ARXML), or a table.", metavar="FILE")
+    ],
     out: Annotated[Path | None, typer.Option("--out", help="File to write; without it, standard output.")] = None,
     log: Annotated[
-        Path | None, typer.Option("--log", help="Log of a drive: only what is in it is proposed, and signs are told.")
+        Path | None, typer.Option("--log", help="Log of a drive: only what it holds is proposed, with signs.")
     ] = None,
+    branches: Annotated[
+        str | None,
+        typer.Option("--branches", help="No guess: battery=SIGNAL,-motor=SIGNAL, minus: positive out of the junction."),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing at a terminal.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Propose a layout by units, names, comments and senders in a DBC, and by what a log shows.
+    """Find the branches of the junction by units, names and senders, and by what a recording shows.
 
-    Whatever is guessed is marked in the file with '# confirm:' and the reason.
+    All candidates are listed with a score, and why each is not a branch. Whatever is guessed is marked in the file with
+    '# confirm:' and the reason.
     """
     with importing():
-        from calibrator.proposal.propose import propose_layout
-        from calibrator.proposal.toml_text import layout_text
+        from calibrator.proposal.dialogue import ask, candidate_lines
+        from calibrator.proposal.proposal import layout_text, look_at, parsed_branches
         from calibrator.recordings.frames import is_log
+        from calibrator.recordings.tables import is_table
 
     if out is not None:
         if out.exists() or out.is_symlink():
             raise ProposalError(f"{out}: exists, and is not overwritten; choose another --out")
         require_possible_file(out)
-    if is_log(dbc) and log is not None and not is_log(log):
-        raise ProposalError(f"{dbc}: a log, and {log} is none; the DBC comes first, the log behind --log")
-    proposal = propose_layout(dbc, log, _name_of(out or dbc))
+    if is_log(source) and not is_table(source):
+        other = f"and {log} is none; " if log is not None and not is_log(log) else ""
+        raise ProposalError(f"{source}: a log, {other}the database comes first, the log behind --log")
+    proposal = look_at(source, log, _name_of(out or source))
+    asked = not (yes or json or environ.get("TERM") == "dumb") and sys.stdin.isatty() and sys.stderr.isatty()
+    if branches is not None:
+        proposal = parsed_branches(branches, proposal)
+        problem = proposal.unready()
+    elif asked and proposal.verdicts:
+        proposal = ask(proposal)
+        problem = proposal.unready()
+    else:
+        problem = proposal.problem()
+        for line in candidate_lines(proposal) if not json else []:
+            say_error(line)
+    if problem:
+        if json:
+            write_output(dumps(_as_json(proposal.verdicts, None, None, problem)))
+        raise ProposalError(f"{source}: {problem}; --branches battery=SIGNAL,-motor=SIGNAL names them without a guess")
     text = layout_text(proposal, out)
-    names, guesses = [branch.name for branch in proposal.branches], text.count("# confirm:")
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, text.encode())
     if json:
-        file = None if out is None else str(out)
-        write_output(dumps({"file": file, "branches": names, "guesses": guesses, "layout": text}))
+        write_output(dumps(_as_json(proposal.verdicts, out, text, "")))
         return
     if out is None:
         write_output(text.rstrip("\n"))
         return
-    write_output(f"{printable(str(out))}: branches {', '.join(names)}; {guesses} guesses to confirm")
-    shown_log = "LOG" if log is None else shlex.quote(str(log))
-    say_error(f"next: calibrator doctor --layout {shlex.quote(str(out))} --log {shown_log}")
+    names = ", ".join(verdict.branch for verdict in proposal.branches)
+    write_output(f"{printable(str(out))}: branches {names}; {text.count('# confirm:')} guesses to confirm")
+    recording = "LOG" if proposal.recording is None else shlex.quote(str(proposal.recording))
+    say_error(f"next: calibrator doctor --layout {shlex.quote(str(out))} --log {recording}")
+
+
+def _as_json(verdicts: "Sequence[Verdict]", out: Path | None, text: str | None, problem: str) -> dict[str, object]:
+    return {
+        "file": None if out is None else str(out),
+        "branches": [verdict.branch for verdict in verdicts if verdict.branch],
+        "guesses": 0 if text is None else text.count("# confirm:"),
+        "layout": text,
+        "problem": problem or None,
+        "candidates": [
+            {
+                "signal": verdict.candidate.name,
+                "unit": verdict.candidate.unit,
+                "place": verdict.place or None,
+                "score": round(min(max(verdict.score, 0.0), 100.0), 1),
+                "branch": verdict.branch or None,
+                "sign": verdict.sign if verdict.branch else None,
+                "why": verdict.why,
+            }
+            for verdict in verdicts
+        ],
+    }
 
 
 def _name_of(path: Path) -> str:

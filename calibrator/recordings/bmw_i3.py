@@ -27,13 +27,12 @@ import numpy as np
 
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.errors import DriveError
-from calibrator.recordings.csv_table import CsvTable
 from calibrator.recordings.signal_range import SignalRange
+from calibrator.recordings.tables import Table
 
 __all__ = ["BRANCHES", "COLUMNS", "INPUTS", "ImportedTrip", "trip_from_table"]
 
 COLUMNS = {
-    "time": "Time [s]",
     "speed": "Velocity [km/h]",
     "accelerator": "Throttle [%]",
     "torque": "Motor Torque [Nm]",
@@ -83,7 +82,7 @@ class ImportedTrip:
     notices: tuple[str, ...]
 
 
-def trip_from_table(table: CsvTable, *, vehicle: str, name: str, ranges: Mapping[str, SignalRange]) -> ImportedTrip:
+def trip_from_table(table: Table, *, vehicle: str, name: str, ranges: Mapping[str, SignalRange]) -> ImportedTrip:
     """Turn one file into a drive.
 
     Parameters
@@ -103,18 +102,17 @@ def trip_from_table(table: CsvTable, *, vehicle: str, name: str, ranges: Mapping
     Raises
     ------
     LogError
-        If a column is missing, a cell is not a number, or time does not increase.
+        If a column is missing.
     DriveError
         If the file is too short, or the battery current, of which the motor's is made, has no usable value.
     """
-    columns = {key: table.numbers(header) for key, header in COLUMNS.items()}
-    table.require_increasing(COLUMNS["time"])
-    time_s = columns["time"] - columns["time"][0]
+    columns = {key: table.columns[table.column(header)] for key, header in COLUMNS.items()}
+    time_s = table.time_s
     if time_s[-1] < SHORTEST_S:
-        raise DriveError(f"{table.where}: only {time_s[-1]:.1f} s long; at least {SHORTEST_S:g} s are needed")
+        raise DriveError(f"{table.path}: only {time_s[-1]:.1f} s long; at least {SHORTEST_S:g} s are needed")
     notices = [
-        f"column '{COLUMNS[key]}': {np.sum(bad)} cells without a number, the first at line "
-        f"{table.line(int(np.argmax(bad)))}; labelled as not good"
+        f"column '{COLUMNS[key]}': {np.sum(bad)} cells without a number, the first at {time_s[np.argmax(bad)]:.1f} s; "
+        f"labelled as not good"
         for key, values in columns.items()
         if (bad := ~np.isfinite(values)).any()
     ]
@@ -125,7 +123,7 @@ def trip_from_table(table: CsvTable, *, vehicle: str, name: str, ranges: Mapping
     for key, sources in _MADE_OF.items():
         good[key] &= np.logical_and.reduce([good[source] for source in sources])
     if not good["battery"].any():
-        raise DriveError(f"{table.where}: column '{COLUMNS['current']}' has no usable value; leave the file out")
+        raise DriveError(f"{table.path}: column '{COLUMNS['current']}' has no usable value; leave the file out")
     channels = {key: Channel(time_s=time_s, value=value, good=good[key]) for key, value in values.items()}
     drive = Drive(
         vehicle=vehicle,

@@ -1,22 +1,27 @@
-"""Lines of ``candump -L`` turned into frame arrays without a Python object per frame.
+"""Lines of ``candump`` turned into frame arrays; those of ``candump -L`` without a Python object per frame.
 
     (1740960798.000833) can0 2E5#000007320000DD00           classic, 11 bits
     (1740960798.000833) can0 000002E5##1000007320000DD00    CAN FD, 29 bits; one digit of flags after ##
     (1740960798.000833) can0 123#R8                         remote frame
 
+    (1740960798.000833)  can0  2E5   [8]  00 00 07 32      printed with -ta, -tA, -tz, -td: turned into the form above
+
 Lines of one shape (lengths of time stamp, channel, identifier and payload) are a matrix of characters; a file has a few
 dozen shapes at most. A line of no known shape is damaged and counted.
 """
 
+import re
 from dataclasses import dataclass, replace
+from datetime import datetime
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import CLASSIC_BYTES, EXTENDED_BIT, FD_BYTES, Frames, concatenate_frames
 
-__all__ = ["CandumpBlock", "parse_candump"]
+__all__ = ["CandumpBlock", "is_candump", "log_lines", "parse_candump"]
 
 _Bytes = NDArray[np.uint8]
 _Index = NDArray[np.int64]
@@ -35,6 +40,19 @@ _NOT_HEX = 255
 _HEX = np.full(256, _NOT_HEX, np.uint8)
 for _digit, _character in enumerate("0123456789ABCDEF"):
     _HEX[[ord(_character), ord(_character.lower())]] = _digit
+
+
+_PRINTED = re.compile(
+    rb"^[ \t]*(?:\((?P<time>[-\d:. ]+)\)[ \t]+)?(?P<channel>[\w.-]+)[ \t]+(?:[RT]X [-B] [-E][ \t]+)?"
+    rb"(?P<id>[\dA-F]{8}|[\dA-F]{3})[ \t]+\[(?P<length>\d+)\](?:[ \t]+(?P<remote>remote request)|[ \t]+(?P<data>"
+    rb"(?:[\dA-F]{2} ?)*))[^\r\n]*",
+    re.MULTILINE | re.IGNORECASE,
+)
+_LOGGED = re.compile(rb"\(\d+\.\d+\) \S+ [\dA-Fa-f]{3,8}#")
+_MOST_DISORDER = 0.1
+"""Share of lines whose time is not after the one before: in a log nearly none, of distances about half. [1]"""
+_SINCE_1970_S = 1e8
+"""Later than any time since a start. [s]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +84,54 @@ class _Fields:
     identifier: tuple[_Index, _Index]
     payload: tuple[_Index, _Index]
     fd: NDArray[np.bool_]
+
+
+def is_candump(head: str, *, printed: bool = False) -> bool:
+    """Whether a text begins with lines of candump; with `printed`, as it prints them without ``-L``."""
+    lines = [line for line in head.splitlines() if line.strip()][:50]
+    forms = (_PRINTED,) if printed else (_PRINTED, _LOGGED)
+    return 2 * sum(any(form.match(line.encode()) for form in forms) for line in lines) > len(lines)
+
+
+def log_lines(text: bytes, where: str) -> bytes:
+    """Turn what candump prints into lines of ``candump -L``.
+
+    Parameters
+    ----------
+    text : bytes
+        Whole lines with absolute times (``-ta``, ``-tA``), times since the start (``-tz``) or since the line before
+        (``-td``), which hardly ever increase. Other lines stay as they are.
+    where : str
+        The file, for messages.
+
+    Returns
+    -------
+    bytes
+        As many lines.
+
+    Raises
+    ------
+    LogError
+        If the lines have no times.
+    """
+    times = [match["time"] for match in _PRINTED.finditer(text)]
+    if None in times:
+        raise LogError(f"{where}: printed by candump without times; record it with 'candump -L' or 'candump -ta'")
+    seconds = np.array([_seconds(time.decode()) for time in times])
+    if np.mean(np.diff(seconds, prepend=-1.0) <= 0.0) > _MOST_DISORDER and np.all(seconds < _SINCE_1970_S):
+        seconds = np.cumsum(seconds)
+    left = iter(seconds.tolist())
+
+    def line(match: re.Match[bytes]) -> bytes:
+        fd = b"##0" if len(match["length"]) > 1 else b"#"
+        data = b"R" if match["remote"] else match["data"].replace(b" ", b"")
+        return b"(%.6f) %b %b%b%b" % (next(left), match["channel"], match["id"], fd, data)
+
+    return _PRINTED.sub(line, text)
+
+
+def _seconds(time: str) -> float:
+    return datetime.fromisoformat(time).timestamp() if "-" in time else float(time)
 
 
 def parse_candump(text: bytes) -> CandumpBlock:

@@ -1,30 +1,44 @@
-"""MDF 4 logs, read in a process of their own that a time limit ends.
+"""MDF 4 files, read in a process of their own that a time limit ends: frames of a bus, or decoded channels.
 
 The format is a graph of binary blocks that point at each other; a damaged one can keep its reader busy for ever.
 Needs the extra ``mf4`` (asammdf).
 """
 
 import importlib.util
+import mmap
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import Frames
 
-__all__ = ["main", "read_mf4"]
+__all__ = ["is_bus_log", "main", "read_mf4", "read_mf4_table"]
 
 START_S = 60.0
 """Time for the process to start on a slow machine; asammdf imports much. [s]"""
+_FRAME_CHANNEL = bytes(8) + b"CAN_DataFrame\0"
+"""A block of text begins with its count of links, which is 0, then comes the text."""
 BYTES_PER_S = 20_000.0
 """Slowest reading that is still waited for, a tenth of what a slow machine does."""
 
 
+def is_bus_log(path: Path) -> bool:
+    """Whether an MDF 4 file holds frames: ASAM's name of their channel is a text in it, which is never compressed."""
+    if not path.stat().st_size:
+        return True
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        return content.find(_FRAME_CHANNEL) >= 0
+
+
 def read_mf4(path: Path) -> Frames:
-    """Read an MDF 4 log.
+    """Read the frames of an MDF 4 log.
 
     Parameters
     ----------
@@ -41,11 +55,48 @@ def read_mf4(path: Path) -> Frames:
     LogError
         If asammdf is not installed, the file is damaged, or reading takes too long.
     """
+    with _converted(path, "frames.npz") as result, np.load(result, allow_pickle=False) as arrays:
+        return Frames(
+            time_ns=arrays["time_ns"],
+            key=arrays["key"],
+            channel=arrays["channel"],
+            length=arrays["length"],
+            data=arrays["data"],
+            channels=tuple(str(name) for name in arrays["channels"]),
+            error_frames=int(arrays["error_frames"]),
+            remote_frames=int(arrays["remote_frames"]),
+            damaged=int(arrays["damaged"]),
+        )
+
+
+def read_mf4_table(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
+    """Read the decoded channels of an MDF 4 file; raises as :func:`read_mf4`.
+
+    Parameters
+    ----------
+    path : Path
+        The uncompressed file.
+
+    Returns
+    -------
+    frame : DataFrame
+        A row per instant [s] of any channel, in the index; NaN where a channel has none then.
+    units : dict of str to str
+        By channel.
+    """
+    with _converted(path, "channels.parquet") as result:
+        frame = pd.read_parquet(result)
+    return frame, frame.attrs["units"]
+
+
+@contextmanager
+def _converted(path: Path, name: str) -> Iterator[Path]:
+    """File of this name that another process made of an MDF 4 file."""
     if importlib.util.find_spec("asammdf") is None:
         raise LogError(f"{path}: reading MF4 needs asammdf; pip install 'hv-current-correction[mf4]'")
     limit_s = START_S + path.stat().st_size / BYTES_PER_S
     with tempfile.TemporaryDirectory(prefix="mf4-") as folder:
-        result = Path(folder) / "frames.npz"
+        result = Path(folder) / name
         command = [sys.executable, "-W", "ignore", "-m", "calibrator.recordings.mf4", str(path), str(result)]
         try:
             done = subprocess.run(command, capture_output=True, timeout=limit_s, check=False, text=True)  # noqa: S603
@@ -56,12 +107,15 @@ def read_mf4(path: Path) -> Frames:
             ) from None
         if done.returncode:
             reason = (done.stderr.strip().splitlines() or ["the reader ended without a word"])[-1]
-            raise LogError(f"{path}: not a readable MF4 log: {reason[:200]}; copy the file again")
-        return _load(result)
+            raise LogError(f"{path}: not a readable MF4 file: {reason[:200]}; copy the file again")
+        yield result
 
 
 def main(path: str, result: str) -> None:
-    """Read `path` through python-can and write its arrays to `result`: what the process does."""
+    """Write frames (.npz) or decoded channels (.parquet) of `path` to `result`: what the process does."""
+    if result.endswith(".parquet"):
+        _write_channels(path, result)
+        return
     import can  # noqa: PLC0415 (only here: the parent needs neither)
 
     from calibrator.recordings.frame_arrays import FrameCollector  # noqa: PLC0415
@@ -74,19 +128,21 @@ def main(path: str, result: str) -> None:
     np.savez(result, **{**vars(frames), "channels": np.array(frames.channels, dtype=np.str_)})
 
 
-def _load(path: Path) -> Frames:
-    with np.load(path, allow_pickle=False) as arrays:
-        return Frames(
-            time_ns=arrays["time_ns"],
-            key=arrays["key"],
-            channel=arrays["channel"],
-            length=arrays["length"],
-            data=arrays["data"],
-            channels=tuple(str(name) for name in arrays["channels"]),
-            error_frames=int(arrays["error_frames"]),
-            remote_frames=int(arrays["remote_frames"]),
-            damaged=int(arrays["damaged"]),
-        )
+def _write_channels(path: str, result: str) -> None:
+    from asammdf import MDF  # noqa: PLC0415
+
+    with MDF(path) as mdf:
+        frame = mdf.to_dataframe(use_display_names=True, time_as_date=False, reduce_memory_usage=False)
+        units = {
+            name: channel.unit
+            for group in mdf.groups
+            for channel in group.channels
+            for name in (channel.name, *channel.display_names)
+            if channel.unit
+        }
+    frame = frame.rename_axis("time [s]")
+    frame.attrs["units"] = {name: unit for name in frame if (unit := units.get(name))}
+    frame.to_parquet(result)
 
 
 if __name__ == "__main__":

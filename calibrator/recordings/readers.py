@@ -1,33 +1,54 @@
-"""One log and the layout's signals make one drive.
+"""One log or table and the layout's signals make one drive.
 
 Branch k is signal * sign, or sign * power / voltage with the voltage of the latest good frame at or before the power's,
-not older than the branch's time-out. Every branch keeps the instants of its own frames. Currents are positive into the
-junction.
+not older than the branch's time-out, or sign * formula at the instants of what comes most often in it, the others
+interpolated. Every branch keeps the instants of its own frames or rows. Currents are positive into the junction.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from cantools.database.can import Message
+from numpy.typing import NDArray
 
 from calibrator.drive import Array, Channel, Drive, Mask
+from calibrator.drives.align import at_instants, base_inputs
+from calibrator.drives.derived import evaluate_formula
 from calibrator.errors import LogError
-from calibrator.recordings.decode import codes_of_no_value, decode_signal
+from calibrator.recordings.decode import bad_values, codes_of_no_value, decode_signal
 from calibrator.recordings.e2e_profile import message_is_sound
 from calibrator.recordings.frame_arrays import EXTENDED_BIT, Frames, frame_key
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.log_time import CLOCK_GAP_S, repaired_time
-from calibrator.terminal.notices import Notice
+from calibrator.recordings.signal_range import signal_range
+from calibrator.recordings.tables import Table, is_table, read_table
+from calibrator.terminal.text import Notice
 from ecu_node.database import VehicleDatabase
-from ecu_node.layout import Branch
-from ecu_node.units import AMPERE, VOLT, WATT, unit_factor
+from ecu_node.formula import formula_names, parse_formula
+from ecu_node.layout import Branch, split_signal
+from ecu_node.units import AMPERE, VOLT, WATT, factor_of, usual_unit
 
-__all__ = ["ChannelReport", "Recording", "RecordingReport", "drive_from_frames", "read_drive", "read_recording"]
+__all__ = [
+    "ChannelReport",
+    "FrameSource",
+    "Recording",
+    "RecordingReport",
+    "Source",
+    "TableSource",
+    "drive_from_frames",
+    "drive_from_table",
+    "read_drive",
+    "read_recording",
+]
 
 _MOST_LISTED = 12
 """Identifiers listed in a message: enough to recognise the bus, short enough for one line."""
+MOST_STRAY = 0.05
+"""Share of a message's frames on other buses that is ignored: what gateways and loggers spill. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,18 +82,24 @@ class RecordingReport:
     channels : tuple of ChannelReport
         All branches and inputs of the layout, in its order.
     frames, error_frames, remote_frames, damaged : int
-        Counts over the whole log.
+        Counts over the whole log; rows of a table are its frames.
     disordered, clock_steps : int
         Frames logged before an earlier one; steps of the clock that became gaps.
+    ignored : mapping of str to int
+        Frames that come from other buses than those that the layout means, by channel.
+    found : str
+        How a table was read; empty for logs.
     """
 
     channels: tuple[ChannelReport, ...]
     frames: int
-    error_frames: int
-    remote_frames: int
-    damaged: int
-    disordered: int
-    clock_steps: int
+    error_frames: int = 0
+    remote_frames: int = 0
+    damaged: int = 0
+    disordered: int = 0
+    clock_steps: int = 0
+    ignored: Mapping[str, int] = field(default_factory=dict)
+    found: str = ""
 
     def notices(self) -> list[str]:
         """Return what a user should know, one short text each; empty if the log is whole and sound."""
@@ -99,8 +126,11 @@ class RecordingReport:
             "{} error frames": self.error_frames,
             "{} frames out of order, sorted": self.disordered,
             f"the clock was set {{}} times, each step became a gap of {CLOCK_GAP_S:g} s": self.clock_steps,
+            f"{{}} frames of other buses ignored ({', '.join(self.ignored)})": sum(self.ignored.values()),
         }
-        return [Notice(text=text, counts=(count,)) for text, count in texts.items() if count]
+        found = self.found.replace("{", "{{").replace("}", "}}")
+        told = [Notice(text=f"{{}} rows, {found}", counts=(self.frames,))] if found else []
+        return [*told, *(Notice(text=text, counts=(count,)) for text, count in texts.items() if count)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,12 +158,12 @@ def read_drive(path: Path, database: VehicleDatabase, *, vehicle: str, name: str
 
 
 def read_recording(path: Path, database: VehicleDatabase, *, vehicle: str, name: str) -> Recording:
-    """Read a log as a drive with its account.
+    """Read a log or a table as a drive with its account.
 
     Parameters
     ----------
     path : Path
-        Log file of any format of :mod:`calibrator.recordings.frames`.
+        Log of any format of :mod:`calibrator.recordings.frames`, or table of :mod:`calibrator.recordings.tables`.
     database : VehicleDatabase
         DBC and layout.
     vehicle, name : str
@@ -151,100 +181,278 @@ def read_recording(path: Path, database: VehicleDatabase, *, vehicle: str, name:
     DatabaseError
         If a signal of the layout cannot be decoded.
     """
+    if is_table(path):
+        return drive_from_table(read_table(path), database, vehicle=vehicle, name=name)
     return drive_from_frames(read_frames(path), database, vehicle=vehicle, name=name, where=str(path))
 
 
 def drive_from_frames(frames: Frames, database: VehicleDatabase, *, vehicle: str, name: str, where: str) -> Recording:
     """Decode frames as a drive; as :func:`read_recording`, with `where` to name the source in messages."""
-    source = _Source(frames, database, where)
-    layout = database.layout
+    return _recording(FrameSource(frames, database, where), vehicle, name)
+
+
+def drive_from_table(table: Table, database: VehicleDatabase, *, vehicle: str, name: str) -> Recording:
+    """Take the columns of a table as a drive; as :func:`read_recording`."""
+    return _recording(TableSource(table, database), vehicle, name)
+
+
+def _recording(source: "Source", vehicle: str, name: str) -> Recording:
+    layout = source.database.layout
     branches = {branch.name: source.branch(branch, branch.source) for branch in layout.branch}
     if not any(channel.time_s.size for channel in branches.values()):
-        raise LogError(f"{where}: no branch of {layout.path} in this log; {source.found_and_expected()}")
+        raise LogError(f"{source.where}: no branch of {layout.path} in it; {source.found_and_expected()}")
     inputs = {item.name: source.channel(item.signal) for item in layout.input}
     corrected = {branch.name: source.branch(branch, branch.corrected) for branch in layout.branch if branch.corrected}
     signals = {branch.name: branch.source for branch in layout.branch} | {i.name: i.signal for i in layout.input}
-    report = RecordingReport(
-        channels=tuple(_channel_report(key, signals[key], c) for key, c in (branches | inputs).items()),
-        frames=len(frames),
-        error_frames=frames.error_frames,
-        remote_frames=frames.remote_frames,
-        damaged=frames.damaged,
-        disordered=source.time.disordered,
-        clock_steps=source.time.clock_steps,
-    )
+    channels = tuple(_channel_report(key, signals[key], c) for key, c in (branches | inputs).items())
     available = {key: channel for key, channel in inputs.items() if channel.good.any()}
     drive = Drive(vehicle=vehicle, name=name, branches=_present(branches), inputs=available)
-    return Recording(drive=drive, corrected=_present(corrected), report=report)
+    return Recording(drive=drive, corrected=_present(corrected), report=source.report(channels))
 
 
-class _Source:
-    """Frames in the order of time, with the look-ups that turn them into channels."""
+class Source(ABC):
+    """A recording in the order of time, with the look-ups that turn it into channels.
 
-    def __init__(self, frames: Frames, database: VehicleDatabase, where: str) -> None:
-        self.time = repaired_time(frames.time_ns)
-        self._frames = frames.take(self.time.order) if self.time.disordered or self.time.clock_steps else frames
-        self._database = database
-        self._where = where
-        self._messages: dict[str, tuple[Frames, Array, Mask]] = {}
+    Attributes
+    ----------
+    database : VehicleDatabase
+        DBC and layout.
+    where : str
+        The file, for messages.
+    """
 
+    def __init__(self, database: VehicleDatabase, where: str) -> None:
+        self.database = database
+        self.where = where
+
+    @abstractmethod
     def channel(self, signal_name: str) -> Channel:
-        """One signal in the unit of the DBC, at the frames that carry it."""
-        message, signal = self._database.signal(signal_name)
-        frames, time_s, unspoilt = self._of_message(message)
-        no_value = codes_of_no_value(self._database, signal_name)
-        decoded = decode_signal(message, signal, frames.data, frames.length, no_value)
-        kept = decoded.present
-        return Channel(time_s=time_s[kept], value=decoded.value[kept], good=(decoded.good & unspoilt)[kept])
+        """One signal in the unit of the DBC, at the frames or rows that carry it."""
 
-    def scaled(self, signal_name: str, units: Mapping[str, float], branch: Branch) -> Channel:
-        """One signal in A, V or W."""
-        _, signal = self._database.signal(signal_name)
-        factor = unit_factor(signal, units, f"{self._database.layout.path}: branch {branch.name}")
-        channel = self.channel(signal_name)
-        return Channel(time_s=channel.time_s, value=channel.value * factor, good=channel.good)
+    @abstractmethod
+    def bad(self, signal_name: str) -> Mapping[str, Mask]:
+        """Why samples of :meth:`channel` may not be used, by reason; what has no reason is good."""
+
+    @abstractmethod
+    def unit(self, signal_name: str) -> str:
+        """Unit of a signal; empty where nobody says it."""
+
+    @abstractmethod
+    def found_and_expected(self) -> str:
+        """What the recording has and what the branches need, for a message."""
+
+    @abstractmethod
+    def report(self, channels: tuple[ChannelReport, ...]) -> RecordingReport:
+        """The account of the recording."""
 
     def branch(self, branch: Branch, signal_name: str) -> Channel:
         """One branch, measured or corrected, as a current positive into the junction.
 
-        The signal is a current, or a power if the branch is one.
+        The signal is a current, or a power if the branch is one; of a computed branch it is the formula.
         """
+        if branch.formula is not None:
+            return self._computed(branch, branch.formula)
         if branch.power is None or branch.voltage is None:
-            current = self.scaled(signal_name, AMPERE, branch)
+            current = self._scaled(signal_name, AMPERE, branch)
             return Channel(time_s=current.time_s, value=branch.sign * current.value, good=current.good)
-        power = self.scaled(signal_name, WATT, branch)
-        voltage = self.scaled(branch.voltage, VOLT, branch)
+        power = self._scaled(signal_name, WATT, branch)
+        voltage = self._scaled(branch.voltage, VOLT, branch)
         held_v, fresh = _held(voltage, power.time_s, branch.timeout_s)
         good = power.good & fresh & (held_v != 0.0)
         value = np.divide(branch.sign * power.value, held_v, out=np.full(len(held_v), np.nan), where=good)
         return Channel(time_s=power.time_s, value=value, good=good & np.isfinite(value))
 
-    def found_and_expected(self) -> str:
-        """Identifiers of the log and of the branches, for a message."""
-        expected = [self._database.signal(branch.source)[0] for branch in self._database.layout.branch]
-        texts = [f"{message.name} ({_hex(_key(message))})" for message in expected]
-        keys = np.unique(self._frames.key).tolist()
+    def _scaled(self, signal_name: str, units: Mapping[str, float], branch: Branch) -> Channel:
+        """One signal in A, V or W."""
+        channel = self.channel(signal_name)
+        where = f"{self.database.layout.path}: branch {branch.name}"
+        factor = factor_of(self.unit(signal_name), units, f"{where}: {signal_name}")
+        return Channel(time_s=channel.time_s, value=channel.value * factor, good=channel.good)
+
+    def _computed(self, branch: Branch, formula: str) -> Channel:
+        """A branch by its formula, at the instants of what comes most often in it."""
+        layout, tree = self.database.layout, parse_formula(formula)
+        signals = {item.name: item.signal for item in layout.input}
+        channels = {name: self.channel(signals.get(name, name)) for name in base_inputs(layout, formula_names(tree))}
+        if not channels or not all(channel.good.any() for channel in channels.values()):
+            return Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_))
+        time_s = max(channels.values(), key=lambda channel: len(channel.time_s)).time_s
+        values, good = {}, np.ones(len(time_s), np.bool_)
+        for name, channel in channels.items():
+            values[name], known = at_instants(channel, time_s, branch.timeout_s)
+            good &= known
+        for item in layout.derived:
+            if base_inputs(layout, [item.name]) <= values.keys():
+                values[item.name] = evaluate_formula(parse_formula(item.formula), values)
+        value = branch.sign * evaluate_formula(tree, values)
+        return Channel(time_s=time_s, value=value, good=good & np.isfinite(value))
+
+
+class FrameSource(Source):
+    """Frames of a log.
+
+    Attributes
+    ----------
+    frames : Frames
+        In the order of time.
+    time : LogTime
+        Their times, and what was repaired.
+    ignored : dict of str to int
+        Frames looked at and left out as they come from another bus, by channel.
+    """
+
+    def __init__(self, frames: Frames, database: VehicleDatabase, where: str) -> None:
+        super().__init__(database, where)
+        self.time = repaired_time(frames.time_ns)
+        self.frames = frames.take(self.time.order) if self.time.disordered or self.time.clock_steps else frames
+        self._messages: dict[str, tuple[Frames, Array, Mask]] = {}
+        self.ignored: Counter[str] = Counter()
+        if database.layout.bus:
+            known = {bus.channel for bus in database.layout.bus}
+            counts = np.bincount(frames.channel, minlength=len(frames.channels)).tolist()
+            found = zip(frames.channels, counts, strict=True)
+            self.ignored.update({channel: count for channel, count in found if channel not in known and count})
+
+    def channel(self, signal_name: str) -> Channel:  # noqa: D102 (as above)
+        message, signal = self.database.signal(signal_name)
+        frames, time_s, unspoilt = self._of_message(signal_name)
+        no_value = codes_of_no_value(self.database, signal_name)
+        decoded = decode_signal(message, signal, frames.data, frames.length, no_value)
+        kept = decoded.present
+        return Channel(time_s=time_s[kept], value=decoded.value[kept], good=(decoded.good & unspoilt)[kept])
+
+    def bad(self, signal_name: str) -> Mapping[str, Mask]:  # noqa: D102 (as above)
+        message, signal = self.database.signal(signal_name)
+        frames, _, unspoilt = self._of_message(signal_name)
+        no_value = codes_of_no_value(self.database, signal_name)
+        kept = decode_signal(message, signal, frames.data, frames.length, no_value).present
+        reasons = bad_values(message, signal, frames.data, frames.length, no_value)
+        return {reason: mask[kept] for reason, mask in {"E2E check failed": ~unspoilt, **reasons}.items()}
+
+    def unit(self, signal_name: str) -> str:  # noqa: D102 (as above)
+        return self.database.signal(signal_name)[1].unit or ""
+
+    def found_and_expected(self) -> str:  # noqa: D102 (as above)
+        names = [branch.source for branch in self.database.layout.branch if not branch.computed]
+        messages = [self.database.signal(name)[0] for name in names]
+        expected = ", ".join(dict.fromkeys(f"{message.name} ({_hex(_key(message))})" for message in messages))
+        wanted = [f" on {', '.join(names)}" if self.database.layout.bus else "" for names in self._channels()]
+        keys = np.unique(self.frames.key).tolist()
         more = f" and {len(keys) - _MOST_LISTED} more" if len(keys) > _MOST_LISTED else ""
         return (
-            f"it has the identifiers {', '.join(map(_hex, keys[:_MOST_LISTED]))}{more}; expected "
-            f"{', '.join(dict.fromkeys(texts))}; check that layout and log belong to the same vehicle and bus"
+            f"it has the identifiers {', '.join(map(_hex, keys[:_MOST_LISTED]))}{more}{wanted[0]}; expected "
+            f"{expected or 'signals of the inputs'}{wanted[1]}; check that layout and log belong to the same vehicle "
+            f"and bus"
         )
 
-    def _of_message(self, message: Message) -> tuple[Frames, Array, Mask]:
-        """Frames of a message, their times, and whether their end-to-end protection is right."""
-        if message.name not in self._messages:
-            index = np.flatnonzero(self._frames.key == np.uint32(_key(message)))
-            frames = self._frames.take(index)
-            buses = np.unique(frames.channel)
-            if len(buses) > 1:
-                names = ", ".join(frames.channels[bus] for bus in buses)
+    def _channels(self) -> tuple[Sequence[str], Sequence[str]]:
+        """Channels of the log, and of the layout."""
+        return self.frames.channels, [bus.channel for bus in self.database.layout.bus]
+
+    def report(self, channels: tuple[ChannelReport, ...]) -> RecordingReport:  # noqa: D102 (as above)
+        return RecordingReport(
+            channels=channels,
+            frames=len(self.frames),
+            error_frames=self.frames.error_frames,
+            remote_frames=self.frames.remote_frames,
+            damaged=self.frames.damaged,
+            disordered=self.time.disordered,
+            clock_steps=self.time.clock_steps,
+            ignored=dict(self.ignored),
+        )
+
+    def _of_message(self, signal_name: str) -> tuple[Frames, Array, Mask]:
+        """Frames of the message of a signal, their times, and whether their end-to-end protection is right."""
+        name = split_signal(signal_name)[0]
+        if name not in self._messages:
+            message = self.database.message(name)
+            index = np.flatnonzero(self.frames.key == np.uint32(_key(message)))
+            index = index[self._is_of_bus(name, self.frames.channel[index])]
+            frames = self.frames.take(index)
+            unspoilt = message_is_sound(self.database, message, frames.data, frames.length)
+            self._messages[name] = (frames, self.time.time_s[index], unspoilt)
+        return self._messages[name]
+
+    def _is_of_bus(self, name: str, channel: NDArray[np.uint32]) -> Mask:
+        """Which frames of a message come from the bus that the layout names, or from the one that has nearly all."""
+        channels, wanted = self.frames.channels, self.database.channel_of(name)
+        if wanted is not None:
+            return np.asarray(channel == (channels.index(wanted) if wanted in channels else len(channels)))
+        counts = np.bincount(channel, minlength=len(channels))
+        main = int(np.argmax(counts))
+        if counts.sum() - counts[main] > MOST_STRAY * counts.sum():
+            names = ", ".join(f"{bus} {count}" for bus, count in zip(channels, counts, strict=True) if count)
+            raise LogError(
+                f"{self.where}: {name} comes on several buses (frames: {names}), as if from two sensors; in the layout "
+                f'write [[bus]] with name = "hv", channel = "{channels[main]}", dbc = "{self.database.layout.dbc}" in '
+                f"place of dbc"
+            )
+        strays = {bus: count for bus, count in zip(channels, counts.tolist(), strict=True) if bus != channels[main]}
+        self.ignored.update({bus: count for bus, count in strays.items() if count})
+        return np.asarray(channel == main)
+
+
+class TableSource(Source):
+    """Columns of a table; with a DBC they may be called ``Message.Signal`` or ``Signal``."""
+
+    def __init__(self, table: Table, database: VehicleDatabase) -> None:
+        super().__init__(database, str(table.path))
+        self.table = table
+        layout = database.layout
+        names = {name for item in layout.branch for name in (item.signal, item.power, item.voltage) if name is not None}
+        owners: dict[str, str] = {}
+        for name in sorted(names | {item.signal for item in layout.input}):
+            header = table.header(name)
+            if header is not None and owners.setdefault(header, name) != name:
                 raise LogError(
-                    f"{self._where}: {message.name} comes on {len(buses)} buses ({names}); "
-                    f"leave one bus in the log, else two sensors are mixed"
+                    f"{table.path}: column {header!r} could be {owners[header]} and {name}; call columns after message "
+                    f"and signal"
                 )
-            unspoilt = message_is_sound(self._database, message, frames.data, frames.length)
-            self._messages[message.name] = (frames, self.time.time_s[index], unspoilt)
-        return self._messages[message.name]
+
+    def channel(self, signal_name: str) -> Channel:  # noqa: D102 (as above)
+        return self._column(signal_name)[0]
+
+    def bad(self, signal_name: str) -> Mapping[str, Mask]:  # noqa: D102 (as above)
+        return self._column(signal_name)[1]
+
+    def unit(self, signal_name: str) -> str:  # noqa: D102 (as above)
+        unit = self.database.signal(signal_name)[1].unit
+        return unit or self.table.units.get(self.table.header(signal_name) or "", "")
+
+    def found_and_expected(self) -> str:  # noqa: D102 (as above)
+        expected = ", ".join(repr(branch.source) for branch in self.database.layout.branch)
+        return f"{self.table.known(self.database.layout.branch[0].source)}; expected {expected}"
+
+    def report(self, channels: tuple[ChannelReport, ...]) -> RecordingReport:  # noqa: D102 (as above)
+        return RecordingReport(
+            channels=channels,
+            frames=len(self.table.time_s),
+            damaged=self.table.without_time,
+            disordered=self.table.disordered,
+            clock_steps=self.table.clock_steps,
+            found=self.table.found,
+        )
+
+    def _column(self, signal_name: str) -> tuple[Channel, dict[str, Mask]]:
+        """A column in the unit of the DBC where both units are known, and why samples may not be used."""
+        header = self.table.header(signal_name)
+        if header is None:
+            return Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_)), {}
+        signal = self.database.signal(signal_name)[1]
+        value = self.table.columns[header] * _ratio(self.table.units.get(header, ""), signal.unit or "")
+        text = self.table.bad.get(header, np.zeros(len(value), np.bool_))
+        kept = np.isfinite(value) | text
+        reasons = {"no number": text[kept], "out of range": (~text & ~signal_range(signal).holds(value))[kept]}
+        good = ~np.logical_or.reduce(list(reasons.values()))
+        return Channel(time_s=self.table.time_s[kept], value=value[kept], good=good), reasons
+
+
+def _ratio(unit: str, wanted: str) -> float:
+    """Factor from one unit to another of the same quantity; 1 where that is not known."""
+    for known in (AMPERE, VOLT, WATT):
+        if unit in known and usual_unit(wanted) in known:
+            return known[unit] / known[usual_unit(wanted)]
+    return 1.0
 
 
 def _held(channel: Channel, time_s: Array, max_age_s: float) -> tuple[Array, Mask]:

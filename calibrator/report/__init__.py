@@ -1,1 +1,1 @@
-"""Pages that show a result: one of the whole fleet, and one of each vehicle. HTML files that need nothing else."""
+"""The page that shows a result: one HTML file of the whole fleet, or of one vehicle, that needs nothing else."""

@@ -1,18 +1,4 @@
-"""What the battery's protection margin costs before and after correction, figure 1 of [1]_.
-
-A controller that may let a current limit I flow must stay below it by what its sensor can be wrong by, or the true
-current passes the limit. By the model i_m = (1 + d) i + o it is off by |d| I + |o| at the limit in one direction
-or the other, and a margin that is one for all vehicles is set for the worst sensor of the fleet:
-
-    as measured:       M = worst of |d| I + |o|
-    after correction:  z s where the branch is corrected or no fault was found, else |d| I + |o| + z s; at most M
-    s^2 = (I s_d)^2 + s_o^2
-
-with d, o and their standard deviations s_d, s_o from the posterior. Its doubt counts only against the correction, so
-what is given back is not made larger by what is not known. With one margin for all, the correction gives back the
-difference of M to the largest that is needed then, which the worst vehicle that is not corrected decides. With a
-margin per vehicle, as each has its own parameters, it gives back the difference to what the same vehicle needs where
-its sensor is known but not corrected: |d| I + |o| + z s, at most M.
+"""What the battery's protection margin costs before and after correction, figure 1 of [1]_; docs/report.md derives it.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -23,10 +9,10 @@ import numpy as np
 
 from calibrator.drive import Array, Mask
 
-__all__ = ["SIGMAS", "Margins", "margins"]
+__all__ = ["SIGMAS", "Margins", "Protection", "margins", "protection_of"]
 
 SIGMAS = 3.0
-"""z: standard deviations that a margin covers beyond the estimate; 1 in 370 is beyond if errors are Gaussian. [1]"""
+"""Standard deviations that a margin covers beyond the estimate; 1 in 370 is beyond if errors are Gaussian. [1]"""
 QUANTILE = 0.999
 """Share of the fleet that one margin for all must cover; of fewer than a thousand vehicles all of them. [1]"""
 
@@ -40,9 +26,9 @@ class Margins:
     limit_a : float
         The battery's current limit I. [A]
     before_a : ndarray of shape (N,)
-        What each sensor is off by at the limit. [A]
+        Error of each sensor at the limit. [A]
     known_a, after_a : ndarray of shape (N,)
-        Margin that each vehicle needs where its sensor is known but not corrected; and after correction. [A]
+        Margin of each vehicle where its sensor is known but not corrected; and after correction. [A]
     """
 
     limit_a: float
@@ -69,7 +55,7 @@ class Margins:
 def margins(
     drift: Array, offset_a: Array, drift_sd: Array, offset_sd_a: Array, applied: Mask, *, limit_a: float
 ) -> Margins:
-    """Margins of one branch.
+    """Margins of one branch of N vehicles.
 
     Parameters
     ----------
@@ -79,22 +65,68 @@ def margins(
         Whether the node corrects the branch.
     limit_a : float
         Current limit I. [A]
-
-    Returns
-    -------
-    Margins
-        Before and after correction.
     """
-    doubt_a = SIGMAS * np.hypot(limit_a * drift_sd, offset_sd_a)
-    off_a = np.abs(drift) * limit_a + np.abs(offset_a)
-    worst_a = _for_all(off_a)
+    uncertain_a = SIGMAS * np.hypot(limit_a * drift_sd, offset_sd_a)
+    error_a = np.abs(drift) * limit_a + np.abs(offset_a)
+    worst_a = _for_all(error_a)
     return Margins(
         limit_a=limit_a,
-        before_a=off_a,
-        known_a=np.minimum(off_a + doubt_a, worst_a),
-        after_a=np.minimum(np.where(applied, doubt_a, off_a + doubt_a), worst_a),
+        before_a=error_a,
+        known_a=np.minimum(error_a + uncertain_a, worst_a),
+        after_a=np.minimum(np.where(applied, uncertain_a, error_a + uncertain_a), worst_a),
     )
 
 
 def _for_all(needed_a: Array) -> float:
     return float(np.max(needed_a) if len(needed_a) * (1.0 - QUANTILE) < 1.0 else np.quantile(needed_a, QUANTILE))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protection:
+    """Battery protection margin before and after correction.
+
+    Attributes
+    ----------
+    branch : str
+        The battery's.
+    limit_a, voltage_v : float, float or None
+        Current limit, and the voltage that makes kW of A. [A], [V]
+    common_before_a, common_after_a : float
+        One margin for all vehicles. [A]
+    corrected : int
+        Vehicles of which the branch is corrected.
+    common_gain_a, own_gain_a : float, float or None
+        What the correction gives back: with one margin for all; and with a margin per vehicle, the median of the
+        vehicles that are corrected, None if there is none. [A]
+    common_gain_kw, own_gain_kw : float or None
+        The same at the voltage. [kW]
+    """
+
+    branch: str
+    limit_a: float
+    voltage_v: float | None
+    common_before_a: float
+    common_after_a: float
+    corrected: int
+    common_gain_a: float
+    own_gain_a: float | None
+    common_gain_kw: float | None
+    own_gain_kw: float | None
+
+
+def protection_of(found: Margins, corrected: Mask, *, branch: str, voltage_v: float | None) -> Protection:
+    """Summarise the margins of a fleet; `corrected`, shape (N,), are the vehicles of which the branch is corrected."""
+    common_a = found.common_before_a - found.common_after_a
+    own_a = float(np.median(found.own_gain_a[corrected])) if corrected.any() else None
+    return Protection(
+        branch=branch,
+        limit_a=found.limit_a,
+        voltage_v=voltage_v,
+        common_before_a=found.common_before_a,
+        common_after_a=found.common_after_a,
+        corrected=int(corrected.sum()),
+        common_gain_a=common_a,
+        own_gain_a=own_a,
+        common_gain_kw=None if voltage_v is None else common_a * voltage_v / 1e3,
+        own_gain_kw=None if voltage_v is None or own_a is None else own_a * voltage_v / 1e3,
+    )

@@ -16,6 +16,7 @@ from calibrator.signing.key_files import PASSPHRASE_VARIABLE, new_key, read_publ
 from calibrator.signing.numbers import require_near_number, signing_time, time_text
 from calibrator.signing.orders import Order
 from calibrator.signing.statements import signed_statement
+from calibrator.terminal.command_line import example
 from calibrator.terminal.options import JsonOption, whole_option
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps
@@ -40,7 +41,7 @@ keys = typer.Typer(help="Keys of signers, and the set of them that vehicles trus
 
 KeyOption = Annotated[
     list[Path],
-    typer.Option("--key", help=f"Private key of a signer; repeat for several. Its passphrase: ${PASSPHRASE_VARIABLE}."),
+    typer.Option("--key", metavar="PATH", help=f"Private key of a signer. Its passphrase: ${PASSPHRASE_VARIABLE}."),
 ]
 OutFileOption = Annotated[Path, typer.Option("--out", help="File to write.")]
 _SEQUENCE = "Number, above all that the vehicle accepted (default: time in seconds, UTC)"
@@ -50,12 +51,10 @@ FarOption = Annotated[
         "--far-sequence", help="The number may be far above the time, as where the vehicle took such a one by mistake."
     ),
 ]
-RevokedOption = Annotated[
-    list[int], whole_option("--number", 1, LAST_SEQUENCE, "Number that was signed, repeat for several")
-]
+RevokedOption = Annotated[list[int], whole_option("--number", 1, LAST_SEQUENCE, "Number that was signed")]
 
 
-@keys.command("new")
+@keys.command("new", epilog=example("calibrator keys new alice --out keys"))
 def new(
     name: Annotated[str, typer.Argument(help="Name of the signer.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for NAME.key (private) and NAME.pub.")],
@@ -77,7 +76,7 @@ def new(
     _tell({"signer": name, "private_key": str(private), "public_key": str(public)}, made, json=json)
 
 
-@keys.command("set")
+@keys.command("set", epilog=example("calibrator keys set keys/alice.pub keys/bob.pub --threshold 2 --out keys/set"))
 def make_set(
     public: Annotated[list[Path], typer.Argument(help="Public keys (NAME.pub) of all signers.")],
     threshold: Annotated[int, whole_option("--threshold", 1, MOST_SIGNERS, "So many of them must sign")],

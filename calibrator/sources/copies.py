@@ -5,16 +5,16 @@ recordings of a car are: noise and time stamps differ. Of one that two vehicles 
 neither is calibrated with it. Copies of a drive that different versions of this program stored are not recognised.
 """
 
-import gzip
 import hashlib
 import io
-import zlib
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 from calibrator.drive import DriveFile
-from calibrator.drives.drive_file import drive_digest, drive_outline
+from calibrator.drives.drive_file import drive_digest, drive_outline, is_drive_file
+from calibrator.recordings.log_files import UNREADABLE, opened, readable
 from calibrator.sources.fleet_source import FleetSource
 from ecu_node.errors import UserError
 
@@ -23,7 +23,7 @@ __all__ = ["without_copies"]
 _HEAD_BYTES = 1 << 16
 """Looked at before a whole log is: where the noise differs, it does so here."""
 WHOSE = "it cannot be told whose it is: remove it where it does not belong"
-_UNREADABLE = (UserError, OSError, EOFError, zlib.error)
+_UNREADABLE = (UserError, *UNREADABLE)
 """What a damaged file may raise; whoever reads the drive tells of it."""
 
 
@@ -81,9 +81,9 @@ def _groups(entries: Iterable[DriveFile], key: Callable[[Path], Hashable]) -> li
 
 def _outline(path: Path) -> Hashable:
     """What is quickly seen of a recording; it differs between different ones, as a rule."""
-    if path.suffix == ".parquet":
+    if is_drive_file(path):
         return drive_outline(path)
-    with _unpacked(path) as file:
+    with readable(path) as copy, opened(copy) as file:
         head = file.read(_HEAD_BYTES)
     if not head:
         raise EOFError  # an empty log is no recording
@@ -92,11 +92,7 @@ def _outline(path: Path) -> Hashable:
 
 def _digest(path: Path) -> Hashable:
     """What tells a recording from all others."""
-    if path.suffix == ".parquet":
+    if is_drive_file(path):
         return drive_digest(path)
-    with _unpacked(path) as file:
-        return hashlib.file_digest(file, "blake2b").digest()
-
-
-def _unpacked(path: Path) -> io.BufferedIOBase:
-    return gzip.open(path) if path.name.lower().endswith(".gz") else path.open("rb")
+    with readable(path) as copy, opened(copy) as file:
+        return hashlib.file_digest(cast("io.BufferedIOBase", file), "blake2b").digest()

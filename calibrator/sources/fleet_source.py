@@ -10,7 +10,7 @@ from pathlib import Path
 
 from calibrator.drive import Drive, DriveFile
 from calibrator.drives.align import choose_inputs
-from calibrator.drives.drive_file import read_drive_file
+from calibrator.drives.drive_file import is_drive_file, read_drive_file
 from calibrator.drives.fleet_id import read_fleet_ids
 from calibrator.drives.store import list_drives
 from calibrator.errors import FleetError
@@ -99,9 +99,8 @@ def find_fleet(path: Path) -> FleetSource:
     FleetError
         If there is no drive at all.
     """
-    if not path.is_dir():
-        what = "is a file" if path.is_file() else "no such folder"
-        raise FleetError(f"{path}: {what}; give a drive store or a folder with one folder of logs per vehicle")
+    if not path.exists():
+        raise FleetError(f"{path}: no such file or folder; give a log, a drive store, or a folder with logs")
     left_out: dict[str, str] = {}
     folder = path
     if (path / STORE_FOLDER).is_dir():
@@ -115,7 +114,8 @@ def find_fleet(path: Path) -> FleetSource:
         raise FleetError(f"{path}: no drive in it{few_reasons(left_out)}")
     entries.sort(key=lambda entry: (entry.vehicle, entry.name))
     vehicles = {vehicle: tuple(group) for vehicle, group in groupby(entries, key=lambda entry: entry.vehicle)}
-    return FleetSource(path=path, vehicles=vehicles, left_out=left_out, fleet_ids=read_fleet_ids(folder))
+    ids = read_fleet_ids(path.parent if path.is_file() else folder)
+    return FleetSource(path=path, vehicles=vehicles, left_out=left_out, fleet_ids=ids)
 
 
 def load_drive(entry: DriveFile, database: VehicleDatabase) -> Drive:
@@ -138,13 +138,19 @@ def load_drive(entry: DriveFile, database: VehicleDatabase) -> Drive:
     UserError
         If the file cannot be used; the message names it.
     """
-    if entry.path.suffix == ".parquet":
+    if is_drive_file(entry.path):
         return read_drive_file(entry.path, database.layout)
     return read_drive(entry.path, database, vehicle=entry.vehicle, name=entry.name)
 
 
 def probe_equipment(
-    fleet: FleetSource, database: VehicleDatabase, branches: Sequence[str] | None, *, limit_s: float = TIME_LIMIT_S
+    fleet: FleetSource,
+    database: VehicleDatabase,
+    branches: Sequence[str] | None,
+    *,
+    limit_s: float = TIME_LIMIT_S,
+    modelled: bool = True,
+    drives: Sequence[Drive] = (),
 ) -> Equipment:
     """Learn from some vehicles which branches and inputs the fleet has.
 
@@ -160,11 +166,15 @@ def probe_equipment(
         Different branches to use instead of those found.
     limit_s : float
         Longest time for one drive. [s]
+    modelled : bool
+        Whether the branches are modelled from inputs, as those of a fleet are.
+    drives : sequence of Drive
+        One of each vehicle to look at, if they were read already.
 
     Returns
     -------
     Equipment
-        At least two branches and one input.
+        At least two branches, and one input if they are modelled.
 
     Raises
     ------
@@ -174,25 +184,28 @@ def probe_equipment(
         If a branch is asked for that the layout does not have.
     """
     layout = database.layout
-    drives, errors = _probed(fleet, database, limit_s)
-    if not drives:
+    names, errors = [_names_in(drive) for drive in drives], list[str]()
+    if not names:
+        names, errors = _probed(fleet, database, limit_s)
+    if not names:
         raise FleetError(
             f"{fleet.path}: none of the first {len(errors)} vehicles can be read; the first says: {errors[0]}"
         )
-    seen = Counter(name for drive in drives for name in drive.branches)
-    found = [name for name in layout.branch_names if 2 * seen[name] > len(drives)]
+    seen = Counter(name for each in names for name in each.branches)
+    found = [name for name in layout.branch_names if 2 * seen[name] > len(names)]
     if branches is not None and len(branches) < 2:
         raise FleetError(
             f"--branches {','.join(branches)}: a junction has two branches or more; name all that are measured, or "
             f"leave --branches out"
         )
     chosen = _distinct(branches, layout) if branches is not None else tuple(found)
-    available = {name for drive in drives for name in drive.inputs}
-    inputs, missing_inputs = choose_inputs(layout, available)
-    fleet_inputs, _ = choose_inputs(layout, available, names=layout.fleet_inputs or layout.model_inputs)
+    available = {name for each in names for name in each.inputs}
+    inputs, missing_inputs = choose_inputs(layout, available) if modelled else ((), ())
+    wanted = layout.fleet_inputs or layout.model_inputs
+    fleet_inputs = choose_inputs(layout, available, names=wanted)[0] if modelled else ()
     if len(chosen) < 2:
         raise FleetError(f"{fleet.path}: branches found: {', '.join(chosen) or 'none'}; a junction needs two or more")
-    if not inputs:
+    if modelled and not inputs:
         raise FleetError(f"{fleet.path}: none of the model inputs of {layout.path} was recorded")
     texts = {
         "branches not recorded, taken as not fitted": [b for b in layout.branch_names if b not in {*found, *chosen}],
@@ -237,4 +250,8 @@ def _names(entry: DriveFile, database: VehicleDatabase) -> _Names | str:
         drive = load_drive(entry, database)
     except UserError as error:
         return str(error)
+    return _names_in(drive)
+
+
+def _names_in(drive: Drive) -> _Names:
     return _Names(branches=tuple(drive.branches), inputs=tuple(drive.inputs))

@@ -13,9 +13,8 @@ from calibrator.processes.messages import Unread
 from calibrator.processes.reading import TIME_LIMIT_S, read_in_processes
 from calibrator.recordings.readers import read_recording
 from calibrator.sources.logs import find_logs
-from calibrator.terminal.notices import Notice, merged_notices
 from calibrator.terminal.progress import progress_bar
-from calibrator.terminal.text import dumps, left_out_text, table
+from calibrator.terminal.text import Notice, dumps, left_out_text, merged_notices, table
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 
@@ -110,7 +109,7 @@ def import_logs(
 def _note_fleets(store: Path, logs: Sequence[DriveFile]) -> None:
     """Carry over which artificial fleets the logs are of."""
     folders = {log.path.resolve().parent.parent for log in logs}
-    fleet_ids = read_fleet_ids(store).union(*map(read_fleet_ids, folders))
+    fleet_ids = read_fleet_ids(store).union(*(read_fleet_ids(folder) for folder in folders if folder.is_dir()))
     if fleet_ids:
         write_fleet_ids(store, fleet_ids)
 

@@ -1,9 +1,9 @@
 """Which log belongs to which vehicle.
 
 The rule: a log belongs to the vehicle that its folder is named after, and the drive has the name of the file without
-its suffixes: ``FLEET/logs/V0001/monday.log.gz`` is drive ``monday`` of vehicle ``V0001``. Folders are searched for logs
-at any depth. Logs that lie beside the folders of vehicles, vehicles whose name stands for two folders, and drives that
-two files claim, are left out and named.
+its suffixes: ``FLEET/logs/V0001/monday.log.gz`` is drive ``monday`` of vehicle ``V0001``. Folders and ``.zip`` archives
+are searched for logs at any depth; an archive stands for a folder of its name. Logs that lie beside the folders of
+vehicles, vehicles whose name stands for two folders, and drives that two files claim, are left out and named.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,6 +14,7 @@ from calibrator.drive import DriveFile
 from calibrator.drives.plain_names import require_plain_name
 from calibrator.errors import LogError
 from calibrator.recordings.frames import LOG_SUFFIXES, is_log
+from calibrator.recordings.log_files import files_in
 from ecu_node.errors import UserError
 
 __all__ = ["LogSources", "find_logs"]
@@ -74,13 +75,14 @@ def find_logs(arguments: Iterable[Path]) -> LogSources:
 
 
 def _logs_of(argument: Path) -> list[Path]:
-    if argument.is_file():
-        return [argument]
-    if not argument.is_dir():
+    if not argument.exists():
         raise LogError(f"{argument}: no such file or folder; give logs that are there")
-    paths = sorted(path for path in argument.rglob("*") if path.is_file() and is_log(path))
+    if argument.is_file() and argument.suffix.lower() != ".zip":
+        return [argument]
+    inside = [inner for path in files_in(argument) for inner in files_in(path) or [path]]
+    paths = [path for path in inside if is_log(path)]
     if not paths:
-        raise LogError(f"{argument}: no logs in this folder; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
+        raise LogError(f"{argument}: no logs in it; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
     return paths
 
 
@@ -93,7 +95,7 @@ def _stray(path: Path) -> LogError:
 
 def _source(path: Path) -> DriveFile:
     name = path.name.removesuffix(".gz")
-    vehicle = path.resolve().parent.name
+    vehicle = path.resolve().parent.name.removesuffix(".zip")
     require_plain_name(vehicle, f"{path}: the folder's name, which names the vehicle,")
     require_plain_name(Path(name).stem, f"{path}: the file's name, which names the drive,")
     return DriveFile(vehicle=vehicle, name=Path(name).stem, path=path)

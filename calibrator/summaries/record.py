@@ -15,6 +15,7 @@ from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
 from calibrator.drives.plain_names import require_plain_name
 from calibrator.errors import DriveError
+from calibrator.recordings.log_files import file_on_disk
 from calibrator.summaries.vehicle_summary import LEAST_DURATION_S, VehicleSummary
 from calibrator.summaries.zero_current import ZeroCurrent, weighted_mean
 from calibrator.terminal.text import counted
@@ -97,7 +98,7 @@ def drives_digest(records: Sequence[Record]) -> str:
 def source_version(path: Path) -> str:
     """Size and time of the last change of a drive's file; empty if there is no such file."""
     try:
-        status = path.stat()
+        status = file_on_disk(path).stat()
     except OSError:
         return ""
     return f"{status.st_size}-{status.st_mtime_ns}"

@@ -35,12 +35,15 @@ class Summariser:
         Number of branches K.
     settling : int
         Samples after the start of a drive that are not used, if they are more than the bank needs.
+    block_s : float
+        Length of a block. [s]
     """
 
-    def __init__(self, bank: FilterBank, *, branches: int, settling: int = 0) -> None:
+    def __init__(self, bank: FilterBank, *, branches: int, settling: int = 0, block_s: float = BLOCK_S) -> None:
         self.bank = bank
         self.branches = branches
-        self._block = max(round(BLOCK_S / bank.period_s), 1)
+        self._block_s = block_s
+        self._block = max(round(block_s / bank.period_s), 1)
         self._columns = bank.width + branches + 1
         rows = self._block * max(BATCH_SAMPLES // self._block, 1)
         self._table = np.zeros((rows, self._columns))
@@ -114,7 +117,8 @@ class Summariser:
         moments = np.concatenate([np.zeros((0, self._columns, self._columns)), *self._moments])
         if not len(moments):
             raise DriveError(
-                f"no {BLOCK_S:.0f} s of drive in which {LEAST_SHARE:.0%} of the samples are valid{self._settled()}"
+                f"no {self._block_s:.0f} s of drive in which {LEAST_SHARE:.0%} of the samples are valid"
+                f"{self._settled()}"
             )
         return DriveSummary(
             moments=moments,
@@ -199,6 +203,7 @@ def summarise(
     period_s: float,
     bank: FilterBank | None = None,
     temperatures_c: Sequence[Array] | None = None,
+    block_s: float = BLOCK_S,
 ) -> DriveSummary:
     """Summarise the drives of one vehicle.
 
@@ -212,6 +217,8 @@ def summarise(
         Filters of the inputs; None: the plain inputs.
     temperatures_c : sequence of ndarray of shape (T,), or None
         Temperature of the sensors in each drive, NaN where it is not known. [degC]
+    block_s : float
+        Length of a block. [s]
 
     Returns
     -------
@@ -225,7 +232,7 @@ def summarise(
     """
     used = plain_bank(drives[0].input_names, period_s=period_s) if bank is None else bank
     _require_fitting(used, drives, period_s)
-    summariser = Summariser(used, branches=drives[0].currents_a.shape[1])
+    summariser = Summariser(used, branches=drives[0].currents_a.shape[1], block_s=block_s)
     for number, drive in enumerate(drives):
         warm = None if temperatures_c is None else temperatures_c[number]
         summariser.add(drive.inputs, drive.currents_a, drive.valid, temperature_c=warm)

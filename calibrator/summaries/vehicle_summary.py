@@ -18,7 +18,14 @@ from calibrator.terminal.text import counted
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
-__all__ = ["VehicleSummary", "read_samples", "read_vehicle_summary", "summarise_drives"]
+__all__ = [
+    "VehicleSummary",
+    "most_moving_first",
+    "read_samples",
+    "read_vehicle_summary",
+    "require_possible",
+    "summarise_drives",
+]
 
 LEAST_DURATION_S = 120.0
 """Valid data below which a vehicle is left out: fewer than four blocks do not tell how sure anything is. [s]"""
@@ -135,8 +142,8 @@ class _AlignedDrives:
 def _aligned(drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase) -> _AlignedDrives:
     layout = database.layout
     for drive in drives:
-        _require_possible(drive, layout)
-    delays = estimate_delays(drives, _most_moving_first(drives, equipment.branches))
+        require_possible(drive, layout)
+    delays = estimate_delays(drives, most_moving_first(drives, equipment.branches))
     samples = [
         align(without_delays(drive, delays.by_branch()), layout, equipment.branches, inputs=equipment.fleet_inputs)
         for drive in drives
@@ -161,7 +168,7 @@ def _temperature_c(channel: Channel | None, samples: Samples) -> Array:
     return np.interp(samples.time_s, channel.time_s[channel.good], channel.value[channel.good])
 
 
-def _require_possible(drive: Drive, layout: Layout) -> None:
+def require_possible(drive: Drive, layout: Layout) -> None:
     """Refuse currents that no sensor of this junction shows, and numbers that are none."""
     for name, channel in drive.branches.items():
         largest = float(np.abs(channel.value[channel.good]).max(initial=0.0))
@@ -179,7 +186,7 @@ def _recorded(drive: Drive) -> frozenset[str]:
     return frozenset(name for name, channel in drive.inputs.items() if channel.good.any())
 
 
-def _most_moving_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple[str, ...]:
+def most_moving_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple[str, ...]:
     """Branches by falling variance; the order asked for where a drive lacks one, as is noticed later."""
 
     def variance_a2(name: str) -> float:

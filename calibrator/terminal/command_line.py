@@ -3,7 +3,9 @@
 Wrong use and errors are one line on standard error, with what to do; ``--debug`` shows the traceback of an error.
 """
 
+import re
 import sys
+import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -13,7 +15,7 @@ from calibrator.errors import ContradictionError
 from ecu_node.failures import DEBUG_HINT, FAILED, end_of, say_error, split_debug
 from ecu_node.standard_output import drop_output, flush_output
 
-__all__ = ["EXIT_CODES", "command_app", "run_app", "run_tool"]
+__all__ = ["EXIT_CODES", "command_app", "example", "run_app", "run_tool"]
 
 EXIT_CODES = (
     f"Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted, 143 ended by SIGTERM. {DEBUG_HINT}"
@@ -37,13 +39,31 @@ def command_app(**settings: Any) -> typer.Typer:
     typer.Typer
         Without commands; to be run by :func:`run_app`.
     """
-    return typer.Typer(
-        add_completion=False,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-        context_settings={"help_option_names": ["-h", "--help"]},
-        **settings,
-    )
+    shared = {
+        "add_completion": False,
+        "pretty_exceptions_enable": False,
+        "rich_markup_mode": None,
+        "context_settings": {"help_option_names": ["-h", "--help"]},
+    }
+    return typer.Typer(**(shared | settings))
+
+
+def example(*commands: str) -> str:
+    """What stands below the options of a command: how it is called.
+
+    Parameters
+    ----------
+    *commands : str
+        Whole command lines; long ones are broken as a shell allows.
+
+    Returns
+    -------
+    str
+        For typer's ``epilog``.
+    """
+    kept = [re.sub(r"(--\S+) (?!-)", "\\1\0", line) for line in commands]  # an option stays with its value
+    lines = [textwrap.wrap(line, 72, break_long_words=False, break_on_hyphens=False) for line in kept]
+    return "\b\n" + "\n".join(["Example:", *("  " + " \\\n    ".join(parts) for parts in lines)]).replace("\0", " ")
 
 
 def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
@@ -71,8 +91,11 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
     others, debug = split_debug(arguments)
     command = typer.main.get_command(app)
     for each in _all_commands(command):
-        each.epilog = EXIT_CODES
+        each.epilog = f"{each.epilog}\n\n{EXIT_CODES}" if each.epilog else EXIT_CODES
         each.short_help = (each.help or "").partition("\n\n")[0]  # whole in the list of commands, not cut
+        for option in each.params:
+            if getattr(option, "multiple", False):
+                option.help = f"{option.help} May be repeated."
     try:
         code = command.main(args=others, prog_name=program, standalone_mode=False)
     except SystemExit as end:

@@ -5,7 +5,7 @@ Upper bounds are far beyond what a vehicle has; they catch slips of units before
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -56,28 +56,29 @@ def number_option(name: str, low: float, high: float, meaning: str) -> Any:
     typer's option
         For ``Annotated[float, ...]``.
     """
-
-    def parse(given: str | float) -> float:
-        try:
-            value = float(given)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:  # nor is not-a-number
-            raise typer.BadParameter(f"{given}: expected a number from {low:g} to {high:g}")
-        return value
-
-    return typer.Option(name, parser=parse, metavar="NUMBER", help=f"{meaning}, {low:g} to {high:g}.")
+    return _bounded(name, low, high, meaning, read=float, what="a number")
 
 
 def whole_option(name: str, low: int, high: int, meaning: str) -> Any:
     """Make an option that is a whole number between bounds; parameters and result as for :func:`number_option`."""
 
-    def parse(given: str | int) -> int:
-        if not re.fullmatch(r"[+-]?[0-9]{1,20}", str(given)) or not low <= int(given) <= high:
-            raise typer.BadParameter(f"{given}: expected a whole number from {low} to {high}")
-        return int(given)
+    def whole(text: str) -> float:
+        return int(text) if re.fullmatch(r"[+-]?[0-9]{1,20}", text) else math.nan
 
-    return typer.Option(name, parser=parse, metavar="NUMBER", help=f"{meaning}, {low} to {high}.")
+    return _bounded(name, low, high, meaning, read=whole, what="a whole number")
+
+
+def _bounded(name: str, low: float, high: float, meaning: str, *, read: Callable[[str], float], what: str) -> Any:
+    def parse(given: str | float) -> float:
+        try:
+            value = read(str(given))
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:  # nor is not-a-number
+            raise typer.BadParameter(f"{given}: expected {what} from {low:.12g} to {high:.12g}")
+        return value
+
+    return typer.Option(name, parser=parse, metavar="NUMBER", help=f"{meaning}, {low:.12g} to {high:.12g}.")
 
 
 def _branches(value: str | None) -> str | None:
@@ -114,7 +115,8 @@ FleetOrSummariesArgument = Annotated[
     str,
     typer.Argument(
         callback=_named,
-        help="Drive store, folder with a folder of logs per vehicle, or summaries (path or URL).",
+        help="Log, table, or folder of them, of one vehicle; folder with a folder of logs per vehicle; drive store; or "
+        "summaries (path or URL).",
     ),
 ]
 StoreOption = Annotated[

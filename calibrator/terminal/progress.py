@@ -13,18 +13,18 @@ from itertools import count
 from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import Progress, ProgressColumn, Task
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
-__all__ = ["bar_line", "no_progress", "numbered_passes", "one_pass", "progress_bar", "rate_text", "shown"]
+__all__ = ["no_progress", "numbered_passes", "one_pass", "progress_bar", "rate_text", "shown"]
 
 LINE_EVERY_S = 10.0
 DRAWN_EVERY_S = 0.1
 """A bar is moved no more often: a step may have millions of units. [s]"""
 WORTH_A_LINE_S = 1.0
 """A step that is done sooner is not told in a log. [s]"""
-LEAST_BAR = 6
-"""A bar that is shorter than this many characters tells nothing, and is left out. [1]"""
+NARROW = 70
+"""A terminal of fewer columns gets shorter figures. [1]"""
 _Item = TypeVar("_Item")
 _active: ContextVar[Progress | None] = ContextVar("active", default=None)
 """The bars on the terminal; a step within a step adds its own to them."""
@@ -105,7 +105,8 @@ def _bars(console: Console) -> Iterator[Progress]:
     if (bars := _active.get()) is not None:
         yield bars
         return
-    with Progress(_Line(console), console=console, redirect_stdout=False) as bars:
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), _Figures(console.width))
+    with Progress(*columns, console=console, expand=True, redirect_stdout=False) as bars:
         before = _active.set(bars)
         try:
             yield bars
@@ -147,82 +148,23 @@ def rate_text(per_s: float) -> str:
     return f"{rate:.0f}/{name}" if rate >= 10.0 else f"{rate:.1f}/{name}"
 
 
-def bar_line(
-    label: str,
-    done: float,
-    total: float | None,
-    unit: str,
-    *,
-    per_s: float | None,
-    elapsed_s: float,
-    width: int,
-    strokes: str = "━╌",
-) -> str:
-    """One line of progress that fits a terminal.
+class _Figures(ProgressColumn):
+    """How far, how fast and how long it goes on, at the end of the line of a bar."""
 
-    Parameters
-    ----------
-    label, unit : str
-        What is done, and what is counted.
-    done, total : float
-        How far it is; a total of None is not known.
-    per_s : float or None
-        Rate, if it is known yet. [1/s]
-    elapsed_s : float
-        Time since the beginning. [s]
-    width : int
-        Columns of the terminal; what has no room is left out, the bar first, and the unit.
-    strokes : str
-        Characters of what is done and of what is to come.
-
-    Returns
-    -------
-    str
-        At most `width` characters.
-    """
-    elapsed = _clock(elapsed_s)
-    if total is None:
-        return f"{label}, {elapsed}"[:width]
-    counted = f"{done:.0f}/{total:.0f}"
-    rate = "" if not per_s else f", {rate_text(per_s)}"
-    left = ", -:-- left" if not per_s else f", {_clock((total - done) / per_s)} left"
-    shortest = f"{label} {counted}{left}"
-    forms = [f"{counted} {unit}{rate}, {elapsed}{left}", f"{counted}{rate}, {elapsed}{left}", f"{counted}{rate}{left}"]
-    figures = next((form for form in forms if len(label) + 1 + len(form) <= width), None)
-    if figures is None:
-        return shortest[:width]
-    room = width - len(label) - len(figures) - 2
-    if room < LEAST_BAR:
-        return f"{label} {figures}"
-    full = round(room * min(done / total, 1.0)) if total else room
-    return f"{label} {strokes[0] * full}{strokes[1] * (room - full)} {figures}"
-
-
-class _Line(ProgressColumn):
-    """The whole line of a bar."""
-
-    def __init__(self, console: Console) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
-        self._console = console
-        self._strokes = "━╌" if console.encoding.startswith("utf") else "#."
+        self._is_narrow = width < NARROW
 
     def render(self, task: Task) -> Text:
-        """Draw the line as long as the terminal is wide."""
+        """Say it; a narrow terminal gets no unit and no rate."""
         elapsed_s = (task.finished_time if task.finished else task.elapsed) or 0.0
-        begun, unit = task.fields["begun"], task.fields["unit"]
-        text = bar_line(
-            task.description,
-            task.completed,
-            task.total,
-            unit,
-            per_s=(task.completed - begun) / elapsed_s if elapsed_s else None,
-            elapsed_s=elapsed_s,
-            width=self._console.width - 1,
-            strokes=self._strokes,
-        )
-        line = Text(text, no_wrap=True)
-        line.highlight_regex(f"[{self._strokes[0]}]+", "green" if task.finished else "cyan")
-        return line
+        if task.total is None:
+            return Text(_clock(elapsed_s), no_wrap=True)
+        per_s = (task.completed - task.fields["begun"]) / elapsed_s if elapsed_s else 0.0
+        left = f", {_clock((task.total - task.completed) / per_s)} left" if per_s else ""
+        rate = f", {rate_text(per_s)}" if per_s and not self._is_narrow else ""
+        unit = "" if self._is_narrow else f" {task.fields['unit']}"
+        return Text(f"{task.completed:.0f}/{task.total:.0f}{unit}{rate}{left}", no_wrap=True)
 
 
 class _Lines:

@@ -1,6 +1,8 @@
 """Reports as text or JSON for standard output."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import msgspec
@@ -8,11 +10,14 @@ import msgspec
 from ecu_node.standard_output import write_output, write_text
 
 __all__ = [
+    "Notice",
     "counted",
     "dumps",
     "few",
     "few_reasons",
+    "figure",
     "left_out_text",
+    "merged_notices",
     "print_report",
     "reasons_text",
     "table",
@@ -120,6 +125,83 @@ def few_reasons(reasons: Mapping[str, str], *, count: int | None = None) -> str:
     return f"{told}; and {more} more" if more > 0 else told
 
 
+def figure(value: float, digits: int = 3) -> str:
+    """A number as people write it: ``50``, ``2.4``, ``0.035``, ``4,096``; a dash for what is no number.
+
+    Parameters
+    ----------
+    value : float
+        The number.
+    digits : int
+        Significant digits; those before the decimal point are never rounded away.
+
+    Returns
+    -------
+    str
+        Without an exponent and without zeros at the end.
+    """
+    if not math.isfinite(value):
+        return "-"
+    decimals = min(max(digits - 1 - math.floor(math.log10(abs(value))), 0), 9) if value else 0
+    text = f"{value:,.{decimals}f}"
+    bare = text.rstrip("0").rstrip(".") if "." in text else text
+    return "0" if bare == "-0" else bare
+
+
 def counted(number: int, what: str) -> str:
     """A number of things: ``1 drive``, ``2 drives``."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Notice:
+    """What a user should know of a drive.
+
+    Attributes
+    ----------
+    text : str
+        With ``{}`` for every count; notices of one text are the same notice.
+    counts : tuple of int
+        How many frames, lines, ...; over several drives they add up.
+    """
+
+    text: str
+    counts: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        """The notice of this drive."""
+        return self.text.format(*self.counts)
+
+
+def merged_notices(notices: Mapping[tuple[str, str], Sequence[Notice]]) -> list[str]:
+    """Tell equal notices once.
+
+    Parameters
+    ----------
+    notices : mapping of (vehicle, drive) to sequence of Notice
+        What is to be said of each drive.
+
+    Returns
+    -------
+    list of str
+        One line per notice, with the drive or the number of vehicles it is about.
+    """
+    found: dict[str, dict[tuple[str, str], Notice]] = {}
+    for drive, items in notices.items():
+        for item in items:
+            found.setdefault(item.text, {})[drive] = item
+    return [f"{_where(list(drives))}: {_sum(text, list(drives.values()))}" for text, drives in found.items()]
+
+
+def _where(drives: Sequence[tuple[str, str]]) -> str:
+    vehicles = len({vehicle for vehicle, _ in drives})
+    if len(drives) == 1:
+        return "/".join(drives[0])
+    if vehicles == 1:
+        return f"in {len(drives)} drives of {drives[0][0]}"
+    return f"in {vehicles} vehicles" if vehicles == len(drives) else f"in {len(drives)} drives of {vehicles} vehicles"
+
+
+def _sum(text: str, items: Sequence[Notice]) -> str:
+    totals = (sum(counts) for counts in zip(*(item.counts for item in items), strict=True))
+    return str(Notice(text=text, counts=tuple(totals)))

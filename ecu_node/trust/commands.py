@@ -107,14 +107,13 @@ def _provision(options: argparse.Namespace) -> int:
 
 
 def _take(options: argparse.Namespace) -> int:
-    from ecu_node.database import read_database  # noqa: PLC0415
-    from ecu_node.layout import read_layout  # noqa: PLC0415
+    from ecu_node.database import node_database  # noqa: PLC0415
     from ecu_node.trust.activation import accept, examine  # noqa: PLC0415
     from ecu_node.trust.canonical import read_bytes  # noqa: PLC0415
     from ecu_node.trust.key_set import KeySet  # noqa: PLC0415
     from ecu_node.trust.statements import Revocation, SignedParameters  # noqa: PLC0415
 
-    database = read_database(read_layout(options.layout))
+    database = node_database(options.layout)
     content, where = read_bytes(options.file), str(options.file)
     if options.name == "verify":
         accepted = examine(options.state, content, where, database, _now())

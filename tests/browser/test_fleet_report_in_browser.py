@@ -1,22 +1,28 @@
-"""The fleet report as a user has it before him: opened in Chromium from the disk."""
+"""The report as a user sees it: opened in Chromium from the disk."""
 
+import base64
 import json
+import re
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+from msgspec.structs import replace
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 from selenium.webdriver.support.wait import WebDriverWait
 
-from calibrator.report.write import ReportOptions, fleet_report, vehicle_report
+from calibrator.estimator.rows import VehicleEvidence
+from calibrator.report.page import fleet_report, vehicle_report
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
-from tests.calibrator.report.results_at_hand import six_vehicle_result
+from ecu_node.parameters import VehicleParameters
+from tests.calibrator.report import results_at_hand
+from tests.calibrator.report.results_at_hand import evidence_of, sensor, six_vehicle_result, vehicle, write_result
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 PATIENCE_S = 60.0
@@ -58,9 +64,13 @@ def result(tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase) 
 
 @pytest.fixture
 def page(browser: webdriver.Chrome, result: Path, tmp_path: Path) -> webdriver.Chrome:
-    """The report, opened and set up; what the browser logged before is forgotten."""
-    path = tmp_path / "report.html"
-    path.write_text(fleet_report(result, ReportOptions())[0])
+    """The report of the fleet, opened and set up."""
+    return opened(browser, fleet_report(result)[0], tmp_path / "report.html")
+
+
+def opened(browser: webdriver.Chrome, text: str, path: Path) -> webdriver.Chrome:
+    """Open a page; what the browser logged before is forgotten."""
+    path.write_text(text)
     browser.get_log("browser")
     browser.get_log("performance")
     browser.get(f"file://{path}")
@@ -80,13 +90,20 @@ def rows(browser: webdriver.Chrome) -> list[list[str]]:
     return found
 
 
+def vehicle_text(browser: webdriver.Chrome, name: str) -> str:
+    """What the page shows of a vehicle that is chosen."""
+    browser.execute_script(f"location.hash = 'vehicle={name}'")
+    until(browser, f"return document.getElementById('vehicle').dataset.vehicle === '{name}'")
+    return browser.find_element(By.ID, "vehicle").text
+
+
 def names(browser: webdriver.Chrome) -> list[str]:
     return [row[0] for row in rows(browser)]
 
 
 def test_it_opens_without_an_error_and_fetches_nothing(page: webdriver.Chrome) -> None:
     page.execute_script("document.querySelectorAll('[data-figure]').forEach((at) => at.scrollIntoView())")
-    for name in ("verdicts", "junction", "sensors", "margin", "durations"):
+    for name in ("junction", "sensors", "margin"):
         page.execute_script(f"document.querySelector('[data-figure={name}]').scrollIntoView()")
         until(page, f"return document.querySelector('[data-figure={name}]').dataset.drawn")
     assert page.execute_script("return document.body.dataset.failed") is None
@@ -113,14 +130,19 @@ def test_the_table_shows_the_numbers_of_the_result(page: webdriver.Chrome, resul
 
 
 def test_the_vehicle_shows_the_numbers_of_its_parameters(page: webdriver.Chrome) -> None:
-    page.execute_script("location.hash = 'vehicle=V1'")
-    until(page, "return document.getElementById('vehicle').dataset.vehicle === 'V1'")
-    text = page.find_element(By.ID, "vehicle").text
-    for told in ("+10.00 ± 0.10", "+4.00 ± 0.10", "99.5 %", "corrects", "24.00 A as measured, 0.50 A after correction"):
-        assert told in text
+    text = vehicle_text(page, "V1")
+    for part in (
+        "+10.00 ± 0.10",
+        "+4.00 ± 0.10",
+        "99.5 %",
+        "corrects it",
+        "24.00 A as measured, 0.50 A after correction",
+    ):
+        assert part in text
+    assert "Yes: all that was measured is as the estimate predicts" in text
     until(page, "return document.querySelectorAll('#vehicle .plot[data-drawn]').length === 2")
     traces = page.execute_script(
-        "return document.querySelector('#vehicle .plot').data"
+        "return document.querySelectorAll('#vehicle .plot')[1].data"
         ".map((t) => [t.name, t.yaxis, Math.max(...t.y), Math.min(...t.y)])"
     )
     measured, corrected, ideal = (trace[2] for trace in traces[:3])
@@ -130,13 +152,54 @@ def test_the_vehicle_shows_the_numbers_of_its_parameters(page: webdriver.Chrome)
     assert max(map(abs, traces[-1][2:])) < 0.05, "the corrected currents sum to nothing"
 
 
-def test_competing_explanations_are_told(page: webdriver.Chrome) -> None:
-    page.execute_script("location.hash = 'vehicle=V4'")
-    until(page, "return document.getElementById('vehicle').dataset.vehicle === 'V4'")
-    text = page.find_element(By.ID, "vehicle").text
-    assert "60.0 % battery sensor: offset +8.00 A" in text
-    assert "a zero-current window (contactors open) would decide" in text
-    assert "passes through: harm limit" in text
+def test_an_estimate_with_two_peaks_shows_both(page: webdriver.Chrome) -> None:
+    text = vehicle_text(page, "V4")
+    assert "battery 0.00 ± 2.00 +8.00 ± 2.00 (60 %) or none (40 %)" in text
+    assert "60.0 % +8.00 A no fault no fault" in text
+    assert "40.0 % no fault −3.00 % all currents +1.00 %" in text
+    assert "a zero-current window (contactors open) would decide" in text.lower()
+    assert "does not correct it: the correction might do harm" in text
+    until(page, "return document.querySelectorAll('#vehicle .plot[data-drawn]').length === 3")
+    peaks = page.execute_script(
+        "const [, offsets] = document.querySelector('#vehicle .plot').data;"
+        "return offsets.x.map((x, n) => [offsets.y[n], x, offsets.marker.size[n]])"
+        ".filter(([name]) => name === 'battery')"
+    )
+    assert [peak[1] for peak in peaks] == [8.0, 0.0]
+    assert peaks[0][2] > peaks[1][2], "the more probable, the larger"
+
+
+def test_what_is_not_known_is_never_a_zero(
+    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
+) -> None:
+    lost = replace(sensor(), drift_sd=None, offset_sd_a=None, fault_probability=None, delay_s=None)
+    items = [
+        vehicle(database, "V1", lost, lost, verdict="cannot tell"),
+        vehicle(database, "V2", sensor(), replace(sensor(), identifiable=False)),
+    ]
+    opened(browser, fleet_report(write_result(tmp_path / "r", items))[0], tmp_path / "page.html")
+    assert {row[0]: row[5] for row in rows(browser)} == {"V1": "not known", "V2": "not known"}
+    text = vehicle_text(browser, "V1")
+    assert "battery not known not known not known not known does not correct it: not known well enough" in text
+    assert "motor not known 0.00 ± 0.10" in vehicle_text(browser, "V2")
+
+
+def test_an_estimate_that_misses_what_was_measured_is_said_not_to_fit(
+    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = vehicle(database, "V1", sensor(0.1, 4.0, apply=True), sensor())
+
+    def missed(item: VehicleParameters) -> VehicleEvidence:
+        evidence = evidence_of(item)
+        return VehicleEvidence(
+            value=[None if each is None else each + 1.0 for each in evidence.value],
+            sd=evidence.sd,
+            explained=evidence.explained,
+        )
+
+    monkeypatch.setattr(results_at_hand, "evidence_of", missed)
+    opened(browser, vehicle_report(write_result(tmp_path / "r", [wrong]), "V1")[0], tmp_path / "page.html")
+    assert "Not all of it: what was measured is up to 500.0 standard deviations" in vehicle_text(browser, "V1")
 
 
 def test_a_place_that_there_is_not_changes_nothing(page: webdriver.Chrome) -> None:
@@ -221,15 +284,53 @@ def test_text_can_be_read_against_its_background(page: webdriver.Chrome) -> None
 
 
 def test_the_page_of_a_vehicle_opens_without_an_error(browser: webdriver.Chrome, result: Path, tmp_path: Path) -> None:
-    path = tmp_path / "V1.html"
-    path.write_text(vehicle_report(result, "V1")[0])
-    browser.get_log("browser")
-    browser.get(f"file://{path}")
+    opened(browser, vehicle_report(result, "V1")[0], tmp_path / "V1.html")
+    until(browser, "return document.querySelectorAll('.plot[data-drawn]').length === 2")
     assert browser.get_log("browser") == []
     assert browser.find_element(By.TAG_NAME, "h1").text == "Vehicle V1"
     sizes = browser.execute_script(
-        "return [...document.querySelectorAll('svg')].map((drawing) => drawing.getBoundingClientRect().width)"
+        "return [...document.querySelectorAll('.plot')].map((drawing) => drawing.getBoundingClientRect().width)"
     )
-    assert len(sizes) == 2
     assert min(sizes) > 300
     assert [item for item in browser.execute_script(CONTRAST) if item[0] < LEAST_CONTRAST] == []
+
+
+def test_one_junction_by_itself_opens_without_an_error(
+    browser: webdriver.Chrome, database: VehicleDatabase, tmp_path: Path
+) -> None:
+    item = vehicle(database, "car", sensor(0.1, 4.0, apply=True), replace(sensor(), identifiable=False))
+    item = replace(item, hardware_fault=replace(item.hardware_fault, probability=None))
+    result = write_result(tmp_path / "r", [item], window=None, evidence=False)
+    opened(browser, fleet_report(result)[0], tmp_path / "car.html")
+    assert browser.get_log("browser") == []
+    assert browser.execute_script("return document.body.dataset.failed") is None
+    text = browser.find_element(By.TAG_NAME, "main").text
+    assert "battery +10.00 ± 0.10 +4.00 ± 0.10 99.5 % 0.02 % 20 ms corrects it" in text
+    assert "Not known: this calibration keeps no evidence." in text
+
+
+def test_nothing_is_wider_than_a_narrow_screen(page: webdriver.Chrome) -> None:
+    """What is wider, as tables, scrolls in itself."""
+    vehicle_text(page, "V4")
+    size = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        assert until(page, "return document.documentElement.scrollWidth <= 400")
+    finally:
+        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_it_prints_on_a4_with_its_figures_whole(page: webdriver.Chrome) -> None:
+    vehicle_text(page, "V4")
+    until(page, "return document.querySelectorAll('#vehicle .plot[data-drawn]').length === 3")
+    printed = base64.b64decode(page.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})["data"])
+    boxes = [tuple(map(float, box.split())) for box in re.findall(rb"/MediaBox \[([0-9. ]+)\]", printed)]
+    assert boxes
+    assert all(box == pytest.approx((0, 0, 595, 842), abs=1.0) for box in boxes)
+    # While it is printed figures are as wide as the paper, and afterwards as the screen again.
+    widths = page.execute_script(
+        "const wide = () => [...document.querySelectorAll('.plot[data-drawn] .main-svg')].map((at) => at.clientWidth);"
+        "window.dispatchEvent(new Event('beforeprint')); return wide();"
+    )
+    assert set(widths) == {680}
+    page.execute_script("window.dispatchEvent(new Event('afterprint'))")

@@ -5,6 +5,7 @@ import json
 import shutil
 from pathlib import Path
 
+import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
@@ -192,15 +193,21 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
     assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)
 
 
-@pytest.mark.parametrize("method", ["posterior", "published"])
-def test_one_car_alone_is_refused_with_what_can_be_done(fleet: Path, method: str, tmp_path: Path) -> None:
+def test_one_car_alone_gives_ratios_of_gains(fleet: Path, tmp_path: Path) -> None:
+    shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "V001")
+    run = calibrator("calibrate", tmp_path / "logs", "--layout", LAYOUT, "--out", tmp_path / "x", "--workers", 1)
+    assert run.returncode == 0
+    assert "only ratios of gains are known: name a sensor that you trust" in run.stdout
+    assert not pd.read_parquet(tmp_path / "x" / "results.parquet").applied.any()
+
+
+def test_one_car_alone_is_no_fleet_of_the_published_method(fleet: Path, tmp_path: Path) -> None:
     shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "V001")
     files = ["--layout", LAYOUT, "--out", tmp_path / "x", "--workers", 1]
-    run = calibrator("calibrate", tmp_path / "logs", "--method", method, *files)
+    run = calibrator("calibrate", tmp_path / "logs", "--method", "published", *files)
     assert run.returncode == 1
     (line,) = [line for line in run.stderr.splitlines() if line.startswith("calibrator:")]
-    assert "1 usable vehicle to learn from, at least 2 are needed, as every vehicle is compared with its fleet" in line
-    assert "('calibrator kirchhoff' shows the sum of one, 'ecu-node template' begins a parameter file by hand)" in line
+    assert "1 usable vehicle to learn from; a fleet that is compared with itself needs 5 or more" in line
     assert "pass 1" not in run.stderr
     assert not (tmp_path / "x").exists()
 

@@ -1,6 +1,5 @@
 """Words and equations: each is defined once, and what the method says of a vehicle is what it can say."""
 
-import json
 import re
 from pathlib import Path
 from typing import get_args
@@ -55,16 +54,6 @@ def test_every_verdict_is_explained() -> None:
     section = METHOD.partition("### Verdict of a vehicle")[2].partition("\n### ")[0]
     for verdict in get_args(Verdict):
         assert re.search(rf"\n\| {verdict} \||\*{verdict}\*", section), verdict
-
-
-def test_notebooks_are_kept_without_outputs_and_are_short() -> None:
-    notebooks = sorted((ROOT / "examples").glob("*.ipynb"))
-    assert notebooks
-    for path in notebooks:
-        cells = json.loads(path.read_text())["cells"]
-        code = [cell for cell in cells if cell["cell_type"] == "code"]
-        assert len(code) <= 12, path
-        assert [cell["id"] for cell in code if cell["outputs"] or cell["execution_count"] is not None] == [], path
 
 
 def notices() -> list[list[str]]:

@@ -74,7 +74,3 @@ def test_what_it_imports_is_in_the_reference_of_the_python_interface(source: str
     listed = re.findall(r"(?m)^   ([\w.]+)$", (ROOT / "docs" / "reference" / "api.md").read_text())
     assert len(MODULE.findall(source)) > 3
     assert sorted(set(MODULE.findall(source)) - set(listed)) == []
-
-
-def test_it_has_less_than_40_lines() -> None:
-    assert len(EXAMPLE.read_text().splitlines()) < 40

@@ -1,11 +1,14 @@
 """The references of the site have every command and every public name."""
 
 import importlib
+import os
 import re
+import shlex
 import subprocess
 import sys
 from inspect import isclass, isroutine
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer.main
@@ -43,6 +46,39 @@ def test_every_command_of_the_node_is_in_the_reference() -> None:
     known = re.findall(r"[\w-]+", wrong.stderr.partition("choose from")[2].partition(")")[0])
     assert "run" in known
     assert {name for name, _ in command_help("ecu-node")} == {"ecu-node", *(f"ecu-node {name}" for name in known)}
+
+
+def test_every_command_of_calibrator_has_examples_that_it_accepts() -> None:
+    group: Any = typer.main.get_command(app)
+    for name, text in command_help("calibrator"):
+        examples = text.replace("\\\n", "").partition("Example:\n")[2].partition("\n\n")[0].splitlines()
+        assert examples or isinstance(group.commands.get(name.partition(" ")[2]), TyperGroup), name
+        for words in map(shlex.split, examples):
+            command, used = group, words[1:]
+            while isinstance(command, TyperGroup):
+                command, used = command.commands[used[0]], used[1:]
+            command.make_context(name, used)
+
+
+def test_commands_stand_in_the_order_of_use() -> None:
+    text = dict(command_help("calibrator"))["calibrator"]
+    first, second, third, last = ("look at a recording:", "to calibrate:", "to sign parameters:", "for research:")
+    assert text.index(first) < text.index(second) < text.index(third) < text.index(last)
+    assert text.index("  layout ") < text.index("  doctor ") < text.index("  kirchhoff ") < text.index(second)
+
+
+def test_options_that_may_be_repeated_say_so() -> None:
+    text = " ".join(dict(command_help("calibrator"))["calibrator calibrate"].split())
+    for option in ("--trusted", "--hold-out", "--charge"):
+        assert "May be repeated." in text.partition(f" {option} ")[2].partition(" --")[0], option
+
+
+def test_shell_completes_commands() -> None:
+    words = {"_CALIBRATOR_COMPLETE": "complete_bash", "COMP_WORDS": "calibrator ki", "COMP_CWORD": "1"}
+    shown = subprocess.run(
+        [sys.executable, "-m", "calibrator"], capture_output=True, text=True, env=os.environ | words, check=False
+    )
+    assert shown.stdout.split() == ["kirchhoff"]
 
 
 @pytest.mark.parametrize("program", PROGRAMS)

@@ -57,7 +57,7 @@ def parameters_for(database: VehicleDatabase, **faults: tuple[float, float]) -> 
         vehicle="v1",
         number=300,
         layout=FileReference(name=layout.path.name, sha256=layout.digest),
-        dbc=FileReference(name=layout.dbc, sha256=database.digest),
+        dbc=FileReference(name=layout.dbc_path.name, sha256=database.digest),
         verdict="corrected",
         branches={
             name: BranchParameters(drift=drift, offset_a=offset, apply=True) for name, (drift, offset) in faults.items()

@@ -32,7 +32,7 @@ def test_the_wheel_has_every_file_of_the_packages_and_no_other(in_wheel: set[str
 
 
 def test_the_wheel_has_types_assets_and_the_schema(in_wheel: set[str]) -> None:
-    assets = {f"calibrator/report/assets/{name}" for name in ("fleet.html", "fleet.js", "page.css", "vehicle.html")}
+    assets = {f"calibrator/report/assets/{name}" for name in ("page.css", "page.html", "page.js")}
     needed = {"calibrator/py.typed", "ecu_node/py.typed", "ecu_node/parameters.schema.json", *assets}
     assert needed <= in_wheel
 

@@ -11,12 +11,11 @@ from typing import Any
 
 import pytest
 
-from calibrator.doctor.examine import examine
-from calibrator.doctor.findings import Severity
 from calibrator.drives.store import iterate_drives
 from calibrator.files.layout_files import vehicle_database
 from calibrator.recordings.drive_log import write_drive_log
 from ecu_node.layout import read_layout
+from tests.calibrator.doctor.artificial_logs import examined
 from tests.real.delay_trips import import_trips
 
 ROOT = Path(__file__).parents[2]
@@ -46,13 +45,15 @@ def test_three_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -> Non
         0,
         "my_car.toml: branches battery, motor_rear, motor_front",
     )
-    assert made.stderr == "next: calibrator doctor --layout my_car.toml --log drive.log.gz\n"
+    assert made.stderr.endswith("\nnext: calibrator doctor --layout my_car.toml --log drive.log.gz\n")
     again = calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--out", "my_car.toml"])
     assert again.returncode == 1
     assert again.stderr.startswith("calibrator: my_car.toml: exists, and is not overwritten")
     told = calibrator(tesla, *["doctor", "--layout", "my_car.toml", "--log", "drive.log.gz"])
     assert told.returncode == 0, told.stdout
-    assert "ready for: kirchhoff, import, calibrate, ecu-node --gateway" in told.stdout.splitlines()
+    assert (
+        "ready for: kirchhoff, import, calibrate --trusted, calibrate, ecu-node --gateway" in told.stdout.splitlines()
+    )
     drawn = calibrator(tesla, *["kirchhoff", "drive.log.gz", "--layout", "my_car.toml", "--plot", "sum.png", "--json"])
     assert drawn.returncode == 0, drawn.stderr
     total = json.loads(drawn.stdout)["before"]["sum"]
@@ -119,22 +120,22 @@ def errors_of(folder: Path, data: Path, log: Path, change_layout: Any = str, cha
         change_dbc((data / "Model3CAN.dbc").read_text(encoding="cp1252")), encoding="cp1252"
     )
     (folder / "layout.toml").write_text(change_layout(LAYOUT.read_text()))
-    found = examine(read_layout(folder / "layout.toml"), [log])
-    return found, [(f.kind, f.subject) for f in found.findings if f.severity is Severity.ERROR]
+    told = examined(folder / "layout.toml", log)
+    return told, told.errors
 
 
 def test_nothing_is_complained_of_in_the_recording_as_it_is(tesla: Path, tmp_path: Path) -> None:
-    found, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz")
+    told, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz")
     assert errors == []
-    assert [finding.kind for finding in found.findings] == ["mean"]
-    assert found.findings[0].figures["mean_a"] == pytest.approx(4.1, abs=0.1)
+    assert [finding.kind for finding in told.findings()] == ["mean"]
+    assert told.findings()[0].figures["mean_a"] == pytest.approx(4.1, abs=0.1)
 
 
 @pytest.mark.parametrize("branch", ["battery", "motor_rear"])
 def test_an_inverted_sign_is_named(branch: str, tesla: Path, tmp_path: Path) -> None:
-    found, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz", inverted(branch))
+    told, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz", inverted(branch))
     assert errors == [("sign", branch)]
-    assert found.findings[0].figures["rms_before_a"] > 20.0 * found.findings[0].figures["rms_after_a"]
+    assert told.findings()[0].figures["rms_before_a"] > 20.0 * told.findings()[0].figures["rms_after_a"]
 
 
 @pytest.mark.parametrize(
@@ -149,9 +150,9 @@ def test_an_inverted_sign_is_named(branch: str, tesla: Path, tmp_path: Path) -> 
 def test_a_factor_of_1000_is_named(
     branch: str, signal: str, unit: str, factor: float, tesla: Path, tmp_path: Path
 ) -> None:
-    found, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz", change_dbc=with_unit(signal, unit))
+    told, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz", change_dbc=with_unit(signal, unit))
     assert errors == [("unit", branch)]
-    assert found.findings[0].figures["factor"] == factor
+    assert told.findings()[0].figures["factor"] == factor
 
 
 def test_a_sign_and_a_factor_are_named_together(tesla: Path, tmp_path: Path) -> None:
@@ -178,10 +179,10 @@ def test_a_skew_of_200_ms_is_named_and_is_no_error(identifier: str, late_s: floa
             time_s = float(stamp.strip("()")) + (late_s if frame.startswith(f"{identifier}#") else 0.0)
             lines.append((time_s, f"({time_s:.6f}) {channel} {frame}\n"))
     (tmp_path / "skewed.log").write_text("".join(text for _, text in sorted(lines)))
-    found, errors = errors_of(tmp_path, tesla, tmp_path / "skewed.log")
+    told, errors = errors_of(tmp_path, tesla, tmp_path / "skewed.log")
     assert errors == []
-    (delay,) = [finding for finding in found.findings if finding.kind == "delay"]
-    assert (delay.subject, delay.severity) == ("motor_rear", Severity.WARNING)
+    (delay,) = told.findings("delay")
+    assert (delay.subject, delay.severity) == ("motor_rear", "warning")
     assert delay.figures["delay_s"] == pytest.approx(0.2, abs=0.01)
     assert "late against battery" in delay.text
 
@@ -192,13 +193,11 @@ def test_trips_of_a_bmw_i3_are_sound_and_an_inverted_motor_is_named(trip: str, i
     database = vehicle_database(I3_LAYOUT)
     drive = next(d for d in iterate_drives(i3_store, database.layout) if d.name == trip)
     write_drive_log(tmp_path / "trip.log.gz", drive, database)
-    right = examine(database.layout, [tmp_path / "trip.log.gz"])
-    assert [finding for finding in right.findings if finding.severity is Severity.ERROR] == []
+    assert examined(I3_LAYOUT, tmp_path / "trip.log.gz").errors == []
     text = I3_LAYOUT.read_text().replace('dbc = "hv', f'dbc = "{ROOT}/dbc/hv')
     changed = re.sub(r'("HV_Motor.MotorCurrent"\nsign = )-1', r"\g<1>1", text)
     (tmp_path / "wrong.toml").write_text(changed)
-    wrong = examine(read_layout(tmp_path / "wrong.toml"), [tmp_path / "trip.log.gz"])
-    assert [(f.kind, f.subject) for f in wrong.findings if f.severity is Severity.ERROR] == [("sign", "motor")]
+    assert examined(tmp_path / "wrong.toml", tmp_path / "trip.log.gz").errors == [("sign", "motor")]
 
 
 @pytest.fixture(scope="module")

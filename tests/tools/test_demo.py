@@ -28,8 +28,10 @@ def test_every_step_runs_up_to_the_picture(
     printed = capfd.readouterr().out
     assert [line[4] for line in printed.splitlines() if line.startswith("=== ")] == list("12345")
     assert "RMSE of the sum" in printed
-    assert printed.splitlines()[-2].startswith("put into V")
-    assert (out / "kirchhoff.png").stat().st_size > 0
+    assert "(confidence " in printed
+    assert "put into V" in printed
+    for picture in ("kirchhoff.png", "before_after.png"):
+        assert (out / picture).stat().st_size > 0
     assert "#" in (out / "live.log").read_text()
 
 

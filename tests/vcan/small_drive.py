@@ -73,7 +73,7 @@ def true_parameters(database: VehicleDatabase) -> VehicleParameters:
         vehicle=VEHICLE,
         number=7,
         layout=FileReference(name=layout.path.name, sha256=layout.digest),
-        dbc=FileReference(name=layout.dbc, sha256=database.digest),
+        dbc=FileReference(name=layout.dbc_path.name, sha256=database.digest),
         verdict="corrected",
         branches={
             name: BranchParameters(drift=float(branch.drift), offset_a=float(branch.offset_a), apply=True)

@@ -21,9 +21,8 @@ from calibrator.estimator.results import (
     write_parameter_files,
     write_run,
 )
-from calibrator.estimator.rows import evidence_names
-from calibrator.estimator.vehicle_evidence import VehicleEvidence
-from calibrator.report.write import ReportOptions, fleet_report
+from calibrator.estimator.rows import VehicleEvidence, evidence_names
+from calibrator.report.page import fleet_report
 from calibrator.summaries.filter_bank import plain_bank
 from calibrator.summaries.unity import UNITY_FILE, UnityWindow
 from ecu_node.parameters import (
@@ -67,7 +66,7 @@ def rows(*, quick: bool) -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         result, page = make_result(Path(folder) / "result", vehicles), Path(folder) / "report.html"
         started = time.perf_counter()
-        text, _ = fleet_report(result, ReportOptions())
+        text, _ = fleet_report(result)
         page.write_text(text)
         written_s = time.perf_counter() - started
         ready_s = ready_times_s(page)

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from bench.row import Row
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
-from calibrator.estimator.fleet_estimate import estimate_rows
+from calibrator.estimator.decision import estimate_rows
 from calibrator.estimator.learning import Law, learn_laws
 from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows, row_design, row_places
 from calibrator.published.basis_pursuit import BasisPursuit

@@ -14,11 +14,11 @@ import numpy as np
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
-from calibrator.estimator.workers import Workers
 from calibrator.experiments.recorded_fleet import builtin_fleet
 from calibrator.experiments.recorded_trial import RecordedCase, record_vehicles
 from calibrator.faults import Faults
 from calibrator.files.storage import open_storage
+from calibrator.processes.computing import Workers
 from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.moments import DriveSummary

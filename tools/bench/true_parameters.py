@@ -34,7 +34,7 @@ def true_parameters(database: VehicleDatabase, branches: Mapping[str, BranchPara
     return VehicleParameters(
         vehicle="bench",
         layout=FileReference(name=layout.path.name, sha256=layout.digest),
-        dbc=FileReference(name=layout.dbc, sha256=database.digest),
+        dbc=FileReference(name=layout.dbc_path.name, sha256=database.digest),
         verdict="corrected",
         branches=dict(branches),
         hardware_fault=HardwareFault(suspected=False),

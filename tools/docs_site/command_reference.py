@@ -24,7 +24,7 @@ PROGRAMS: dict[str, Callable[[], int]] = {"calibrator": calibrator_cli.main, "ec
 """What runs each program with the arguments of the process."""
 _WIDTH = "80"
 """Of the terminal for which the help is written. [characters]"""
-_COMMANDS = re.compile(r"(?mi)^commands:\n((?:[ ]+.*\n)+)")
+_COMMANDS = re.compile(r"(?mi)^commands\b[^\n]*:\n((?:[ ]+.*\n)+)")
 _NAME = re.compile(r"(?m)^ {2,4}([a-z][a-z-]*)")
 
 

@@ -37,6 +37,7 @@ REVIEWED = {
 _SPDX = {
     "apache 2.0": "Apache-2.0",
     "apache software license": "Apache-2.0",
+    "3-clause bsd": "BSD-3-Clause",
     "bsd 3-clause license": "BSD-3-Clause",
     "bsd license": "BSD",
     "gnu lesser general public license v3 (lgplv3)": "LGPL-3.0-only",

@@ -1,18 +1,19 @@
 """A drive of known currents as a log of dbc/hv_powertrain, and copies of its layout with faults put in."""
 
+import json
 import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
-from calibrator.doctor.examine import Examination, examine
-from calibrator.doctor.findings import Finding
 from calibrator.drive import Array, Channel, Drive
 from calibrator.recordings.drive_log import write_drive_log
 from ecu_node.database import VehicleDatabase
-from ecu_node.layout import read_layout
+from tests.calibrator.command_here import calibrator
 
 DBC = Path(__file__).parents[3] / "dbc"
 DURATION_S = 120.0
@@ -85,9 +86,28 @@ def write_layout(
     return folder / "layout.toml"
 
 
-def examined(layout: Path, *logs: Path) -> Examination:
-    return examine(read_layout(layout), logs)
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """What ``calibrator doctor --json`` told."""
+
+    code: int
+    report: dict[str, Any]
+
+    def findings(self, *kinds: str) -> list[SimpleNamespace]:
+        """Those of some kinds, or all."""
+        found = [SimpleNamespace(**item) for item in self.report["findings"]]
+        return [item for item in found if item.kind in kinds or not kinds]
+
+    @property
+    def errors(self) -> list[tuple[str, str]]:
+        """Kind and subject of each error."""
+        return [(item.kind, item.subject) for item in self.findings() if item.severity == "error"]
 
 
-def findings(found: Examination, *kinds: str) -> list[Finding]:
-    return [finding for finding in found.findings if finding.kind in kinds]
+def examined(layout: Path, *logs: Path) -> Told:
+    """Run the command; its exit code must fit to what it found."""
+    done = calibrator("doctor", "--layout", layout, *(word for log in logs for word in ("--log", log)), "--json")
+    assert done.stderr == ""
+    told = Told(code=done.returncode, report=json.loads(done.stdout))
+    assert told.code == (1 if told.errors else 0)
+    return told

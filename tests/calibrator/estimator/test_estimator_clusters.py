@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.estimator.clusters import densest_clusters
+from calibrator.estimator.fleet_model import densest_clusters
 
 
 def one_sided(seed: int, *, good: int, faulty: int, sd: float = 0.002) -> Array:

@@ -9,7 +9,7 @@ from bench.dynamic_vehicles import INPUT_NAMES, PERIOD_S, bank_model, drive_inpu
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
-from calibrator.estimator.filter_bank_choice import (
+from calibrator.estimator.fleet_identification import (
     FIRST_HELD_OUT,
     FOLDS,
     LONGEST_S,

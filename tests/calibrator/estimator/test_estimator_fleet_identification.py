@@ -14,7 +14,7 @@ from calibrator.cli import app
 from calibrator.drive import Array, Channel, Drive, DriveFile, Mask
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError, FleetError
-from calibrator.estimator.fleet_identification import VehicleModel, read_vehicle_model
+from calibrator.estimator.published_fleet import VehicleModel, read_vehicle_model
 from calibrator.faults import corrected_currents
 from calibrator.files.parameter_files import current_moments, junction_residual
 from calibrator.sources.fleet_source import Equipment

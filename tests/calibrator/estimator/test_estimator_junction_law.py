@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.estimator.junction_law import junction_law
-from calibrator.estimator.moments import VehicleRegressions, stack_summaries
+from calibrator.estimator.moments import VehicleRegressions, junction_law, stack_summaries
 from calibrator.estimator.rows import LEAST_GAIN
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summariser import summarise

@@ -13,7 +13,6 @@ from calibrator.estimator.readings import (
     BenchTable,
     Readings,
     check_bench_table,
-    contradicted_readings,
     merge_readings,
     read_bench_table,
     trust_notices,
@@ -168,25 +167,6 @@ def test_readings_become_rows_and_what_was_not_read_stays_unknown() -> None:
     assert np.sqrt(variance[1, 12:]) == pytest.approx(0.0005)
     np.testing.assert_array_equal(found.relative[:, :5], rows.relative[:, :5])
     np.testing.assert_array_equal(found.covariance[:, 8:12, :12], rows.covariance[:, 8:12, :12])
-
-
-def test_reading_far_from_every_explanation_contradicts_the_drives() -> None:
-    explained = {
-        "weight": np.array([[0.7, 0.3]]),
-        "drift": np.array([[[0.0, 0.0], [0.1, 0.0]]]),
-        "drift_sd": np.full((1, 2, 2), 0.002),
-        "offset_a": np.array([[[5.0, 0.0], [0.0, 0.0]]]),
-        "offset_sd_a": np.full((1, 2, 2), 0.5),
-    }
-
-    def found(drift: float, offset_a: float = NAN) -> dict[tuple[str, str], str]:
-        bench = bench_of(drift, 0.002, offset_a, 0.2 + 0.0 * offset_a)
-        return contradicted_readings(bench, ["V1"], BRANCHES, **explained)
-
-    assert found(0.1) == found(0.1, 0.5) == {}
-    assert list(found(-0.1)) == [("V1", "battery")]
-    assert "bench reading of its battery sensor is not what its drives show" in found(0.1, 5.0)["V1", "battery"]
-    assert contradicted_readings(bench_of(-0.1, 0.002, NAN, NAN), ["V2"], BRANCHES, **explained) == {}
 
 
 @pytest.mark.parametrize("others_a", [0.0, 5.0, -12.0])

@@ -35,7 +35,7 @@ def shared_by(laws: list[Law]) -> dict[tuple[int, ...], float]:
     """Probabilities of what all vehicles share: places of offsets, gains and of a group's offset."""
     found: dict[tuple[int, ...], float] = {}
     for law in laws:
-        cause = tuple(np.flatnonzero(np.abs(law.spread.shared) > learning.DOUBT).tolist())
+        cause = tuple(np.flatnonzero(np.abs(law.spread.shared) > learning.LEAST_SHARED).tolist())
         found[cause] = found.get(cause, 0.0) + law.probability
     return found
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array, Mask
-from calibrator.estimator.fleet_estimate import HARM_LIMIT, RowsEstimate, estimate_rows
+from calibrator.estimator.decision import RowsEstimate, estimate_rows
+from calibrator.estimator.fleet_estimate import HARM_LIMIT
 from calibrator.estimator.learning import learn_laws
 from calibrator.estimator.rows import EvidenceRows
 from calibrator.faults import Faults

@@ -8,8 +8,7 @@ from msgspec.structs import replace as changed
 
 from calibrator.drive import Array
 from calibrator.estimator.fleet_estimate import FleetEstimate
-from calibrator.estimator.rows import EvidenceRows, evidence_names
-from calibrator.estimator.vehicle_evidence import reported_evidence
+from calibrator.estimator.rows import EvidenceRows, evidence_names, reported_evidence
 from calibrator.estimator.vehicle_report import deciding_evidence, explained, impossible
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters, Explanation, Finding, HardwareFault
@@ -69,7 +68,7 @@ def estimate(
 
 
 def advice(found: FleetEstimate) -> str:
-    return deciding_evidence(found, 0, NAMES, full_scale_a=FULL_SCALE_A, layout="hv.toml")
+    return deciding_evidence(found, 0, NAMES, full_scale_a=FULL_SCALE_A, layout="hv.toml")[0]
 
 
 @pytest.mark.parametrize(
@@ -139,7 +138,17 @@ def test_finding_says_why_its_branch_is_not_corrected() -> None:
     finding = Finding(branch="motor", cause="clipped", probability=0.98, text="the motor sensor clips at 100 A")
     found = estimate(of(1.0, drift=(0, 0.1)), held_back=("", "does not fit"), findings=(finding,))
     assert advice(found) == "the motor sensor clips at 100 A"
+    load = Finding(branch=None, cause="switching", probability=0.9, text="a load is switched")
+    assert advice(replace(found, findings=[(load,)])) == "a load is switched"
     assert "a check of the motor sensor would decide" in advice(replace(found, findings=[()]))
+
+
+def test_explanation_that_a_reading_would_decide_between_is_given_with_it() -> None:
+    best, other, rival = of(0.958, offset_a=(0, 8)), of(0.04, drift=(0.2, 0), offset_a=(0, 8)), of(0.002)
+    found = estimate(best, other, rival, held_back=("", "harm limit"))
+    text, explanation = deciding_evidence(found, 0, NAMES, full_scale_a=FULL_SCALE_A)
+    assert text.endswith("the motor sensor then shows +8.0 A or +0.0 A")
+    assert explanation is rival
 
 
 def test_gain_error_of_a_whole_or_more_has_no_parameters() -> None:
@@ -166,7 +175,8 @@ def test_explanation_in_words_names_sensors_vehicle_and_findings(database: Vehic
     for part in (
         "V7: corrected (confidence 0.97)",
         "battery: gain error (drift) +10.00%, offset +4.00 A: corrected",
-        "motor: gain error (drift) +20.00% +- 1.00%, offset +0.00 A: not corrected, because the",
+        "motor: gain error (drift) +20.00% +- 1.00%, offset +0.00 A: not corrected\n",
+        "\n  motor not corrected, because the correction might do harm\n",
         "differs from its fleet, probability 0.90: hardware: all currents -6.00%; hardware: motor +2.00 A",
         "0.600  battery sensor: drift +10.00%; motor sensor: drift +20.00%",
         "0.400  no fault",

@@ -1,157 +1,363 @@
-import io
-from dataclasses import replace
-from pathlib import Path
+"""Through the command line: the sum of the currents of logs, tables and live buses, before and after."""
 
+import json
+import signal
+import subprocess
+import threading
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import can
 import numpy as np
+import pandas as pd
 import pytest
-from rich.console import Console
+from can.interfaces.virtual import channels
 
 from calibrator.drive import Array, Channel, Drive
-from calibrator.errors import DriveError
-from calibrator.kirchhoff.sums import Comparison, compare_kirchhoff, figures_of
-from calibrator.kirchhoff.view import kirchhoff_table, plot_kirchhoff
-from calibrator.recordings.readers import Recording, RecordingReport
+from calibrator.files.layout_files import vehicle_database
+from calibrator.kirchhoff.command import kirchhoff
+from calibrator.recordings.canlog import encode_message, write_candump
+from calibrator.recordings.drive_log import drive_series
 from ecu_node.database import VehicleDatabase
-from ecu_node.layout import Layout
+from ecu_node.template import template_text
+from tests.calibrator.command_here import calibrator
 
-TIME_S = np.arange(0.0, 20.0, 0.05)
-REPORT = RecordingReport(channels=(), frames=0, error_frames=0, remote_frames=0, damaged=0, disordered=0, clock_steps=0)
-
-
-@pytest.fixture
-def layout(database: VehicleDatabase) -> Layout:
-    return database.layout
-
-
-def channel(value: Array) -> Channel:
-    return Channel(time_s=TIME_S, value=value, good=np.isfinite(value))
+ROOT = Path(__file__).parents[3]
+LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
+TIME_S = np.arange(0.0, 10.0, 0.05)
+TABLE_S = np.arange(0.0, 120.0, 0.1)
+MOTOR_A = 60.0 * np.sin(0.7 * TABLE_S) + 25.0 * np.sin(2.3 * TABLE_S + 1.0) + 20.0
 
 
-def recording(measured: dict[str, Array], corrected: dict[str, Array] | None = None) -> Recording:
-    drive = Drive(vehicle="V1", name="d", branches={k: channel(v) for k, v in measured.items()}, inputs={})
-    return Recording(drive=drive, corrected={k: channel(v) for k, v in (corrected or {}).items()}, report=REPORT)
+def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
+    return calibrator("kirchhoff", *arguments)
 
 
-def faulty(drift: float, offset_a: float) -> tuple[dict[str, Array], dict[str, Array]]:
-    true = {"battery": 100.0 * np.sin(TIME_S), "motor": -100.0 * np.sin(TIME_S)}
-    return true | {"battery": (1.0 + drift) * true["battery"] + offset_a}, true
+def figures(*arguments: object) -> Any:
+    """What --json gives."""
+    done = run(*arguments, "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    return json.loads(done.stdout)
 
 
-def test_figures_of_a_known_current() -> None:
-    figures = figures_of(np.array([3.0, -5.0, 5.0, 1.0]))
-    assert figures.rmse_a == pytest.approx(15.0**0.5)
-    assert (figures.max_a, figures.mean_a) == (5.0, 1.0)
-    assert figures.rmse_a**2 == pytest.approx(figures.mean_a**2 + figures.sd_a**2)
-    assert figures.as_json(200.0)["rmse_percent"] == pytest.approx(figures.rmse_a / 2.0)
+def table(folder: Path, digits: int = 3, **columns_a: Array) -> tuple[object, ...]:
+    """A table of currents as they are measured, and the arguments to read it."""
+    frame = pd.DataFrame({"time [s]": TABLE_S, **columns_a}).round(digits)
+    frame.to_csv(folder / "table.csv", index=False)
+    return folder / "table.csv", "--branches", ",".join(f"{name}={name}" for name in columns_a), "--full-scale", 200
 
 
-def test_an_offset_is_the_mean_of_the_sum_before_and_gone_after(layout: Layout) -> None:
-    measured, true = faulty(0.0, 12.0)
-    comparison = compare_kirchhoff(recording(measured, true), layout)
-    assert comparison.before["sum"].rmse_a == pytest.approx(12.0)
-    assert comparison.after is not None
-    assert comparison.change is not None
-    assert comparison.after["sum"].rmse_a == pytest.approx(0.0, abs=1e-12)
-    assert comparison.change["battery"].mean_a == pytest.approx(-12.0)
-    assert comparison.change["motor"].max_a == 0.0
+@pytest.fixture(scope="module")
+def log(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Battery offset of 12 A; the corrected frames, 1 ms later, are right."""
+    true, good = 100.0 * np.sin(TIME_S), np.ones(len(TIME_S), np.bool_)
+    measured = {"battery": true + 12.0, "motor": -true}
+    branches = {name: Channel(time_s=TIME_S, value=value, good=good) for name, value in measured.items()}
+    series = drive_series(Drive(vehicle="V1", name="d", branches=branches, inputs={}), database)
+    for name in ("Battery", "Motor"):
+        series.append(encode_message(database, f"HV_{name}Corrected", TIME_S, {f"{name}CurrentCorrected": true}))
+    path = tmp_path_factory.mktemp("log") / "drive.log.gz"
+    write_candump(path, series)
+    return path
 
 
-def test_doubling_all_currents_doubles_all_figures(layout: Layout) -> None:
-    measured, _ = faulty(0.1, 3.0)
-    one = compare_kirchhoff(recording(measured), layout).before
-    two = compare_kirchhoff(recording({k: 2.0 * v for k, v in measured.items()}), layout).before
-    for name, figures in one.items():
-        np.testing.assert_allclose(list(vars(two[name]).values()), 2.0 * np.array(list(vars(figures).values())))
+# ---- figures
 
 
-def test_without_corrected_frames_there_is_only_a_before(layout: Layout) -> None:
-    comparison = compare_kirchhoff(recording(faulty(0.1, 0.0)[0]), layout)
-    assert comparison.after is None
-    assert comparison.change is None
-    assert "no corrected frames: only the figures before" in comparison.notices()
+def test_offset_is_the_mean_of_the_sum_before_and_gone_after(log: Path) -> None:
+    found = figures(log, "--layout", LAYOUT)
+    assert found["before"]["sum"]["rmse_a"] == pytest.approx(12.0, abs=0.02)
+    assert found["before"]["sum"]["rmse_percent"] == pytest.approx(3.0, abs=0.005)
+    assert found["after"]["sum"]["max_a"] < 0.03
+    assert found["change"]["battery"]["mean_a"] == pytest.approx(-12.0, abs=0.02)
+    assert found["change"]["motor"]["max_a"] < 0.03
+    assert found["left_out"] == ["auxiliary", "dcdc", "motor_rear"]
 
 
-def test_absent_branches_are_named_and_left_out_of_the_sum(layout: Layout) -> None:
-    comparison = compare_kirchhoff(recording(faulty(0.1, 0.0)[0]), layout)
-    assert comparison.branches == ("battery", "motor")
-    assert comparison.notices()[0] == "no usable frames of auxiliary, dcdc, motor_rear: left out of the sum"
+def test_figures_are_those_of_their_definition(tmp_path: Path) -> None:
+    found = figures(*table(tmp_path, battery=MOTOR_A + 3.0, motor=-MOTOR_A))["before"]
+    battery = MOTOR_A + 3.0
+    wanted = {"rmse_a": np.sqrt(np.mean(battery**2)), "max_a": np.abs(battery).max(), "mean_a": battery.mean()}
+    assert {key: found["battery"][key] for key in wanted} == pytest.approx(wanted, abs=1e-3)
+    total = found["sum"]
+    assert total["rmse_a"] ** 2 == pytest.approx(total["mean_a"] ** 2 + total["sd_a"] ** 2)
+    assert total["rmse_percent"] == pytest.approx(total["rmse_a"] / 2.0)
 
 
-def test_a_branch_without_corrected_frames_enters_the_sum_after_as_measured(layout: Layout) -> None:
-    measured, true = faulty(0.0, 12.0)
-    comparison = compare_kirchhoff(recording(measured, {"battery": true["battery"]}), layout)
-    assert comparison.uncorrected == ("motor",)
-    assert comparison.after is not None
-    assert comparison.after["motor"] == comparison.before["motor"]
-    assert comparison.after["sum"].rmse_a == pytest.approx(0.0, abs=1e-12)
+def test_doubling_all_currents_doubles_all_figures(tmp_path: Path) -> None:
+    one = figures(*table(tmp_path, battery=1.1 * MOTOR_A + 3.0, motor=-MOTOR_A))["before"]
+    two = figures(*table(tmp_path, battery=2.2 * MOTOR_A + 6.0, motor=-2.0 * MOTOR_A))["before"]
+    for name, item in one.items():
+        assert two[name] == pytest.approx({key: 2.0 * value for key, value in item.items()}, abs=0.01)
 
 
-def test_corrected_frames_without_measured_ones_are_not_used(layout: Layout) -> None:
-    measured, true = faulty(0.0, 12.0)
-    comparison = compare_kirchhoff(recording(measured, {"dcdc": true["motor"]}), layout)
-    assert comparison.after is None
+def test_rows_without_a_number_are_counted_and_not_used(tmp_path: Path) -> None:
+    battery = MOTOR_A + 12.0
+    battery[100:110] = np.nan
+    found = figures(*table(tmp_path, battery=battery, motor=-MOTOR_A))
+    assert found["before"]["sum"]["rmse_a"] == pytest.approx(12.0, abs=1e-3)
+    assert (found["instants"], found["valid"], found["masked"]["stale"]) == (1200, 1190, 10)
+    assert "10 of 1,200 instants not used: 10 stale" in found["notices"]
 
 
-def test_instants_that_are_not_good_are_counted_and_not_used(layout: Layout) -> None:
-    measured, _ = faulty(0.0, 12.0)
-    measured["battery"][100:110] = np.nan
-    comparison = compare_kirchhoff(recording(measured), layout)
-    assert comparison.before["sum"].rmse_a == pytest.approx(12.0)
-    assert comparison.masked["not good"] == 5
-    assert comparison.notices()[-1] == "5 of 200 instants not used: 5 not good"
+# ---- the band, and what the sum is made of
 
 
-def test_one_branch_alone_has_no_sum(layout: Layout) -> None:
-    with pytest.raises(DriveError, match="usable frames of battery only; a sum needs two branches"):
-        compare_kirchhoff(recording({"battery": np.sin(TIME_S)}), layout)
+@pytest.mark.parametrize("digits", [0, 1, 2])
+def test_quantisation_alone_lies_in_the_band(digits: int, tmp_path: Path) -> None:
+    expected = figures(*table(tmp_path, digits, battery=MOTOR_A, motor=-0.4 * MOTOR_A, heater=-0.6 * MOTOR_A))[
+        "expected"
+    ]
+    assert expected["parts_a"]["quantisation"] == pytest.approx(10.0**-digits / 2.0)
+    assert expected["in_band"]["before"] > 0.97
 
 
-def test_branches_that_are_never_fresh_together_are_refused(layout: Layout) -> None:
-    sparse = Channel(time_s=np.array([0.03, 18.03]), value=np.zeros(2), good=np.ones(2, np.bool_))
-    broken = recording(faulty(0.0, 1.0)[0])
-    drive = Drive(vehicle="V1", name="d", branches={**broken.drive.branches, "motor": sparse}, inputs={})
-    with pytest.raises(DriveError, match="no instant at which all of battery, motor are fresh"):
-        compare_kirchhoff(Recording(drive=drive, corrected={}, report=REPORT), layout)
+@pytest.mark.parametrize("noise_a", [0.3, 1.0])
+def test_noise_of_the_sensors_widens_the_band(noise_a: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    battery, motor = MOTOR_A + noise_a * rng.normal(size=1200), -MOTOR_A
+    expected = figures(*table(tmp_path, battery=battery, motor=motor))["expected"]
+    assert expected["parts_a"]["noise"] == pytest.approx(noise_a, rel=0.15)
+    far = figures(*table(tmp_path, battery=battery + 10.0 * noise_a, motor=motor))["expected"]
+    assert expected["in_band"]["before"] > 0.9
+    assert far["in_band"]["before"] < 0.5
 
 
-def printed(comparison: Comparison) -> list[str]:
-    output = io.StringIO()
-    Console(width=80, file=output).print(kirchhoff_table(comparison))
-    return output.getvalue().splitlines()
+def shares(found: Any) -> dict[str, float]:
+    return {name: found["residual"]["before"][name] for name in ("constant", "gains", "delays", "rest")}
 
 
-def test_the_table_fits_80_columns_with_the_longest_names_and_largest_figures(layout: Layout) -> None:
-    measured = {name: -1000.0 + np.sin(TIME_S) for name in layout.branch_names}
-    lines = printed(compare_kirchhoff(recording(measured, measured), layout))
-    assert all(len(line) <= 80 for line in lines)
-    assert sum("motor_rear" in line and "-999.97" in line for line in lines) == 2
-    assert [line.strip() for line in lines if line.strip() in {"before", "after", "change"}] == [
-        "before",
-        "after",
-        "change",
+def test_sum_of_a_gain_error_is_told_from_a_constant_and_a_delay(tmp_path: Path) -> None:
+    noise = 0.05 * np.random.default_rng(5).normal(size=1200)
+    late = 60.0 * np.sin(0.7 * (TABLE_S - 0.08)) + 25.0 * np.sin(2.3 * (TABLE_S - 0.08) + 1.0) + 20.0
+    for wrong, name in ((1.03 * MOTOR_A - 0.6, "gains"), (MOTOR_A + 2.0, "constant"), (late, "delays")):
+        found = figures(*table(tmp_path, battery=wrong + noise, motor=-MOTOR_A))
+        assert shares(found)[name] > 0.95
+        assert sum(shares(found).values()) == pytest.approx(1.0)
+        battery = found["residual"]["before"]["alone"]["battery"]
+        if name == "gains":
+            assert battery["gain_error"] == pytest.approx(0.03, abs=0.001)
+            assert battery["gain_share"] > 0.99
+        if name == "delays":
+            assert battery["delay_s"] == pytest.approx(0.08, abs=0.01)
+
+
+def test_noise_of_a_small_branch_is_not_taken_for_its_gain(tmp_path: Path) -> None:
+    heater = -3.0 - 2.0 * np.sign(np.sin(0.4 * TABLE_S)) + 0.3 * np.random.default_rng(5).normal(size=1200)
+    true = -3.0 - 2.0 * np.sign(np.sin(0.4 * TABLE_S))
+    alone = figures(*table(tmp_path, battery=MOTOR_A - true, motor=-MOTOR_A, heater=heater))["residual"]["before"][
+        "alone"
+    ]
+    assert abs(alone["heater"]["gain_error"]) < 0.01
+    assert alone["heater"]["gain_share"] < 0.02
+
+
+# ---- parameters
+
+
+def parameters(folder: Path, **values: object) -> Path:
+    """A file that corrects the battery's sensor."""
+    document = json.loads(template_text(vehicle_database(LAYOUT), "V1", datetime(2026, 6, 1, tzinfo=UTC)))
+    document["branches"] = {"battery": document["branches"]["battery"] | values}
+    (folder / "V1.json").write_text(json.dumps(document))
+    return folder / "V1.json"
+
+
+def test_parameters_correct_as_the_node_would(log: Path, tmp_path: Path) -> None:
+    file = parameters(tmp_path, offset_a=12.0, apply=True)
+    found = figures(log, "--layout", LAYOUT, "--parameters", file)
+    assert found["after"]["sum"]["max_a"] < 0.05
+    assert found["uncorrected"] == ["motor"]
+    passing = figures(log, "--layout", LAYOUT, "--parameters", parameters(tmp_path, offset_a=12.0, apply=False))
+    assert passing["after"] == passing["before"]
+    assert passing["uncorrected"] == ["battery", "motor"]
+
+
+def test_parameters_of_another_junction_are_refused(log: Path, tmp_path: Path) -> None:
+    text = parameters(tmp_path, offset_a=12.0, apply=True).read_text().replace('"battery"', '"pack"')
+    (tmp_path / "V1.json").write_text(text)
+    done = run(log, "--layout", LAYOUT, "--parameters", tmp_path / "V1.json")
+    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
+    assert "parameters of vehicle V1: they are of pack, and the sum has battery, motor" in done.stderr
+
+
+def test_help_has_a_short_form_and_an_example() -> None:
+    short, long = run("-h"), run("--help")
+    assert short.returncode == long.returncode == 0
+    assert short.stdout == long.stdout
+    assert "Usage: calibrator kirchhoff [OPTIONS] [LOG]" in short.stdout
+    words = " ".join(short.stdout.replace("\\\n", "").split())
+    assert "calibrator kirchhoff table.csv --branches battery=Ibat,-motor=Imot --plot sum.html" in words
+
+
+# ---- text, pictures and tables
+
+
+def test_text_has_80_columns_and_ends_with_the_sum(log: Path) -> None:
+    lines = run(log, "--layout", LAYOUT).stdout.splitlines()
+    assert all(len(line) <= 80 for line in lines[:6]), lines
+    assert "\x1b" not in "".join(lines)
+    assert "no usable frames of auxiliary, dcdc, motor_rear: left out of the sum" in lines
+    assert lines[-1].startswith("RMSE of the sum: 12.00 A before, 0.0")
+
+
+def test_name_that_has_no_room_is_broken_and_no_figure_is_cut(tmp_path: Path) -> None:
+    long = "x" * 60
+    path, _, _, *rest = table(tmp_path, battery=-1000.0 - MOTOR_A, motor=MOTOR_A + 1000.0)
+    done = run(path, "--branches", f"{long}=battery,motor=motor", *rest)
+    lines = done.stdout.partition("\n\n")[0].splitlines()
+    assert max(map(len, lines)) <= 80
+    assert sum(line.count("x") for line in lines if "max" not in line) == len(long)
+    assert "…" not in done.stdout
+
+
+@pytest.mark.parametrize(("name", "start"), [("out.png", b"\x89PNG"), ("out.PDF", b"%PDF"), ("out.svg", b"<?xml")])
+def test_picture_has_the_format_of_its_suffix(name: str, start: bytes, log: Path, tmp_path: Path) -> None:
+    assert run(log, "--layout", LAYOUT, "--plot", tmp_path / name).returncode == 0
+    assert (tmp_path / name).read_bytes().startswith(start)
+
+
+def test_page_needs_no_other_file(log: Path, tmp_path: Path) -> None:
+    assert run(log, "--layout", LAYOUT, "--plot", tmp_path / "out.html").returncode == 0
+    page = (tmp_path / "out.html").read_text()
+    assert "<title>Branch currents, positive into the junction: drive.log.gz</title>" in page
+    assert "sum after" in page
+    assert "<script src=" not in page
+    assert "<link" not in page.partition("<body>")[0]
+
+
+def test_long_recording_is_thinned_out_in_the_picture(tmp_path: Path) -> None:
+    times, motor = np.arange(0.0, 6000.0, 0.1), np.tile(MOTOR_A, 50)
+    frame = pd.DataFrame({"time [s]": times, "battery": motor + 1.0, "motor": -motor}).round(2)
+    frame.to_parquet(tmp_path / "long.parquet", index=False)
+    arguments = (tmp_path / "long.parquet", "--branches", "battery=battery,motor=motor", "--plot", tmp_path / "x.html")
+    assert figures(*arguments)["before"]["sum"]["mean_a"] == pytest.approx(1.0)
+    page = (tmp_path / "x.html").read_text()
+    assert "long.parquet (1 instant of 2)" in page
+    assert len(page) < 10e6
+
+
+def test_table_has_the_currents_for_a_spreadsheet(log: Path, tmp_path: Path) -> None:
+    for name, read in (("out.csv", pd.read_csv), ("out.parquet", pd.read_parquet)):
+        assert run(log, "--layout", LAYOUT, "--table", tmp_path / name).returncode == 0
+        frame = read(tmp_path / name)
+        assert list(frame) == [
+            "time_s", "battery_a", "motor_a", "sum_a", "battery_corrected_a", "motor_corrected_a", "sum_corrected_a",
+            "expected_sd_a",
+        ]  # fmt: skip
+        np.testing.assert_allclose(frame["sum_a"].mean(), 12.0, atol=0.02)
+
+
+@pytest.mark.parametrize("what", ["--plot", "--table"])
+def test_output_that_cannot_be_written_is_one_line(what: str, log: Path, tmp_path: Path) -> None:
+    suffix = {"--plot": "png", "--table": "csv"}[what]
+    done = run(log, "--layout", LAYOUT, what, tmp_path / "nowhere" / f"x.{suffix}")
+    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (1, "", 1)
+    assert f"x.{suffix}: cannot write the" in done.stderr
+    done = run(log, "--layout", LAYOUT, what, tmp_path / "x.what")
+    assert done.returncode == 2
+    assert f"x.what: expected a file name that ends with .{suffix}" in done.stderr
+
+
+# ---- mistakes
+
+
+def test_wrong_use_is_exit_code_2(log: Path) -> None:
+    for arguments in (
+        (log, "--layout", LAYOUT, "--interface", "virtual"),
+        (log,),
+        (log, "--layout", LAYOUT, "--branches", "a=b,c=d"),
+        (log, "--layout", LAYOUT, "--full-scale", 400),
+        (log, "--branches", "a=b,c=d"),
+        ("--interface", "virtual", "--branches", "a=b,c=d"),
+    ):
+        done = run(*arguments)
+        assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), arguments
+
+
+def test_empty_log_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "empty.log").touch()
+    done = run(tmp_path / "empty.log", "--layout", LAYOUT)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.splitlines() == [
+        f"calibrator: {tmp_path / 'empty.log'}: the log is empty: no data frames (0 error frames, "
+        "0 remote frames, 0 damaged lines); record it again"
     ]
 
 
-def test_a_name_that_has_no_room_is_broken_and_no_figure_is_cut(layout: Layout) -> None:
-    measured, corrected = faulty(0.1, 2.0)
-    comparison = compare_kirchhoff(recording(measured, corrected), layout)
-    long = "x" * 64
-    lines = printed(replace(comparison, branches=(long, *comparison.branches[1:])))
-    assert "…" not in "".join(lines)
-    assert sum(line.count("x") for line in lines if "max" not in line) == 3 * len(long)  # before, after, change
-    assert max(map(len, lines)) <= 80
+def test_missing_column_names_those_that_are_there(tmp_path: Path) -> None:
+    path, *_ = table(tmp_path, battery=MOTOR_A, motor=-MOTOR_A)
+    done = run(path, "--branches", "battery=Ibat,motor=motor")
+    assert done.returncode == 1
+    assert "there is no column 'Ibat'; the columns are 'battery', 'motor'" in done.stderr
 
 
-def test_the_picture_is_written_with_one_panel_or_two(layout: Layout, tmp_path: Path) -> None:
-    measured, true = faulty(0.05, 12.0)
-    for name, corrected in (("one.png", None), ("two.png", true)):
-        plot_kirchhoff(compare_kirchhoff(recording(measured, corrected), layout), tmp_path / name, title="drive")
-    heights = [int.from_bytes((tmp_path / name).read_bytes()[20:24]) for name in ("one.png", "two.png")]
-    assert heights[0] < heights[1]
+def test_one_branch_alone_has_no_sum(tmp_path: Path, database: VehicleDatabase) -> None:
+    channel = Channel(time_s=TIME_S, value=np.sin(TIME_S), good=np.ones(len(TIME_S), np.bool_))
+    drive = Drive(vehicle="V1", name="d", branches={"battery": channel}, inputs={})
+    write_candump(tmp_path / "one.log", drive_series(drive, database))
+    done = run(tmp_path / "one.log", "--layout", LAYOUT)
+    assert done.returncode == 1
+    assert "usable frames of battery only; a sum needs two branches" in done.stderr
 
 
-def test_a_picture_that_cannot_be_written_is_named(layout: Layout, tmp_path: Path) -> None:
-    comparison = compare_kirchhoff(recording(faulty(0.05, 12.0)[0]), layout)
-    for path in (tmp_path / "nowhere" / "x.png", tmp_path / "x.what"):
-        with pytest.raises(DriveError, match="cannot write the picture"):
-            plot_kirchhoff(comparison, path, title="drive")
+def test_branches_that_are_never_fresh_together_are_refused(tmp_path: Path) -> None:
+    motor = np.where(np.isin(np.arange(1200), (0, 500, 1000)), -MOTOR_A, np.nan)
+    battery = np.where(np.isin(np.arange(1200), (250, 750)), MOTOR_A, np.nan)
+    path, *_ = table(tmp_path, battery=battery, motor=motor)
+    (tmp_path / "layout.toml").write_text(
+        'schema = 1\nname = "t"\nfull_scale_a = 100\n[[branch]]\nname = "battery"\nsignal = "battery"\nsign = 1\n'
+        '[[branch]]\nname = "motor"\nsignal = "motor"\nsign = 1\n'
+    )
+    done = run(path, "--layout", tmp_path / "layout.toml")
+    assert done.returncode == 1
+    assert "no instant at which all of battery, motor are fresh; check timeout_s" in done.stderr
+
+
+def test_missing_dbc_is_the_options_and_not_the_layouts(log: Path) -> None:
+    done = run(log, "--layout", LAYOUT, "--dbc", "missing.dbc")
+    assert (done.returncode, done.stderr) == (1, "calibrator: missing.dbc: no such DBC; check --dbc\n")
+
+
+# ---- a live bus
+
+
+@pytest.mark.parametrize("duration", ["nan", "inf", "0", "long"])
+def test_duration_that_is_none_is_named_with_what_is_expected(duration: str) -> None:
+    done = run("--interface", "virtual", "--channel", "x", "--duration", duration, "--layout", LAYOUT)
+    assert done.returncode == 2
+    assert f"'--duration': {duration}: expected a number from 0.1 to 86400" in done.stderr
+
+
+def test_silent_bus_and_unknown_interface_are_named() -> None:
+    silent = run("--interface", "virtual", "--channel", "x", "--duration", 0.2, "--layout", LAYOUT)
+    assert (silent.returncode, silent.stdout) == (1, "")
+    assert "virtual:x: no frame in 0.2 s" in silent.stderr
+    unknown = run("--interface", "nonsense", "--channel", "x", "--layout", LAYOUT)
+    assert (unknown.returncode, len(unknown.stderr.splitlines())) == (1, 1)
+    assert "cannot listen to the bus" in unknown.stderr
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_live_bus_gives_the_figures_of_its_log(
+    interrupted: bool, log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def send() -> None:
+        while not channels.get("live"):  # until the command listens
+            time.sleep(0.01)
+        with can.Bus(interface="virtual", channel="live", preserve_timestamps=True) as bus:
+            for message in can.LogReader(log):
+                bus.send(message)
+        if interrupted:
+            time.sleep(1.0)
+            signal.raise_signal(signal.SIGINT)
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    kirchhoff(layout=LAYOUT, interface="virtual", channel="live", duration=600.0 if interrupted else 1.5, json=True)
+    sender.join()
+    found = json.loads(capsys.readouterr().out)
+    assert found["before"]["sum"]["mean_a"] == pytest.approx(12.0, abs=0.02)
+    assert found["after"]["sum"]["max_a"] < 0.03

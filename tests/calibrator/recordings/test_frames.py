@@ -180,10 +180,10 @@ def test_an_empty_log_is_refused(tmp_path: Path, suffix: str) -> None:
 
 
 def test_an_unknown_suffix_is_refused_with_the_known_ones(tmp_path: Path) -> None:
-    (tmp_path / "drive.csv").touch()
-    with pytest.raises(LogError, match=r"expected \.log, \.asc, \.blf, \.trc, \.mf4"):
-        read_frames(tmp_path / "drive.csv")
-    assert not is_log(tmp_path / "drive.csv")
+    (tmp_path / "drive.xlsx").touch()
+    with pytest.raises(LogError, match=r"expected \.log, \.asc, \.blf, \.trc, \.mf4, \.csv"):
+        read_frames(tmp_path / "drive.xlsx")
+    assert not is_log(tmp_path / "drive.xlsx")
     assert is_log(tmp_path / "drive.LOG.gz")
 
 
@@ -307,7 +307,7 @@ def test_what_python_can_complains_of_is_counted_and_not_printed(
 def test_a_damaged_mf4_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "drive.mf4"
     path.write_bytes(b"MDF     4.10    " + bytes(200))
-    with pytest.raises(LogError, match=r"drive\.mf4: not a readable MF4 log: .*") as caught:
+    with pytest.raises(LogError, match=r"drive\.mf4: not a readable MF4 file: .*") as caught:
         read_frames(path)
     assert "\n" not in str(caught.value)
 

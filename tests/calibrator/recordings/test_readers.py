@@ -207,13 +207,6 @@ def test_corrected_frames_are_read_beside_the_measured_ones(tmp_path: Path, data
     np.testing.assert_allclose(recording.corrected["motor"].value, [-9.0, -18.0])
 
 
-def test_one_message_on_two_buses_is_refused(tmp_path: Path, power_database: VehicleDatabase) -> None:
-    path = tmp_path / "x.log"
-    path.write_text("(1.000000) can0 00000003#0100\n(1.100000) can1 00000003#0200\n")
-    with pytest.raises(LogError, match=r"Batt comes on 2 buses \(can0, can1\)"):
-        read_drive(path, power_database, vehicle="v", name="d")
-
-
 def test_another_message_on_another_bus_does_no_harm(tmp_path: Path, power_database: VehicleDatabase) -> None:
     path = tmp_path / "x.log"
     path.write_text("(1.000000) can0 00000003#0100\n(1.100000) can1 00000004#0200\n")

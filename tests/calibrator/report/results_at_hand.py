@@ -7,8 +7,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from calibrator.estimator.results import RunRecord, encode_chunk, join_rows, write_parameter_files, write_run
-from calibrator.estimator.rows import evidence_names
-from calibrator.estimator.vehicle_evidence import VehicleEvidence
+from calibrator.estimator.rows import VehicleEvidence, evidence_names
 from calibrator.summaries.filter_bank import plain_bank
 from calibrator.summaries.unity import UNITY_FILE, UnityWindow
 from ecu_node.database import VehicleDatabase

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.calibrator.conftest import LAYOUT, run_command
+from tests.calibrator.conftest import run_command
 
 
 def test_the_page_of_the_fleet_is_written(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -21,6 +21,8 @@ def test_its_numbers_come_as_json(result: Path, tmp_path: Path, capsys: pytest.C
     assert found["bytes"] == out.stat().st_size
     assert found["overview"]["verdicts"] == {"corrected": 2, "no sensor fault": 2, "cannot tell": 2}
     assert found["protection"]["limit_a"] == 300.0
+    assert len(found["next_steps"]) == 5
+    assert found["workshop"][0]["cause"] == "hardware"
 
 
 def test_the_page_of_a_vehicle_is_named_after_it(
@@ -31,15 +33,13 @@ def test_the_page_of_a_vehicle_is_named_after_it(
     found = json.loads(capsys.readouterr().out)
     assert found["page"] == "V3.html"
     assert found["parameters"]["hardware_fault"]["drift"] == -0.06
-    assert "For the workshop" in (tmp_path / "V3.html").read_text()
+    assert "Look at the hardware of V3" in (tmp_path / "V3.html").read_text()
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--vehicle", "V1", "--limit", "300"], "--limit: belongs to the page of the fleet"),
-        (["--drives", "d", "--layout", "l"], "--drives: belongs to the page of one vehicle"),
-        (["--vehicle", "V1", "--drives", "d"], "drives need the layout"),
         (["--limit", "-3"], "expected a number from 0.1 to 10000"),
     ],
 )
@@ -58,16 +58,6 @@ def test_a_pipe_is_not_replaced_by_a_page(result: Path, tmp_path: Path, capsys: 
     assert run_command(["report", str(result), "--out", str(pipe)]) == 1
     assert "is no file but a device, pipe or socket" in capsys.readouterr().err
     assert pipe.is_fifo()
-
-
-def test_drives_are_read_with_the_layout_of_the_calibration_alone(
-    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = LAYOUT.read_text().replace("sign = 1 ", "sign = -1 ", 1).replace('"hv_pow', f'"{LAYOUT.parent}/hv_pow', 2)
-    (tmp_path / "other.toml").write_text(text.replace(f'name = "{LAYOUT.parent}/', 'name = "'))
-    options = ["--vehicle", "V1", "--drives", str(tmp_path), "--layout", str(tmp_path / "other.toml")]
-    assert run_command(["report", str(result), *options, "--out", str(tmp_path / "page.html")]) == 1
-    assert "other.toml: not the file that vehicle V1 was calibrated with" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

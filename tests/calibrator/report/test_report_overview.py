@@ -5,12 +5,13 @@ from pathlib import Path
 import duckdb
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from calibrator.errors import FleetError
-from calibrator.report.fleet_table import read_fleet_table
-from calibrator.report.lists import changes_since, largest_faults, left_out_rows, workshop_list
-from calibrator.report.overview import overview_of
+from calibrator.report.fleet_table import FleetTable, read_details, read_fleet_table
+from calibrator.report.overview import WorkshopRow, next_steps, overview_of, workshop_list
 from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import Finding
 from tests.calibrator.report.results_at_hand import EVIL, sensor, six_vehicles, vehicle, write_result
 
 
@@ -18,6 +19,15 @@ def query(result: Path, sql: str) -> list[tuple[object, ...]]:
     found = duckdb.sql(sql.replace("RESULT", f"'{result / 'results.parquet'}'"))
     assert found is not None
     return found.fetchall()
+
+
+def workshop(table: FleetTable) -> list[WorkshopRow]:
+    return workshop_list(table, read_details(table, np.arange(len(table))).files)
+
+
+def steps(result: Path) -> list[str]:
+    table = read_fleet_table(result)
+    return next_steps(table, workshop(table))
 
 
 def test_counts_are_those_of_the_result(result: Path) -> None:
@@ -32,6 +42,7 @@ def test_counts_are_those_of_the_result(result: Path) -> None:
     assert found.held_back == {"harm limit": 1, "beyond the limits": 1}
     assert found.hardware_suspected == 1
     assert found.left_out == 1
+    assert found.left_out_reasons == {f"cannot be read: {EVIL}": 1}
     assert found.moved_sensors == 1
 
 
@@ -47,50 +58,76 @@ def test_sums_are_those_of_the_result(result: Path) -> None:
     assert found.duration_h.median == 0.5
 
 
-def test_an_uncorrected_vehicle_keeps_its_measured_sum(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_uncorrected_vehicle_keeps_its_measured_sum(tmp_path: Path, database: VehicleDatabase) -> None:
     item = vehicle(database, "V1", sensor(0.1), sensor(), verdict="cannot tell", sums_a=(9.0, 2.0))
     table = read_fleet_table(write_result(tmp_path / "r", [item]))
     assert table.deployed_a.tolist() == [9.0]
 
 
-def test_largest_faults_come_first_with_what_is_done_about_them(result: Path) -> None:
-    rows = largest_faults(read_fleet_table(result))
-    assert [(row.vehicle, row.branch, row.error_a) for row in rows[:3]] == [
-        ("V5", "motor", 180.0),
-        ("V1", "battery", 44.0),
-        ("V10", "battery", 20.0),
-    ]
-    assert [row.state for row in rows[:2]] == ["beyond the limits", "corrected"]
-    assert rows[1].drift == "+10.00 ± 0.10 %"
-    assert rows[1].offset == "+4.00 ± 0.10 A"
+def test_estimate_without_a_fault_is_no_fault(tmp_path: Path, database: VehicleDatabase) -> None:
+    """One junction by itself reports an estimate of every sensor, also of those that are in order."""
+    sound = replace(sensor(), drift=1e-4, offset_a=0.01, fault_probability=0.02)
+    item = vehicle(database, "V1", sensor(0.1, apply=True), sound)
+    found = overview_of(read_fleet_table(write_result(tmp_path / "r", [item])))
+    assert (found.faulty_sensors, found.applied_sensors) == (1, 1)
 
 
-def test_the_workshop_gets_hardware_faults_and_sensors_that_parameters_do_not_mend(result: Path) -> None:
-    found = workshop_list(read_fleet_table(result))
-    (row,) = found.hardware
-    assert (row.vehicle, row.probability, row.drift, list(row.offset_a)) == ("V3", 0.97, -0.06, [2.0, -2.0])
-    assert [(row.vehicle, row.branch) for row in found.sensors] == [("V5", "motor")]
+def test_unknown_is_not_counted_as_none(tmp_path: Path, database: VehicleDatabase) -> None:
+    item = vehicle(database, "V1", sensor(), replace(sensor(), delay_s=None), verdict="no sensor fault")
+    item = replace(item, hardware_fault=replace(item.hardware_fault, probability=None))
+    found = overview_of(read_fleet_table(write_result(tmp_path / "r", [item])))
+    assert found.hardware_suspected is None
+    assert list(found.delay_ms) == ["battery"]
 
 
-def test_vehicles_left_out_are_told_by_reason(result: Path) -> None:
-    table = read_fleet_table(result)
-    (row,) = left_out_rows(table, overview_of(table))
-    assert (row.count, row.reason, row.names) == (1, f"cannot be read: {EVIL}", f"log of {EVIL}")
-
-
-def test_changes_since_an_earlier_result_are_of_the_sensors_that_changed(
-    result: Path, tmp_path: Path, database: VehicleDatabase
+def test_workshop_list_has_hardware_then_sensors_then_what_many_share(
+    tmp_path: Path, database: VehicleDatabase
 ) -> None:
-    before = six_vehicles(database)
-    before[0] = vehicle(database, "V1", sensor(0.08, 5.0, apply=True), sensor())
-    table, earlier = read_fleet_table(result), read_fleet_table(write_result(tmp_path / "before", before))
-    found = changes_since(table, earlier)
-    np.testing.assert_allclose(found["battery"], [0.02 * 400.0 - 1.0])
-    assert len(found["motor"]) == 0
-    assert changes_since(table, table) == changes_since(table, None) == {}
+    vehicles = six_vehicles(database)
+    load = Finding(branch="battery", cause="load", probability=0.99, text="5 A without a sensor.")
+    inverted = Finding(branch="motor", cause="inverted", probability=0.9, text="its sign is turned.")
+    vehicles[1] = replace(vehicles[1], findings=[load, inverted])
+    rows = workshop(read_fleet_table(write_result(tmp_path / "r", vehicles)))
+    assert [(row.vehicle, row.branch, row.cause, row.probability) for row in rows] == [
+        ("V3", "", "hardware", 0.97),
+        ("V5", "motor", "beyond the limits", 0.995),
+        ("V2", "motor", "inverted", 0.9),
+        ("V2", "battery", "load", 0.99),
+    ]
+    assert rows[0].text == "its currents differ from the fleet's: all −6.00 %, battery +2.00 A, motor −2.00 A"
+    assert "replace the sensor" in rows[1].text
 
 
-def test_a_result_whose_rows_are_not_those_of_its_run_is_refused(result: Path) -> None:
+def test_steps_say_what_to_do_and_to_whom(result: Path) -> None:
+    install, window, hardware, check, left_out = steps(result)
+    assert install.startswith("Install the parameters of V1, V10 on their nodes")
+    assert window == "A zero-current window (contactors open) would decide about V4."
+    assert hardware == "Look at the hardware of V3: their currents differ from the fleet's."
+    assert check == "Check the sensors of V5 (motor): see the workshop list."
+    assert left_out == f"Find out why log of {EVIL} could not be used; most often: cannot be read: {EVIL}."
+
+
+def test_steps_join_vehicles_that_need_the_same(tmp_path: Path, database: VehicleDatabase) -> None:
+    needs = {
+        "V1": "a zero-current window (contactors open) would decide: the motor sensor then shows -7 A or +0 A",
+        "V2": "a zero-current window (contactors open) would decide: the motor sensor then shows +3 A or +0 A",
+        "V3": "only ratios of gains are known: name a sensor that you trust",
+        "V4": "a check of the motor sensor would decide: its gain is off by 3 % or 4 %",
+    }
+    items = [vehicle(database, name, sensor(), sensor(), decides=need) for name, need in needs.items()]
+    assert steps(write_result(tmp_path / "r", items)) == [
+        "A zero-current window (contactors open) would decide about V1, V2.",
+        "V3: only ratios of gains are known: name a sensor that you trust.",
+        "A check of the motor sensor would decide about V4: its gain is off by 3 % or 4 %.",
+    ]
+
+
+def test_faultless_fleet_has_nothing_to_do(tmp_path: Path, database: VehicleDatabase) -> None:
+    items = [vehicle(database, name, sensor(), sensor(), verdict="no sensor fault") for name in ("V1", "V2")]
+    assert steps(write_result(tmp_path / "r", items)) == ["Nothing: no fault was found, and no question is open."]
+
+
+def test_result_whose_rows_are_not_those_of_its_run_is_refused(result: Path) -> None:
     run = (result / "run.json").read_text()
     (result / "run.json").write_text(run.replace('"motor"\n', '"dcdc"\n', 1))
     with pytest.raises(
@@ -99,7 +136,7 @@ def test_a_result_whose_rows_are_not_those_of_its_run_is_refused(result: Path) -
         read_fleet_table(result)
 
 
-def test_a_damaged_result_is_named(result: Path) -> None:
+def test_damaged_result_is_named(result: Path) -> None:
     (result / "results.parquet").write_bytes(b"PAR1")
     with pytest.raises(FleetError, match=r"results\.parquet: cannot be read: .*; give a folder"):
         read_fleet_table(result)

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from calibrator.report.overview import protection_of
-from calibrator.report.protection import SIGMAS, Margins, margins
+from calibrator.report.protection import SIGMAS, Margins, margins, protection_of
 
 ONES = np.ones(4)
 DRIFT, OFFSET_A = np.array([0.1, -0.1, 0.0, 0.02]), np.array([4.0, 4.0, 0.0, -1.0])

@@ -61,7 +61,7 @@ def test_an_argument_that_does_not_exist_or_has_no_logs_is_a_problem(tmp_path: P
     (tmp_path / "empty").mkdir()
     found = find_logs([tmp_path / "nothing", tmp_path / "empty", tmp_path / "V1"])
     assert len(found.logs) == 1
-    assert ["no such file or folder" in str(p) or "no logs in this folder" in str(p) for p in found.problems] == [
+    assert ["no such file or folder" in str(p) or "no logs in it" in str(p) for p in found.problems] == [
         True,
         True,
     ]

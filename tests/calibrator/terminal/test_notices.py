@@ -1,7 +1,6 @@
 """Equal notices of many drives are told once."""
 
-from calibrator.terminal.notices import Notice, merged_notices
-from calibrator.terminal.text import left_out_text, reasons_text, told_once
+from calibrator.terminal.text import Notice, left_out_text, merged_notices, reasons_text, told_once
 
 
 def spoilt(bad: int, of: int) -> Notice:

@@ -1,4 +1,26 @@
-from calibrator.terminal.text import counted, few, few_reasons
+import math
+
+import pytest
+
+from calibrator.terminal.text import counted, few, few_reasons, figure
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (50.0, 1, "50"),
+        (2.4, 3, "2.4"),
+        (0.034567, 2, "0.035"),
+        (4096.4, 2, "4,096"),
+        (-123.456, 3, "-123"),
+        (0.0, 3, "0"),
+        (-1e-12, 3, "0"),
+        (1e7, 3, "10,000,000"),
+        (math.nan, 3, "-"),
+    ],
+)
+def test_figures_are_written_as_people_do(value: float, digits: int, text: str) -> None:
+    assert figure(value, digits) == text
 
 
 def test_of_many_names_the_first_are_told() -> None:

@@ -1,0 +1,482 @@
+"""What logs or tables hold of the branches and inputs of a layout: the facts that the doctor's checks look at."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from cantools.database.can import Signal
+
+from calibrator.doctor.junction import JunctionFacts, junction_facts
+from calibrator.doctor.words import is_battery
+from calibrator.drive import Array, Channel, Drive, Mask
+from calibrator.drives.align import TIME_RESOLUTION_S, align, base_inputs, choose_inputs
+from calibrator.errors import DriveError, LogError
+from calibrator.kirchhoff.sums import Comparison, compare_kirchhoff, sensor_of, with_voltages
+from calibrator.recordings.frames import read_frames
+from calibrator.recordings.log_time import repaired_time
+from calibrator.recordings.readers import (
+    FrameSource,
+    RecordingReport,
+    Source,
+    TableSource,
+    drive_from_frames,
+    drive_from_table,
+)
+from calibrator.recordings.tables import is_table, read_table
+from ecu_node.database import VehicleDatabase, look_everything_up, read_database
+from ecu_node.errors import DatabaseError, LayoutError
+from ecu_node.layout import Branch, Input, Layout
+
+__all__ = ["ChannelFacts", "Facts", "Log", "examine"]
+
+NOTHING = Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_))
+VOLTAGE = "_junction_voltage"
+"""Input that the doctor adds for itself: what powers are divided by."""
+MOST_MINUTES = 60.0
+"""Of each log: an hour tells what is wrong with a layout, and takes some seconds. [min]"""
+FEWEST_CLIPPED = 3
+"""In a row at the end of the range: one or two may be the true peak."""
+LEAST_V, GREATEST_V, USUAL_V = 30.0, 1500.0, 400.0
+"""From 48 V systems to the highest that road vehicles have; a slip is a power of ten that leads nearest to most. [V]"""
+AVERAGED_S = 2.0
+"""Noise is averaged out over this long, to see whether currents move. [s]"""
+FEWEST_INSTANTS = 300
+"""Of aligned samples, to say how well inputs explain a current: half a minute at 0.1 s."""
+COARSEST = 0.01
+"""Share of full scale; a coarser step is a slip of a unit. [1]"""
+LEAST_SHARE = 0.05
+"""Of the greatest branch's variation: that of a smaller one is mostly noise. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelFacts:
+    """One branch or input over all logs.
+
+    Attributes
+    ----------
+    name, signal, unit : str
+        Name in the layout; signal, column or formula; unit of `low` and `high`.
+    frames : int
+        Frames, or rows, that carry it.
+    in_logs, logs : int
+        In how many of how many logs.
+    period_s, jitter_s, gap_s : float
+        Median distance of frames, the 95th percentile of how far distances are from it, and the longest distance; NaN
+        with fewer than two frames. [s]
+    late : int
+        Distances longer than its time-out.
+    same_time : int
+        Frames with the time stamp of the one before.
+    bad : dict of str to int
+        Frames that cannot be used, by reason.
+    low, high : float
+        Least and greatest good value; branches are positive into the junction; NaN without any. [unit]
+    moves : bool
+        Whether good values differ at all.
+    clipped : int
+        Good values at an end of what the signal can show, several in a row.
+    """
+
+    name: str
+    signal: str
+    unit: str
+    frames: int
+    in_logs: int
+    logs: int
+    period_s: float
+    jitter_s: float
+    gap_s: float
+    late: int
+    same_time: int
+    bad: dict[str, int]
+    low: float
+    high: float
+    moves: bool
+    clipped: int
+
+    @property
+    def bad_frames(self) -> int:
+        """Frames that cannot be used."""
+        return sum(self.bad.values())
+
+    @property
+    def good(self) -> int:
+        """Frames that can be used."""
+        return self.frames - self.bad_frames
+
+
+@dataclass(frozen=True, kw_only=True)
+class Log:
+    """One log or table.
+
+    Attributes
+    ----------
+    name : str
+        Its file.
+    source : Source
+        Look-ups of signals in it.
+    report : RecordingReport
+        Its account.
+    drive : Drive or None
+        None if it has no branch of the layout; `why` then tells what it has.
+    why : str
+        Empty if there is a drive.
+    duration_s : float
+        From the first to the last frame. [s]
+    cut : bool
+        Whether it goes on after :data:`MOST_MINUTES`, where it was cut.
+    """
+
+    name: str
+    source: Source
+    report: RecordingReport
+    drive: Drive | None
+    why: str
+    duration_s: float
+    cut: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """Everything that the checks look at.
+
+    Attributes
+    ----------
+    layout : Layout
+        As the user has it.
+    database : VehicleDatabase
+        DBC and the part of the layout that it can serve.
+    missing : mapping of (str, str) to str
+        Why a ``branch`` or ``input`` of this name, or the ``layout``, cannot be looked up.
+    logs : tuple of Log
+        What was looked at.
+    branches, inputs : tuple of ChannelFacts
+        Of those that the DBC has, in the order of the layout.
+    usable : tuple of str
+        Branches with good values.
+    slip : tuple of (str, float, float) or None
+        Signal of a voltage that is impossible, its median [V], and the power of ten that makes it usual.
+    comparisons : tuple of Comparison
+        The currents of each log on one time base, with such a slip put right.
+    steps_a : mapping of str to float
+        Step of the signal of each usable branch, at most :data:`COARSEST`. [A]
+    junction : JunctionFacts or None
+        What the sum tells; None with fewer than two usable branches.
+    explained : mapping of str to float
+        Share of each current's variation that the model inputs explain; empty if that cannot be told.
+    """
+
+    layout: Layout
+    database: VehicleDatabase
+    missing: Mapping[tuple[str, str], str]
+    logs: tuple[Log, ...]
+    branches: tuple[ChannelFacts, ...]
+    inputs: tuple[ChannelFacts, ...]
+    usable: tuple[str, ...]
+    slip: tuple[str, float, float] | None
+    comparisons: tuple[Comparison, ...]
+    steps_a: Mapping[str, float]
+    junction: JunctionFacts | None
+    explained: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def drives(self) -> list[Drive]:
+        """What the logs gave."""
+        return [log.drive for log in self.logs if log.drive is not None]
+
+    @cached_property
+    def sum_a(self) -> Array:
+        """Sum of the branches at all valid instants. [A]"""
+        return np.concatenate([np.zeros(0), *(c.sums_a["before"][c.valid] for c in self.comparisons)])
+
+    @property
+    def valid_s(self) -> float:
+        """How long all usable branches have values together. [s]"""
+        return self.layout.period_s * len(self.sum_a)
+
+    @cached_property
+    def movement_a(self) -> dict[str, float]:
+        """Standard deviation of each usable branch, noise averaged out. [A]"""
+        length = max(round(AVERAGED_S / self.layout.period_s), 1)
+        found = {}
+        for k, name in enumerate(self.usable):
+            parts = [c.currents_a["before"][c.valid, k] for c in self.comparisons]
+            whole = [part[: len(part) // length * length].reshape(-1, length).mean(axis=1) for part in parts]
+            found[name] = float(np.std(np.concatenate([np.zeros(0), *whole]))) if sum(map(len, whole)) > 1 else 0.0
+        return found
+
+    @cached_property
+    def available(self) -> set[str]:
+        """Inputs that were recorded."""
+        return {name for drive in self.drives for name in drive.inputs}
+
+    def sum_json(self) -> dict[str, float] | None:
+        """Figures of the sum."""
+        if not len(self.sum_a):
+            return None
+        instants = sum(len(c.valid) for c in self.comparisons)
+        return {
+            "mean_a": float(self.sum_a.mean()),
+            "sd_a": float(self.sum_a.std()),
+            "instants": instants,
+            "valid": len(self.sum_a),
+        }
+
+
+def examine(layout: Layout, paths: Sequence[Path]) -> Facts:
+    """Gather the facts of a layout and logs of one vehicle.
+
+    Parameters
+    ----------
+    layout : Layout
+        The layout; its DBC is read.
+    paths : sequence of Path
+        At least one log or table.
+
+    Returns
+    -------
+    Facts
+        For :func:`calibrator.doctor.checks.findings_of`.
+
+    Raises
+    ------
+    UserError
+        If DBC or a log cannot be read at all.
+    """
+    database, missing = _usable_part(layout)
+    voltage = _voltage_signal(database)
+    more = [] if voltage is None else [Input(name=VOLTAGE, signal=voltage)]
+    extended = with_voltages(_with_layout(database, input=[*database.layout.input, *more]))
+    logs = [_read(path, extended) for path in paths]
+    branches = tuple(_channel_facts(item, item.timeout_s, logs, database) for item in database.layout.branch)
+    inputs = tuple(_channel_facts(item, database.layout.max_age_s, logs, database) for item in database.layout.input)
+    drives = [log.drive for log in logs if log.drive is not None]
+    usable = [facts.name for facts in branches if facts.good]
+    slip = None if voltage is None else _voltage_slip(drives, voltage, database)
+    right = drives
+    if slip is not None:
+        divided = {item.name for item in database.layout.branch if item.voltage == voltage}
+        right = [_divided(drive, divided, slip[2]) for drive in drives]
+    whole = [drive for drive in right if {name for name in usable if drive.branches[name].good.any()} == set(usable)]
+    comparisons, junction, steps_a = [], None, dict[str, float]()
+    if len(usable) > 1:
+        for drive in whole:
+            with suppress(DriveError):
+                comparisons.append(compare_kirchhoff(drive, extended))
+        for name in usable if whole else []:
+            step_a = max(sensor_of(extended, name, drive).step_a for drive in whole)
+            steps_a[name] = min(step_a, COARSEST * layout.full_scale_a)
+        junction = junction_facts(
+            right,
+            usable,
+            full_scale_a=layout.full_scale_a,
+            least_a=float(np.linalg.norm([*steps_a.values()])),
+            battery=next((name for name in usable if is_battery(name, layout.find_branch(name).source)), None),
+            voltage=VOLTAGE,
+        )
+    return Facts(
+        layout=layout,
+        database=database,
+        missing=missing,
+        logs=tuple(logs),
+        branches=branches,
+        inputs=inputs,
+        usable=tuple(usable),
+        slip=slip,
+        comparisons=tuple(comparisons),
+        steps_a=steps_a,
+        junction=junction,
+        explained=_explained_shares(drives, database.layout, usable) if usable else {},
+    )
+
+
+_NOTHING: dict[str, Any] = {
+    "branch": [], "input": [], "derived": [], "model_inputs": [], "fleet_inputs": [], "contactor": None, "status": None,
+    "temperature": None, "e2e": [],
+}  # fmt: skip
+
+
+def _with_layout(database: VehicleDatabase, **keys: Any) -> VehicleDatabase:
+    return replace(database, layout=msgspec.structs.replace(database.layout, **keys))
+
+
+def _usable_part(layout: Layout) -> tuple[VehicleDatabase, dict[tuple[str, str], str]]:
+    """DBC, and the layout without what it does not have, and what depends on that; and why for each left out."""
+    try:
+        return read_database(layout), {}
+    except (DatabaseError, LayoutError) as error:
+        nothing = msgspec.structs.replace(layout, **_NOTHING, watch=type(layout.watch)())
+        bare, reason = read_database(nothing), str(error)
+    missing: dict[tuple[str, str], str] = {}
+
+    def kept(items: Iterable[Any], what: str) -> list[Any]:
+        good = []
+        for item in items:
+            try:
+                look_everything_up(_with_layout(bare, **{what: [item]}))
+                good.append(item)
+            except (DatabaseError, LayoutError) as error:
+                missing[what, item.name] = str(error)
+        return good
+
+    branches, inputs = kept(layout.branch, "branch"), kept(layout.input, "input")
+    names = [item.name for item in inputs]
+    pruned = msgspec.structs.replace(
+        layout,
+        branch=branches,
+        input=inputs,
+        derived=[item for item in layout.derived if base_inputs(layout, [item.name]) <= set(names)],
+        model_inputs=list(choose_inputs(layout, names)[0]),
+        fleet_inputs=list(choose_inputs(layout, names, names=layout.fleet_inputs)[0]),
+        contactor=None,
+        status=None,
+        temperature=None,
+        watch=type(layout.watch)(),
+    )
+    return replace(bare, layout=pruned), missing or {("layout", layout.path.name): reason}
+
+
+def _read(path: Path, database: VehicleDatabase) -> Log:
+    names, cut = {"vehicle": database.layout.name, "name": path.name.partition(".")[0]}, False
+    if is_table(path):
+        table = read_table(path)
+        source: Source = TableSource(table, database)
+        duration_s, make = float(table.time_s[-1]), partial(drive_from_table, table, database, **names)
+    else:
+        whole = read_frames(path)
+        time = repaired_time(whole.time_ns)
+        first = int(np.searchsorted(time.time_s, 60.0 * MOST_MINUTES, side="right"))
+        frames, cut = whole.take(np.sort(time.order[:first])), first < len(whole)  # in the order of the file
+        source, duration_s = FrameSource(frames, database, str(path)), float(time.time_s[first - 1])
+        make = partial(drive_from_frames, frames, database, **names, where=str(path))
+    drive, why, report = None, "", source.report(())
+    try:
+        recording = make()
+        drive, report = recording.drive, recording.report
+    except LogError as error:
+        why = str(error)
+    return Log(name=str(path), source=source, report=report, drive=drive, why=why, duration_s=duration_s, cut=cut)
+
+
+def _channel_facts(
+    item: Branch | Input, timeout_s: float, logs: Sequence[Log], database: VehicleDatabase
+) -> ChannelFacts:
+    """Gather what logs hold of one branch [A], or of one input in the unit of its signal."""
+    is_branch = isinstance(item, Branch)
+    name, signal = (item.name, item.source) if isinstance(item, Branch) else (item.name, item.signal)
+    computed = isinstance(item, Branch) and item.computed
+    unit, clipped, bad, frames = "A" if is_branch else "", 0, dict[str, int](), list[int]()
+    values, steps = list[Array]([np.zeros(0)]), list[Array]([np.zeros(0)])
+    for log in logs:
+        if log.drive is None:
+            continue
+        made = (log.drive.branches if is_branch else log.drive.inputs).get(name)
+        if made is not None:
+            values.append(made.value[made.good])
+        raw = made or NOTHING if computed else log.source.channel(signal)
+        reasons = {"no value": ~raw.good} if computed else log.source.bad(signal)
+        counted = np.zeros(len(raw.time_s), np.bool_)
+        for reason, mask in reasons.items():
+            bad[reason] = bad.get(reason, 0) + int((mask & ~counted).sum())
+            counted |= mask
+        frames.append(len(raw.time_s))
+        steps.append(np.diff(raw.time_s))
+        if not computed:
+            clipped += _clipped(database.signal(signal)[1], raw.value[~counted])
+            unit = unit or log.source.unit(signal)
+    value, step_s = np.concatenate(values), np.concatenate(steps)
+    if (other := sum(frames) - sum(bad.values()) - len(value)) > 0:
+        bad["no voltage"] = other
+    period_s = float(np.median(step_s)) if len(step_s) else np.nan
+    return ChannelFacts(
+        name=name,
+        signal=signal,
+        unit=unit,
+        frames=sum(frames),
+        in_logs=sum(count > 0 for count in frames),
+        logs=len(logs),
+        period_s=period_s,
+        jitter_s=float(np.quantile(np.abs(step_s - period_s), 0.95)) if len(step_s) else np.nan,
+        gap_s=float(step_s.max()) if len(step_s) else np.nan,
+        late=int(np.sum(step_s > timeout_s + TIME_RESOLUTION_S)),
+        same_time=int(np.sum(step_s <= 0.0)),
+        bad={reason: count for reason, count in bad.items() if count},
+        low=float(value.min()) if len(value) else np.nan,
+        high=float(value.max()) if len(value) else np.nan,
+        moves=bool(len(value) and value.max() > value.min()),
+        clipped=clipped,
+    )
+
+
+def _clipped(signal: Signal, value: Array) -> int:
+    """Values at an end, other than 0, of what an integer signal can show and the DBC allows; some in a row each."""
+    if signal.is_float:
+        return 0
+    half = 1 << (signal.length - 1)
+    codes = (-half, half - 1) if signal.is_signed else (0, 2 * half - 1)
+    low, high = sorted(float(code * signal.scale + signal.offset) for code in codes)
+    if signal.minimum or signal.maximum:
+        low = max(low, float(signal.minimum) if signal.minimum is not None else low)
+        high = min(high, float(signal.maximum) if signal.maximum is not None else high)
+    return sum(_in_a_row(np.abs(value - end) < 0.5 * abs(float(signal.scale))) for end in (low, high) if end)
+
+
+def _in_a_row(mask: Mask) -> int:
+    """How many are true with at least :data:`FEWEST_CLIPPED` in a row."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    lengths = edges[1::2] - edges[::2]
+    return int(lengths[lengths >= FEWEST_CLIPPED].sum())
+
+
+def _voltage_signal(database: VehicleDatabase) -> str | None:
+    """What powers are divided by, or else the first input in volts."""
+    volts = [item.signal for item in database.layout.input if database.signal(item.signal)[1].unit == "V"]
+    return next((item.voltage for item in database.layout.branch if item.voltage), volts[0] if volts else None)
+
+
+def _voltage_slip(drives: Sequence[Drive], signal: str, database: VehicleDatabase) -> tuple[str, float, float] | None:
+    """Signal, median and factor of a voltage that is none of a vehicle; zero (contactors open) is possible."""
+    channels = [drive.inputs[VOLTAGE] for drive in drives if VOLTAGE in drive.inputs]
+    value = np.concatenate([np.zeros(0), *(channel.value[channel.good] for channel in channels)])
+    median_v = float(np.median(np.abs(value))) if len(value) else 0.0
+    if database.signal(signal)[1].unit != "V" or median_v <= 0.0 or LEAST_V <= median_v <= GREATEST_V:
+        return None
+    return signal, median_v, 10.0 ** float(np.rint(np.log10(USUAL_V / median_v)))
+
+
+def _divided(drive: Drive, names: set[str], divisor: float) -> Drive:
+    """Put the currents right that were made of powers by dividing by such a voltage."""
+    right = {
+        name: replace(channel, value=channel.value / divisor) if name in names else channel
+        for name, channel in drive.branches.items()
+    }
+    return replace(drive, branches=right)
+
+
+def _explained_shares(drives: Sequence[Drive], layout: Layout, branches: Sequence[str]) -> dict[str, float]:
+    """How much of each current's variation the model inputs explain, as a plain linear model.
+
+    By branch that matters, 1 for all of it; empty if the inputs are not recorded or too little is valid.
+    """
+    recorded = choose_inputs(layout, set.intersection(*(set(drive.inputs) for drive in drives)))[0] if drives else ()
+    if not recorded:
+        return {}
+    try:
+        samples = [align(drive, layout, branches, inputs=recorded) for drive in drives]
+    except DriveError:
+        return {}
+    inputs = np.concatenate([s.inputs[s.valid] for s in samples])
+    currents_a = np.concatenate([s.currents_a[s.valid] for s in samples])
+    if len(inputs) < FEWEST_INSTANTS:
+        return {}
+    spread = inputs.std(axis=0)
+    columns = np.column_stack([inputs / np.where(spread > 0.0, spread, 1.0), np.ones(len(inputs))])
+    rest = currents_a - columns @ np.linalg.lstsq(columns, currents_a, rcond=1e-8)[0]
+    power = currents_a.var(axis=0)
+    shares = 1.0 - np.divide(rest.var(axis=0), power, out=np.ones(len(power)), where=power > 0.0)
+    return {name: float(shares[k]) for k, name in enumerate(branches) if power[k] > LEAST_SHARE**2 * power.max()}

@@ -1,0 +1,290 @@
+"""Signals of a database or columns of a table: what units, words and ranges say of them, and what a recording shows."""
+
+import copy
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from cantools.database.can import Database, Message, Signal
+from numpy.typing import NDArray
+
+from calibrator.doctor.words import CURRENT, POWER, VOLTAGE, words_of
+from calibrator.drive import Array, Channel, Mask
+from calibrator.recordings.decode import decode_signal, raw_values
+from calibrator.recordings.frame_arrays import Frames, frame_key
+from calibrator.recordings.log_time import repaired_time
+from calibrator.recordings.signal_range import signal_range
+from calibrator.recordings.tables import Table
+from ecu_node.errors import DatabaseError
+from ecu_node.units import AMPERE, VOLT, WATT, unit_factor
+
+__all__ = ["FLOWS", "Candidate", "of_database", "of_table", "with_log"]
+
+FLOWS = {"current": AMPERE, "power": WATT, "voltage": VOLT}
+"""Quantities of branches, with the units that the layout knows."""
+_OTHERS = {
+    "torque": {"nm", "n.m", "n*m", "newtometer"},
+    "speed": {"km/h", "kph", "kmh", "km/hr", "m/s", "mph", "rpm", "1/min", "kilometerperhour", "minutinver"},
+    "temperature": {"degc", "°c", "c", "celsius"},
+}
+"""Units as databases write them, in lower case and without blanks, by quantity."""
+_MEASURED = {"current": CURRENT, "voltage": VOLTAGE, "power": POWER}
+"""Words by which a signal without a unit is known, if its name ends with one or begins with a letter for it."""
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_FEWEST_BITS = 8
+"""Signals without a unit that are shorter are states."""
+NO_RANGE = 1e-3
+"""A range below this share of what the bits can say is a slip, such as 0 to 1 for a voltage. [1]"""
+WRONG_RANGE, FEWEST_OUTSIDE = 0.01, 5
+"""Share of values, and how many different ones, outside the database's range, to call the range wrong: a code for
+"not available" is one value. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """A signal or column.
+
+    Attributes
+    ----------
+    name : str
+        ``Message.Signal``, or the header of a column.
+    quantity : str
+        By its unit, or else by its name; empty for others.
+    unit, comment : str
+        As written.
+    own, words : tuple of str
+        Words of its name and comment; these, and those of its message and sender.
+    factor : float
+        Turns values as written into A, V or W; 1 for other quantities.
+    low, high : float
+        Least and greatest value that bits and range allow [A, V, W]; infinite for columns.
+    message, signal : Message, Signal or None
+        Of the database; None for columns.
+    channel : Channel or None
+        What a recording has of it, in A, V or W, whatever range the database gives; None without one.
+    formula : str
+        Of inputs, if it is computed; empty for what is measured.
+    wrong : str
+        What the recording shows to be wrong in the database: ``range`` or ``sign``; empty for nothing.
+    """
+
+    name: str
+    quantity: str
+    unit: str
+    comment: str
+    own: tuple[str, ...]
+    words: tuple[str, ...]
+    factor: float = 1.0
+    low: float = -np.inf
+    high: float = np.inf
+    message: Message | None = field(default=None, repr=False)
+    signal: Signal | None = field(default=None, repr=False)
+    channel: Channel | None = field(default=None, repr=False)
+    formula: str = ""
+    wrong: str = ""
+
+    @property
+    def about(self) -> str:
+        """Unit and comment, for a remark."""
+        comment = " ".join(self.comment.split())
+        return (self.unit or "no unit") + (f', "{comment}"' if comment else "")
+
+    @property
+    def multiplexed(self) -> bool:
+        """Whether only some frames of its message carry it."""
+        return self.signal is not None and bool(self.signal.multiplexer_ids)
+
+    @cached_property
+    def good(self) -> Array:
+        """Good values of the recording, shape (n,)."""
+        return self.channel.value[self.channel.good] if self.channel is not None else np.zeros(0)
+
+    @property
+    def peak(self) -> float:
+        """Greatest magnitude but for wild samples; 0 without any. [A, V, W]"""
+        return float(np.quantile(np.abs(self.good), 0.999)) if len(self.good) else 0.0
+
+    @cached_property
+    def roughness(self) -> float:
+        """Root mean square of steps over that of white noise of the same spread: near 1 for what jumps about. [1]"""
+        value = self.good
+        spread = float(value.std()) if len(value) > 1 else 0.0
+        return float(np.sqrt(np.mean(np.diff(value) ** 2) / 2.0)) / spread if spread > 0.0 else 0.0
+
+    @property
+    def rough_steps_s(self) -> tuple[float, float]:
+        """Median and longest distance of its samples; NaN without any. [s]"""
+        steps_s = np.diff(self.channel.time_s) if self.channel is not None else np.zeros(0)
+        return (float(np.median(steps_s)), float(steps_s.max())) if len(steps_s) else (np.nan, np.nan)
+
+
+def of_database(database: Database) -> list[Candidate]:
+    """All signals of a database that a layout can name, in its order.
+
+    Signals that no control unit sends (``VECTOR__INDEPENDENT_SIG_MSG``) are none.
+    """
+    found = []
+    for message in database.messages:
+        if message.name == "VECTOR__INDEPENDENT_SIG_MSG" or not _NAME.fullmatch(message.name):
+            continue
+        rest = words_of(message.name, message.comment, *message.senders)
+        for signal in message.signals:
+            if not _NAME.fullmatch(signal.name):
+                continue
+            quantity, factor = _quantity(signal)
+            span = signal_range(signal, factor)
+            codes = (-(1 << signal.length - 1), (1 << signal.length - 1) - 1)
+            codes = codes if signal.is_signed else (0, (1 << signal.length) - 1)
+            ends = sorted(factor * (code * float(signal.scale) + float(signal.offset)) for code in codes)
+            if span.high - span.low < NO_RANGE * (ends[1] - ends[0]):
+                span = replace(span, low=-np.inf, high=np.inf)
+            own = words_of(signal.name, signal.comment)
+            found.append(
+                Candidate(
+                    name=f"{message.name}.{signal.name}",
+                    quantity=quantity,
+                    unit=signal.unit or "",
+                    comment=signal.comment or "",
+                    own=own,
+                    words=(*own, *rest),
+                    factor=factor,
+                    low=max(ends[0], span.low),
+                    high=min(ends[1], span.high),
+                    message=message,
+                    signal=signal,
+                )
+            )
+    return found
+
+
+def _quantity(signal: Signal) -> tuple[str, float]:
+    for quantity, units in FLOWS.items():
+        try:
+            factor = unit_factor(signal, units, "")
+        except DatabaseError:
+            continue
+        return (quantity, factor) if signal.unit else (_by_name(signal), 1.0)
+    return _other(signal.unit or ""), 1.0
+
+
+def _by_name(signal: Signal) -> str:
+    named = words_of(signal.name)
+    if signal.length < _FEWEST_BITS or signal.choices or not named:
+        return ""
+    return _named_quantity(named)
+
+
+def _named_quantity(named: Sequence[str]) -> str:
+    letters = [word for word in named if not word.isdigit()] or [""]
+    for quantity, words in _MEASURED.items():
+        if letters[-1] in words or letters[0] in words & {"i", "u", "p"}:
+            return quantity
+    return ""
+
+
+def _other(unit: str) -> str:
+    plain = re.sub(r"^(unit_|\w+:)|\s", "", unit.lower())
+    return next((quantity for quantity, units in _OTHERS.items() if plain in units), "")
+
+
+def with_log(found: Sequence[Candidate], frames: Frames) -> list[Candidate]:
+    """Those of some signals that a log holds, with what it shows of them.
+
+    Parameters
+    ----------
+    found : sequence of Candidate
+        Signals of the database.
+    frames : Frames
+        Of the log; of an identifier on several buses, the one with most frames counts.
+
+    Returns
+    -------
+    list of Candidate
+        Without those whose message, or multiplexed part of it, never comes.
+    """
+    time = repaired_time(frames.time_ns)
+    ordered = frames.take(time.order)
+    rows: dict[int, NDArray[np.intp]] = {}
+    kept: list[Candidate] = []
+    for item in found:
+        if item.message is None or item.signal is None or not item.quantity:
+            continue
+        key = frame_key(item.message.frame_id, extended=item.message.is_extended_frame)
+        if key not in rows:
+            rows[key] = _on_one_bus(np.flatnonzero(ordered.key == np.uint32(key)), ordered)
+        if len(rows[key]):
+            seen = _seen(item, item.message, item.signal, ordered.take(rows[key]), time.time_s[rows[key]])
+            kept += [seen] if seen is not None else []
+    return kept
+
+
+def _on_one_bus(rows: NDArray[np.intp], frames: Frames) -> NDArray[np.intp]:
+    if not len(rows):
+        return rows
+    channels = frames.channel[rows]
+    return np.asarray(rows[channels == np.bincount(channels).argmax()])
+
+
+def _seen(item: Candidate, message: Message, signal: Signal, frames: Frames, time_s: Array) -> Candidate | None:
+    """The candidate with its values; a range that these show to be wrong is not applied to them."""
+    named = frozenset(map(int, signal.choices or {})) if item.quantity in FLOWS else None
+    unlimited = copy.copy(signal)
+    unlimited.minimum = unlimited.maximum = None
+    every = decode_signal(message, unlimited, frames.data, frames.length, named)
+    if not every.present.any():
+        return None
+    inside = signal_range(signal).holds(every.value)
+    outside = every.good & ~inside
+    wrong = ""
+    if outside.sum() > WRONG_RANGE * every.good.sum() and len(np.unique(every.value[outside])) >= FEWEST_OUTSIDE:
+        wrong = "range"
+    value = every.value
+    turned = _signed(signal, frames, every.good) if item.quantity in FLOWS else None
+    if turned is not None:
+        wrong, value = "sign", turned
+    channel = Channel(
+        time_s=time_s[every.present],
+        value=(item.factor * value)[every.present],
+        good=(every.good & (inside | bool(wrong)))[every.present],
+    )
+    return replace(item, channel=channel, wrong=wrong)
+
+
+def _signed(signal: Signal, frames: Frames, good: Mask) -> Array | None:
+    """Values as if the highest bit were a sign, if the codes jump between both ends without that; else None."""
+    if signal.is_signed or signal.is_float or signal.length < _FEWEST_BITS or not good.any():
+        return None
+    raw = raw_values(signal, frames.data, frames.length)[0].astype(np.float64)
+    turned = np.where(raw >= 2.0 ** (signal.length - 1), raw - 2.0**signal.length, raw)
+    negative = np.unique(turned[good & (turned < 0.0)])
+    if len(negative) < FEWEST_OUTSIDE or turned[good].std() > 0.3 * raw[good].std():
+        return None
+    return turned * float(signal.scale) + float(signal.offset)
+
+
+def of_table(table: Table) -> list[Candidate]:
+    """The columns of a table, in its order."""
+    found = []
+    for name, value in table.columns.items():
+        own = words_of(name)
+        unit = table.units.get(name, "")
+        quantity, factor = next(
+            ((quantity, units[unit]) for quantity, units in FLOWS.items() if unit in units),
+            (_other(unit) if unit else _named_quantity(own), 1.0),
+        )
+        channel = Channel(time_s=table.time_s, value=factor * value, good=np.isfinite(value))
+        found.append(
+            Candidate(
+                name=name,
+                quantity=quantity,
+                unit=unit,
+                comment="",
+                own=own,
+                words=own,
+                factor=factor,
+                channel=channel,
+            )
+        )
+    return found

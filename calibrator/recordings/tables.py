@@ -1,0 +1,538 @@
+"""Tables of measured values: CSV and other text, Parquet, Feather, decoded MF4. One column is the time.
+
+Nothing has to be said about a file: delimiter, decimal sign, encoding, header, units and the time column are found, and
+:attr:`Table.found` tells what was found. Rows need not have a value in every column.
+"""
+
+import codecs
+import csv
+import difflib
+import io
+import itertools
+import re
+import warnings
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from calibrator.drive import Array, Mask
+from calibrator.drives.charge import GAP_PERIODS
+from calibrator.errors import LogError
+from calibrator.recordings.candump import is_candump
+from calibrator.recordings.log_files import UNREADABLE, exists, files_in, head_of, opened, readable, suffix_of
+from calibrator.recordings.log_time import repaired_time
+from calibrator.recordings.mf4 import is_bus_log, read_mf4_table
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.errors import LayoutError
+from ecu_node.layout import layout_of
+from ecu_node.units import AMPERE, usual_unit
+
+__all__ = ["TABLE_SUFFIXES", "Table", "bare_name", "is_table", "layout_from_branches", "read_table", "text_head"]
+
+TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow", ".mf4")
+FRAME_COLUMNS = ("arbitration_id", "id", "canid", "can id")
+"""Headers of identifiers, lower case: a text file that has one of them beside a time is a log of CAN frames."""
+_HEAD_BYTES = 1 << 16
+_DELIMITERS = ("\t", ";", "|", ",", " ")
+"""In the order in which they are tried: a comma may be the decimal sign, a blank stand in a date."""
+_EMPTY = frozenset(("", "-", "--", "nan", "na", "n/a", "#n/a", "null", "none"))
+_NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+_UNIT_BEHIND = re.compile(r"(.*\S)\s*[\[({<]([^\])}>]*)[\])}>]")
+_UNIT_SUFFIX = re.compile(r"(.*\w)\s*[_/, ]\s*(\w+)")
+_SUFFIXES = frozenset(["mA", "A", "kA", "mV", "V", "kV", "W", "kW", "ms", "us", "ns", "s"])
+_TIME_WORDS = frozenset(
+    [
+        "t",
+        "time",
+        "timestamp",
+        "timestamps",
+        "stamp",
+        "date",
+        "datetime",
+        "zeit",
+        "zeitstempel",
+        "datum",
+        "uhrzeit",
+        "temps",
+        "fecha",
+        "tiempo",
+        "tijd",
+        "elapsed",
+        "utc",
+        "epoch",
+        "seconds",
+        "sec",
+        "secs",
+        "millis",
+    ]
+)
+_TIME_UNITS = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), 1.0),
+    **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "micros", "microseconds"), 1e-6),
+    **dict.fromkeys(("ns", "nanoseconds"), 1e-9),
+    **dict.fromkeys(("min", "minutes"), 60.0),
+    **dict.fromkeys(("h", "hours"), 3600.0),
+}
+_SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+"""Least count since 1970 in each unit, which no recording reaches in the next larger one."""
+_LONG_STEPS = ((5000.0, "us"), (5.0, "ms"))
+"""Whole numbers without a unit with this median step or more: tables have up to 200 rows a second, or one in seconds.
+
+Steps below 100 are milliseconds only where the table is then not shorter than :data:`_SHORTEST_S`.
+"""
+_SHORTEST_S = 60.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table in the order of time.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    time_s : ndarray of shape (n,)
+        Time since the first row, not decreasing. [s]
+    columns : dict of str to ndarray of shape (n,)
+        Numbers by header as written; NaN where there is none.
+    units : dict of str to str
+        Unit by header, where it has one: ``A`` for ``Ibat [A]``, ``Ibat (Amps)`` or ``Ibat_A``.
+    bad : dict of str to ndarray of bool, shape (n,)
+        Where a column has a text or an infinite number instead of a number; columns without such cells are absent.
+    found : str
+        What was found out about the file, for people.
+    disordered, clock_steps, without_time : int
+        Rows after a later one, now sorted; steps of the clock, now gaps; rows left out as they have no time
+        or more cells than the header.
+    """
+
+    path: Path
+    time_s: Array
+    columns: dict[str, Array]
+    units: dict[str, str]
+    bad: dict[str, Mask] = field(default_factory=dict)
+    found: str = ""
+    disordered: int = 0
+    clock_steps: int = 0
+    without_time: int = 0
+
+    def header(self, name: str) -> str | None:
+        """Header of a column by its name: as written, without unit, or the signal's name alone; None without one."""
+        bare = {header: bare_name(header) for header in self.columns}
+        whole = name.rpartition(":")[2]
+        for same in (
+            [header for header in bare if header == name],
+            [header for header, text in bare.items() if text == whole],
+            [header for header, text in bare.items() if text.endswith(f".{whole}")],
+            [header for header, text in bare.items() if text == whole.rpartition(".")[2]],
+            [header for header, text in bare.items() if text.casefold() == whole.casefold()],
+        ):
+            if len(same) > 1:
+                raise LogError(f"{self.path}: {name!r} stands for {', '.join(map(repr, same))}; write it in full")
+            if same:
+                return same[0]
+        return None
+
+    def column(self, name: str) -> str:
+        """As :meth:`header`; :class:`LogError` with the columns that are there if there is none."""
+        header = self.header(name)
+        if header is None:
+            raise LogError(f"{self.path}: there is no column {name!r}; {self.known(name)}")
+        return header
+
+    def known(self, name: str = "") -> str:
+        """The columns, those that look like a name first, as part of a message."""
+        like = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
+        names = list(dict.fromkeys([*like, *self.columns]))
+        more = f" and {len(names) - 12} more" if len(names) > 12 else ""
+        return f"the columns are {', '.join(map(repr, names[:12]))}{more}"
+
+
+def is_table(path: Path) -> bool:
+    """Whether a file is a table: by its suffix, and where logs of frames have the same one, by what is in it."""
+    suffix = suffix_of(path)
+    if suffix == ".zip" or path.is_dir():
+        return any(is_table(file) for file in files_in(path)[:1])
+    if suffix not in TABLE_SUFFIXES or not exists(path):
+        return False
+    try:
+        with readable(path) as file:
+            if suffix == ".mf4":
+                return not is_bus_log(file)
+            if suffix in {".csv", ".tsv", ".txt"}:
+                head = text_head(file)[0]
+                return not is_candump(head) and not any(_is_frame_header(line) for line in head.splitlines()[:5])
+    except UNREADABLE:
+        return suffix != ".txt"
+    return True
+
+
+def _is_frame_header(line: str) -> bool:
+    cells = {cell.strip().lower() for cell in re.split(r"[,;\t]", line)}
+    return bool(cells.intersection(FRAME_COLUMNS)) and bool(cells & {"data", "databytes", "d1", "len", "dlc"})
+
+
+def bare_name(header: str) -> str:
+    """Header of a column without its unit."""
+    return _name_and_unit(header)[0]
+
+
+def _name_and_unit(header: str) -> tuple[str, str]:
+    header = header.strip()
+    if found := _UNIT_BEHIND.fullmatch(header):
+        return found[1], usual_unit(found[2])
+    if (found := _UNIT_SUFFIX.fullmatch(header)) and found[2] in _SUFFIXES:
+        return found[1], found[2]
+    return header, ""
+
+
+def read_table(path: Path) -> Table:
+    """Read a table.
+
+    Parameters
+    ----------
+    path : Path
+        The file; text may be gzipped.
+
+    Returns
+    -------
+    Table
+        All columns with numbers but the time.
+
+    Raises
+    ------
+    LogError
+        If the file cannot be read, has no header, no time or no other numbers.
+    """
+    files = files_in(path)
+    if len(files) == 1:
+        return read_table(files[0])
+    if files:
+        raise LogError(f"{path}: {len(files)} files in it; give one table, or import the folder as drives")
+    if not exists(path):
+        raise LogError(f"{path}: no such file; give a table that is there")
+    units: dict[str, str] = {}
+    found = ""
+    try:
+        with readable(path) as file:
+            match suffix_of(path):
+                case ".parquet":
+                    frame = pd.read_parquet(file)
+                case ".feather" | ".arrow":
+                    frame = pd.read_feather(file)
+                case ".mf4":
+                    frame, units = read_mf4_table(file)
+                case _:
+                    frame, units, found = _read_text(file)
+    except (*UNREADABLE, pa.ArrowException, pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeError) as error:
+        reason = (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0]
+        raise LogError(f"{path}: not a readable table: {reason[:200]}; save or copy it again") from None
+    frame.columns = [str(name).strip() for name in frame.columns]
+    if frame.index.name is not None or not isinstance(frame.index, pd.RangeIndex):
+        frame = frame.rename_axis(frame.index.name or "time").reset_index()
+    if len(frame) < 2:
+        raise LogError(f"{path}: {len(frame)} rows of values; a header and at least two rows are expected")
+    return _table(path, frame, units, found)
+
+
+def layout_from_branches(
+    text: str, *, full_scale_a: float | None = None, table: Table | None = None
+) -> VehicleDatabase:
+    """Make a layout for a table out of an option.
+
+    Parameters
+    ----------
+    text : str
+        Branches between commas, as ``battery=Ibat,-motor=Imot``: name and column, or the column alone. A minus stands
+        before a current that is positive out of the junction. Quotients such as ``-motor=Pmot/Ubat`` are formulas [A].
+    full_scale_a : float, optional
+        Of the junction [A]; without it the largest current, rounded up to 1, 2 or 5.
+    table : Table, optional
+        Tells full scale, period and time-outs, and checks the columns.
+
+    Returns
+    -------
+    VehicleDatabase
+        With a layout that stands in no file.
+
+    Raises
+    ------
+    LayoutError
+        If the text does not name two branches or more.
+    LogError
+        If the table has no such column.
+    """
+    branches: list[dict[str, Any]] = []
+    for place, item in enumerate(filter(None, map(str.strip, text.split(","))), start=1):
+        name, _, column = (part.strip() for part in item.rpartition("="))
+        is_out = name.startswith("-") or column.startswith("-")
+        column = column.removeprefix("-").strip()
+        words = re.findall(r"[A-Za-z0-9]+", name) or re.findall(r"[A-Za-z0-9]+", bare_name(column)) or [f"b{place}"]
+        is_column = table is None or table.header(column) is not None or not re.search(r"[-+*/]", column)
+        branch: dict[str, Any] = {"name": re.sub(r"^(?=\d)", "_", "_".join(words)), "sign": -1 if is_out else 1}
+        branches.append({**branch, "signal" if is_column else "formula": column})
+    if len(branches) < 2:
+        raise LayoutError(f"--branches {text}: two or more are expected, such as battery=Ibat,-motor=Imot")
+    keys: dict[str, Any] = {"schema": 1, "name": "table", "branch": branches, "full_scale_a": full_scale_a or 1.0}
+    if table is not None:
+        columns = {item["name"]: table.column(item["signal"]) for item in branches if "signal" in item}
+        periods_s = {name: _period_s(table.time_s[np.isfinite(table.columns[c])]) for name, c in columns.items()}
+        factors = {name: AMPERE.get(table.units.get(column, "A"), 1.0) for name, column in columns.items()}
+        largest_a = [
+            factors[name] * float(np.nanmax(np.abs(table.columns[c]), initial=0.0)) for name, c in columns.items()
+        ]
+        keys["full_scale_a"] = full_scale_a or _rounded_up(max([*largest_a, 0.5]))
+        keys["period_s"] = min(max(0.1, min(periods_s.values(), default=0.1)), 10.0)
+        longest_s = max(periods_s.values(), default=0.0)
+        for branch in branches:
+            branch["timeout_s"] = max(0.5, GAP_PERIODS * periods_s.get(branch["name"], longest_s))
+    return read_database(layout_of(keys, Path("--branches")))
+
+
+def _period_s(time_s: Array) -> float:
+    return round(float(np.median(np.diff(time_s))), 3) if len(time_s) > 1 else 0.0
+
+
+def _rounded_up(value: float) -> float:
+    """The next of 1, 2, 5, 10, 20, ..."""
+    decade = 10.0 ** np.floor(np.log10(value))
+    return float(next(step * decade for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= value * (1.0 - 1e-9)))
+
+
+def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -> Table:
+    units = {name: unit for name in frame if (unit := usual_unit(units.get(name, "")) or _name_and_unit(name)[1])}
+    names, time_s, about = _time(path, frame, units)
+    known = np.isfinite(time_s)
+    order = repaired_time(np.rint(1e9 * (time_s[known] - time_s[known][0])).astype(np.int64))
+    rows = np.flatnonzero(known)[order.order]
+    columns, bad = {}, {}
+    for name in frame.columns.difference(names, sort=False):
+        value, is_bad = _numbers(frame[name])
+        if np.isfinite(value).any() or not is_bad.any():
+            columns[name] = value[rows]
+            if is_bad[rows].any():
+                bad[name] = is_bad[rows]
+    if not columns:
+        name = next(iter(frame.columns.difference(names, sort=False)), "")
+        shown = f"; '{name}' begins with {str(frame[name].iloc[0])!r}" if name else ""
+        raise LogError(f"{path}: no column of numbers beside the time{shown}")
+    return Table(
+        path=path,
+        time_s=order.time_s,
+        columns=columns,
+        units={name: unit for name, unit in units.items() if name in columns},
+        bad=bad,
+        found=f"{found}{about}",
+        disordered=order.disordered,
+        clock_steps=order.clock_steps,
+        without_time=int(np.sum(~known)) + frame.attrs.get("left out", 0),
+    )
+
+
+def _numbers(column: "pd.Series[float]") -> tuple[Array, Mask]:
+    """Numbers of a column, NaN where there is none, and where something else than a number stands."""
+    if pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column):
+        value = column.to_numpy(np.float64, na_value=np.nan)
+        bad = np.isinf(value)
+    else:
+        text = column.astype("string").str.strip()
+        value = pd.to_numeric(text, errors="coerce").to_numpy(np.float64, na_value=np.nan)
+        empty = text.isna() | text.str.lower().isin(_EMPTY)
+        bad = ~np.isfinite(value) & ~empty.to_numpy(np.bool_)
+    return np.where(np.isfinite(value), value, np.nan), bad
+
+
+# ---- time
+
+
+def _time(path: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> tuple[list[str], Array, str]:
+    """Headers of the time, the time [s] and what it was taken for."""
+    named = [name for name in frame if _TIME_WORDS.intersection(re.split(r"[\W_]+", bare_name(name).lower()))]
+    for first, second in itertools.pairwise(named):  # a date and the time of day beside it
+        if "dat" in first.lower() and not pd.api.types.is_numeric_dtype(frame[second]):
+            both = _dates(frame[first].astype("string") + " " + frame[second].astype("string"))
+            if _increases(both):
+                return [first, second], both, f"time '{first}' and '{second}'"
+    for name in dict.fromkeys([*named, *frame.columns]):
+        time_s, unit = _seconds(frame[name], name, units.get(name, ""))
+        if (name in named or unit in {"date", "time of day"} or not _is_row_number(name)) and _increases(time_s):
+            return [name], time_s, f"time '{name}' in {unit}" if unit in _TIME_UNITS else f"time '{name}', a {unit}"
+    raise LogError(
+        f"{path}: no column is the time: none has it in its name and increases; expected seconds, ms, us or dates "
+        f"under a header such as 'time [s]'; the columns are {', '.join(map(repr, frame.columns[:12]))}"
+    )
+
+
+def _is_row_number(name: str) -> bool:
+    return (
+        re.fullmatch(r"(unnamed.*|column \d+|index|no\.?|nr\.?|row|sample|samples|count|#|)", name.lower()) is not None
+    )
+
+
+def _increases(time_s: Array) -> bool:
+    """Whether these can be instants: there, different, and hardly ever going back."""
+    step = np.diff(time_s[np.isfinite(time_s)])
+    return len(step) + 1 > 0.5 * len(time_s) and bool((step > 0.0).any()) and float(np.mean(step < 0.0)) < 0.02
+
+
+def _seconds(column: "pd.Series[float]", name: str, unit: str) -> tuple[Array, str]:
+    """A column as seconds, and the unit or form it was taken for; NaN where it is no time."""
+    if pd.api.types.is_timedelta64_dtype(column):
+        return np.asarray(column.dt.total_seconds()), "duration"
+    if pd.api.types.is_datetime64_any_dtype(column):
+        return _dates(column), "date"
+    value, bad = _numbers(column)
+    if bad.mean() > 0.5:
+        text = column.astype("string").str.strip()
+        of_day = text.str.fullmatch(r"\d+:\d\d(:\d\d([.,]\d+)?)?")
+        if bool(of_day.mean() > 0.5):
+            minutes = text.str.replace(",", ".").str.replace(r"^(\d+:\d\d)$", r"\1:00", regex=True)
+            return np.asarray(pd.to_timedelta(minutes, errors="coerce").dt.total_seconds()), "time of day"
+        return _dates(text), "date"
+    words = [unit.lower(), *reversed(re.split(r"[\W_]+", name.lower()))]
+    known = next((word for word in words if word in _TIME_UNITS), None) or _likely_unit(value[np.isfinite(value)])
+    return value * _TIME_UNITS[known], known
+
+
+def _likely_unit(value: Array) -> str:
+    if not value.size:
+        return "s"
+    for least, unit in _SINCE_1970:
+        if np.median(value) >= least:
+            return unit
+    step = float(np.median(np.abs(np.diff(value)))) if value.size > 1 else 0.0
+    if np.any(value != np.rint(value)) or (step < 100.0 and np.ptp(value) < 1e3 * _SHORTEST_S):
+        return "s"
+    return next((unit for least, unit in _LONG_STEPS if step >= least), "s")
+
+
+def _dates(column: "pd.Series[str]") -> Array:
+    """Seconds since the first instant; days come before months where points part them."""
+    if not pd.api.types.is_datetime64_any_dtype(column):
+        text = column.astype("string").str.strip().str.replace(r"(:\d\d),(\d)", r"\1.\2", regex=True)
+        if not bool(text.str.match(r"\d+[-./]\d").mean() > 0.5):
+            return np.full(len(column), np.nan)
+        day_first = bool(text.str.match(r"\d{1,2}\.\d{1,2}\.").mean() > 0.5)
+        column = pd.to_datetime(text, format="mixed", dayfirst=day_first, utc=True, errors="coerce")
+    if column.dt.tz is not None:
+        column = column.dt.tz_convert("UTC").dt.tz_localize(None)
+    return np.asarray((column - column.min()) / pd.Timedelta(seconds=1), np.float64)
+
+
+# ---- text
+
+
+def text_head(path: Path) -> tuple[str, str]:
+    """Beginning of a text file, whole lines, and its encoding."""
+    head = head_of(path, _HEAD_BYTES)
+    encoding = "utf-16" if head[:2] in {codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE} else "utf-8-sig"
+    try:
+        text = codecs.getincrementaldecoder(encoding)().decode(head)
+    except UnicodeDecodeError:
+        encoding = "cp1252"
+        text = head.decode(encoding, errors="replace")
+    return (text.rpartition("\n")[0] if len(head) == _HEAD_BYTES else text), encoding
+
+
+def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
+    head, encoding = text_head(path)
+    if "\0" in head:
+        raise LogError(f"{path}: binary data under the name of a text; give the file the suffix of its format")
+    if not head.strip():
+        raise LogError(f"{path}: the file is empty; a header and rows of numbers are expected")
+    delimiter, rows = _cells(path, head)
+    width = _usual_width(rows)
+    first = next((k for k, row in enumerate(rows) if len(row) >= width and _has_values(row)), None)
+    if first is None:
+        raise LogError(f"{path}: no row of numbers below the header; a header and rows of numbers are expected")
+    above = [k for k in range(first) if len(rows[k]) >= width - 1]
+    if not above:
+        raise LogError(f"{path}: no header: line {first + 1} has numbers; write the names of the columns above them")
+    units: list[str] = []
+    header = rows[above[-1]]
+    if len(above) > 1 and above[-2] == above[-1] - 1 and _are_units(header):
+        units, header = header, rows[above[-2]]
+    names = _distinct([*header, *[""] * (width - len(header))])
+    body = [cell for row in rows[first:] for cell in row]
+    commas = sum(_DECIMAL_COMMA.fullmatch(cell) is not None for cell in body)
+    decimal = "," if commas > sum("." in cell and _NUMBER.fullmatch(cell) is not None for cell in body) else "."
+    with _text(path, encoding) as file, warnings.catch_warnings(record=True) as complaints:
+        warnings.simplefilter("always")
+        frame = pd.read_csv(
+            file,
+            sep=r"\s+" if delimiter == " " else delimiter,
+            decimal=decimal,
+            skiprows=first,
+            header=None,
+            names=names,
+            index_col=False,
+            skipinitialspace=True,
+            on_bad_lines="warn",
+            low_memory=False,
+        )
+    frame.attrs["left out"] = sum(str(complaint.message).count("Skipping line") for complaint in complaints)
+    frame = frame.drop(columns=[name for name in names if name not in header and frame[name].isna().all()])
+    if decimal == ",":  # columns that hold a text somewhere
+        texts = frame.select_dtypes(exclude="number")
+        frame[texts.columns] = texts.apply(lambda c: c.astype("string").str.replace(r"^([-+\d]*),", r"\1.", regex=True))
+    shown = {"\t": "tabs", " ": "blanks"}.get(delimiter, f"'{delimiter}'")
+    about = f"columns between {shown}, decimal '{decimal}', {encoding}; "
+    return frame, {name: usual_unit(unit) for name, unit in zip(names, units, strict=False) if unit}, about
+
+
+def _text(path: Path, encoding: str) -> TextIO:
+    return io.TextIOWrapper(opened(path), encoding=encoding, errors="replace", newline="")
+
+
+def _cells(path: Path, head: str) -> tuple[str, list[list[str]]]:
+    """Delimiter, and the cells of the first lines."""
+    lines = head.splitlines()
+    for delimiter in _DELIMITERS:
+        reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
+        try:
+            rows = [[cell.strip() for cell in row] for row in reader]
+        except csv.Error:
+            continue
+        width = _usual_width(rows)
+        if width > 1 and np.mean([len(row) == width for row in rows[len(rows) // 2 :] if row]) > 0.8:
+            return delimiter, rows
+    found = (
+        f"only one line, of {len(lines[0])} characters" if len(lines) == 1 else f"the first line is {lines[0][:60]!r}"
+    )
+    raise LogError(f"{path}: no table: {found}; columns between commas, semicolons, tabs or blanks are expected")
+
+
+def _usual_width(rows: Sequence[Sequence[str]]) -> int:
+    """Number of cells that most of the lower half of the rows have."""
+    return Counter(len(row) for row in rows[len(rows) // 2 :] if row).most_common(1)[0][0] if rows else 0
+
+
+def _has_values(cells: Sequence[str]) -> bool:
+    """Whether most cells that are not empty begin as numbers and dates do."""
+    filled = [cell for cell in cells if cell.lower() not in _EMPTY]
+    return 2 * sum(re.match(r"[-+.,]?\d", cell) is not None for cell in filled) > len(filled)
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    units = {"A", "V", "W", "kW", "mA", "mV", "%", "°C", "degC", "km/h", "Nm", "rpm", *_TIME_UNITS}
+    known = [cell in {"", "-"} or usual_unit(cell) in units or cell[0] in "[(" for cell in cells]
+    return any(cells) and sum(known) >= 0.5 * len(known)
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """Names of which none is empty and no two are alike."""
+    seen: Counter[str] = Counter()
+    result = []
+    for place, text in enumerate(names, start=1):
+        name = text.strip() or f"column {place}"
+        seen[name] += 1
+        result.append(name if seen[name] == 1 else f"{name}.{seen[name]}")
+    return result

@@ -1,0 +1,409 @@
+"""Known truth, through the command line: what was put into a log or a layout is found, and nothing else."""
+
+import re
+import shlex
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrator.drive import Array, Channel, Drive
+from ecu_node.database import VehicleDatabase
+from ecu_node.wrapping import wrapped
+from tests.calibrator.command_here import calibrator
+from tests.calibrator.doctor.artificial_logs import (
+    channel,
+    examined,
+    true_drive,
+    with_branch,
+    write_layout,
+    write_log,
+)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory, database: VehicleDatabase) -> Path:
+    return write_log(tmp_path_factory.mktemp("log"), true_drive(), database)
+
+
+@pytest.fixture
+def layout(tmp_path: Path) -> Path:
+    return write_layout(tmp_path)
+
+
+def cut(drive: Drive, seconds: float) -> Drive:
+    """The beginning of a drive."""
+
+    def first(channels: Mapping[str, Channel]) -> dict[str, Channel]:
+        return {
+            name: replace(item, time_s=item.time_s[keep], value=item.value[keep], good=item.good[keep])
+            for name, item in channels.items()
+            if (keep := item.time_s < seconds).any()
+        }
+
+    return replace(drive, branches=first(drive.branches), inputs=first(drive.inputs))
+
+
+# ---- a sound log
+
+
+def test_sound_log_is_ready_for_all(log: Path, layout: Path) -> None:
+    told = examined(layout, log)
+    assert told.errors == []
+    assert told.findings("sign", "unit", "delay", "sum", "stuck", "clipped", "gap", "gain", "stands still") == []
+    steps = ["kirchhoff", "import", "calibrate --trusted", "calibrate", "ecu-node", "ecu-node --gateway"]
+    assert (told.report["ready"], told.report["not_ready"]) == (steps, {})
+    (mean,) = told.findings("mean")
+    assert mean.figures["mean_a"] == pytest.approx(2.5, abs=0.1)
+    battery, auxiliary = (told.report["branches"][name] for name in ("battery", "auxiliary"))
+    assert battery["frames"] == 6000
+    assert 1.0 / auxiliary["period_s"] == pytest.approx(20.0, rel=1e-3)
+    assert [item.subject for item in told.findings("not in log") if "Rear" in item.text] == ["motor_rear"]
+
+
+def test_text_names_the_next_commands_in_people_s_figures(log: Path, layout: Path) -> None:
+    done = calibrator("doctor", "--layout", layout, "--log", log)
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = done.stdout.splitlines()
+    assert "ready for: kirchhoff, import, calibrate --trusted, calibrate, ecu-node, ecu-node --gateway" in lines
+    assert f"calibrator calibrate {log} --layout {layout} --trusted battery --out result" in lines[-2]
+    assert lines[-1].startswith("5 vehicles or more: calibrator calibrate FOLDER_OF_VEHICLES")
+    assert re.search(r"[0-9]e[+-]?[0-9]", done.stdout.replace(str(log), "").replace(str(layout), "")) is None
+    table = done.stdout.partition("of the currents'")[0]
+    assert all(len(line) <= 80 for line in table.splitlines()[1:]), table
+
+
+def test_terminal_of_80_columns_gets_all_words(log: Path, tmp_path: Path) -> None:
+    text = calibrator("doctor", "--layout", write_layout(tmp_path, inverted=("motor",)), "--log", log).stdout
+    assert wrapped(text, 80).split() == text.split()
+
+
+@pytest.mark.parametrize(("declared_a", "told"), [(2.5, False), (1.5, False), (0.5, True)])
+def test_declared_load_is_not_told_again(declared_a: float, told: bool, log: Path, layout: Path) -> None:
+    with layout.open("a") as file:
+        file.write(f"\n[unmeasured_load]\nmean_a = {declared_a}\nsd_a = 0.5\n")
+    found = examined(layout, log).findings("mean")
+    assert bool(found) is told
+    assert all("(0.5 A are declared as a load)" in item.text for item in found)
+    assert all("look at the load declared in [unmeasured_load]" in item.remedy for item in found)
+
+
+# ---- no false alarms
+
+
+def at_rest(
+    database: VehicleDatabase, folder: Path, *, noise_a: float, offset_a: float = 0.0, speed: float = 0.0
+) -> Path:
+    """Two minutes of a car that stands: noise, offsets of 2 A, or nothing but quantisation."""
+    noise, drive = np.random.default_rng(4), true_drive()
+    branches = {
+        name: replace(item, value=noise.normal(0.0, noise_a, len(item.value)) + offset_a * (name == "battery"))
+        for name, item in drive.branches.items()
+    }
+    moving = drive.inputs["speed"]
+    inputs = {**drive.inputs, "speed": replace(moving, value=np.full(len(moving.value), speed))}
+    return write_log(folder, replace(drive, branches=branches, inputs=inputs), database)
+
+
+@pytest.mark.parametrize(("noise_a", "offset_a"), [(0.0, 0.0), (0.02, 0.0), (0.3, 0.0), (0.7, 0.0), (0.3, 2.0)])
+def test_car_at_rest_has_no_error_and_stands_still(
+    noise_a: float, offset_a: float, tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
+    told = examined(layout, at_rest(database, tmp_path, noise_a=noise_a, offset_a=offset_a))
+    assert told.errors == []
+    (still,) = told.findings("stands still")
+    assert still.text.startswith("the car stands still: no current varies by more than ")
+    assert "and its speed is 0" in still.text
+    assert told.findings("sign", "unit", "cannot tell", "gain", "delay", "constant", "full scale", "inputs") == []
+    assert [round(item.figures["mean_a"]) for item in told.findings("mean")] == ([2] if offset_a else [])
+    assert "calibrate --trusted" in told.report["ready"]
+
+
+def test_currents_that_stand_still_while_the_car_drives_are_not_called_rest(
+    tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
+    told = examined(layout, at_rest(database, tmp_path, noise_a=0.02, speed=50.0))
+    assert told.findings("stands still") == []
+    assert [item.subject for item in told.findings("full scale")] == ["all branches"]
+
+
+@pytest.mark.parametrize(("seconds", "severity", "text"), [
+    (12.0, "warning", "signs, units and gains cannot be told"), (40.0, "hint", "are short"),
+])  # fmt: skip
+def test_short_log_is_called_short(
+    seconds: float, severity: str, text: str, tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
+    told = examined(layout, write_log(tmp_path, cut(true_drive(), seconds), database))
+    assert told.errors == []
+    (short,) = told.findings("too short")
+    assert (short.severity, text in short.text) == (severity, True)
+    assert short.figures["valid_s"] == pytest.approx(seconds, abs=0.5)
+    assert "calibrate --trusted" in told.report["ready"]
+
+
+@pytest.mark.parametrize(("seconds", "inverted"), [(120.0, ()), (12.0, ()), (3.0, ()), (120.0, ("motor",))])
+def test_calibrate_takes_what_the_doctor_calls_ready(
+    seconds: float, inverted: tuple[str, ...], tmp_path: Path, database: VehicleDatabase
+) -> None:
+    layout = write_layout(tmp_path, inverted=inverted)
+    log = write_log(tmp_path, cut(true_drive(), seconds), database)
+    lines = calibrator("doctor", "--layout", layout, "--log", log).stdout.splitlines()
+    (told,) = [line.partition(": calibrator ")[2] for line in lines if "a sensor you trust" in line] or [""]
+    command = told or f"calibrate {log} --layout {layout} --trusted battery --out result"
+    done = calibrator(*shlex.split(command.replace("--out result", f"--out {tmp_path / 'result'}")))
+    assert (done.returncode == 0) is bool(told), done.stderr
+    if seconds == 3.0:
+        waits = examined(layout, log).report["not_ready"]["calibrate --trusted"]
+        assert waits == "it needs 5 s with values of all branches, and there are 3 s"
+
+
+def test_two_minutes_with_gaps_everywhere_are_said_to_have_gaps(
+    tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
+    drive = true_drive()
+    motor = drive.branches["motor"]
+    keep = (motor.time_s % 15.0) < 12.0
+    gaps = replace(motor, time_s=motor.time_s[keep], value=motor.value[keep], good=motor.good[keep])
+    told = examined(layout, write_log(tmp_path, replace(drive, branches={**drive.branches, "motor": gaps}), database))
+    assert told.errors == []
+    assert "no 20 s in which battery, motor, auxiliary, dcdc have no gap" in told.findings("too short")[0].text
+    assert "motor" in {item.subject for item in told.findings("gap", "bad frames")}
+
+
+# ---- signs and units
+
+
+@pytest.mark.parametrize("branch", ["battery", "motor", "auxiliary"])
+def test_inverted_sign_is_found_of_the_right_branch(branch: str, log: Path, tmp_path: Path) -> None:
+    told = examined(write_layout(tmp_path, inverted=(branch,)), log)
+    assert told.errors == [("sign", branch)]
+    error = told.findings("sign")[0]
+    assert error.figures["rms_before_a"] > 4.0 * error.figures["rms_after_a"]
+    assert re.search(rf'set sign = -?1 in the \[\[branch\]\] "{branch}"', error.remedy)
+    assert told.report["ready"] == ["kirchhoff"]
+
+
+def test_all_signs_inverted_are_told_by_the_voltage(log: Path, tmp_path: Path) -> None:
+    layout = write_layout(tmp_path, inverted=("battery", "motor", "auxiliary", "dcdc", "motor_rear"))
+    assert examined(layout, log).errors == [("sign", "all branches")]
+
+
+@pytest.mark.parametrize(
+    ("branch", "signal", "unit", "factor"),
+    [
+        ("battery", "BatteryCurrent", "mA", 1000.0),
+        ("motor", "MotorCurrent", "kA", 0.001),
+        ("auxiliary", "AuxiliaryCurrent", "mA", 1000.0),
+        ("auxiliary", "AuxiliaryCurrent", "kA", 0.001),
+    ],
+)
+def test_slip_of_a_unit_is_found_with_its_factor(
+    branch: str, signal: str, unit: str, factor: float, log: Path, tmp_path: Path
+) -> None:
+    told = examined(write_layout(tmp_path, units={signal: unit}), log)
+    assert told.errors == [("unit", branch)]
+    assert told.findings("unit")[0].figures["factor"] == factor
+
+
+def test_sign_and_unit_are_found_together(log: Path, tmp_path: Path) -> None:
+    told = examined(write_layout(tmp_path, inverted=("battery",), units={"AuxiliaryCurrent": "kA"}), log)
+    assert set(told.errors) == {("sign", "battery"), ("unit", "auxiliary")}
+
+
+def test_sign_of_a_branch_too_small_to_tell_is_not_guessed(log: Path, tmp_path: Path) -> None:
+    """The converter's current changes too slowly to be seen in the sum."""
+    told = examined(write_layout(tmp_path, inverted=("dcdc",)), log)
+    assert told.errors == []
+    assert [item.subject for item in told.findings("cannot tell")] == ["dcdc"]
+
+
+RNG = np.random.default_rng(3)
+MOTOR, HEATER = 40.0 * RNG.normal(size=300), 6.0 * RNG.normal(size=300)
+TRUE = np.stack([MOTOR + HEATER, -MOTOR, -HEATER], axis=1) + 0.1 * RNG.normal(size=(300, 3))
+
+
+def told_of(folder: Path, currents_a: Array) -> list[tuple[str, str]]:
+    """Errors of a table: a new set point each second, ten rows a second."""
+    names = ("battery", "motor", "heater")[: currents_a.shape[1]]
+    rows = np.repeat(currents_a, 10, axis=0)
+    lines = [f"{0.1 * k:.1f}," + ",".join(f"{value:.9g}" for value in row) for k, row in enumerate(rows)]
+    (folder / "table.csv").write_text("\n".join([f"time,{','.join(names)}", *lines]))
+    branches = "".join(f'[[branch]]\nname = "{name}"\nsignal = "{name}"\nsign = 1\n' for name in names)
+    (folder / "table.toml").write_text(f'schema = 1\nname = "table"\nfull_scale_a = 150\n{branches}')
+    return examined(folder / "table.toml", folder / "table.csv").errors
+
+
+def test_currents_of_a_table_that_cancel_are_left_as_they_are(tmp_path: Path) -> None:
+    assert told_of(tmp_path, TRUE) == []
+
+
+@pytest.mark.parametrize(("branch", "factor"), list(product(range(3), (-1.0, 1e3, 1e-3))))
+def test_one_wrong_branch_of_a_table_is_found(branch: int, factor: float, tmp_path: Path) -> None:
+    wrong = TRUE.copy()
+    wrong[:, branch] *= factor
+    name = ("battery", "motor", "heater")[branch]
+    assert told_of(tmp_path, wrong) == [("sign" if factor < 0.0 else "unit", name)]
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 2.0])
+def test_common_factor_changes_no_sign(scale: float, tmp_path: Path) -> None:
+    assert told_of(tmp_path, scale * TRUE * [1.0, 1.0, -1.0]) == [("sign", "heater")]
+
+
+def test_unrelated_currents_are_an_error_of_the_sum(tmp_path: Path) -> None:
+    assert told_of(tmp_path, 30.0 * RNG.normal(size=(300, 3))) == [("sum", "sum")]
+
+
+def test_currents_of_nothing_are_no_error(tmp_path: Path) -> None:
+    assert told_of(tmp_path, np.zeros((300, 3))) == []
+
+
+# ---- delays, gains
+
+
+@pytest.mark.parametrize("delay_s", [0.06, 0.2, -0.3])
+def test_delay_is_found_and_is_no_error(
+    delay_s: float, tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
+    late = {"motor": 0.4 + delay_s, "battery": 0.4, "auxiliary": 0.4, "dcdc": 0.4}
+    told = examined(layout, write_log(tmp_path, true_drive(delay_s=late), database))
+    assert told.errors == []
+    (delay,) = told.findings("delay")
+    assert (delay.subject, delay.severity) == ("motor", "warning" if abs(delay_s) >= 0.1 else "hint")
+    assert delay.figures["delay_s"] == pytest.approx(delay_s, abs=0.005)
+
+
+def test_gain_below_a_slip_of_units_is_told_in_percent(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
+    drive = true_drive()
+    log = write_log(tmp_path, with_branch(drive, "motor", 1.08 * drive.branches["motor"].value), database)
+    told = examined(layout, log)
+    assert told.errors == []
+    (gain,) = told.findings("gain")
+    assert gain.subject in {"motor", "battery"}
+    assert abs(gain.figures["percent"]) == pytest.approx(8.0, abs=1.0)
+
+
+# ---- single branches
+
+
+def test_stuck_branch_is_found_with_its_time(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
+    drive = true_drive()
+    motor = drive.branches["motor"].value.copy()
+    motor[1000:2500] = -37.0
+    (stuck,) = examined(layout, write_log(tmp_path, with_branch(drive, "motor", motor), database)).findings("stuck")
+    assert stuck.subject == "motor"
+    assert stuck.figures["value_a"] == pytest.approx(-37.0)
+    assert stuck.figures["duration_s"] == pytest.approx(30.0, abs=0.3)
+
+
+def test_clipped_branch_is_found(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
+    drive = true_drive()
+    log = write_log(tmp_path, with_branch(drive, "battery", 12.0 * drive.branches["battery"].value), database)
+    assert [item.subject for item in examined(layout, log).findings("clipped")] == ["battery"]
+
+
+def test_constant_branch_and_one_without_values_are_told(
+    tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
+    drive = with_branch(true_drive(), "auxiliary", np.full(2400, -5.0))
+    told = examined(layout, write_log(tmp_path, with_branch(drive, "dcdc", np.full(1200, np.nan)), database))
+    assert [item.subject for item in told.findings("constant")] == ["auxiliary"]
+    assert told.errors == [("bad frames", "dcdc")]
+    (bad,) = (item for item in told.findings("bad frames") if item.subject == "dcdc")
+    assert bad.figures["share"] == 1.0
+    assert "1,200 of 1,200 frames (100 %) cannot be used: not available 1,200" in bad.text
+
+
+def test_gaps_and_failed_checks_are_counted(log: Path, tmp_path: Path, layout: Path) -> None:
+    lines = log.read_text().splitlines(keepends=True)
+    kept = [line for line in lines if not ("can0 110#" in line and 40.0 < float(line[1:].partition(")")[0]) < 45.0)]
+    for k, line in enumerate(kept[:3000]):
+        if "can0 120#" in line:
+            kept[k] = line.replace("can0 120#", "can0 120#FF").rstrip("\n")[:33].ljust(33, "0") + "\n"
+    (tmp_path / "drive.log").write_text("".join(kept))
+    told = examined(layout, tmp_path / "drive.log")
+    (gap,) = (item for item in told.findings("gap") if item.subject == "battery")
+    assert gap.figures["longest_s"] == pytest.approx(5.0, abs=0.05)
+    (bad,) = (item for item in told.findings("bad frames") if item.subject == "motor")
+    assert "E2E check failed" in bad.text
+
+
+def test_time_out_shorter_than_the_period_is_an_error(log: Path, layout: Path) -> None:
+    layout.write_text(layout.read_text().replace("timeout_s = 0.25", "timeout_s = 0.03"))
+    told = examined(layout, log)
+    assert told.errors == [("rate", "auxiliary")]
+    assert told.report["not_ready"]["kirchhoff"] == "auxiliary is always stale"
+
+
+def test_advice_for_a_slow_branch_is_a_number_that_people_write(
+    tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
+    drive = true_drive()
+    slow = channel(drive.branches["dcdc"].value[::100], 10.0)
+    log = write_log(tmp_path, replace(drive, branches={**drive.branches, "dcdc": slow}), database)
+    (rate,) = examined(layout, log).findings("rate")
+    assert rate.remedy == 'set timeout_s = 50 in the [[branch]] "dcdc"'
+
+
+def test_full_scale_that_is_exceeded_or_never_approached_is_told(log: Path, tmp_path: Path) -> None:
+    beyond = examined(write_layout(tmp_path, full_scale_a=50.0), log).findings("full scale")
+    assert {item.subject for item in beyond} == {"battery", "motor"}
+    (far,) = examined(write_layout(tmp_path, full_scale_a=20000.0), log).findings("full scale")
+    assert far.subject == "all branches"
+    assert "full_scale_a is 20,000 A" in far.text
+
+
+# ---- layout and logs that do not fit
+
+
+def test_signals_that_the_dbc_lacks_are_findings_and_the_rest_is_examined(log: Path, layout: Path) -> None:
+    text = layout.read_text().replace("HV_Dcdc.DcdcCurrent", "HV_Dcdc.Nothing").replace("TM_Demand.Heater", "TM_X.H")
+    layout.write_text(text)
+    told = examined(layout, log)
+    assert {(item.subject, item.severity) for item in told.findings("not in DBC")} == {
+        ("dcdc", "error"),
+        ("heater_demand", "warning"),
+    }
+    assert [name for name, item in told.report["branches"].items() if item["frames"]] == [
+        "battery",
+        "motor",
+        "auxiliary",
+    ]
+
+
+def test_log_of_another_vehicle_is_an_error_that_names_what_it_has(tmp_path: Path, layout: Path) -> None:
+    (tmp_path / "other.log").write_text("(1.000000) can0 7FF#00\n(1.100000) can0 7FF#01\n")
+    told = examined(layout, tmp_path / "other.log")
+    (error,) = told.findings("no branch")
+    assert error.severity == "error"
+    assert "0x7FF" in error.text
+    assert told.report["ready"] == []
+
+
+def test_one_branch_alone_is_no_sum(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
+    drive = true_drive()
+    alone = replace(drive, branches={"battery": drive.branches["battery"]}, inputs={})
+    told = examined(layout, write_log(tmp_path, alone, database))
+    assert told.errors == [("too few branches", "sum")]
+    assert "needs two branches" in told.report["not_ready"]["kirchhoff"]
+
+
+def test_two_copies_of_a_log_change_no_verdict(log: Path, tmp_path: Path) -> None:
+    layout = write_layout(tmp_path, inverted=("auxiliary",))
+    one, two = examined(layout, log), examined(layout, log, log)
+    assert [(f.kind, f.subject) for f in one.findings()] == [(f.kind, f.subject) for f in two.findings()]
+    frames = [told.report["branches"]["battery"]["frames"] for told in (one, two)]
+    assert frames[1] == 2 * frames[0]
+
+
+def test_missing_log_and_missing_dbc_are_one_line(layout: Path) -> None:
+    done = calibrator("doctor", "--layout", layout, "--log", "none.log")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "calibrator: none.log: no such file; give a log that is there\n"
+    layout.with_name("hv_powertrain.dbc").unlink()
+    done = calibrator("doctor", "--layout", layout, "--log", "none.log")
+    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
+    assert calibrator("doctor", "--layout", layout).returncode == 2

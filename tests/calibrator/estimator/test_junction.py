@@ -1,0 +1,241 @@
+"""One junction by itself: gains from a sensor that is known, offsets from what tells them, and what stays open."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from calibrator import Junction, JunctionCalibrator
+from calibrator.errors import ContradictionError, DriveError, FleetError
+from tests.calibrator.command_here import calibrator as command
+
+JUNCTION = Junction(branches=["battery", "motor", "heater"], full_scale_a=400.0)
+SECONDS, PERIOD_S = 240.0, 0.1
+
+
+def recording(
+    seed: int = 1,
+    *,
+    gain: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    offset_a: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    load_a: float = 0.0,
+    seconds: float = SECONDS,
+) -> pd.DataFrame:
+    """Three currents of a drive; what no branch measures flows out of the junction."""
+    rng, time_s = np.random.default_rng(seed), np.arange(0.0, seconds, PERIOD_S)
+    motor_a = 40.0 * np.convolve(rng.normal(size=len(time_s) + 19), np.full(20, 0.22), "valid")
+    heater_a = 12.0 * np.repeat(rng.integers(0, 2, len(time_s) // 150 + 1), 150)[: len(time_s)]
+    true_a = np.stack([motor_a + heater_a + load_a, -motor_a, -heater_a], axis=1)
+    measured_a = true_a * (1.0 + np.array(gain)) + offset_a + rng.normal(0.0, 0.2, true_a.shape)
+    return pd.DataFrame(measured_a, columns=list(JUNCTION.branches), index=time_s)
+
+
+def found(frames: Any, **known: Any) -> pd.DataFrame:
+    return JunctionCalibrator(**known).fit(frames, JUNCTION).parameters_.set_index(["vehicle", "branch"])
+
+
+@pytest.fixture(scope="module")
+def motor_off() -> pd.DataFrame:
+    return recording(gain=(0.0, 0.05, 0.0))
+
+
+def test_trusted_sensor_gives_the_other_gains(motor_off: pd.DataFrame) -> None:
+    rows = found(motor_off, trusted=["battery"]).loc["vehicle"]
+    truth = pd.Series({"battery": 0.0, "motor": 0.05, "heater": 0.0})
+    assert ((rows.gain_error - truth).abs() < 3.0 * rows.gain_error_sd).all()
+    assert rows.gain_error_sd.max() < 0.005
+    assert rows.corrected.to_dict() == {"battery": False, "motor": True, "heater": False}
+
+
+def test_correction_takes_the_error_out_of_another_drive(motor_off: pd.DataFrame) -> None:
+    calibrator = JunctionCalibrator(trusted=["battery"]).fit(motor_off, JUNCTION)
+    other = recording(7, gain=(0.0, 0.05, 0.0))
+    left_a = calibrator.vehicles_["vehicle"].correct(other).sum(axis=1)
+    assert left_a.std() < 0.3 * other.sum(axis=1).std()
+
+
+def test_gains_equal_those_of_least_squares(motor_off: pd.DataFrame) -> None:
+    current_a = motor_off - motor_off.mean()
+    ratio = -np.linalg.lstsq(current_a[["motor", "heater"]], current_a["battery"], rcond=None)[0]
+    rows = found(motor_off, trusted=["battery"]).loc["vehicle"]
+    assert rows.gain_error[["motor", "heater"]].to_numpy() == pytest.approx(1.0 / ratio - 1.0, abs=2e-3)
+
+
+def test_ratios_alone_have_no_scale(motor_off: pd.DataFrame) -> None:
+    calibrator = JunctionCalibrator().fit(motor_off, JUNCTION)
+    assert not calibrator.parameters_.corrected.any()
+    assert calibrator.parameters_.gain_error_sd.min() > 0.1
+    assert "only ratios of gains are known" in calibrator.summary()
+    assert "1.05" in calibrator.notices_[0]
+
+
+def test_offset_is_open_where_loads_are_not_known() -> None:
+    frame = recording(offset_a=(0.0, 4.0, 0.0))
+    rows = found(frame, trusted=["battery"]).loc["vehicle"]
+    assert rows.offset_sd_a["motor"] > 2.0
+    assert not rows.corrected.any()
+
+
+def test_declared_load_tells_the_offset() -> None:
+    junction = Junction(branches=["battery", "motor"], full_scale_a=400.0)
+    frame = recording(offset_a=(0.0, 4.0, 0.0), load_a=3.0)
+    frame["motor"] += frame.pop("heater")
+    calibrator = JunctionCalibrator(trusted=["battery"], load=(3.0, 0.2)).fit(frame, junction)
+    row = calibrator.parameters_.set_index("branch").loc["motor"]
+    assert row.offset_a == pytest.approx(4.0, abs=3.0 * row.offset_sd_a)
+    assert row.offset_sd_a < 0.6
+    assert row.corrected
+
+
+def test_offset_of_one_of_two_has_two_explanations() -> None:
+    calibrator = JunctionCalibrator(trusted=["battery"], load=(0.0, 0.1)).fit(
+        recording(offset_a=(0.0, 6.0, 0.0)), JUNCTION
+    )
+    first, second = calibrator.vehicles_["vehicle"].parameters.explanations[:2]
+    assert {*first.offset_a, *second.offset_a} == {"motor", "heater"}
+    assert first.probability + second.probability > 0.9
+    assert not calibrator.parameters_.corrected.any()
+
+
+def test_charge_balance_tells_an_offset() -> None:
+    """Also of a sensor with a gain error, and where a tenth of the samples of another branch are missing."""
+    frame = recording(offset_a=(5.0, 0.0, 0.0), gain=(0.1, 0.0, 0.0), load_a=30.0)
+    true_ah = float((frame["battery"] - 5.0).mean()) / 1.1 * SECONDS / 3600.0
+    frame.loc[100.0:124.0, "heater"] = np.nan
+    row = found(frame, trusted=["motor"], charge_ah={"battery": (true_ah, 0.01)}).loc["vehicle", "battery"]
+    assert row.offset_a == pytest.approx(5.0, abs=0.5)
+    assert row.offset_sd_a < 0.5
+
+
+def test_bench_reading_is_a_reference() -> None:
+    readings = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["motor"], "drift": [0.05], "drift_sd": [0.001]})
+    rows = found(recording(gain=(0.03, 0.05, 0.0)), readings=readings).loc["vehicle"]
+    assert rows.gain_error["battery"] == pytest.approx(0.03, abs=3.0 * rows.gain_error_sd["battery"])
+
+
+def test_meters_of_one_car_are_one_system() -> None:
+    """The battery is known by the first meter, so the second meter is known by the battery."""
+    junction = Junction(branches=["battery", "charger"], full_scale_a=400.0)
+    frames = {}
+    for seed, (name, gain) in enumerate({"station_1": 0.0, "station_2": 0.03}.items()):
+        frame = recording(seed, gain=(-0.02, gain, gain))
+        frames[name] = pd.DataFrame({"battery": frame["battery"], "charger": frame["motor"] + frame["heater"]})
+    readings = pd.DataFrame({"vehicle": ["station_1"], "branch": ["charger"], "drift": [0.0], "drift_sd": [0.001]})
+    calibrator = JunctionCalibrator(meter="charger", readings=readings).fit(frames, junction)
+    rows = calibrator.parameters_.set_index(["vehicle", "branch"])
+    assert rows.gain_error["station_1", "battery"] == pytest.approx(-0.02, abs=0.009)
+    assert rows.gain_error["station_1", "battery"] == rows.gain_error["station_2", "battery"]
+    assert rows.gain_error["station_2", "charger"] == pytest.approx(0.03, abs=0.012)
+
+
+def test_contradicting_knowledge_corrects_nothing() -> None:
+    calibrator = JunctionCalibrator(trusted=["battery", "motor"]).fit(recording(gain=(0.0, 0.05, 0.2)), JUNCTION)
+    assert any("contradicts itself" in notice for notice in calibrator.notices_)
+    assert not calibrator.parameters_.corrected.any()
+
+
+def test_trust_in_a_sensor_that_shows_an_offset_is_a_contradiction() -> None:
+    readings = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "offset_a": [3.0], "offset_sd_a": [0.05]})
+    calibrator = JunctionCalibrator(trusted=["battery"], readings=readings).fit(recording(), JUNCTION)
+    assert any("the offset of battery is known as" in notice for notice in calibrator.notices_)
+
+
+def test_order_of_branches_makes_no_difference(motor_off: pd.DataFrame) -> None:
+    turned = Junction(branches=["heater", "motor", "battery"], full_scale_a=400.0)
+    here = found(motor_off, trusted=["battery"]).loc["vehicle"]
+    there = JunctionCalibrator(trusted=["battery"]).fit(motor_off, turned).parameters_.set_index("branch")
+    pd.testing.assert_series_equal(here.gain_error.sort_index(), there.gain_error.sort_index(), rtol=1e-6)
+
+
+def test_more_data_tells_more() -> None:
+    short, long = (
+        found(recording(seconds=seconds), trusted=["battery"]).loc["vehicle"].gain_error_sd["heater"]
+        for seconds in (30.0, 600.0)
+    )
+    assert long < short
+
+
+def test_branch_that_is_off_keeps_its_gain_open() -> None:
+    frame = recording().assign(heater=0.0)
+    frame["battery"] = -frame["motor"] + np.random.default_rng(2).normal(0.0, 0.2, len(frame))
+    rows = found(frame, trusted=["battery"]).loc["vehicle"]
+    assert rows.gain_error_sd["heater"] > 0.1
+    assert rows.gain_error_sd["motor"] < 0.01
+    assert not rows.corrected["heater"]
+
+
+def test_standard_deviations_are_right() -> None:
+    """Gains of thirty junctions are within their deviation about as often as normal errors, and never far."""
+    errors = []
+    for seed in range(30):
+        gain = np.random.default_rng(seed).uniform(-0.2, 0.2, 2)
+        rows = found(recording(seed, gain=(0.0, *gain), seconds=60.0), trusted=["battery"]).loc["vehicle"]
+        errors += list((rows.gain_error[["motor", "heater"]] - gain) / rows.gain_error_sd[["motor", "heater"]])
+    assert np.mean(np.abs(errors) < 1.0) >= 0.6
+    assert np.abs(errors).max() < 4.0
+
+
+@pytest.mark.parametrize(
+    ("change", "known", "match"),
+    [
+        (lambda frame: frame.assign(motor=-frame["motor"]), {}, "check sign and unit of branch"),
+        (lambda frame: frame.drop(columns="motor"), {}, "no column motor"),
+        (lambda frame: frame.iloc[:20], {}, "at least 5 s are needed"),
+        (lambda frame: frame, {"trusted": ["gearbox"]}, "trusted gearbox: no such branch"),
+        (lambda frame: frame, {"meter": "gearbox"}, "meter gearbox: no such branch"),
+        (lambda frame: frame, {"load": (1.0,)}, "a value with its standard deviation"),
+        (lambda frame: frame, {"charge_ah": {"battery": 3.0}}, "a value with its standard deviation"),
+        (lambda frame: frame.iloc[::50].iloc[:7], {}, "tell too little: at least"),
+        (lambda frame: {"a": frame, "b": frame * 1.001}, {"charge_ah": {"battery": (1.0, 0.1)}}, "of one vehicle"),
+        (
+            lambda frame: frame.assign(battery=frame["battery"].where(abs(frame.index - 100.0) > 30.0)),
+            {"charge_ah": {"battery": (1.0, 0.1)}},
+            "have no samples of it",
+        ),
+        (lambda frame: frame, {"harm_limit": 2.0}, "a number from 0 to 1"),
+    ],
+)
+def test_mistake_is_one_line(motor_off: pd.DataFrame, change: Any, known: dict[str, Any], match: str) -> None:
+    with pytest.raises((FleetError, DriveError, ContradictionError), match=match) as raised:
+        JunctionCalibrator(**known).fit(change(motor_off), JUNCTION)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory, motor_off: pd.DataFrame) -> Path:
+    """A car in a folder of its own: a table, and the layout of its columns."""
+    folder = tmp_path_factory.mktemp("car")
+    motor_off.rename_axis("time_s").to_csv(folder / "drive.csv")
+    branches = "".join(f'[[branch]]\nname = "{name}"\nsignal = "{name}"\nsign = 1\n' for name in motor_off)
+    (folder / "layout.toml").write_text(f'schema = 1\nname = "car"\nfull_scale_a = 400.0\n{branches}')
+    return folder
+
+
+def test_command_writes_what_python_finds(table: Path, tmp_path: Path, motor_off: pd.DataFrame) -> None:
+    layout, out = table / "layout.toml", tmp_path / "result"
+    arguments = ["calibrate", table / "drive.csv", "--layout", layout, "--trusted", "battery", "--out", out]
+    assert command(*arguments).returncode == 0
+    rows = pd.read_parquet(out / "results.parquet").set_index("branch")
+    here = found(motor_off, trusted=["battery"]).loc["vehicle"]
+    assert rows.drift.to_dict() == pytest.approx(here.gain_error.to_dict(), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        (["--load", "much"], "expected a number and its standard deviation"),
+        (["--charge", "battery"], "expected a branch with its charge"),
+        (["--charge", "battery=3"], "give its standard deviation"),
+        (["--trusted", "battery", "--expected-faults", "0.2"], "--expected-faults is for a fleet"),
+        (["--trusted", "battery", "--hold-out", "car"], "--hold-out is for a fleet"),
+    ],
+)
+def test_wrong_option_is_one_line(table: Path, tmp_path: Path, options: list[str], match: str) -> None:
+    arguments = ["calibrate", table / "drive.csv", "--layout", table / "layout.toml", "--out", tmp_path / "r", *options]
+    done = command(*arguments)
+    assert done.returncode != 0
+    assert match in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "r").exists()

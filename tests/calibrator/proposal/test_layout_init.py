@@ -1,0 +1,573 @@
+"""``calibrator layout init``: databases with the units, names and ranges of real ones, logs, tables, the dialogue."""
+
+import fcntl
+import json
+import math
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cantools
+import pytest
+
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.layout import Layout, read_layout
+from tests.calibrator.command_here import calibrator
+from tests.calibrator.doctor.artificial_logs import DBC, true_drive, write_log
+
+HEAD = 'VERSION ""\nBU_: BMS INV OBC EMS CLIMA Battery\n'
+PACK = """BO_ 1 PackStatus: 8 BMS
+ SG_ PackCurrent : 0|16@1- (0.1,0) [-1000|1000] "A" INV
+ SG_ PackVoltage : 16|16@1+ (0.1,0) [0|1000] "V" INV
+"""
+INVERTER = """BO_ 2 InverterStatus: 8 INV
+ SG_ DcPower : 0|16@1- (0.02,0) [-300|300] "kW" BMS
+ SG_ PhaseCurrent : 16|16@1+ (0.1,0) [0|900] "A" BMS
+"""
+HEATER = """BO_ 3 ClimaStatus: 8 CLIMA
+ SG_ HeaterCurrent : 0|16@1+ (0.1,0) [0|50] "A" BMS
+"""
+
+
+def database_file(folder: Path, *messages: str, name: str = "car.dbc") -> Path:
+    (folder / name).write_text(HEAD + "".join(messages))
+    return folder / name
+
+
+def found(path: Path, *arguments: object) -> Layout:
+    """The layout that is written, which the rest of the software can read."""
+    out = path.parent / "found" / f"{path.stem}.toml"
+    out.unlink(missing_ok=True)
+    run = calibrator("layout", "init", path, "--out", out, *arguments)
+    assert run.returncode == 0, run.stderr
+    layout = read_layout(out)
+    read_database(layout)
+    return layout
+
+
+def sources(layout: Layout) -> dict[str, str]:
+    return {branch.name: branch.source for branch in layout.branch}
+
+
+# ---- from a database alone
+
+
+def test_own_power_train_is_found_whole(tmp_path: Path) -> None:
+    (tmp_path / "hv_powertrain.dbc").write_bytes((DBC / "hv_powertrain.dbc").read_bytes())
+    guessed = found(tmp_path / "hv_powertrain.dbc")
+    by_hand = read_layout(DBC / "hv_powertrain.toml")
+    assert {(b.source, b.sign, b.timeout_s) for b in guessed.branch} == {
+        (b.source, b.sign, b.timeout_s) for b in by_hand.branch
+    }
+    needed = {
+        "voltage",
+        "torque",
+        "speed",
+        "heater_demand",
+        "aircon_demand",
+        "low_voltage_demand",
+        "sensor_temperature",
+    }
+    signals = {item.name: item.signal for item in guessed.input}
+    assert signals.items() >= {item.name: item.signal for item in by_hand.input if item.name in needed}.items()
+    assert set(by_hand.model_inputs) <= set(guessed.model_inputs)
+
+
+BATTERIES = {
+    "Amps": ('SG_ Battery_Current : 0|16@1+ (0.1,-819.2) [0|819] "Amps"', "BMS"),
+    "Ampere": ('SG_ HVBattCurr : 0|16@1- (0.1,0) [0|0] "Ampere"', "BMS"),
+    "A_DC": ('SG_ IBat : 0|16@1- (0.1,0) [-500|500] "A_DC"', "BMS"),
+    "prefixed unit": ('SG_ AccuCurrent : 0|16@1- (0.1,0) [-500|500] "Unit_Amper"', "BMS"),
+    "quantity in the unit": ('SG_ PackCurrent : 0|16@1- (0.1,0) [-500|500] "current:A"', "BMS"),
+    "milliampere of 32 bits": ('SG_ PackCurrent : 0|32@1- (1,0) [0|0] "mA"', "BMS"),
+    "no unit": ('SG_ Current : 0|12@1+ (0.25,-500) [0|0] ""', "Battery"),
+    "German": ('SG_ BAT_StromIst : 0|16@1- (0.1,0) [-500|500] "A"', "BMS"),
+    "French": ('SG_ CourantBatterie : 0|16@1- (0.1,0) [-500|500] "A"', "EMS"),
+    "Spanish": ('SG_ CorrienteBateria : 0|16@1- (0.1,0) [-500|500] "A"', "EMS"),
+    "abbreviated": ('SG_ RdHVltBatPckCrnt : 0|13@1- (0.15,0) [-614.4|614.25] "A"', "EMS"),
+    "unsigned": ('SG_ PackCurrent : 0|16@1+ (0.1,0) [0|0] "A"', "BMS"),
+    "8 bits": ('SG_ Pack_Current : 0|8@1- (0.1,-0.1) [0|0] "A"', "BMS"),
+}
+
+
+@pytest.mark.parametrize("kind", BATTERIES)
+def test_battery_current_as_databases_call_it(kind: str, tmp_path: Path) -> None:
+    signal, sender = BATTERIES[kind]
+    message = f'BO_ 1 Status1: 8 {sender}\n {signal} INV\n SG_ HV_Voltage : 40|16@1+ (0.1,0) [0|900] "Volts" INV\n'
+    limits = 'BO_ 7 Limits: 8 BMS\n SG_ MaxPackCurrent : 0|16@1- (0.1,0) [-500|500] "A" INV\n'
+    layout = found(database_file(tmp_path, limits, INVERTER, message))
+    name = signal.split()[1]
+    assert sources(layout) == {"battery": f"Status1.{name}", "motor": "InverterStatus.DcPower"}
+
+
+LEFT_OUT = {
+    "12 V beside it": (
+        'BO_ 1 BAT11: 8 EMS\n SG_ BAT_SNSR_I : 0|16@1+ (0.01,-327) [-327|328] "A" INV\n'
+        ' SG_ BAT_SNSR_V : 16|14@1+ (0.001,6) [6|18] "V" INV\n',
+        "BAT_SNSR_V beside it is at most 18 V: not at the junction",
+    ),
+    "nothing of a high voltage": (
+        'BO_ 1 Mgmt: 8 EMS\n SG_ BSBattCurrent : 0|14@1+ (0.0625,-512) [0|0] "Amps" INV\n',
+        "nothing says that it is of a high-voltage battery",
+    ),
+    "a limit": (
+        'BO_ 1 Pack: 8 BMS\n SG_ PackMaxCurrent : 0|16@1- (0.1,0) [-500|500] "A" INV\n',
+        "'max': a limit, demand, estimate or part of one",
+    ),
+    "in a message of limits": (
+        'BO_ 1 BMS_Limits: 8 BMS\n SG_ Discharge_Current : 0|16@1+ (0.1,0) [0|0] "A" INV\n',
+        "its message has 'limits': no measured flow",
+    ),
+    "of nowhere": (
+        'BO_ 1 Shunt: 8 EMS\n SG_ Current : 0|32@1- (1,0) [0|0] "mA" INV\n',
+        "neither name, comment nor sender says where it flows",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", LEFT_OUT)
+def test_no_pack_current_is_said_with_the_reason(kind: str, tmp_path: Path) -> None:
+    message, why = LEFT_OUT[kind]
+    path = database_file(tmp_path, message, INVERTER)
+    run = calibrator("layout", "init", path, "--out", tmp_path / "car.toml")
+    assert run.returncode == 1
+    assert not (tmp_path / "car.toml").exists()
+    *listed, last = run.stderr.splitlines()
+    assert f"     {why}" in listed
+    assert last.startswith(f"calibrator: {path}: no pack current found")
+
+
+@pytest.mark.parametrize(
+    "signal",
+    [
+        'PhaseCurrent : 0|16@1- (0.1,0) [-900|900] "A"',
+        'DcCurrentRequest : 0|16@1- (0.1,0) [-900|900] "A"',
+        'INV_Iq : 0|16@1- (0.1,0) [-900|900] "A"',
+    ],
+)
+def test_what_is_no_branch_makes_no_layout_beside_the_battery(signal: str, tmp_path: Path) -> None:
+    run = calibrator("layout", "init", database_file(tmp_path, PACK, f"BO_ 2 Drive: 8 INV\n SG_ {signal} BMS\n"))
+    assert run.returncode == 1
+    assert run.stdout == ""
+    assert "the pack current is PackStatus.PackCurrent, but no current, power or torque of a motor" in run.stderr
+
+
+def test_charger_is_a_branch_only_without_a_motor(tmp_path: Path) -> None:
+    charger = (
+        'BO_ 5 Chg: 8 OBC\n SG_ CHG_Amps : 0|16@1+ (0.1,0) [0|500] "Amps" BMS\n'
+        ' SG_ CHG_Volts : 16|16@1+ (0.1,0) [0|1] "Volts" BMS\n'
+    )
+    assert sources(found(database_file(tmp_path, PACK, charger)))["charger"] == "Chg.CHG_Amps"
+    assert set(sources(found(database_file(tmp_path, PACK, charger, INVERTER)))) == {"battery", "motor"}
+
+
+def test_watts_per_bit_are_powers(tmp_path: Path) -> None:
+    heater = 'BO_ 3 x54F: 8 CLIMA\n SG_ HeaterPowerConsumption : 0|6@1+ (1,0) [0|0] "300W/bit?" BMS\n'
+    layout = found(database_file(tmp_path, PACK, INVERTER, heater))
+    assert layout.find_branch("heater").power == "x54F.HeaterPowerConsumption"
+
+
+def test_motor_without_a_current_is_computed_of_torque_and_speed(tmp_path: Path) -> None:
+    motor = (
+        'BO_ 2 x1DA: 8 INV\n SG_ MG_EffectiveTorque : 0|11@1- (0.5,0) [-274|274] "Nm" BMS\n'
+        ' SG_ MG_OutputRevolution : 16|15@1- (1,0) [-16382|16382] "rpm" BMS\n'
+    )
+    branch = found(database_file(tmp_path, PACK, motor)).find_branch("motor")
+    assert (branch.formula, branch.uncertainty) == ("torque * motor_speed * 0.10472 / voltage", 0.1)
+
+
+def test_order_of_a_database_does_not_matter(tmp_path: Path) -> None:
+    one = found(database_file(tmp_path, PACK, INVERTER, HEATER))
+    other = found(database_file(tmp_path, HEATER, INVERTER, PACK))
+    assert (one.branch, one.input) == (other.branch, other.input)
+
+
+def test_comments_cannot_break_the_file(tmp_path: Path) -> None:
+    comment = f'CM_ SG_ 1 PackCurrent "first\nsecond # sign = 1 \\ and {"long " * 40}";\n'
+    assert sources(found(database_file(tmp_path, PACK, INVERTER, comment)))["battery"] == "PackStatus.PackCurrent"
+
+
+@pytest.mark.parametrize(
+    ("comment", "sign"), [("Discharge positive", 1), ("positive while charge flows", -1), ("Current", 1)]
+)
+def test_comments_tell_signs(comment: str, sign: int, tmp_path: Path) -> None:
+    layout = found(database_file(tmp_path, PACK, INVERTER, f'CM_ SG_ 1 PackCurrent "{comment}";\n'))
+    assert layout.find_branch("battery").sign == sign
+
+
+@pytest.mark.parametrize("kind", ["kcd", "sym"])
+def test_other_databases_do_as_well(kind: str, tmp_path: Path) -> None:
+    database: Any = cantools.database.load_file(database_file(tmp_path, PACK, INVERTER))
+    cantools.database.dump_file(database, tmp_path / f"car.{kind}")
+    assert sources(found(tmp_path / f"car.{kind}")) == {
+        "battery": "PackStatus.PackCurrent",
+        "motor": "InverterStatus.DcPower",
+    }
+
+
+def test_slips_of_public_databases_are_put_right(tmp_path: Path) -> None:
+    """Identifiers of 29 bits without the mark, and names for values of a signal that is not there."""
+    far = 'BO_ 316494068 Climate: 8 CLIMA\n SG_ HeaterCurrent : 0|16@1+ (0.1,0) [0|50] "A" BMS\n'
+    names = 'VAL_ 1 NoSuchSignal 0 "off" 1 "on" ;\nCM_ SG_ 316494068 HeaterCurrent "of the cabin";\n'
+    layout = found(database_file(tmp_path, PACK, INVERTER, far, names))
+    assert sources(layout)["heater"] == "Climate.HeaterCurrent"
+    assert read_database(layout).message("Climate").is_extended_frame
+
+
+# ---- with a log
+
+Series = Mapping[str, Callable[[float], float]]
+
+
+def motor_a(t: float) -> float:
+    return 60.0 * math.sin(0.9 * t) + 30.0 * math.sin(2.1 * t + 1.0) + 20.0
+
+
+def heater_a(t: float) -> float:
+    return 8.0 + 4.0 * math.copysign(1.0, math.sin(0.3 * t))
+
+
+def battery_a(t: float) -> float:
+    return motor_a(t) + heater_a(t) + 2.0
+
+
+def nothing_a(_: float) -> float:
+    return 0.0
+
+
+def volts(t: float) -> float:
+    return 390.0 - 0.1 * battery_a(t)
+
+
+DRIVING: Series = {
+    "PackCurrent": battery_a,
+    "PackVoltage": volts,
+    "DcPower": lambda t: 1e-3 * motor_a(t) * volts(t),
+    "PhaseCurrent": lambda t: 1.5 * abs(motor_a(t)),
+    "HeaterCurrent": heater_a,
+}
+
+
+def log_file(dbc: Path, series: Series, *, seconds: float = 60.0, lines: Sequence[str] = ()) -> Path:
+    """Frames every 50 ms; signals without a series are 0; ranges of the database are not looked at."""
+    database: Any = cantools.database.load_file(dbc, strict=False)
+    written = list(lines)
+    for step in range(int(20 * seconds)):
+        t = 0.05 * step
+        for message in database.messages:
+            raw = {}
+            for signal in message.signals:
+                codes = 1 << signal.length
+                value: float = (series.get(signal.name, nothing_a)(t) - signal.offset) / signal.scale
+                code = round(value) % codes
+                raw[signal.name] = code - codes if signal.is_signed and code >= codes // 2 else code
+            selectors = {signal.name: step % 2 for signal in message.signals if signal.is_multiplexer}
+            data = message.encode(raw | selectors, scaling=False, strict=False)
+            written.append(f"({1e9 + t:.6f}) can0 {message.frame_id:03X}#{data.hex().upper()}")
+    path = dbc.with_suffix(".log")
+    path.write_text("\n".join(written) + "\n")
+    return path
+
+
+def test_with_a_log_signs_are_told_against_convention(tmp_path: Path) -> None:
+    dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
+    turned = {**DRIVING, "PackCurrent": lambda t: -battery_a(t), "HeaterCurrent": heater_a}
+    layout = found(dbc, "--log", log_file(dbc, turned))
+    assert {branch.name: branch.sign for branch in layout.branch} == {"battery": -1, "motor": -1, "heater": -1}
+    assert layout.full_scale_a == 250.0
+
+
+def test_heater_that_reads_0_is_left_out(tmp_path: Path) -> None:
+    dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
+    log = log_file(dbc, {**DRIVING, "HeaterCurrent": lambda _: 0.0})
+    run = calibrator("layout", "init", dbc, "--log", log)
+    assert run.returncode == 0
+    assert 'name = "heater"' not in run.stdout
+    assert "     reads 0 A throughout the recording" in run.stderr.splitlines()
+
+
+def test_charge_port_that_reads_0_makes_no_layout(tmp_path: Path) -> None:
+    charger = 'BO_ 5 Chg: 8 OBC\n SG_ CHG_Amps : 0|16@1+ (0.1,0) [0|500] "Amps" BMS\n'
+    dbc = database_file(tmp_path, PACK, charger)
+    run = calibrator("layout", "init", dbc, "--log", log_file(dbc, DRIVING))
+    assert run.returncode == 1
+    assert "the pack current is PackStatus.PackCurrent, but no current" in run.stderr
+
+
+def test_motor_that_does_not_follow_the_battery_is_none(tmp_path: Path) -> None:
+    dbc = database_file(tmp_path, PACK, INVERTER)
+    log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 15.0 * math.sin(5.3 * t)})
+    run = calibrator("layout", "init", dbc, "--log", log)
+    assert run.returncode == 1
+    assert "does not follow the battery's current" in run.stderr
+
+
+def test_sum_that_does_not_close_makes_no_layout(tmp_path: Path) -> None:
+    dbc = database_file(tmp_path, PACK, INVERTER)
+    log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 0.2e-3 * motor_a(t) * volts(t)})
+    run = calibrator("layout", "init", dbc, "--log", log)
+    assert run.returncode == 1
+    assert re.search("the sum of battery, motor still varies by 8.% of the greatest of them", run.stderr)
+
+
+def test_wrong_range_is_judged_by_the_log(tmp_path: Path) -> None:
+    pack = PACK.replace("16@1- (0.1,0) [-1000|1000]", "16@1+ (0.1,-819.2) [0|819]")
+    dbc = database_file(tmp_path, pack, INVERTER)
+    log = log_file(dbc, DRIVING)
+    layout = found(dbc, "--log", log)
+    assert layout.wrong_ranges == ["PackStatus.PackCurrent"]
+    run = calibrator("kirchhoff", log, "--layout", layout.path, "--json")
+    assert json.loads(run.stdout)["before"]["sum"]["rmse_a"] < 20.0  # negative currents count: else 60 A
+
+
+def test_code_for_not_available_makes_no_range_wrong(tmp_path: Path) -> None:
+    pack = PACK.replace("16@1- (0.1,0) [-1000|1000]", "16@1+ (0.1,-819.2) [-819.2|819]")
+    dbc = database_file(tmp_path, pack, INVERTER)
+    log = log_file(dbc, {**DRIVING, "PackCurrent": lambda t: battery_a(t) if t > 5.0 else 5734.3})
+    assert found(dbc, "--log", log).wrong_ranges == []
+
+
+def test_unsigned_signal_that_is_signed_is_said(tmp_path: Path) -> None:
+    dbc = database_file(tmp_path, PACK.replace("@1- (0.1,0) [-1000|1000]", "@1+ (0.1,0) [0|0]"), INVERTER)
+    run = calibrator("layout", "init", dbc, "--log", log_file(dbc, DRIVING))
+    assert run.returncode == 1
+    assert "the log shows PackStatus.PackCurrent signed; in the database it is unsigned: correct it" in run.stderr
+
+
+def test_multiplexed_battery_current_is_found(tmp_path: Path) -> None:
+    pack = """BO_ 1 PackStatus: 8 BMS
+ SG_ Page M : 0|8@1+ (1,0) [0|1] "" INV
+ SG_ PackCurrent m1 : 8|16@1- (0.1,0) [-1000|1000] "A" INV
+ SG_ PackVoltage m0 : 8|16@1+ (0.1,0) [0|1000] "V" INV
+"""
+    dbc = database_file(tmp_path, pack, INVERTER, HEATER)
+    layout = found(dbc, "--log", log_file(dbc, DRIVING))
+    assert sources(layout) == {
+        "battery": "PackStatus.PackCurrent",
+        "motor": "InverterStatus.DcPower",
+        "heater": "ClimaStatus.HeaterCurrent",
+    }
+    assert layout.find_branch("battery").timeout_s == 0.5  # every 100 ms: every other frame
+
+
+def test_stray_frames_of_another_bus_do_not_count(tmp_path: Path) -> None:
+    dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
+    stray = [f"({1e9 + 3.0 * k:.6f}) can1 001#FF7FFF7F00000000" for k in range(5)]
+    layout = found(dbc, "--log", log_file(dbc, DRIVING, lines=stray))
+    assert layout.full_scale_a == 250.0
+
+
+def test_artificial_vehicle_passes_the_doctor(tmp_path: Path, database: VehicleDatabase) -> None:
+    log = write_log(tmp_path, true_drive(), database)
+    (tmp_path / "hv_powertrain.dbc").write_bytes((DBC / "hv_powertrain.dbc").read_bytes())
+    layout = found(tmp_path / "hv_powertrain.dbc", "--log", log)
+    assert set(layout.branch_names) == {"battery", "motor", "auxiliary", "dcdc"}
+    assert calibrator("doctor", "--layout", layout.path, "--log", log).returncode == 0
+
+
+def test_tesla_gives_its_three_branches(shared_data: Path, tmp_path: Path) -> None:
+    (tmp_path / "Model3CAN.dbc").symlink_to(shared_data / "tesla_model3" / "Model3CAN.dbc")
+    started = time.process_time()
+    layout = found(tmp_path / "Model3CAN.dbc", "--log", shared_data / "tesla_model3" / "drive.log.gz")
+    assert time.process_time() - started < 10.0
+    assert {branch.name: (branch.source, branch.sign) for branch in layout.branch} == {
+        "battery": ("ID132HVBattAmpVolt.SmoothBattCurrent132", 1),
+        "motor_rear": ("ID266RearInverterPower.RearPower266", -1),
+        "motor_front": ("ID2E5FrontInverterPower.FrontPower2E5", -1),
+    }
+
+
+I3 = """BO_ 274 Battery112: 8 BMS
+ SG_ Battery_Current : 0|16@1+ (0.1,-819.2) [0|819] "Amps" INV
+ SG_ Battery_Volts : 16|16@1+ (0.1,0) [0|500] "Volts" INV
+BO_ 690 Charger2B2: 8 OBC
+ SG_ CHG_Volts : 0|16@1+ (0.1,0) [0|1] "Volts" BMS
+ SG_ CHG_Amps : 16|16@1+ (0.1,0) [-500|500] "Amps" BMS
+"""
+
+
+@pytest.mark.parametrize("recording", ["Circontrol_end", "Circontrol_midpoint", "eacaec_enda", "efacaec_mida"])
+def test_i3_at_its_chargers(recording: str, shared_data: Path, tmp_path: Path) -> None:
+    """Real ones, of 9 to 40 s; in two of them the current does not change, and only its mean tells the signs."""
+    log = shared_data / "bmw_i3_charging" / f"2019_{recording}.csv.gz"
+    layout = found(database_file(tmp_path, I3), "--log", log)
+    assert {branch.name: (branch.source, branch.sign) for branch in layout.branch} == {
+        "battery": ("Battery112.Battery_Current", -1),
+        "charger": ("Charger2B2.CHG_Amps", 1),
+    }
+
+
+# ---- tables and names
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    rows = ["Zeit [s];Batteriestrom [A];Motorstrom [A];Heizungsstrom [A];Batteriespannung [V];Bordnetz [A]"]
+    for k in range(600):
+        t = 0.1 * k
+        values = (t, -battery_a(t), motor_a(t), heater_a(t), volts(t), 20.0 + (k * 7 % 11))
+        rows.append(";".join(f"{value:.2f}".replace(".", ",") for value in values))
+    path = tmp_path / "drive.csv"
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_columns_of_a_table_are_proposed(table: Path) -> None:
+    layout = found(table)
+    assert {branch.name: (branch.source, branch.sign) for branch in layout.branch} == {
+        "battery": ("Batteriestrom [A]", -1),
+        "motor": ("Motorstrom [A]", -1),
+        "heater": ("Heizungsstrom [A]", -1),
+    }
+    assert calibrator("kirchhoff", table, "--layout", layout.path).returncode == 0
+
+
+def test_named_branches_are_written_without_a_guess(table: Path) -> None:
+    layout = found(table, "--branches", "-battery=Batteriestrom,-motor=Motorstrom [A]")
+    assert [(b.name, b.source, b.sign) for b in layout.branch] == [
+        ("battery", "Batteriestrom [A]", -1),
+        ("motor", "Motorstrom [A]", -1),
+    ]
+
+
+def test_named_signals_of_a_database(tmp_path: Path) -> None:
+    dbc = database_file(tmp_path, PACK, INVERTER)
+    layout = found(dbc, "--branches", "battery=PackCurrent,-motor=InverterStatus.PhaseCurrent")
+    assert sources(layout) == {"battery": "PackStatus.PackCurrent", "motor": "InverterStatus.PhaseCurrent"}
+
+
+MISTAKES: dict[str, tuple[list[str], str]] = {
+    "no such signal": (["--branches", "battery=Nix,-motor=Motorstrom"], "'Nix' is no current or power there"),
+    "no equals sign": (["--branches", "battery"], "two or more are expected, such as battery=Ibat,-motor=Imot"),
+    "one branch": (["--branches", "battery=Batteriestrom"], "two or more are expected"),
+    "a log beside a table": (["--log", "x.log"], "a table, which needs no --log"),
+}
+
+
+@pytest.mark.parametrize("kind", MISTAKES)
+def test_mistake_with_a_table_is_one_line(kind: str, table: Path) -> None:
+    arguments, said = MISTAKES[kind]
+    run = calibrator("layout", "init", table, *arguments)
+    assert run.returncode == 1
+    assert run.stdout == ""
+    (line,) = run.stderr.splitlines()
+    assert said in line
+
+
+def test_mistake_with_a_database_is_one_line(tmp_path: Path) -> None:
+    dbc = database_file(tmp_path, PACK, INVERTER)
+    (tmp_path / "other.log").write_text("(1.000000) can0 7FF#00\n")
+    (tmp_path / "there.toml").write_text("kept")
+    for arguments, said in (
+        ((tmp_path / "none.dbc",), "no such file"),
+        ((dbc, "--log", tmp_path / "other.log"), "none of its identifiers is in"),
+        ((tmp_path / "other.log", "--log", dbc), "the database comes first"),
+        ((dbc, "--out", tmp_path / "there.toml"), "exists, and is not overwritten"),
+    ):
+        run = calibrator("layout", "init", *arguments)
+        assert (run.returncode, len(run.stderr.splitlines())) == (1, 1)
+        assert said in run.stderr
+    assert (tmp_path / "there.toml").read_text() == "kept"
+
+
+def test_json_has_every_candidate(tmp_path: Path) -> None:
+    run = calibrator("layout", "init", database_file(tmp_path, PACK, INVERTER), "--json")
+    told = json.loads(run.stdout)
+    assert told["branches"] == ["battery", "motor"]
+    assert {item["signal"]: item["branch"] for item in told["candidates"]} == {
+        "PackStatus.PackCurrent": "battery",
+        "InverterStatus.DcPower": "motor",
+        "InverterStatus.PhaseCurrent": None,
+    }
+    run = calibrator("layout", "init", database_file(tmp_path, INVERTER), "--json")
+    assert run.returncode == 1
+    assert json.loads(run.stdout)["problem"].startswith("no pack current found")
+
+
+# ---- the dialogue
+
+
+class Screen:
+    """The command at a terminal of 80 columns and 24 lines; what it shows last."""
+
+    def __init__(self, *arguments: object) -> None:
+        self._ours, theirs = pty.openpty()
+        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+        environment = {key: value for key, value in os.environ.items() if key not in {"COLUMNS", "LINES"}}
+        self._run = subprocess.Popen(
+            [sys.executable, "-m", "calibrator", "layout", "init", *map(str, arguments)],
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            env={**environment, "TERM": "xterm-256color"},
+        )
+        os.close(theirs)
+        self._text = ""
+
+    def until(self, wanted: str) -> list[str]:
+        """Lines of the screen as soon as it has a text."""
+        while wanted not in (shown := self._text.rpartition("\x1b[H")[2]):
+            self._text += os.read(self._ours, 65536).decode()
+        return [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line) for line in shown.splitlines()]
+
+    def press(self, keys: str) -> None:
+        self._text = ""
+        os.write(self._ours, keys.encode())
+
+    def ended(self) -> tuple[int, str]:
+        try:
+            while part := os.read(self._ours, 65536):
+                self._text += part.decode()
+        except OSError:  # EIO: the other end is closed
+            pass
+        os.close(self._ours)
+        return self._run.wait(), self._text
+
+
+DOWN = "\x1b[B"
+
+
+def test_dialogue_takes_leaves_and_turns(tmp_path: Path) -> None:
+    dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
+    screen = Screen(dbc, "--log", log_file(dbc, DRIVING), "--out", tmp_path / "car.toml")
+    lines = screen.until("q quit")
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 80
+    assert any("The sum of these 3 closes" in line for line in lines)
+    screen.press(f"{DOWN}s")
+    assert any(re.search(r"motor +\+1 DcPower", line) for line in screen.until("DOES NOT CLOSE"))
+    screen.press("s")
+    screen.until("3 closes")
+    screen.press(f"{DOWN} ")
+    assert any("[ ]" in line and "HeaterCurrent" in line for line in screen.until("these 2"))
+    screen.press("\r")
+    code, text = screen.ended()
+    assert code == 0
+    assert "branches battery, motor;" in text
+    assert {b.name: b.sign for b in read_layout(tmp_path / "car.toml").branch} == {"battery": 1, "motor": -1}
+
+
+def test_dialogue_wants_two_branches_and_quits(tmp_path: Path) -> None:
+    screen = Screen(database_file(tmp_path, PACK, INVERTER), "--out", tmp_path / "car.toml")
+    screen.until("q quit")
+    screen.press(" \r")
+    screen.until("has at least two branches")
+    screen.press("q")
+    code, text = screen.ended()
+    assert code == 1
+    assert text.rstrip().endswith("calibrator: nothing was written")
+    assert not (tmp_path / "car.toml").exists()
+
+
+def test_yes_asks_nothing_at_a_terminal(tmp_path: Path) -> None:
+    code, text = Screen(database_file(tmp_path, PACK, INVERTER), "--yes", "--out", tmp_path / "car.toml").ended()
+    assert code == 0
+    assert "\x1b[?1049h" not in text

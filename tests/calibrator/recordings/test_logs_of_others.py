@@ -1,0 +1,454 @@
+"""Logs and databases as other programs write them, through the command line: one car, a battery and a motor."""
+
+import gzip
+import json
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import asammdf
+import can
+import cantools
+import pytest
+
+from calibrator.files.layout_files import vehicle_database
+from tests.calibrator.command_here import calibrator
+
+DBC = """VERSION ""
+BU_: Car
+BO_ 256 Pack: 8 Car
+ SG_ Current : 0|16@1- (0.1,0) [-1000|1000] "A" Car
+ SG_ Voltage : 16|16@1+ (0.1,0) [0|1000] "V" Car
+BO_ 2147484160 Motor: 8 Car
+ SG_ Current : 0|16@1- (0.1,0) [-1000|1000] "A" Car
+"""
+LAYOUT = """
+schema = 1
+name = "car"
+dbc = "car.dbc"
+full_scale_a = 100
+[[branch]]
+name = "battery"
+signal = "Pack.Current"
+sign = 1
+[[branch]]
+name = "motor"
+signal = "Motor.Current"
+sign = -1
+"""
+COUNT = 40
+PERIOD_S = 0.05
+START_S = 1_700_000_000.0
+
+
+@pytest.fixture
+def layout(tmp_path: Path) -> Path:
+    (tmp_path / "car.dbc").write_text(DBC)
+    (tmp_path / "car.toml").write_text(LAYOUT)
+    return tmp_path / "car.toml"
+
+
+def frames() -> Iterator[tuple[float, int, bool, bytes]]:
+    """Time [s], identifier, whether it has 29 bits, payload: the battery gives k A, the motor takes 2 A less."""
+    for k in range(COUNT):
+        pack = (10 * k).to_bytes(2, "little", signed=True) + (4000).to_bytes(2, "little") + bytes(4)
+        yield PERIOD_S * k, 0x100, False, pack
+        yield PERIOD_S * k + 0.01, 0x200, True, (10 * (k - 2)).to_bytes(2, "little", signed=True) + bytes(6)
+
+
+def messages() -> Iterator[can.Message]:
+    for time_s, number, extended, data in frames():
+        yield can.Message(timestamp=START_S + time_s, arbitration_id=number, is_extended_id=extended, data=data)
+
+
+def write_with_python_can(path: Path) -> None:
+    with can.Logger(path) as logger:
+        for message in messages():
+            logger(message)
+
+
+def lines(form: str) -> Callable[[Path], None]:
+    """Writer of a text with a line per frame, whose `form` has the parts of one."""
+
+    def write(path: Path) -> None:
+        before = 0.0
+        text = []
+        for n, (time_s, number, extended, data) in enumerate(frames(), start=1):
+            texts = {
+                "n": n,
+                "time": time_s,
+                "us": round(1e6 * time_s) + 265_003_377,
+                "ms": 1e3 * time_s,
+                "epoch": START_S + time_s,
+                "step": time_s - before,
+                "second": 20 + time_s,
+                "id": f"{number:08X}" if extended else f"{number:03X}",
+                "id4": f"{number:08X}" if extended else f"{number:04X}",
+                "id8": f"{number:08X}",
+                "idx": f"{number:X}x" if extended else f"{number:X}",
+                "extended": str(extended).lower(),
+                "data": data.hex(" ").upper(),
+                "cells": data.hex(",").upper(),
+                "digits": data.hex().upper(),
+            }
+            text.append(form.format(**texts))
+            before = time_s
+        path.write_text("\n".join(text) + "\n")
+
+    return write
+
+
+def with_head(head: str, form: str) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        lines(form)(path)
+        path.write_text(head + path.read_text())
+
+    return write
+
+
+def packed(path: Path) -> None:
+    write_with_python_can(path.with_name("inner.blf"))
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.write(path.with_name("inner.blf"), "car/inner.blf")
+        archive.writestr("__MACOSX/car/._inner.blf", b"hidden")
+        archive.writestr("../outside.blf", b"not in the archive")
+
+
+def gzipped(write: Callable[[Path], None]) -> Callable[[Path], None]:
+    def write_gzipped(path: Path) -> None:
+        write(path)
+        path.write_bytes(gzip.compress(path.read_bytes()))
+
+    return write_gzipped
+
+
+def folder(path: Path) -> None:
+    path.mkdir()
+    write_with_python_can(path / "a.asc")
+
+
+GVRET = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n"
+TRC_1_1 = ";$FILEVERSION=1.1\n;$STARTTIME=45244.5\n;\n;   Message Number\n"
+TRC_1_3 = ";$FILEVERSION=1.3\n;$STARTTIME=45244.5\n;\n;   Message Number\n"
+TRC_2_0 = ";$FILEVERSION=2.0\n;$STARTTIME=45244.5\n;$COLUMNS=N,O,T,I,d,l,D\n"
+TRC_2_1 = ";$FILEVERSION=2.1\n;$STARTTIME=45244.5\n;$COLUMNS=N,O,T,B,I,d,R,L,D\n"
+ASC = "date Tue Nov 14 10:13:20 pm 2023\nbase hex  timestamps absolute\ninternal events logged\n// version 9.0.0\n"
+LOGS: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "python-can CSV": ("x.csv", write_with_python_can),
+    "python-can ASC": ("x.asc", write_with_python_can),
+    "python-can BLF": ("x.blf", write_with_python_can),
+    "python-can TRC": ("x.trc", write_with_python_can),
+    "python-can MF4": ("x.mf4", write_with_python_can),
+    "python-can candump": ("x.log", write_with_python_can),
+    "SavvyCAN": ("x.csv", with_head(GVRET, "{us},{id8},{extended},Rx,0,8,{cells},")),
+    "SavvyCAN, packed": ("x.csv.gz", gzipped(with_head(GVRET, "{us},{id8},{extended},Rx,0,8,{cells},"))),
+    "candump -ta": ("x.log", lines(" ({epoch:.6f})  can0  {id}   [8]  {data}")),
+    "candump -tA": ("x.log", lines(" (2023-11-14 22:13:{second:09.6f})  can0  {id}   [8]  {data}")),
+    "candump -tz": ("x.txt", lines(" ({time:010.6f})  can0  {id}   [8]  {data}")),
+    "candump -td": ("x.log", lines(" ({step:010.6f})  can0  {id}   [8]  {data}")),
+    "candump -ta -x -a": ("x.txt", lines(" ({epoch:.6f})  can0  RX - -  {id}   [8]  {data}   '........'")),
+    "candump -L in .txt": ("x.txt", lines("({epoch:.6f}) can0 {id}#{digits}")),
+    "PEAK TRC 1.0": ("x.trc", with_head(";   Start time: 14.11.2023\n", "{n:6d})  {ms:10.1f}  {id4}  8  {data}")),
+    "PEAK TRC 1.1": ("x.trc", with_head(TRC_1_1, "{n:6d})  {ms:10.1f}  Rx  {id4:>8}  8  {data}")),
+    "PEAK TRC 1.3": ("x.trc", with_head(TRC_1_3, "{n:6d})  {ms:10.3f} 1  Rx  {id4:>8} -  8    {data}")),
+    "PEAK TRC 2.0": ("x.trc", with_head(TRC_2_0, "{n:6d}  {ms:10.3f} DT {id4:>8} Rx 8  {data}")),
+    "PEAK TRC 2.1": ("x.trc", with_head(TRC_2_1, "{n:6d}  {ms:10.3f} DT 1 {id4:>8} Rx -  8    {data}")),
+    "Vector ASC": ("x.asc", with_head(ASC, "   {time:.6f} 1  {idx:15s} Rx   d 8 {data}  Length = 0 BitCount = 0")),
+    "archive": ("car.zip", packed),
+    "folder": ("car", folder),
+}
+
+
+def before(log: Path, layout: Path, *options: object) -> dict[str, Any]:
+    """Figures of the currents by branch, as `calibrator kirchhoff` gives them, and its notices."""
+    done = calibrator("kirchhoff", log, "--layout", layout, *options, "--json")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    return {**said["before"], "notices": said["notices"]}
+
+
+def require_currents(found: dict[str, Any]) -> None:
+    """The battery's current is 20 A/s * t; the motor's frames come 10 ms later, so that 0.2 A more seem to be lost."""
+    assert found["battery"]["mean_a"] == pytest.approx(20.0, abs=0.1)
+    assert found["sum"]["mean_a"] == pytest.approx(2.2, abs=2e-3)
+    assert found["sum"]["sd_a"] < 2e-3
+
+
+@pytest.mark.parametrize("program", LOGS)
+def test_log_of_other_programs_gives_currents(tmp_path: Path, layout: Path, program: str) -> None:
+    name, write = LOGS[program]
+    write(tmp_path / name)
+    require_currents(before(tmp_path / name, layout))
+
+
+def test_archives_and_folders_are_imported_and_calibrated_as_vehicles(tmp_path: Path, layout: Path) -> None:
+    fleet = tmp_path / "fleet"
+    for vehicle in ("V1", "V2"):
+        (fleet / vehicle).mkdir(parents=True)
+    packed(fleet / "V1" / "monday.zip")
+    (fleet / "V1" / "inner.blf").unlink()
+    LOGS["SavvyCAN"][1](fleet / "V2" / "tuesday.csv")
+    (fleet / "V2" / "notes.txt").write_text("nothing to see here\n")
+    done = calibrator("import", fleet, "--layout", layout, "--out", tmp_path / "store", "--json")
+    assert done.returncode == 0, done.stderr
+    drives = json.loads(done.stdout)["drives"]
+    assert [(drive["vehicle"], drive["name"]) for drive in drives] == [("V2", "tuesday"), ("car", "inner")]
+
+
+def test_logs_in_a_folder_are_one_recording_with_gaps(tmp_path: Path, layout: Path) -> None:
+    for name in ("1.csv", "2.csv"):
+        (tmp_path / "logs").mkdir(exist_ok=True)
+        LOGS["SavvyCAN"][1](tmp_path / "logs" / name)
+    found = before(tmp_path / "logs", layout)
+    assert found["sum"]["mean_a"] == pytest.approx(2.2, abs=2e-3)
+    assert any("the clock was set 1 times" in notice for notice in found["notices"])
+
+
+@pytest.mark.filterwarnings("ignore:The inplace keyword")  # of asammdf
+@pytest.mark.parametrize("suffix", [".mf4", ".parquet"])
+def test_log_decoded_by_asammdf_is_a_table_of_its_signals(tmp_path: Path, layout: Path, suffix: str) -> None:
+    write_with_python_can(tmp_path / "raw.mf4")
+    with asammdf.MDF(tmp_path / "raw.mf4") as raw, raw.extract_bus_logging({"CAN": [(tmp_path / "car.dbc", 0)]}) as mdf:
+        if suffix == ".mf4":
+            mdf.save(tmp_path / "x.mf4")
+        else:
+            mdf.to_dataframe(use_display_names=True).to_parquet(tmp_path / "x.parquet")
+    assert before(tmp_path / f"x{suffix}", layout)["sum"]["mean_a"] == pytest.approx(2.2, abs=0.02)
+
+
+def test_can_fd_frames_of_python_can_csv_are_whole(tmp_path: Path, layout: Path) -> None:
+    (tmp_path / "car.dbc").write_text(DBC.replace("256 Pack: 8", "256 Pack: 12"))
+    with can.Logger(tmp_path / "x.csv") as logger:
+        for message in messages():
+            longer = bytes(message.data).ljust(12, b"\0")
+            logger(
+                can.Message(
+                    timestamp=message.timestamp,
+                    arbitration_id=message.arbitration_id,
+                    is_extended_id=message.is_extended_id,
+                    is_fd=True,
+                    data=longer,
+                )
+            )
+    require_currents(before(tmp_path / "x.csv", layout))
+
+
+def arxml(frames_: dict[str, tuple[int, str]]) -> str:
+    """An AUTOSAR 4 system of frames with a signal `Current` of 0.1 A each, as its schema describes it."""
+
+    def package(name: str, elements: str) -> str:
+        return f"<AR-PACKAGE><SHORT-NAME>{name}</SHORT-NAME><ELEMENTS>{elements}</ELEMENTS></AR-PACKAGE>"
+
+    def of_each(text: str) -> str:
+        return "".join(text.format(name=n, number=number, kind=kind) for n, (number, kind) in frames_.items())
+
+    triggerings = of_each(
+        "<CAN-FRAME-TRIGGERING><SHORT-NAME>{name}T</SHORT-NAME><FRAME-REF DEST='CAN-FRAME'>/F/{name}</FRAME-REF>"
+        "<CAN-ADDRESSING-MODE>{kind}</CAN-ADDRESSING-MODE><IDENTIFIER>{number}</IDENTIFIER></CAN-FRAME-TRIGGERING>"
+    )
+    cluster = (
+        "<CAN-CLUSTER><SHORT-NAME>HV</SHORT-NAME><CAN-CLUSTER-VARIANTS><CAN-CLUSTER-CONDITIONAL><PHYSICAL-CHANNELS>"
+        f"<CAN-PHYSICAL-CHANNEL><SHORT-NAME>C</SHORT-NAME><FRAME-TRIGGERINGS>{triggerings}</FRAME-TRIGGERINGS>"
+        "</CAN-PHYSICAL-CHANNEL></PHYSICAL-CHANNELS></CAN-CLUSTER-CONDITIONAL></CAN-CLUSTER-VARIANTS></CAN-CLUSTER>"
+    )
+    can_frames = of_each(
+        "<CAN-FRAME><SHORT-NAME>{name}</SHORT-NAME><FRAME-LENGTH>8</FRAME-LENGTH><PDU-TO-FRAME-MAPPINGS>"
+        "<PDU-TO-FRAME-MAPPING><SHORT-NAME>M</SHORT-NAME><PDU-REF DEST='I-SIGNAL-I-PDU'>/P/{name}</PDU-REF>"
+        "</PDU-TO-FRAME-MAPPING></PDU-TO-FRAME-MAPPINGS></CAN-FRAME>"
+    )
+    pdus = of_each(
+        "<I-SIGNAL-I-PDU><SHORT-NAME>{name}</SHORT-NAME><LENGTH>8</LENGTH><I-SIGNAL-TO-PDU-MAPPINGS>"
+        "<I-SIGNAL-TO-I-PDU-MAPPING><SHORT-NAME>Current</SHORT-NAME>"
+        "<I-SIGNAL-REF DEST='I-SIGNAL'>/S{name}/Current</I-SIGNAL-REF>"
+        "<PACKING-BYTE-ORDER>MOST-SIGNIFICANT-BYTE-LAST</PACKING-BYTE-ORDER><START-POSITION>0</START-POSITION>"
+        "</I-SIGNAL-TO-I-PDU-MAPPING></I-SIGNAL-TO-PDU-MAPPINGS></I-SIGNAL-I-PDU>"
+    )
+    signal = (
+        "<I-SIGNAL><SHORT-NAME>Current</SHORT-NAME><LENGTH>16</LENGTH><NETWORK-REPRESENTATION-PROPS>"
+        "<SW-DATA-DEF-PROPS-VARIANTS><SW-DATA-DEF-PROPS-CONDITIONAL>"
+        "<BASE-TYPE-REF DEST='SW-BASE-TYPE'>/T/S16</BASE-TYPE-REF>"
+        "</SW-DATA-DEF-PROPS-CONDITIONAL></SW-DATA-DEF-PROPS-VARIANTS></NETWORK-REPRESENTATION-PROPS>"
+        "<SYSTEM-SIGNAL-REF DEST='SYSTEM-SIGNAL'>/T/Current</SYSTEM-SIGNAL-REF></I-SIGNAL>"
+    )
+    types = (
+        "<SW-BASE-TYPE><SHORT-NAME>S16</SHORT-NAME><BASE-TYPE-SIZE>16</BASE-TYPE-SIZE>"
+        "<BASE-TYPE-ENCODING>2C</BASE-TYPE-ENCODING></SW-BASE-TYPE>"
+        "<UNIT><SHORT-NAME>Ampere</SHORT-NAME><DISPLAY-NAME>A</DISPLAY-NAME></UNIT>"
+        "<COMPU-METHOD><SHORT-NAME>Tenths</SHORT-NAME><CATEGORY>LINEAR</CATEGORY><COMPU-INTERNAL-TO-PHYS><COMPU-SCALES>"
+        "<COMPU-SCALE><COMPU-RATIONAL-COEFFS><COMPU-NUMERATOR><V>0</V><V>0.1</V></COMPU-NUMERATOR>"
+        "<COMPU-DENOMINATOR><V>1</V></COMPU-DENOMINATOR></COMPU-RATIONAL-COEFFS></COMPU-SCALE></COMPU-SCALES>"
+        "</COMPU-INTERNAL-TO-PHYS></COMPU-METHOD>"
+        "<SYSTEM-SIGNAL><SHORT-NAME>Current</SHORT-NAME><PHYSICAL-PROPS><SW-DATA-DEF-PROPS-VARIANTS>"
+        "<SW-DATA-DEF-PROPS-CONDITIONAL><COMPU-METHOD-REF DEST='COMPU-METHOD'>/T/Tenths</COMPU-METHOD-REF>"
+        "<UNIT-REF DEST='UNIT'>/T/Ampere</UNIT-REF></SW-DATA-DEF-PROPS-CONDITIONAL></SW-DATA-DEF-PROPS-VARIANTS>"
+        "</PHYSICAL-PROPS></SYSTEM-SIGNAL>"
+    )
+    packages = [package("K", cluster), package("F", can_frames), package("P", pdus), package("T", types)]
+    packages += [package(f"S{name}", signal) for name in frames_]
+    head = '<?xml version="1.0" encoding="UTF-8"?><AUTOSAR xmlns="http://autosar.org/schema/r4.0" '
+    schema = 'xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" '
+    where = 'xsi:schemaLocation="http://autosar.org/schema/r4.0 AUTOSAR_4-2-2.xsd">'
+    return f"{head}{schema}{where}<AR-PACKAGES>{''.join(packages)}</AR-PACKAGES></AUTOSAR>"
+
+
+@pytest.mark.parametrize("suffix", [".kcd", ".sym", ".arxml"])
+def test_databases_of_other_formats_are_read(tmp_path: Path, layout: Path, suffix: str) -> None:
+    database = cantools.database.load_string(DBC, "dbc")
+    path = tmp_path / f"car{suffix}"
+    if suffix == ".arxml":
+        path.write_text(arxml({"Pack": (0x100, "STANDARD"), "Motor": (0x200, "EXTENDED")}))
+    else:
+        assert isinstance(database, cantools.database.Database)
+        cantools.database.dump_file(database, path)
+    layout.write_text(LAYOUT.replace("car.dbc", path.name))
+    write_with_python_can(tmp_path / "x.blf")
+    require_currents(before(tmp_path / "x.blf", layout))
+
+
+BUSES = """
+[[bus]]
+name = "pt"
+channel = "can0"
+dbc = "car.dbc"
+[[bus]]
+name = "aux"
+channel = "can1"
+dbc = "car.dbc"
+"""
+
+
+def on_buses(path: Path, *channels: tuple[str, int]) -> Path:
+    """The car's frames on several buses of one candump log; of each bus the first so many."""
+    lines_ = [
+        (time_s, f"({START_S + time_s:.6f}) {channel} {number:0{8 if extended else 3}X}#{data.hex()}")
+        for channel, count in channels
+        for time_s, number, extended, data in list(frames())[:count]
+    ]
+    path.write_text("".join(f"{line}\n" for _, line in sorted(lines_)))
+    return path
+
+
+def test_stray_frames_of_another_bus_are_ignored_with_one_notice(tmp_path: Path, layout: Path) -> None:
+    found = before(on_buses(tmp_path / "x.log", ("can0", 2 * COUNT), ("can1", 3)), layout)
+    require_currents(found)
+    assert [notice for notice in found["notices"] if "buses" in notice] == ["3 frames of other buses ignored (can1)"]
+
+
+def test_two_buses_with_as_many_frames_are_refused_with_the_lines_to_write(tmp_path: Path, layout: Path) -> None:
+    log = on_buses(tmp_path / "x.log", ("can0", 2 * COUNT), ("can1", COUNT))
+    done = calibrator("kirchhoff", log, "--layout", layout)
+    assert done.returncode == 1
+    assert "Pack comes on several buses (frames: can0 40, can1 20)" in done.stderr
+    assert '[[bus]] with name = "hv", channel = "can0", dbc = "car.dbc"' in done.stderr
+    layout.write_text(LAYOUT.replace('dbc = "car.dbc"', "") + BUSES.partition('[[bus]]\nname = "aux"')[0])
+    found = before(log, layout)
+    require_currents(found)
+    assert "40 frames of other buses ignored (can1)" in found["notices"]
+
+
+def test_branches_come_from_two_buses_with_a_database_each(tmp_path: Path, layout: Path) -> None:
+    layout.write_text(
+        LAYOUT.replace('dbc = "car.dbc"', "").replace("Pack.", "pt:Pack.").replace("Motor.", "aux:Motor.") + BUSES
+    )
+    require_currents(before(on_buses(tmp_path / "x.log", ("can0", 80), ("can1", 80), ("can2", 7)), layout))
+
+
+def test_prefix_of_the_bus_is_needed_only_where_two_buses_have_the_message(tmp_path: Path, layout: Path) -> None:
+    (tmp_path / "motor.dbc").write_text(DBC.replace("256 Pack", "257 Other"))
+    text = LAYOUT.replace('dbc = "car.dbc"', "") + BUSES.replace('can1"\ndbc = "car', 'can1"\ndbc = "motor')
+    log = on_buses(tmp_path / "x.log", ("can0", 80), ("can1", 80))
+    layout.write_text(text)
+    done = calibrator("kirchhoff", log, "--layout", layout)
+    assert "message 'Motor' is in the DBCs of the buses pt and aux; write 'pt:Motor'" in done.stderr
+    layout.write_text(text.replace("Motor.", "aux:Motor."))
+    require_currents(before(log, layout))
+
+
+@pytest.mark.parametrize(
+    ("formula", "sum_a"),
+    [("2 * m", 20.0 - 2 * 17.8), ("m - one", 3.2), ("p / u * 1000", 2.2)],
+)
+def test_branch_computed_by_a_formula(tmp_path: Path, layout: Path, formula: str, sum_a: float) -> None:
+    (tmp_path / "car.dbc").write_text(
+        DBC + ' SG_ One : 16|8@1+ (1,1) [0|0] "" Car\n SG_ Power : 0|16@1- (0.04,0) [-1000|1000] "kW" Car\n'
+    )
+    layout.write_text(
+        LAYOUT.replace('signal = "Motor.Current"', f'formula = "{formula}"\nuncertainty = 0.05')
+        + "".join(
+            f'[[input]]\nname = "{name}"\nsignal = "{signal}"\n'
+            for name, signal in (
+                ("m", "Motor.Current"), ("one", "Motor.One"), ("p", "Motor.Power"), ("u", "Pack.Voltage")
+            )
+        )
+    )  # fmt: skip
+    write_with_python_can(tmp_path / "x.blf")
+    assert before(tmp_path / "x.blf", layout)["sum"]["mean_a"] == pytest.approx(sum_a, abs=0.02)
+    branch = vehicle_database(layout).layout.find_branch("motor")
+    assert (branch.computed, branch.uncertainty) == (True, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("signal = \"Motor.Current\"", 'formula = "torque / 2"'), "motor: torque is no [[input]] or [[derived]]"),
+        (("signal = \"Motor.Current\"", 'formula = "f(1)"'), "motor: formula 'f(1)': 'f(1)' is not allowed"),
+        (("sign = -1", 'sign = -1\nformula = "1"'), "'power' and 'voltage', or 'formula'"),
+        (("sign = -1", "sign = -1\nuncertainty = 0.1"), "motor: 'uncertainty' is that of a 'formula'"),
+        (("sign = -1", 'sign = -1\nunit = "km"'), "motor: unit 'km' is unknown; expected A, kA, mA"),
+        (("Motor.Current", "aux:Motor.Current"), "no [[bus]] is named 'aux'; known are none"),
+        (("full_scale_a", f"{BUSES}\nfull_scale_a"), "unknown key 'full_scale_a'"),
+        (('sign = -1', f'sign = -1\n{BUSES}'), "give either 'dbc', or [[bus]] with a 'dbc' each"),
+        (('dbc = "car.dbc"', ''), "no 'dbc', so that it fits tables only; give the DBC of the frames"),
+        (('dbc = "car.dbc"', 'dbc = "x.kcd"'), "x.kcd: cannot read the DBC: No such file"),
+    ],
+)  # fmt: skip
+def test_mistake_in_a_layout_is_one_line(tmp_path: Path, layout: Path, change: tuple[str, str], words: str) -> None:
+    assert change[0] in LAYOUT
+    layout.write_text(LAYOUT.replace(*change))
+    write_with_python_can(tmp_path / "x.log")
+    require_one_line(calibrator("kirchhoff", tmp_path / "x.log", "--layout", layout), words)
+
+
+def require_one_line(done: subprocess.CompletedProcess[str], words: str) -> None:
+    assert done.returncode == 1
+    assert words in done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "words"),
+    [
+        ("x.log", lines("  can0  {id}   [8]  {data}"), "without times; record it with 'candump -L' or 'candump -ta'"),
+        ("x.csv", with_head(GVRET.replace("LEN", "L"), "{us},{id8},true,Rx,0,8,{cells}"), "without the column 'LEN'"),
+        ("x.csv", with_head(GVRET, "{us},{id8},true,Rx,0,8,ZZ"), "line 2 is damaged, and 80 of 80 are"),
+        ("x.zip", lambda path: path.write_bytes(b"PK nothing"), "x.zip: not a readable archive: File is not a zip"),
+        ("x.zip", lambda path: zipfile.ZipFile(path, "w").close(), "x.zip: no logs in it; expected .log, .asc"),
+        ("x.log", lines("{n} {id} {data}"), "line 1 is damaged"),
+        ("x.xlsx", lines("{n}"), "x.xlsx: not a known log format; expected .log, .asc"),
+    ],
+)  # fmt: skip
+def test_mistake_with_a_log_is_one_line(
+    tmp_path: Path, layout: Path, name: str, write: Callable[[Path], object], words: str
+) -> None:
+    write(tmp_path / name)
+    require_one_line(calibrator("kirchhoff", tmp_path / name, "--layout", layout), words)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            LAYOUT.replace('dbc = "car.dbc"', "") + BUSES,
+            "names several buses; the node corrects the signals of one bus",
+        ),
+        (LAYOUT.replace('dbc = "car.dbc"', ""), "has no 'dbc', so that it fits tables only"),
+        (LAYOUT.replace('signal = "Motor.Current"', 'formula = "1"'), "branch motor is computed by a formula"),
+    ],
+)
+def test_node_refuses_what_it_cannot_run_on(layout: Path, text: str, words: str) -> None:
+    layout.write_text(text)
+    command = [sys.executable, "-m", "ecu_node", "template", "--layout", str(layout), "--vehicle", "V1"]
+    require_one_line(subprocess.run(command, capture_output=True, text=True, check=False), words)

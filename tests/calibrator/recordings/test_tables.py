@@ -1,0 +1,308 @@
+"""Tables as recordings, through the command line: three currents, 0.1 s apart, whose sum is 2 % of the battery's."""
+
+import gzip
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from asammdf import MDF, Signal
+
+from calibrator.errors import LogError
+from calibrator.recordings.tables import is_table, layout_from_branches, read_table
+from tests.calibrator.command_here import calibrator
+
+ROWS = 100
+BRANCHES = "battery=Ibat,-motor=Imot,-heater=Iheat"
+TIME_S = 0.1 * np.arange(ROWS)
+BATTERY_A = 100.0 * np.sin(0.5 * TIME_S)
+
+
+def frame(**columns: Any) -> pd.DataFrame:
+    currents = {"Ibat [A]": BATTERY_A, "Imot (A)": 0.9 * BATTERY_A, "Iheat_A": 0.08 * BATTERY_A}
+    return pd.DataFrame({"time": TIME_S, **currents, **columns})
+
+
+def dates() -> pd.DatetimeIndex:
+    return pd.date_range("2026-03-29 23:59:55", periods=ROWS, freq="100ms")
+
+
+def csv(table: pd.DataFrame, **options: Any) -> Callable[[Path], None]:
+    return lambda path: table.to_csv(path, **{"index": False, **options})
+
+
+def with_text(text: str, table: pd.DataFrame, **options: Any) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        path.write_text(text + table.to_csv(None, index=False, **options))
+
+    return write
+
+
+def decoded_mf4(path: Path) -> None:
+    """Channels in two groups with rates of their own, as a logger decodes them."""
+    mdf = MDF()
+    mdf.append(
+        [Signal(BATTERY_A, TIME_S, name="Ibat", unit="A"), Signal(0.9 * BATTERY_A, TIME_S, name="Imot", unit="A")]
+    )
+    half = slice(None, None, 2)
+    mdf.append([Signal(80.0 * BATTERY_A[half], TIME_S[half], name="Iheat", unit="mA")])
+    mdf.save(path.with_suffix(".mf4"), overwrite=True)
+
+
+def sparse(path: Path) -> None:
+    """A row per value, as tools write that merge channels of different rates."""
+    wide = frame().set_index("time")
+    parts = [wide[[name]].set_axis(wide.index + 0.01 * k) for k, name in enumerate(wide)]
+    pd.concat(parts).sort_index().to_csv(path)
+
+
+def zipped(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("bench/x.csv", frame().to_csv(index=False))
+
+
+UNITS = {"Ibat [A]": "Ibat", "Imot (A)": "Imot", "Iheat_A": "Iheat"}
+TABLES: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "CSV": ("x.csv", csv(frame())),
+    "German CSV": ("x.csv", csv(frame(), sep=";", decimal=",", encoding="latin-1")),
+    "tabs, UTF-16": ("x.tsv", csv(frame(), sep="\t", encoding="utf-16")),
+    "blanks": ("x.txt", csv(frame().rename(columns=UNITS), sep=" ")),
+    "quoted decimal commas": ("x.csv", csv(frame().map(lambda x: f"{x:.6f}".replace(".", ",")), quoting=1)),
+    "BOM": ("x.csv", csv(frame(), encoding="utf-8-sig")),
+    "archive": ("x.zip", zipped),
+    "gzip": ("x.csv.gz", csv(frame())),
+    "numbered rows": ("x.csv", csv(frame(), index=True)),
+    "comment and units below": (
+        "x.csv",
+        with_text(
+            "# exported by X\nvehicle;7\n\ntime;Ibat;Imot;Iheat\ns;A;A;A\n", frame().set_axis(range(4), axis=1),
+            sep=";", header=False,
+        ),
+    ),
+    "milliseconds": ("x.csv", csv(frame(time=np.arange(ROWS) * 100))),
+    "microseconds": ("x.csv", csv(frame(time=np.arange(ROWS) * 100_000))),
+    "ms in the header": ("x.csv", csv(frame().assign(time=1e3 * TIME_S).rename(columns={"time": "Zeit [ms]"}))),
+    "seconds since 1970": ("x.csv", csv(frame(time=1.7e9 + TIME_S))),
+    "ms since 1970": ("x.csv", csv(frame(time=1_700_000_000_000 + np.arange(ROWS) * 100))),
+    "ISO dates": ("x.csv", csv(frame(time=dates()))),
+    "ISO dates with zone": ("x.csv", csv(frame(time=dates().tz_localize("UTC").tz_convert("Europe/Berlin")))),
+    "German dates": ("x.csv", csv(frame(time=dates().strftime("%d.%m.%Y %H:%M:%S,%f")), sep=";", decimal=",")),
+    "American dates": ("x.csv", csv(frame(time=dates().strftime("%m/%d/%Y %I:%M:%S.%f %p")))),
+    "date and time": ("x.csv", csv(frame(Date=dates().strftime("%Y-%m-%d"), time=dates().strftime("%H:%M:%S.%f")))),
+    "time without a name for it": ("x.csv", csv(frame().rename(columns={"time": "x"}))),
+    "mA": ("x.csv", csv(frame(**{"Iheat [mA]": 80.0 * BATTERY_A}).drop(columns="Iheat_A"))),
+    "sparse": ("x.csv", sparse),
+    "Parquet": ("x.parquet", lambda path: frame().to_parquet(path)),
+    "Parquet, dates as index": ("x.parquet", frame().set_index(dates()).iloc[:, 1:].to_parquet),
+    "Feather": ("x.feather", lambda path: frame().to_feather(path)),
+    "Arrow": ("x.arrow", lambda path: frame().to_feather(path)),
+    "MF4": ("x.mf4", decoded_mf4),
+}  # fmt: skip
+
+
+def before(*arguments: object) -> dict[str, Any]:
+    done = calibrator("kirchhoff", *arguments, "--json")
+    assert done.returncode == 0, done.stderr
+    said: dict[str, Any] = json.loads(done.stdout)
+    return {**said["before"], **said}
+
+
+def require_sum(found: dict[str, Any]) -> None:
+    assert found["battery"]["max_a"] == pytest.approx(100.0, abs=0.5)
+    assert found["sum"]["max_a"] == pytest.approx(2.0, abs=0.15)  # two rates are interpolated
+    assert found["full_scale_a"] == 100.0
+    assert found["valid"] >= ROWS - 3
+
+
+@pytest.mark.parametrize("kind", TABLES)
+def test_table_gives_currents_without_a_layout(tmp_path: Path, kind: str) -> None:
+    name, write = TABLES[kind]
+    write(tmp_path / name)
+    assert is_table(tmp_path / name)
+    require_sum(before(tmp_path / name, "--branches", BRANCHES))
+
+
+def test_rows_that_cannot_be_used_are_counted(tmp_path: Path) -> None:
+    rows = frame().to_csv(index=False).splitlines()
+    rows[20] += ",7"
+    rows[30] = "," + rows[30].partition(",")[2]
+    (tmp_path / "x.csv").write_text("\n".join(rows))
+    found = before(tmp_path / "x.csv", "--branches", BRANCHES)
+    assert "2 damaged lines or frames left out" in found["notices"]
+
+
+def test_what_was_found_of_a_table_is_said(tmp_path: Path) -> None:
+    csv(frame(time=np.arange(ROWS) * 100), sep=";", decimal=",")(tmp_path / "x.csv")
+    (found,) = [text for text in before(tmp_path / "x.csv", "--branches", BRANCHES)["notices"] if "rows" in text]
+    assert found == "100 rows, columns between ';', decimal ',', utf-8-sig; time 'time' in ms"
+
+
+def test_rate_of_the_table_gives_period_and_timeouts(tmp_path: Path) -> None:
+    csv(frame().rename(columns={"time": "t [min]"}).assign(**{"t [min]": np.arange(ROWS) / 6}))(tmp_path / "x.csv")
+    layout = layout_from_branches(BRANCHES, table=read_table(tmp_path / "x.csv")).layout
+    assert (layout.period_s, layout.branch[0].timeout_s) == (10.0, 35.0)
+    assert before(tmp_path / "x.csv", "--branches", BRANCHES)["valid"] == ROWS
+
+
+@pytest.mark.parametrize(("step", "rows", "seconds"), [(1, 100, 99), (10, 100, 990), (10, 7000, 69.99), (500, 9, 4)])
+def test_whole_numbers_without_a_unit_are_what_makes_a_recording(
+    tmp_path: Path, step: int, rows: int, seconds: float
+) -> None:
+    csv(pd.DataFrame({"time": step * np.arange(rows), "a": np.arange(rows) % 7, "b": 1, "note": "ok"}))(
+        tmp_path / "x.csv"
+    )
+    table = read_table(tmp_path / "x.csv")
+    assert table.time_s[-1] == pytest.approx(seconds)
+    assert set(table.columns) == {"a", "b"}
+
+
+LAYOUT = """
+schema = 1
+name = "car"
+full_scale_a = 100
+branch = [
+    { name = "battery", signal = "Ibat", sign = 1 },
+    { name = "motor", signal = "Imot", sign = -1 },
+    { name = "heater", power = "Pheat", voltage = "Ubat", sign = -1 },
+]
+input = [{ name = "speed", signal = "Speed" }]
+model_inputs = ["speed"]
+"""
+
+
+def powers() -> pd.DataFrame:
+    return frame(**{"Pheat [kW]": 0.08 * BATTERY_A * 0.4, "Ubat [V]": 400.0, "Speed": 50.0}).drop(columns="Iheat_A")
+
+
+def test_layout_names_columns_in_place_of_signals(tmp_path: Path) -> None:
+    (tmp_path / "car.toml").write_text(LAYOUT)
+    csv(powers())(tmp_path / "x.csv")
+    require_sum(before(tmp_path / "x.csv", "--layout", tmp_path / "car.toml"))
+
+
+def test_unit_of_the_layout_stands_where_the_header_has_none(tmp_path: Path) -> None:
+    (tmp_path / "car.toml").write_text(LAYOUT.replace('"Ibat"', '"Ibat", unit = "mA"'))
+    csv(powers().rename(columns={"Ibat [A]": "Ibat"}).assign(Ibat=1e3 * BATTERY_A))(tmp_path / "x.csv")
+    require_sum(before(tmp_path / "x.csv", "--layout", tmp_path / "car.toml"))
+
+
+@pytest.mark.parametrize("names", ["{0}.{1}", "{1}", "CAN1.{0}.{1}"])
+def test_columns_of_a_decoded_log_belong_to_signals_of_its_dbc(tmp_path: Path, names: str) -> None:
+    (tmp_path / "car.dbc").write_text(
+        'VERSION ""\nBU_: C\nBO_ 1 Bms: 8 C\n SG_ Pack : 0|16@1- (0.1,0) [-90|90] "A" C\n'
+        'BO_ 2 Inv: 8 C\n SG_ Link : 0|16@1- (1,0) [0|0] "mA" C\n'
+    )
+    (tmp_path / "car.toml").write_text(
+        'schema = 1\nname = "car"\ndbc = "car.dbc"\nfull_scale_a = 100\nbranch = [\n'
+        '{ name = "battery", signal = "Bms.Pack", sign = 1 }, { name = "motor", signal = "Inv.Link", sign = -1 }]\n'
+    )
+    columns = {"time": TIME_S, names.format("Bms", "Pack"): BATTERY_A, names.format("Inv", "Link"): 980.0 * BATTERY_A}
+    table = pd.DataFrame(columns)
+    table.iloc[50:60, 1] = np.nan
+    texts = table.astype(object)
+    texts.iloc[50:60, 1] = "SNA"
+    csv(texts)(tmp_path / "x.csv")
+    found = before(tmp_path / "x.csv", "--layout", tmp_path / "car.toml")
+    assert found["sum"]["max_a"] == pytest.approx(1.8, abs=0.04)
+    assert found["valid"] < ROWS - 20  # neither texts nor what the DBC's range forbids is a current
+
+
+def test_columns_that_could_be_of_two_messages_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "car.dbc").write_text(
+        'VERSION ""\nBU_: C\nBO_ 1 Bms: 8 C\n SG_ Current : 0|16@1- (0.1,0) [0|0] "A" C\n'
+        'BO_ 2 Inv: 8 C\n SG_ Current : 0|16@1- (1,0) [0|0] "A" C\n'
+    )
+    (tmp_path / "car.toml").write_text(
+        'schema = 1\nname = "car"\ndbc = "car.dbc"\nfull_scale_a = 100\nbranch = [\n'
+        '{ name = "battery", signal = "Bms.Current", sign = 1 }, '
+        '{ name = "motor", signal = "Inv.Current", sign = -1 }]\n'
+    )
+    csv(frame().rename(columns={"Ibat [A]": "Current", "Imot (A)": "Current_0"}))(tmp_path / "x.csv")
+    done = calibrator("kirchhoff", tmp_path / "x.csv", "--layout", tmp_path / "car.toml")
+    assert "column 'Current' could be Bms.Current and Inv.Current; call columns after message and signal" in done.stderr
+
+
+def test_formula_of_columns_is_a_branch(tmp_path: Path) -> None:
+    (tmp_path / "car.toml").write_text(
+        LAYOUT.replace('power = "Pheat", voltage = "Ubat"', 'formula = "1e3 * P / Ubat"')
+    )
+    csv(powers().rename(columns={"Pheat [kW]": "P [kW]"}))(tmp_path / "x.csv")
+    require_sum(before(tmp_path / "x.csv", "--layout", tmp_path / "car.toml"))
+    require_sum(before(tmp_path / "x.csv", "--branches", "battery=Ibat,-motor=Imot,-heater=P*1000/Ubat"))
+
+
+def test_tables_are_imported(tmp_path: Path) -> None:
+    (tmp_path / "car.toml").write_text(LAYOUT)
+    for vehicle in ("V1", "V2"):
+        (tmp_path / "fleet" / vehicle).mkdir(parents=True)
+        powers().to_parquet(tmp_path / "fleet" / vehicle / "monday.parquet")
+        csv(powers(), sep=";")(tmp_path / "fleet" / vehicle / "tuesday.csv.gz")
+    options = ("--layout", tmp_path / "car.toml")
+    done = calibrator("import", tmp_path / "fleet", *options, "--out", tmp_path / "store", "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert [(d["vehicle"], d["name"], d["branches"]) for d in report["drives"]] == [
+        (vehicle, name, ["battery", "motor", "heater"]) for vehicle in ("V1", "V2") for name in ("monday", "tuesday")
+    ]
+    again = calibrator("import", tmp_path / "fleet", *options, "--out", tmp_path / "store", "--json")
+    assert len(json.loads(again.stdout)["already_there"]) == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "branches", "words"),
+    [
+        ("", BRANCHES, "x.csv: the file is empty; a header and rows of numbers are expected"),
+        ("time;a;b\n", BRANCHES, "x.csv: no row of numbers below the header"),
+        ("0,1,2\n1,2,3\n2,3,4\n", BRANCHES, "x.csv: no header: line 1 has numbers; write the names of the columns"),
+        ("hello\nworld\n", BRANCHES, "x.csv: no table: the first line is 'hello'; columns between commas"),
+        ("time,a\n0,1\n", "a=a,b=b", "x.csv: 1 rows of values; a header and at least two rows are expected"),
+        ("a,b\n3,1\n2,2\n3,1\n", "a,b", "x.csv: no column is the time: none has it in its name and increases"),
+        ("time,a\n0,1x\n1,2y\n", "a,b", "x.csv: no column of numbers beside the time"),
+        ("time,Ibat,Imot\n0,1,2\n1,2,3\n", "Ibatt,Imot", "no column 'Ibatt'; the columns are 'Ibat', 'Imot'"),
+        ("time,Ibat,Imot\n0,1,2\n1,2,3\n", "Ibat", "--branches Ibat: two or more are expected, such as battery=Ibat"),
+        ("time,Ibat,Imot\n0,1,2\n1,2,3\n", "Ibat,Ibat", "Ibat is named twice"),
+        ("time,I [A],I (mA)\n0,1,2\n1,2,3\n", "I,Imot", "'I' stands for 'I [A]', 'I (mA)'; write it in full"),
+        ("time,I [V],J\n0,1,2\n1,2,3\n", "I,J", "branch I: I is in 'V'; expected A, mA, kA"),
+    ],
+)  # fmt: skip
+def test_mistake_with_a_table_is_one_line(tmp_path: Path, text: str, branches: str, words: str) -> None:
+    (tmp_path / "x.csv").write_text(text)
+    done = calibrator("kirchhoff", tmp_path / "x.csv", "--branches", branches)
+    assert done.returncode == 1
+    assert words in done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".feather", ".mf4", ".csv.gz"])
+def test_damaged_table_is_one_line(tmp_path: Path, suffix: str) -> None:
+    (tmp_path / f"x{suffix}").write_bytes(gzip.compress(frame().to_csv(index=False).encode())[:1500])
+    done = calibrator("kirchhoff", tmp_path / f"x{suffix}", "--branches", "a,b")
+    assert done.returncode == 1
+    assert f"x{suffix}: not a readable" in done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+
+
+def test_folder_of_tables_is_refused_where_one_is_needed(tmp_path: Path) -> None:
+    for name in ("x.csv", "y.csv"):
+        csv(frame())(tmp_path / name)
+    done = calibrator("kirchhoff", tmp_path, "--branches", BRANCHES)
+    assert "2 files in it; give one table, or import the folder as drives" in done.stderr
+
+
+def test_table_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"x\.csv: no such file; give a table that is there"):
+        read_table(tmp_path / "x.csv")
+
+
+def test_log_of_frames_is_no_table_for_a_layout_without_dbc(tmp_path: Path) -> None:
+    (tmp_path / "car.toml").write_text(LAYOUT)
+    (tmp_path / "x.log").write_text("(1.000000) can0 123#11\n(2.000000) can0 123#11\n")
+    done = calibrator("kirchhoff", tmp_path / "x.log", "--layout", tmp_path / "car.toml")
+    assert "no 'dbc', so that it fits tables only; give the DBC of the frames" in done.stderr
+    (tmp_path / "car.toml").write_text(LAYOUT.replace('"Ibat"', '"Ibat", corrected = "A.B"'))
+    done = calibrator("kirchhoff", tmp_path / "x.log", "--layout", tmp_path / "car.toml")
+    assert "branch battery: 'corrected' names messages, but the layout has no 'dbc'" in done.stderr

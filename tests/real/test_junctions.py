@@ -1,0 +1,114 @@
+"""Real sensors in one junction: a Tesla's inverters against its battery, a BMW i3's battery against two chargers."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from calibrator import JunctionCalibrator, read_log
+from tests.calibrator.command_here import calibrator as command
+
+ROOT = Path(__file__).parents[2]
+I3_DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: Car
+BO_ 274 Battery: 8 Car
+ SG_ BatteryCurrent : 0|16@1+ (0.1,-819.2) [-819.2|819.2] "A" Car
+BO_ 690 Charger: 8 Car
+ SG_ ChargerCurrent : 16|16@1+ (0.1,0) [0|6553.4] "A" Car
+"""
+I3_LAYOUT = """schema = 1
+name = "i3_charging"
+dbc = "i3.dbc"
+full_scale_a = 200.0
+[[branch]]
+name = "battery"
+signal = "Battery.BatteryCurrent"
+sign = -1
+timeout_s = 0.1
+[[branch]]
+name = "charger"
+signal = "Charger.ChargerCurrent"
+sign = 1
+timeout_s = 0.3
+no_value = [65535]
+"""
+
+
+@pytest.fixture(scope="module")
+def i3(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recordings of one car at two stations, a folder each."""
+    folder = tmp_path_factory.mktemp("i3")
+    for path in (shared_data / "bmw_i3_charging").glob("*.csv.gz"):
+        station = folder / "car" / ("circontrol" if "Circontrol" in path.name else "efacec")
+        station.mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, station)
+    (folder / "i3.dbc").write_text(I3_DBC)
+    (folder / "layout.toml").write_text(I3_LAYOUT)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tesla(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("model3")
+    for name in ("drive.log.gz", "Model3CAN.dbc"):
+        (folder / name).symlink_to(shared_data / "tesla_model3" / name)
+    shutil.copy(ROOT / "dbc" / "tesla_model3.toml", folder)
+    return folder
+
+
+def test_stations_differ_by_their_gains(i3: Path) -> None:
+    """At 124 A the battery reads 2.5 A less than one station, and 1.0 A more than the other."""
+    found = JunctionCalibrator(meter="charger", trusted=["battery"]).fit(i3 / "car", i3 / "layout.toml")
+    rows = found.parameters_.set_index(["vehicle", "branch"]).xs("charger", level="branch")
+    ratio = 1.0 / (1.0 + rows.gain_error)  # battery over charger
+    assert ratio["circontrol"] == pytest.approx(0.988, abs=0.003)
+    assert ratio["efacec"] == pytest.approx(1.012, abs=0.003)
+    assert (rows.gain_error_sd < 0.0035).all()
+
+
+def test_battery_against_both_stations_is_a_contradiction(i3: Path, tmp_path: Path) -> None:
+    """Two meters that are both called right differ by 2.4 %: that is said, and nothing is corrected."""
+    done = command(
+        "calibrate", i3 / "car", "--layout", i3 / "layout.toml", "--meter", "charger", "--trusted", "charger",
+        "--out", tmp_path / "r",
+    )  # fmt: skip
+    assert done.returncode == 0
+    assert "what is known contradicts itself" in done.stdout
+    assert not pd.read_parquet(tmp_path / "r" / "results.parquet").applied.any()
+
+
+def test_offset_of_a_station_needs_the_load_of_the_car(i3: Path) -> None:
+    """After the plug the car draws 0.7 to 0.9 A that no branch measures: declared, they leave no offset."""
+    open_, declared = (
+        JunctionCalibrator(meter="charger", trusted=["battery"], load=load)
+        .fit(i3 / "car", i3 / "layout.toml")
+        .parameters_
+        for load in (None, (0.8, 0.1))
+    )
+    assert (open_[open_.branch == "charger"].offset_sd_a > 1.0).all()
+    chargers = declared[declared.branch == "charger"]
+    assert (chargers.offset_a.abs() < 3.0 * chargers.offset_sd_a).all()
+    assert (chargers.offset_sd_a < 0.6).all()
+
+
+def test_rear_inverter_reads_two_percent_less_than_the_battery(tesla: Path) -> None:
+    """As least squares say; the front one hardly moved, and its gain stays open."""
+    found = JunctionCalibrator(trusted=["battery"]).fit(tesla / "drive.log.gz", tesla / "tesla_model3.toml")
+    rows = found.parameters_.set_index("branch")
+    frame = read_log(tesla / "drive.log.gz", tesla / "tesla_model3.toml").to_frame().dropna()
+    others = np.column_stack([frame.motor_rear, frame.motor_front, np.ones(len(frame))])
+    direct = -1.0 / np.linalg.lstsq(others, frame.battery, rcond=None)[0][0] - 1.0
+    assert rows.gain_error["motor_rear"] == pytest.approx(direct, abs=rows.gain_error_sd["motor_rear"])
+    assert rows.gain_error_sd["motor_rear"] < 0.01
+    assert rows.gain_error_sd["motor_front"] > 0.05
+    assert not rows.corrected.any()
+    assert "the gain of motor_front needs a drive in which that current varies more" in found.summary()
+
+
+def test_sum_at_zero_current_is_the_load_of_the_tesla(tesla: Path) -> None:
+    found = JunctionCalibrator(trusted=["battery"]).fit(tesla / "drive.log.gz", tesla / "tesla_model3.toml")
+    assert any("the sensors sum to +4.1" in notice for notice in found.notices_)
