@@ -115,7 +115,10 @@ def store_frames(folder: Path, frames: Mapping[str, Any], junction: "Junction") 
         for number, frame in enumerate(drives, start=1)
     ]
     for where, frame in labelled:
-        require_columns(frame, list(junction.branches), where)
+        try:
+            require_columns(frame, list(junction.branches), where)
+        except DriveError as error:
+            raise DriveError(f"{error}; name the branches that were recorded: branches=[...] of the Junction") from None
     times = {where: _seconds(frame, where) for where, frame in labelled}
     database = junction.as_database((), _period_s(times, junction))
     contactor = database.layout.contactor

@@ -8,13 +8,13 @@ with the offsets o and the load l that no branch measures. They are linear in th
 of one car with different meters are one system of equations. Ratios have no scale: that comes from sensors that are
 known; offsets come from known ones, zero-current windows, a declared load, or a charge balance. As no fleet tells what
 is usual, the gain of a sensor that is not known is open: its prior is a wide Gaussian. Its offset is absent (a narrow
-Gaussian: no zero is exact) or present (a wide one); each choice is one explanation. What they leave open is reported
+Gaussian: no zero is exact) or present, of any size; each choice is one explanation. What they leave open is reported
 with its standard deviation, and is not corrected.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +42,7 @@ from calibrator.estimator.readings import (
 )
 from calibrator.estimator.results import ChunkResult, encode_chunk
 from calibrator.estimator.settings import CalibrationSettings
+from calibrator.estimator.vehicle_report import sensor_text
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.score import TOLERANCE
 from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive
@@ -75,6 +76,8 @@ LEAST_FAULT = 0.02
 """Size that "recovered" counts a fault with at least: gain error, and offset over full scale. [1]"""
 KNOWN_GAIN_SD, KNOWN_OFFSET_SD = 0.03, 0.005
 """Standard deviations up to which a gain, and an offset over full scale, count as known. [1]"""
+OFFSET_SIZES = (0.0015, 0.005, 0.02, 0.2)
+"""Standard deviations of an offset that is present, over full scale: each is as probable as the others. [1]"""
 MOST_OFFSETS, MARGIN = 3, 12.0
 """Most offsets of one explanation, and the logarithm of the weight below the best from which on it is left out."""
 DRAWS, FEWEST_DRAWS = 8192, 64
@@ -129,8 +132,7 @@ class JunctionEstimate:
     Attributes
     ----------
     estimate : FleetEstimate
-        As of a fleet; drifts and offsets are the means under the most probable explanation, also where no fault is
-        suspected.
+        As of a fleet; drifts and offsets are the means of the posterior, also where no fault is suspected.
     ratios : sequence of N mappings of str to Reading
         Gain of the branch that moves most over that of each other one. [1]
     constant_a : sequence of N Reading
@@ -184,7 +186,8 @@ def summarise_junction(drives: Sequence[Drive], branches: Sequence[str], databas
     duration_s = layout.period_s * sum(int(part.valid.sum()) for part in samples)
     if duration_s < LEAST_DURATION_S:
         raise DriveError(
-            f"{duration_s:.1f} s in which all branches have usable samples; at least {LEAST_DURATION_S:g} s are needed"
+            f"{duration_s:.1f} s in which all branches have usable samples; at least {LEAST_DURATION_S:g} s are "
+            f"needed; 'calibrator doctor' says which lacks them: rows farther apart than its timeout_s are stale"
         )
     block_s = max(min(BLOCK_S, duration_s / BLOCKS), SHORTEST_BLOCK_S, layout.period_s)
     summary = summarise(samples, period_s=layout.period_s, block_s=block_s)
@@ -349,33 +352,39 @@ def _condition(system: _System, sd: Array) -> tuple[Array, Array, float]:
 
 
 class _Posterior(NamedTuple):
-    """Weighted draws of x (n, P); explanation (n,) of each, of which the first is the most probable; its mean (P,)."""
+    """Weighted draws of x (n, P), and the number of the explanation that each is of, the most probable one first."""
 
     draws: Array
     weight: Array
     explanation: NDArray[np.int64]
     mean: Array
+    sd: Array
     offset_probability: Array
-    """That each of the S sensors has an offset that was not read. [1]"""
+    """That each of the S sensors has an offset. [1]"""
 
 
 def _posterior(system: _System) -> _Posterior:
-    """Posterior over the explanations: which sensors have an offset, all others being open or read."""
+    """Posterior over the explanations: which sensors have an offset, and of which size."""
     S = system.sensors
     may = [s for s in range(S) if not system.read[S + s]]
     found = []
     for size in range(min(len(may), MOST_OFFSETS) + 1):
         for chosen in combinations(may, size):
-            sd = system.sd.copy()
-            sd[[S + s for s in may if s not in chosen]] = TRUSTED_OFFSET_SD
-            mean, covariance, log_weight = _condition(system, sd)
-            log_weight += size * np.log(FAULT_SHARE) + (len(may) - size) * np.log(1.0 - FAULT_SHARE)
-            found.append((log_weight, chosen, mean, covariance))
+            for sizes in product(OFFSET_SIZES, repeat=size):
+                sd = system.sd.copy()
+                sd[[S + s for s in may]] = TRUSTED_OFFSET_SD
+                sd[[S + s for s in chosen]] = sizes
+                mean, covariance, log_weight = _condition(system, sd)
+                log_weight += size * np.log(FAULT_SHARE / len(OFFSET_SIZES))
+                log_weight += (len(may) - size) * np.log(1.0 - FAULT_SHARE)
+                found.append((log_weight, chosen, mean, covariance))
     found.sort(key=lambda each: -each[0])
     found = [each for each in found if each[0] > found[0][0] - MARGIN]
     weight = np.exp([each[0] - found[0][0] for each in found])
     weight /= weight.sum()
-    normal = norm.ppf(qmc.Sobol(len(system.mean), scramble=True, rng=1).random(DRAWS))
+    centre = weight @ np.array([each[2] for each in found])
+    square = [np.diagonal(covariance) + (mean - centre) ** 2 for _, _, mean, covariance in found]
+    normal = norm.ppf(qmc.Sobol(len(centre), scramble=True, rng=1).random(DRAWS))
     number = np.maximum((DRAWS * weight).astype(np.int64), FEWEST_DRAWS)
     draws, with_offset = [], np.zeros(S)
     for (_, chosen, mean, covariance), n, share in zip(found, number, weight, strict=True):
@@ -386,7 +395,8 @@ def _posterior(system: _System) -> _Posterior:
         np.concatenate(draws),
         np.repeat(weight / number, number),
         np.repeat(np.arange(len(found)), number),
-        found[0][2],
+        centre,
+        np.sqrt(weight @ np.array(square)),
         with_offset,
     )
 
@@ -416,18 +426,19 @@ def _disagreements(readings: Sequence[tuple[Array, Array]], name: str) -> list[s
 
 
 def _contradictions(system: _System, names: Sequence[str], scale_a: float) -> list[str]:
-    """Readings of sensors that the rows and all other readings deny, whatever the sensors that are not known do."""
+    """Readings and loads that the rows and all other readings deny, whatever the sensors that are not known do."""
     S, found = system.sensors, []
-    for p in np.flatnonzero(system.read[: 2 * S]).tolist():
+    for p in np.flatnonzero(system.read).tolist():
         sd = system.sd.copy()
-        sd[p] = OPEN_GAIN_SD if p < S else OPEN_OFFSET_SD
+        sd[p] = OPEN_GAIN_SD if p < S else OPEN_OFFSET_SD if p < 2 * S else OPEN_LOAD_SD
         mean, covariance, _ = _condition(system, sd)
         if abs(mean[p] - system.mean[p]) > CONTRADICTION * np.hypot(np.sqrt(covariance[p, p]), system.sd[p]):
             text = f"gain error of {names[p % S]} is known as {np.expm1(system.mean[p]):+.2%}, the rest makes it "
             text += f"{np.expm1(mean[p]):+.2%}"
             if p >= S:
                 known_a, rest_a = system.mean[p] * scale_a, mean[p] * scale_a
-                text = f"offset of {names[p % S]} is known as {known_a:+.2f} A, the rest makes it {rest_a:+.2f} A"
+                what = f"offset of {names[p % S]}" if p < 2 * S else "load that no branch measures"
+                text = f"{what} is known as {known_a:+.2f} A, the rest makes it {rest_a:+.2f} A"
             found.append(f"the {text}")
     return found
 
@@ -482,8 +493,7 @@ def estimate_junction(
         contradictions += _disagreements(_readings(of, branches, known), names[s])
     S, scale_known = system.sensors, bool(system.read[: system.sensors].any())
     posterior = _posterior(system)
-    mean, draws, weight = posterior.mean, posterior.draws, posterior.weight
-    sd = np.sqrt(weight @ (draws - mean) ** 2)
+    mean, sd, draws, weight = posterior.mean, posterior.sd, posterior.draws, posterior.weight
     gain_fault = _fault_probability(mean[:S], sd[:S], OPEN_GAIN_SD, TRUSTED_DRIFT_SD)
     offset_fault = _fault_probability(mean[S : 2 * S], sd[S : 2 * S], OPEN_OFFSET_SD, TRUSTED_OFFSET_SD)
     offset_fault = np.where(system.read[S : 2 * S], offset_fault, posterior.offset_probability)
@@ -706,6 +716,8 @@ def calibrate_junctions(
                 "constant_a": found.constant_a[j],
             }
             if len(vehicles) <= MOST_SHOWN:
+                sensors = parameters[-1].branches.items()
+                notices += [f"{vehicle.vehicle}: {name}: {sensor_text(branch)}" for name, branch in sensors]
                 notices.append(_shown(vehicle.vehicle, found.ratios[j], found.constant_a[j], branches))
     return encode_chunk(parameters, left_out), {"junction": junctions}, tuple(notices)
 
@@ -752,6 +764,8 @@ def _known(
         for name in names:
             if name not in branches:
                 raise FleetError(f"{option} {name}: no such branch was recorded; there are {', '.join(branches)}")
+    if settings.meter is not None and len(vehicles) < 2:
+        raise FleetError(f"--meter {settings.meter}: one folder of recordings; give one for each of its sensors")
     bench: BenchTable = {}
     if settings.readings is not None:
         bench = read_bench_table(settings.readings, branches, full_scale_a=scale_a)

@@ -8,7 +8,7 @@ from calibrator.drive import Array, Mask
 from calibrator.estimator.fleet_estimate import FleetEstimate
 from ecu_node.parameters import BranchParameters, Explanation, HeldBack, VehicleParameters
 
-__all__ = ["deciding_evidence", "explained", "explanation_text", "faults_of", "impossible"]
+__all__ = ["deciding_evidence", "explained", "explanation_text", "faults_of", "impossible", "sensor_text"]
 
 LEAST_RIVAL, LEAST_IN_THE_WAY = 0.02, 1e-4
 """Probability from which on another explanation is a rival, and from which on it can hold a correction back. [1]"""
@@ -128,7 +128,7 @@ def explained(parameters: VehicleParameters) -> str:
     confidence, hardware, residual = parameters.confidence, parameters.hardware_fault, parameters.junction_residual
     sure = "" if confidence is None else f" (confidence {confidence:.2f})"
     lines = [f"{parameters.vehicle}: {parameters.verdict}{sure}"]
-    lines += [f"  {name}: {_sensor_text(branch)}" for name, branch in parameters.branches.items()]
+    lines += [f"  {name}: {sensor_text(branch)}" for name, branch in parameters.branches.items()]
     for reason, why in REASONS.items():
         held_back = [name for name, branch in parameters.branches.items() if branch.held_back == reason]
         lines += [f"  {', '.join(held_back)} not corrected, because {why}"] if held_back else []
@@ -149,7 +149,8 @@ def explained(parameters: VehicleParameters) -> str:
     return "\n".join(lines)
 
 
-def _sensor_text(branch: BranchParameters) -> str:
+def sensor_text(branch: BranchParameters) -> str:
+    """Faults of a sensor, how sure they are, and whether they are corrected."""
     probability = "" if branch.fault_probability is None else f" (probability of one {branch.fault_probability:.2f})"
     if not branch.drift and not branch.offset_a:
         return f"no fault found{probability}"

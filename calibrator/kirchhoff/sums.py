@@ -13,10 +13,10 @@ Right sensors do not sum to exactly 0 A either. The standard deviation that is e
     sd(t)^2 = max(n^2, sum_k q_k^2 / 12) + sum_k (i_k'(t) T_k)^2 / 12 + (sum_k i_k'(t) tau_k)^2
               + sum_k (u_k i_k(t))^2 + L^2
 
-with q_k the step of the signal of branch k, n the noise of S as its fast changes show it (:func:`noise_of`), T_k the
-period of the frames of branch k (a value is up to T_k old; 0 where all come at the same instants, as in a table), tau_k
-the delay of branch k as S shows it, u_k the uncertainty of a formula that gives branch k, and L the spread of the
-declared load.
+with q_k the step of the signal of branch k, n the noise of S as fast changes of what gains and delays leave of it show
+it (:func:`noise_of`), T_k the period of the frames of branch k (a value is up to T_k old; 0 at instants between frames
+that all branches have at the same times, as in a table), tau_k the delay of branch k as S shows it, u_k the uncertainty
+of a formula that gives branch k, and L the spread of the declared load.
 """
 
 from collections.abc import Mapping
@@ -335,11 +335,15 @@ def _explained(
     """The band of the sum, by the formula at the top of this module, and the shares in it."""
     channels = {name: drive.branches[name] for name in database.layout.branch_names if name in drive.branches}
     sensors = {name: sensor_of(database, name, drive) for name, item in channels.items() if item.good.any()}
-    if len({channels[name].time_s.tobytes() for name in sensors}) == 1:
-        sensors = {name: replace(sensor, period_s=0.0) for name, sensor in sensors.items()}
     load, measured_a = database.layout.unmeasured_load, currents_a["before"]
     mean_a, load_sd_a = (load.mean_a, load.sd_a) if load is not None else (0.0, 0.0)
     slope = np.gradient(measured_a, time_s, axis=0) if len(time_s) > 1 else np.zeros_like(measured_a)
+    # Noise of each branch is in the sum, too: of rows seconds apart the current itself looks like noise, the sum does not.
+    most_a = noise_of(measured_a.sum(axis=1)[valid])
+    sensors = {
+        name: replace(sensor, noise_a=max(min(sensor.noise_a, most_a), sensor.step_a / np.sqrt(12.0)))
+        for name, sensor in sensors.items()
+    }
     shares = {name: _residual(a[valid], slope[valid], sensors, mean_a) for name, a in currents_a.items()}
     parts = {
         "quantisation": np.array(sum(sensor.step_a**2 for sensor in sensors.values()) / 12.0),
