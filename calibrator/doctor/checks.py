@@ -144,6 +144,9 @@ def logs_as_a_whole(facts: Facts) -> Findings:
         if count := report.clock_steps:
             remedy = "each step becomes a gap; record with a steady clock"
             yield warning("time", log.name, f"its clock was set {counted(count, 'time')}", remedy, {"count": count})
+        if report.unfit:
+            text, _, remedy = report.unfit.rpartition("; ")
+            yield warning("unfit", log.name, text, remedy)
         nothing = "nothing has to be done"
         for count, kind, text, remedy in (
             (report.disordered, "time", f"of {report.frames:,} frames come with an earlier time stamp than one before "
@@ -162,7 +165,9 @@ def absent(facts: Facts) -> Findings:
     needed = base_inputs(facts.database.layout, facts.database.layout.model_inputs)
     is_table = not facts.layout.dbc_files
     what, where = (
-        ("column", "name the column that has it") if is_table else ("frame of", "record the bus that carries it")
+        ("column of numbers", "name the column that has it")
+        if is_table
+        else ("frame of", "record the bus that carries it")
     )
     for item in (*facts.branches, *facts.inputs):
         if item.frames:

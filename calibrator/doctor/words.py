@@ -22,7 +22,10 @@ PLACES: dict[str, frozenset[str]] = {
         {"motor", "mot", "inverter", "inv", "emotor", "machine", "edu", "mcu", "drive", "dif", "dir", "emachine", "tm"}
         | {"mtr", "em1", "mg", "pulswechselrichter", "wechselrichter", "antrieb", "maschine", "onduleur", "moteur"}
     ),
-    "heater": frozenset({"heater", "ptc", "heating", "htr", "heizer", "heizung", "hzg", "chauffage", "calefactor"}),
+    "heater": frozenset(
+        {"heater", "ptc", "heating", "heat", "htr", "heizer", "heizung", "heiz", "hzg", "chauffage"}
+        | {"calefactor", "calefaccion", "riscaldatore"}
+    ),
     "aircon": frozenset(
         {"compressor", "aircon", "ac", "cmpd", "cmp", "cmpr", "eac", "hvac", "airconditioning", "evap"}
         | {"klima", "kompressor", "komp", "klimageraet", "klimakompressor", "clim", "climatisation"}

@@ -1,6 +1,6 @@
 """``calibrator kirchhoff``: the sum of the branch currents, from a log, a table or a live bus."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,6 +27,14 @@ def _file(*suffixes: str) -> Callable[[Path | None], Path | None]:
 
 def _option(help_text: str, *suffixes: str) -> Any:
     return typer.Option(help=f"{help_text} ({' '.join(suffixes)}).", callback=_file(*suffixes))
+
+
+def _require_others(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    """See that no file to be written is one that is read."""
+    read = {path.resolve() for path in inputs}
+    for path in outputs:
+        if path.resolve() in read:
+            raise typer.BadParameter(f"{path}: is read here and would be overwritten; choose another name")
 
 
 def kirchhoff(
@@ -68,14 +76,21 @@ def kirchhoff(
         raise typer.BadParameter("give either --layout, or --branches with the columns of a table")
     if full_scale is not None and branches is None:
         raise typer.BadParameter("--full-scale goes with --branches; a layout has its own full_scale_a")
+    if parameters is not None and layout is None:
+        raise typer.BadParameter("--parameters belong to a layout; give --layout instead of --branches")
     with importing():
         from calibrator.kirchhoff.sums import compare_kirchhoff, with_voltages
         from calibrator.kirchhoff.view import draw_kirchhoff, kirchhoff_json, kirchhoff_text, save_table
+        from calibrator.recordings.frames import is_log
         from calibrator.recordings.live import listen
+        from calibrator.recordings.log_files import files_in
         from calibrator.recordings.readers import drive_from_frames, read_recording
         from calibrator.recordings.tables import is_table, layout_from_branches, read_table
+        from ecu_node.parameter_fit import check_fit
         from ecu_node.parameters import read_parameters
 
+    logs = [] if log is None else [log, *filter(is_log, files_in(log))]
+    _require_others(filter(None, (plot, table)), filter(None, (*logs, layout, dbc, parameters)))
     found = None if parameters is None else read_parameters(parameters)
     if layout is not None:
         database = with_voltages(vehicle_database(layout, dbc))
@@ -83,6 +98,8 @@ def kirchhoff(
         database = layout_from_branches(str(branches), full_scale_a=full_scale, table=read_table(log))
     else:
         raise typer.BadParameter("--branches names columns of a table; a log of frames and a bus need --layout")
+    if found is not None:
+        check_fit(found, database, None)
     vehicle = database.layout.name
     if log is not None:
         recording = read_recording(log, database, vehicle=vehicle, name=log.name.partition(".")[0])

@@ -19,7 +19,7 @@ that all branches have at the same times, as in a table), tau_k the delay of bra
 of a formula that gives branch k, and L the spread of the declared load.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import msgspec
@@ -338,18 +338,23 @@ def _explained(
     load, measured_a = database.layout.unmeasured_load, currents_a["before"]
     mean_a, load_sd_a = (load.mean_a, load.sd_a) if load is not None else (0.0, 0.0)
     slope = np.gradient(measured_a, time_s, axis=0) if len(time_s) > 1 else np.zeros_like(measured_a)
-    # Noise of each branch is in the sum, too: of rows seconds apart the current itself looks like noise, the sum does not.
+    # The noise of each branch is in the sum. Of rows seconds apart a current itself looks like noise, the sum less so,
+    # and what gain errors and delays leave of the sum does not.
     most_a = noise_of(measured_a.sum(axis=1)[valid])
-    sensors = {
-        name: replace(sensor, noise_a=max(min(sensor.noise_a, most_a), sensor.step_a / np.sqrt(12.0)))
-        for name, sensor in sensors.items()
-    }
-    shares = {name: _residual(a[valid], slope[valid], sensors, mean_a) for name, a in currents_a.items()}
+    for _ in range(2):
+        sensors = {
+            name: replace(sensor, noise_a=max(min(sensor.noise_a, most_a), sensor.step_a / np.sqrt(12.0)))
+            for name, sensor in sensors.items()
+        }
+        shares = {name: _residual(a[valid], slope[valid], sensors, mean_a) for name, a in currents_a.items()}
+        _, delay_s, left_a = shares["before"]
+        most_a = min(most_a, noise_of(left_a))
+    together = _together([channels[name] for name in sensors], time_s)
     parts = {
         "quantisation": np.array(sum(sensor.step_a**2 for sensor in sensors.values()) / 12.0),
-        "noise": np.array(noise_of(measured_a.sum(axis=1)[valid]) ** 2),
-        "sampling": (slope**2) @ np.array([sensor.period_s**2 / 12.0 for sensor in sensors.values()]),
-        "delays": (slope @ shares["before"][1]) ** 2,
+        "noise": np.array(most_a**2),
+        "sampling": ~together * (slope**2 @ np.array([sensor.period_s**2 / 12.0 for sensor in sensors.values()])),
+        "delays": (slope @ delay_s) ** 2,
         "formulas": (measured_a**2)
         @ np.array([database.layout.find_branch(name).uncertainty ** 2 for name in sensors]),
         "load": np.array(load_sd_a**2),
@@ -357,13 +362,23 @@ def _explained(
     parts_a = {name: float(np.median(np.sqrt(part if part.ndim == 0 else part[valid]))) for name, part in parts.items()}
     sd_a = np.sqrt(sum(parts.values()) - np.minimum(parts["quantisation"], parts["noise"]))
     expected = Expected(mean_a=mean_a, sd_a=sd_a, parts_a=parts_a)
-    return expected, {stage: residual for stage, (residual, _) in shares.items()}
+    return expected, {stage: residual for stage, (residual, *_) in shares.items()}
+
+
+def _together(channels: Sequence[Channel], time_s: Array) -> Mask:
+    """Instants between, or at, good frames that have the same times in all channels."""
+    sides = []
+    for channel in channels:
+        good_s = np.concatenate([[-np.inf], channel.time_s[channel.good], [np.inf]])
+        before = np.searchsorted(good_s, time_s + 1e-6, side="right") - 1  # 1 us: rounding
+        sides.append(good_s[np.stack([before, np.searchsorted(good_s, time_s - 1e-6)])])
+    return np.asarray(np.all([side == sides[0] for side in sides], axis=(0, 1)))
 
 
 def _residual(
     currents_a: Array, slope: Array, sensors: Mapping[str, Sensor], mean_a: float
-) -> tuple[Residual | None, Array]:
-    """Shares in the sum, and the delays that it shows relative to the branch that moves most, shape (K,). [s]
+) -> tuple[Residual | None, Array, Array]:
+    """Shares in the sum, the delays that it shows relative to the branch that moves most, shape (K,) [s], and the rest.
 
     The sum holds the noise of each branch, too: its variance is taken out of both sides of the regression on the gains.
     The branch that moves most is left out of the regressions, since all gains together cannot be told from its own.
@@ -371,7 +386,7 @@ def _residual(
     x, total = currents_a - currents_a.mean(axis=0), currents_a.sum(axis=1) - mean_a
     power, s, delay_s = float(np.mean(total**2)), total - total.mean(), np.zeros(x.shape[1])
     if len(total) < FEWEST or power <= 0.0:
-        return None, delay_s
+        return None, delay_s, s
     noise2 = np.array([sensor.noise_a**2 for sensor in sensors.values()])
     variance, covariance, change = x.var(axis=0), x.T @ s / len(s), slope - slope.mean(axis=0)
     moving = variance > MOVES**2 * noise2
@@ -393,10 +408,12 @@ def _residual(
     delay_s[others] = np.where(np.abs(late) < MAX_DELAY_S, late, 0.0)
     varying = float(np.mean(s**2)) / power
     gains = varying * _gone(s, straight)
-    delays = (varying - gains) * _gone(straight, straight + change @ delay_s)
+    left = straight + change @ delay_s
+    delays = (varying - gains) * _gone(straight, left)
     rest = max(varying - gains - delays, 0.0)
     constant, rest_a = float(np.mean(total)) ** 2 / power, float(np.sqrt(rest * power))
-    return Residual(constant=constant, gains=gains, delays=delays, rest=rest, rest_a=rest_a, alone=alone), delay_s
+    residual = Residual(constant=constant, gains=gains, delays=delays, rest=rest, rest_a=rest_a, alone=alone)
+    return residual, delay_s, left
 
 
 def _gone(before: Array, after: Array) -> float:

@@ -21,6 +21,8 @@ __all__ = ["draw_kirchhoff", "kirchhoff_json", "kirchhoff_text", "save_table"]
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B", "#999999")
 """Okabe and Ito's colours, which colour-blind readers can tell apart; black is kept for the sum."""
 _BAND_COLOUR = "#D9D9D9"
+SLIP = 0.5
+"""Magnitude of a gain error beyond which it is no sensor's but a slip of sign or unit. [1]"""
 MOST_DRAWN = 50_000
 """Instants: more make a page of tens of megabytes, and no line that could be seen. [1]"""
 
@@ -51,7 +53,7 @@ def kirchhoff_text(comparison: Comparison, notices: Sequence[str]) -> str:
         rows = [
             (
                 name,
-                f"{100.0 * item['gain_error']:+.1f} %",
+                f"{100.0 * item['gain_error']:+.1f} %" if abs(item["gain_error"]) <= SLIP else "-",
                 _percent(item["gain_share"]),
                 *(
                     (f"{round(1e3 * item['delay_s']):+d} ms", _percent(item["delay_share"]))
@@ -63,6 +65,8 @@ def kirchhoff_text(comparison: Comparison, notices: Sequence[str]) -> str:
         ]
         header = ["gain error", "explains", "or a delay", "explains"]
         lines += ["", _printed("What one branch alone could explain of how the sum varies", header, rows), ""]
+        if any(abs(item["gain_error"]) > SLIP and item["gain_share"] > 0.5 for item in last.alone.values()):
+            lines.append("run 'calibrator doctor': a sign or a unit looks wrong")
     total = f"RMSE of the sum: {(before_a := stages['before'][SUM].rmse_a):.2f} A before"
     if "after" in stages:
         after_a = stages["after"][SUM].rmse_a

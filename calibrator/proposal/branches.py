@@ -10,7 +10,17 @@ from calibrator.doctor.words import CURRENT, PLACES, POWER, places_of, word_set,
 from calibrator.drive import Array, Channel
 from calibrator.proposal.candidates import Candidate
 
-__all__ = ["TAKEN", "Verdict", "choose_branches", "closure", "current_of", "find_signs", "judge", "with_usual_sign"]
+__all__ = [
+    "TAKEN",
+    "Verdict",
+    "choose_branches",
+    "close_sum",
+    "closure",
+    "current_of",
+    "find_signs",
+    "judge",
+    "with_usual_sign",
+]
 
 TAKEN = 50.0
 """Score from which on a candidate is a branch: names, comments or sender say where it flows."""
@@ -58,6 +68,8 @@ FOLLOWS, IGNORES = 0.3, 0.15
 """Correlation with the battery's current from which on a motor's speaks for it, and below which against it. [1]"""
 CLEAR, SAG = 2.0, 0.5
 """By so much more the sum must vary with the other sign, and correlation with the voltage that tells the battery's."""
+OWN_GAIN, FEWEST_BINS = 1.3, 20
+"""Gain errors that a load which closes the sum may leave to any branch, and means that it takes to tell. [1]"""
 MEANS = 50
 """One row of means for so many instants: loads that no branch measures are in them."""
 MOST_TURNED = 12
@@ -159,7 +171,8 @@ def judge(item: Candidate, place: str, around: _Around, battery: Array | None = 
     points.append((MEASURED * bool(own & (CURRENT | POWER)) + MEASURED * (item.quantity == "current"), ""))
     points.append((-5.0 * item.multiplexed - 0.3 * len(item.name), ""))
     points.append((-15.0 * ("raw" in own), "raw"))
-    if words := own & NOT_MEASURED:
+    # "Iheat" of a table is a heater's current; in a database, or beside a motor, heat is a loss.
+    if words := own & NOT_MEASURED - (named if item.message is None and places_of(near) == {place} else set()):
         points.append((AGAINST * len(words), f"{_quoted(words)}: a limit, demand, estimate or part of one"))
     elif words := (near - own) & LIMITS:
         points.append((AGAINST, f"its message has {_quoted(words)}: no measured flow"))
@@ -197,6 +210,8 @@ def _of_recording(item: Candidate, place: str) -> list[tuple[float, str]]:
     assert item.channel is not None
     value, unit = item.good, _unit(item)
     if len(value) < 0.5 * len(item.channel.value):
+        if item.signal is None and item.comment:
+            return [(NEVER, item.comment)]
         return [(NEVER, f"{1.0 - len(value) / len(item.channel.value):.0%} of its values are not usable")]
     if np.ptp(value) == 0.0:
         empty = 0.0 if item.signal is None else item.factor * float(item.signal.offset)
@@ -306,6 +321,44 @@ def _named_branches(verdicts: Sequence[Verdict]) -> dict[int, str]:
             is_number = position.isdigit() and not several
             taken[k] = f"{place}_{position}" if position and not is_number else place
     return taken
+
+
+def close_sum(verdicts: Sequence[Verdict], voltage: Candidate | None) -> list[Verdict]:
+    """Take measured currents that no word places, where the recording shows that they close the sum of the others.
+
+    The battery's current is fitted by the other branches, each with a gain: with the current, all gains must be near 1,
+    which those of copies are not, and the rest must be half of what it is without.
+
+    Parameters
+    ----------
+    verdicts : sequence of Verdict
+        The branches first, the battery first of them.
+    voltage : Candidate or None
+        What powers are divided by.
+
+    Returns
+    -------
+    list of Verdict
+        All, the branches first.
+    """
+    result = list(verdicts)
+    for k, verdict in enumerate(result):
+        taken = [v for v in result if v.branch]
+        is_free = not verdict.branch and verdict.place == NOWHERE and verdict.score > 0.5 * AGAINST
+        if not is_free or verdict.candidate.quantity != "current" or len(taken) < 2 or taken[0].place != "battery":
+            continue
+        found = [current_of(v.candidate, voltage) for v in (*taken, verdict)]
+        channels = [channel for channel in found if channel is not None]
+        if len(channels) < len(found) or len(current := bands(channels)) < FEWEST_BINS:
+            continue
+        battery, others = current[:, 0], current[:, 1:]
+        gain = np.abs(np.linalg.lstsq(others, battery)[0])
+        left = [_rms(battery - part @ np.linalg.lstsq(part, battery)[0]) for part in (others[:, :-1], others)]
+        if CLEAR * left[1] < left[0] and np.all((gain > 1.0 / OWN_GAIN) & (gain < OWN_GAIN)):
+            name = "auxiliary" if all(v.branch != "auxiliary" for v in taken) else f"auxiliary_{len(taken)}"
+            why = f"closes the sum: it varies by {left[1]:.2g} A with it, and by {left[0]:.2g} A without"
+            result[k] = replace(verdict, place="auxiliary", branch=name, score=TAKEN, why=why)
+    return sorted(result, key=lambda v: not v.branch)
 
 
 def _seen(verdicts: Sequence[Verdict]) -> bool:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from calibrator.doctor.words import CURRENT, POWER, VOLTAGE, words_of
 from calibrator.drive import Array, Channel, Mask
+from calibrator.errors import LogError
 from calibrator.recordings.decode import decode_signal, raw_values
 from calibrator.recordings.frame_arrays import Frames, frame_key
 from calibrator.recordings.log_time import repaired_time
@@ -20,7 +21,7 @@ from calibrator.recordings.tables import Table
 from ecu_node.errors import DatabaseError
 from ecu_node.units import AMPERE, VOLT, WATT, unit_factor
 
-__all__ = ["FLOWS", "Candidate", "of_database", "of_table", "with_log"]
+__all__ = ["FLOWS", "Candidate", "of_database", "of_table", "with_log", "with_table"]
 
 FLOWS = {"current": AMPERE, "power": WATT, "voltage": VOLT}
 """Quantities of branches, with the units that the layout knows."""
@@ -236,10 +237,7 @@ def _seen(item: Candidate, message: Message, signal: Signal, frames: Frames, tim
     if not every.present.any():
         return None
     inside = signal_range(signal).holds(every.value)
-    outside = every.good & ~inside
-    wrong = ""
-    if outside.sum() > WRONG_RANGE * every.good.sum() and len(np.unique(every.value[outside])) >= FEWEST_OUTSIDE:
-        wrong = "range"
+    wrong = _wrong_range(every.value, every.good, inside)
     value = every.value
     turned = _signed(signal, frames, every.good) if item.quantity in FLOWS else None
     if turned is not None:
@@ -250,6 +248,50 @@ def _seen(item: Candidate, message: Message, signal: Signal, frames: Frames, tim
         good=(every.good & (inside | bool(wrong)))[every.present],
     )
     return replace(item, channel=channel, wrong=wrong)
+
+
+def _wrong_range(value: Array, good: Mask, inside: Mask) -> str:
+    outside = good & ~inside
+    many = outside.sum() > WRONG_RANGE * good.sum() and len(np.unique(value[outside])) >= FEWEST_OUTSIDE
+    return "range" if many else ""
+
+
+def with_table(found: Sequence[Candidate], table: Table) -> list[Candidate]:
+    """Those of some signals that a table has as columns, called ``Message.Signal`` or ``Signal``, with their values.
+
+    Parameters
+    ----------
+    found : sequence of Candidate
+        Signals of the database.
+    table : Table
+        The recording.
+
+    Returns
+    -------
+    list of Candidate
+        Without those that have no column.
+
+    Raises
+    ------
+    LogError
+        If a column could be currents, powers or voltages of two messages.
+    """
+    kept: dict[str, Candidate] = {}
+    for item in found:
+        header = table.header(item.name) if item.quantity else None
+        if header is None or item.signal is None:
+            continue
+        if header in kept and item.quantity in FLOWS:
+            raise LogError(
+                f"{table.path}: column {header!r} could be {kept[header].name} and {item.name}; call columns after "
+                f"message and signal"
+            )
+        value = table.columns[header] * FLOWS.get(item.quantity, {}).get(table.units.get(header, ""), item.factor)
+        good, inside = np.isfinite(value), signal_range(item.signal, item.factor).holds(value)
+        wrong = _wrong_range(value, good, inside)
+        channel = Channel(time_s=table.time_s, value=value, good=good & (inside | bool(wrong)))
+        kept[header] = replace(item, channel=channel, wrong=wrong)
+    return list(kept.values())
 
 
 def _signed(signal: Signal, frames: Frames, good: Mask) -> Array | None:
@@ -267,7 +309,8 @@ def _signed(signal: Signal, frames: Frames, good: Mask) -> Array | None:
 def of_table(table: Table) -> list[Candidate]:
     """The columns of a table, in its order."""
     found = []
-    for name, value in table.columns.items():
+    unknown = {name: np.full(len(table.time_s), np.nan) for name in table.texts}
+    for name, value in (table.columns | unknown).items():
         own = words_of(name)
         unit = table.units.get(name, "")
         quantity, factor = next(
@@ -280,7 +323,7 @@ def of_table(table: Table) -> list[Candidate]:
                 name=name,
                 quantity=quantity,
                 unit=unit,
-                comment="",
+                comment=table.texts.get(name, ""),
                 own=own,
                 words=own,
                 factor=factor,

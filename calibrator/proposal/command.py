@@ -40,7 +40,7 @@ def init(
     ],
     out: Annotated[Path | None, typer.Option("--out", help="File to write; without it, standard output.")] = None,
     log: Annotated[
-        Path | None, typer.Option("--log", help="Log of a drive: only what it holds is proposed, with signs.")
+        Path | None, typer.Option("--log", help="Log or table of a drive: only what it holds is proposed, with signs.")
     ] = None,
     branches: Annotated[
         str | None,

@@ -16,11 +16,12 @@ from calibrator.proposal.branches import (
     TAKEN,
     Verdict,
     choose_branches,
+    close_sum,
     closure,
     find_signs,
     with_usual_sign,
 )
-from calibrator.proposal.candidates import Candidate, of_database, of_table, with_log
+from calibrator.proposal.candidates import Candidate, of_database, of_table, with_log, with_table
 from calibrator.proposal.inputs import (
     Derived,
     Input,
@@ -144,7 +145,8 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
     source : Path
         A database (DBC, KCD, SYM, ARXML), or a table.
     log : Path or None
-        One of the vehicle's logs, beside a database: only signals in it are then judged, and by what it shows.
+        Beside a database, one of the vehicle's logs or a table of its signals: only signals in it are then judged, and
+        by what it shows.
     name : str
         Of the layout.
 
@@ -170,11 +172,12 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
         database = source
         everything = found = of_database(read_database(_bare_layout(name, source)).database)
         if log is not None:
-            found = with_log(everything, read_frames(log))
+            if is_table(log):
+                found, what = with_table(everything, read_table(log)), "columns"
+            else:
+                found, what = with_log(everything, read_frames(log)), "identifiers"
             if not found:
-                raise LogError(
-                    f"{log}: none of its identifiers is in {source}; check that both belong to the same vehicle"
-                )
+                raise LogError(f"{log}: none of its {what} is in {source}; check that both belong to the same vehicle")
     voltage = find_voltage(found)
     verdicts = choose_branches(found, voltage, everything)
     battery = next((verdict.candidate for verdict in verdicts if verdict.place == "battery" and verdict.branch), None)
@@ -189,6 +192,7 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
                 verdicts = [
                     replace(v, branch="", why=ONLY_CHARGING) if v.branch.startswith("charger") else v for v in verdicts
                 ]
+    verdicts = close_sum(verdicts, voltage)
     proposal = Proposal(
         name=name,
         database=database,

@@ -244,11 +244,18 @@ def _joined(data: NDArray[np.uint8], columns: list[int], shift: int) -> NDArray[
 def _presence(
     message: Message, signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]
 ) -> tuple[Mask, Mask]:
-    """Whether the frames carry a signal, and whether they are long enough to know; unknown counts as present."""
+    """Whether the frames carry a signal, and whether they are long enough to know; unknown counts as present.
+
+    No frame carries a signal whose multiplexer the message does not have.
+    """
     everywhere = np.ones(len(data), np.bool_)
     if signal.multiplexer_ids is None or signal.multiplexer_signal is None:
         return everywhere, everywhere
-    selector = message.get_signal_by_name(signal.multiplexer_signal)
+    # Where a DBC gives long names in attributes, cantools leaves the multiplexer's cut to 32 characters.
+    long = [s for s in message.signals if s.is_multiplexer and s.name.startswith(signal.multiplexer_signal)]
+    selector = min(long, key=lambda s: len(s.name), default=None)
+    if selector is None:
+        return ~everywhere, everywhere
     present, known = _presence(message, selector, data, length)
     raw, complete = raw_values(selector, data, length)
     selected = np.isin(raw, np.array(signal.multiplexer_ids, raw.dtype))

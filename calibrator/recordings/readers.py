@@ -89,6 +89,9 @@ class RecordingReport:
         Frames that come from other buses than those that the layout means, by channel.
     found : str
         How a table was read; empty for logs.
+    unfit : str
+        What of the layout the recording cannot serve, and what to do: channels of a ``[[bus]]`` that the log does not
+        have, columns of branches whose cells are no numbers; empty for nothing.
     """
 
     channels: tuple[ChannelReport, ...]
@@ -100,6 +103,7 @@ class RecordingReport:
     clock_steps: int = 0
     ignored: Mapping[str, int] = field(default_factory=dict)
     found: str = ""
+    unfit: str = ""
 
     def notices(self) -> list[str]:
         """Return what a user should know, one short text each; empty if the log is whole and sound."""
@@ -130,6 +134,8 @@ class RecordingReport:
         }
         found = self.found.replace("{", "{{").replace("}", "}}")
         told = [Notice(text=f"{{}} rows, {found}", counts=(self.frames,))] if found else []
+        unfit = self.unfit.replace("{", "{{").replace("}", "}}")
+        told += [Notice(text=unfit)] if unfit else []
         return [*told, *(Notice(text=text, counts=(count,)) for text, count in texts.items() if count)]
 
 
@@ -359,7 +365,14 @@ class FrameSource(Source):
             disordered=self.time.disordered,
             clock_steps=self.time.clock_steps,
             ignored=dict(self.ignored),
+            unfit=self._unfit(),
         )
+
+    def _unfit(self) -> str:
+        here, named = self._channels()
+        lacking = ", ".join(channel for channel in named if channel not in here)
+        remedy = "correct channel in [[bus]], or record that bus"
+        return f"no channel {lacking} in it, which has {', '.join(here)}; {remedy}" if lacking else ""
 
     def _of_message(self, signal_name: str) -> tuple[Frames, Array, Mask]:
         """Frames of the message of a signal, their times, and whether their end-to-end protection is right."""
@@ -424,6 +437,7 @@ class TableSource(Source):
         return f"{self.table.known(self.database.layout.branch[0].source)}; expected {expected}"
 
     def report(self, channels: tuple[ChannelReport, ...]) -> RecordingReport:  # noqa: D102 (as above)
+        names = [item.source for item in self.database.layout.branch if not item.computed]
         return RecordingReport(
             channels=channels,
             frames=len(self.table.time_s),
@@ -431,6 +445,7 @@ class TableSource(Source):
             disordered=self.table.disordered,
             clock_steps=self.table.clock_steps,
             found=self.table.found,
+            unfit=next(filter(None, map(self.table.no_numbers, names)), ""),
         )
 
     def _column(self, signal_name: str) -> tuple[Channel, dict[str, Mask]]:

@@ -12,7 +12,7 @@ import itertools
 import re
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
@@ -38,6 +38,8 @@ __all__ = ["TABLE_SUFFIXES", "Table", "bare_name", "is_table", "layout_from_bran
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow", ".mf4")
 FRAME_COLUMNS = ("arbitration_id", "id", "canid", "can id")
 """Headers of identifiers, lower case: a text file that has one of them beside a time is a log of CAN frames."""
+MOST_SHARING = 1.5
+"""Rows with the same time, on average, from which on the time is too coarse: loggers repeat a few instants. [1]"""
 _HEAD_BYTES = 1 << 16
 _DELIMITERS = ("\t", ";", "|", ",", " ")
 """In the order in which they are tried: a comma may be the decimal sign, a blank stand in a date."""
@@ -107,6 +109,8 @@ class Table:
         Unit by header, where it has one: ``A`` for ``Ibat [A]``, ``Ibat (Amps)`` or ``Ibat_A``.
     bad : dict of str to ndarray of bool, shape (n,)
         Where a column has a text or an infinite number instead of a number; columns without such cells are absent.
+    texts : dict of str to str
+        Of columns whose cells are no numbers, by header: the first such cell and where it stands, for messages.
     found : str
         What was found out about the file, for people.
     disordered, clock_steps, without_time : int
@@ -119,6 +123,7 @@ class Table:
     columns: dict[str, Array]
     units: dict[str, str]
     bad: dict[str, Mask] = field(default_factory=dict)
+    texts: dict[str, str] = field(default_factory=dict)
     found: str = ""
     disordered: int = 0
     clock_steps: int = 0
@@ -126,7 +131,10 @@ class Table:
 
     def header(self, name: str) -> str | None:
         """Header of a column by its name: as written, without unit, or the signal's name alone; None without one."""
-        bare = {header: bare_name(header) for header in self.columns}
+        return self._same(name, self.columns)
+
+    def _same(self, name: str, headers: Iterable[str]) -> str | None:
+        bare = {header: bare_name(header) for header in headers}
         whole = name.rpartition(":")[2]
         for same in (
             [header for header in bare if header == name],
@@ -145,8 +153,16 @@ class Table:
         """As :meth:`header`; :class:`LogError` with the columns that are there if there is none."""
         header = self.header(name)
         if header is None:
-            raise LogError(f"{self.path}: there is no column {name!r}; {self.known(name)}")
+            why = self.no_numbers(name) or f"there is no column {name!r}; {self.known(name)}"
+            raise LogError(f"{self.path}: {why}")
         return header
+
+    def no_numbers(self, name: str) -> str:
+        """What to say of a column that is there, without numbers; empty for others."""
+        header = None if self.header(name) is not None else self._same(name, self.texts)
+        if header is None:
+            return ""
+        return f"column {header!r}: {self.texts[header]}; write numbers, and the unit in the header"
 
     def known(self, name: str = "") -> str:
         """The columns, those that look like a name first, as part of a message."""
@@ -313,13 +329,17 @@ def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -
     known = np.isfinite(time_s)
     order = repaired_time(np.rint(1e9 * (time_s[known] - time_s[known][0])).astype(np.int64))
     rows = np.flatnonzero(known)[order.order]
-    columns, bad = {}, {}
+    columns, bad, texts = {}, {}, {}
     for name in frame.columns.difference(names, sort=False):
         value, is_bad = _numbers(frame[name])
         if np.isfinite(value).any() or not is_bad.any():
             columns[name] = value[rows]
             if is_bad[rows].any():
                 bad[name] = is_bad[rows]
+        else:
+            row = int(np.argmax(is_bad))
+            line = f"line {frame.attrs['line'] + row}" if "line" in frame.attrs else f"row {row + 1}"
+            texts[name] = f"its cells are no numbers, such as {str(frame[name].iloc[row])!r} in {line}"
     if not columns:
         name = next(iter(frame.columns.difference(names, sort=False)), "")
         shown = f"; '{name}' begins with {str(frame[name].iloc[0])!r}" if name else ""
@@ -330,11 +350,19 @@ def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -
         columns=columns,
         units={name: unit for name, unit in units.items() if name in columns},
         bad=bad,
-        found=f"{found}{about}",
+        texts=texts,
+        found=f"{found}{about}{_coarse(order.time_s, columns)}",
         disordered=order.disordered,
         clock_steps=order.clock_steps,
         without_time=int(np.sum(~known)) + frame.attrs.get("left out", 0),
     )
+
+
+def _coarse(time_s: Array, columns: Mapping[str, Array]) -> str:
+    """What to say where rows have more values of one column than different times; else nothing."""
+    kept = [time_s[np.isfinite(value)] for value in columns.values()]
+    share = max(len(times) / max(len(np.unique(times)), 1) for times in kept)
+    return f"; {share:.3g} rows share each time: write its fractions of a second" if share > MOST_SHARING else ""
 
 
 def _numbers(column: "pd.Series[float]") -> tuple[Array, Mask]:
@@ -480,12 +508,25 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
         )
     frame.attrs["left out"] = sum(str(complaint.message).count("Skipping line") for complaint in complaints)
     frame = frame.drop(columns=[name for name in names if name not in header and frame[name].isna().all()])
+    frame.attrs["line"] = first + 1
+    for name in frame.select_dtypes(exclude="number"):
+        frame[name] = _without_thousands(frame[name], decimal)
     if decimal == ",":  # columns that hold a text somewhere
         texts = frame.select_dtypes(exclude="number")
         frame[texts.columns] = texts.apply(lambda c: c.astype("string").str.replace(r"^([-+\d]*),", r"\1.", regex=True))
     shown = {"\t": "tabs", " ": "blanks"}.get(delimiter, f"'{delimiter}'")
     about = f"columns between {shown}, decimal '{decimal}', {encoding}; "
     return frame, {name: usual_unit(unit) for name, unit in zip(names, units, strict=False) if unit}, about
+
+
+def _without_thousands(column: "pd.Series[str]", decimal: str) -> "pd.Series[str]":
+    """A column without the separators of its thousands: where a cell has both signs, as 1,234.5 or 1.234,5."""
+    comma, point = (",", r"\.") if decimal == "." else (r"\.", ",")
+    text = column.astype("string").str.strip()
+    if not text.str.fullmatch(rf"[-+]?\d{{1,3}}({comma}\d{{3}})+{point}\d*").any():
+        return column
+    grouped = text.str.fullmatch(rf"[-+]?\d{{1,3}}({comma}\d{{3}})+({point}\d*)?").fillna(value=False)
+    return text.mask(grouped, text.str.replace(comma, "", regex=True))
 
 
 def _text(path: Path, encoding: str) -> TextIO:

@@ -55,6 +55,8 @@ def report(
         what = "belongs to the page of the fleet; leave it out, or leave --vehicle out"
         raise typer.BadParameter(what, param_hint=given[0])
     target = out if out is not None else Path(f"{vehicle or 'report'}.html")
+    if target.suffix.lower() != ".html":
+        raise typer.BadParameter(f"{target}: expected a file name that ends with .html", param_hint="--out")
     require_possible_file(target)
     about: dict[str, Any]
     if vehicle is None:

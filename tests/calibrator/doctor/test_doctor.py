@@ -383,6 +383,17 @@ def test_log_of_another_vehicle_is_an_error_that_names_what_it_has(tmp_path: Pat
     assert told.report["ready"] == []
 
 
+def test_channel_that_the_log_does_not_have_is_named_with_those_it_has(log: Path, layout: Path) -> None:
+    (layout.parent / "lv.dbc").write_text('VERSION ""\nBU_: C\nBO_ 1 Lv: 8 C\n SG_ Load : 0|8@1+ (1,0) [0|0] "A" C\n')
+    buses = '[[bus]]\nname = "hv"\nchannel = "can0"\ndbc = "hv_powertrain.dbc"\n' + (
+        '[[bus]]\nname = "lv"\nchannel = "can7"\ndbc = "lv.dbc"\n'
+    )
+    plain = re.sub(r"(?m)^dbc = .*\n", "", layout.read_text())
+    layout.write_text(plain.replace("[[branch]]", f"{buses}[[branch]]", 1))
+    (told,) = examined(layout, log).findings("unfit")
+    assert told.text == "no channel can7 in it, which has can0"
+
+
 def test_one_branch_alone_is_no_sum(tmp_path: Path, layout: Path, database: VehicleDatabase) -> None:
     drive = true_drive()
     alone = replace(drive, branches={"battery": drive.branches["battery"]}, inputs={})

@@ -154,6 +154,40 @@ def test_noise_of_a_small_branch_is_not_taken_for_its_gain(tmp_path: Path) -> No
     assert alone["heater"]["gain_share"] < 0.02
 
 
+def test_rows_seconds_apart_give_the_gain_error_of_least_squares(tmp_path: Path) -> None:
+    rng, time_s = np.random.default_rng(5), np.arange(0.0, 600.0, 2.0)
+    motor, heater = 60.0 * np.sin(0.7 * time_s) + 25.0 * np.sin(2.3 * time_s + 1.0), 6.0 * np.sign(np.sin(0.1 * time_s))
+    noise = 0.15 * rng.normal(size=(3, 300))
+    battery, motor, heater = noise + np.array([-motor - heater, 1.04 * motor - 1.5, 0.97 * heater])
+    pd.DataFrame({"t": time_s, "b": battery, "m": motor, "h": heater}).round(3).to_csv(tmp_path / "t.csv", index=False)
+    total, columns = battery + motor + heater, np.column_stack([motor, heater, np.ones(300)])
+    straight = total - columns @ np.linalg.lstsq(columns, total, rcond=None)[0]
+    found = figures(tmp_path / "t.csv", "--branches", "battery=b,motor=m,heater=h")
+    assert found["residual"]["before"]["alone"]["motor"]["gain_error"] == pytest.approx(
+        1.0 / (1.0 - np.polyfit(motor, total, 1)[0]) - 1.0, abs=0.0003
+    )
+    assert found["residual"]["before"]["rest_a"] == pytest.approx(straight.std(), rel=0.05)
+    assert found["expected"]["sd_a"] == pytest.approx(straight.std(), rel=0.15)
+
+
+def test_empty_cell_widens_the_band_there_alone(tmp_path: Path) -> None:
+    battery = MOTOR_A + 0.05 * np.random.default_rng(5).normal(size=1200)
+    battery[600] = np.nan
+    assert run(*table(tmp_path, battery=battery, motor=-MOTOR_A), "--table", tmp_path / "out.csv").returncode == 0
+    sd_a = pd.read_csv(tmp_path / "out.csv")["expected_sd_a"]
+    assert list(np.flatnonzero(sd_a > 3.0 * sd_a.median())) == [600]
+
+
+@pytest.mark.parametrize("factor", [-1.0, 1000.0])
+def test_slip_of_sign_or_unit_is_no_gain_error_but_work_for_the_doctor(factor: float, tmp_path: Path) -> None:
+    advice = "run 'calibrator doctor': a sign or a unit looks wrong"
+    wrong = run(*table(tmp_path, battery=factor * MOTOR_A, motor=-MOTOR_A)).stdout.splitlines()
+    cells = next(line.split() for line in reversed(wrong) if line.startswith("battery"))
+    assert (cells[1], cells[2]) == ("-", "100")
+    assert advice in wrong
+    assert advice not in run(*table(tmp_path, battery=1.2 * MOTOR_A, motor=-MOTOR_A)).stdout
+
+
 # ---- parameters
 
 
@@ -180,7 +214,19 @@ def test_parameters_of_another_junction_are_refused(log: Path, tmp_path: Path) -
     (tmp_path / "V1.json").write_text(text)
     done = run(log, "--layout", LAYOUT, "--parameters", tmp_path / "V1.json")
     assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
-    assert "parameters of vehicle V1: they are of pack, and the sum has battery, motor" in done.stderr
+    assert "parameters for branch 'pack', which" in done.stderr
+
+
+def test_parameters_of_another_layout_are_refused(log: Path, tmp_path: Path) -> None:
+    file = parameters(tmp_path, offset_a=12.0, apply=True)
+    (tmp_path / "other.toml").write_text(LAYOUT.read_text() + "# other\n")
+    done = run(log, "--layout", tmp_path / "other.toml", "--dbc", LAYOUT.with_suffix(".dbc"), "--parameters", file)
+    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (1, "", 1)
+    assert "parameters were made with layout hv_powertrain" in done.stderr
+    path, *rest = table(tmp_path, battery=MOTOR_A, motor=-MOTOR_A)
+    done = run(path, *rest, "--parameters", file)
+    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (2, "", 1)
+    assert "--parameters belong to a layout; give --layout" in done.stderr
 
 
 def test_help_has_a_short_form_and_an_example() -> None:
@@ -259,6 +305,22 @@ def test_output_that_cannot_be_written_is_one_line(what: str, log: Path, tmp_pat
     done = run(log, "--layout", LAYOUT, what, tmp_path / "x.what")
     assert done.returncode == 2
     assert f"x.what: expected a file name that ends with .{suffix}" in done.stderr
+
+
+def test_recording_is_not_overwritten(tmp_path: Path) -> None:
+    path, *rest = table(tmp_path, battery=MOTOR_A, motor=-MOTOR_A)
+    (tmp_path / "logs").mkdir()
+    inner = tmp_path / "logs" / "a.csv"
+    inner.write_text("a")
+    for arguments, out, kept in (
+        ((path, *rest), tmp_path / "logs" / ".." / "table.csv", path),
+        ((inner.parent, "--layout", LAYOUT), inner, inner),
+    ):
+        before = Path(str(kept)).read_bytes()
+        done = run(*arguments, "--table", out)
+        assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (2, "", 1)
+        assert f"{out}: is read here and would be overwritten; choose another name" in done.stderr
+        assert Path(str(kept)).read_bytes() == before
 
 
 # ---- mistakes

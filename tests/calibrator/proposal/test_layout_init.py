@@ -358,6 +358,23 @@ def test_multiplexed_battery_current_is_found(tmp_path: Path) -> None:
     assert layout.find_branch("battery").timeout_s == 0.5  # every 100 ms: every other frame
 
 
+def test_multiplexer_whose_name_is_cut_to_32_characters(tmp_path: Path) -> None:
+    """As in the DBC of the Tesla: the long name stands in an attribute, and only the page's own signals go by it."""
+    short = "PackStatus_loggingAndVitals_Page"
+    pack = f"""BO_ 1 PackStatus: 8 BMS
+ SG_ {short} M : 0|8@1+ (1,0) [0|1] "" INV
+ SG_ PackCurrent m1 : 8|16@1- (0.1,0) [-1000|1000] "A" INV
+ SG_ PackVoltage m0 : 8|16@1+ (0.1,0) [0|1000] "V" INV
+"""
+    long = (
+        f'BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;\nBA_ "SystemSignalLongSymbol" SG_ 1 {short} "{short}Index";\n'
+    )
+    dbc = database_file(tmp_path, pack, INVERTER, HEATER, long)
+    layout = found(dbc, "--log", log_file(database_file(tmp_path, pack, INVERTER, HEATER, name="short.dbc"), DRIVING))
+    assert sources(layout)["battery"] == "PackStatus.PackCurrent"
+    assert layout.full_scale_a == 250.0  # voltages on the other page would be currents of 390 A
+
+
 def test_stray_frames_of_another_bus_do_not_count(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
     stray = [f"({1e9 + 3.0 * k:.6f}) can1 001#FF7FFF7F00000000" for k in range(5)]
@@ -430,6 +447,43 @@ def test_columns_of_a_table_are_proposed(table: Path) -> None:
     assert calibrator("kirchhoff", table, "--layout", layout.path).returncode == 0
 
 
+def columns(path: Path, *names: str, delay_s: float = 0.0) -> Path:
+    """A table of battery, motor and heater under other names."""
+    times = [0.1 * k for k in range(900)]
+    rows = [(t, battery_a(t) + 2.0, 1.03 * motor_a(t), heater_a(t - delay_s)) for t in times]
+    path.write_text("\n".join([",".join(["time", *names]), *(",".join(f"{x:.4f}" for x in row) for row in rows)]))
+    return path
+
+
+@pytest.mark.parametrize("name", ["Iheat", "I_heat_A", "Heizstrom [A]"])
+def test_current_of_a_heater_is_a_branch_of_a_table(name: str, tmp_path: Path) -> None:
+    layout = found(columns(tmp_path / "x.csv", "Ibat", "Imot", name))
+    assert {b.name: (b.source, b.sign) for b in layout.branch}["heater"] == (name, -1)
+
+
+def test_current_that_closes_the_sum_is_a_branch_whatever_its_name(tmp_path: Path) -> None:
+    assert sources(found(columns(tmp_path / "x.csv", "Ibat", "Imot", "I_x")))["auxiliary"] == "I_x"
+    late = columns(tmp_path / "late.csv", "Ibat", "Imot", "I_x", delay_s=5.0)
+    assert set(sources(found(late))) == {"battery", "motor"}
+
+
+def test_table_is_a_recording_for_a_database(tmp_path: Path) -> None:
+    dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
+    rows = ["time,PackStatus.PackCurrent [mA],PackVoltage,DcPower,ClimaStatus.HeaterCurrent"]
+    for t in (0.1 * k for k in range(600)):
+        values = (t, 1e3 * battery_a(t), volts(t), 1e-3 * motor_a(t) * volts(t), heater_a(t))
+        rows.append(",".join(f"{value:.4f}" for value in values))
+    (tmp_path / "x.csv").write_text("\n".join(rows))
+    layout = found(dbc, "--log", tmp_path / "x.csv")
+    assert {b.name: (b.source, b.sign) for b in layout.branch} == {
+        "battery": ("PackStatus.PackCurrent", 1),
+        "motor": ("InverterStatus.DcPower", -1),
+        "heater": ("ClimaStatus.HeaterCurrent", -1),
+    }
+    assert layout.full_scale_a == 250.0
+    assert calibrator("kirchhoff", tmp_path / "x.csv", "--layout", layout.path).returncode == 0
+
+
 def test_named_branches_are_written_without_a_guess(table: Path) -> None:
     layout = found(table, "--branches", "-battery=Batteriestrom,-motor=Motorstrom [A]")
     assert [(b.name, b.source, b.sign) for b in layout.branch] == [
@@ -464,11 +518,19 @@ def test_mistake_with_a_table_is_one_line(kind: str, table: Path) -> None:
 
 def test_mistake_with_a_database_is_one_line(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER)
+    two = database_file(tmp_path, PACK, PACK.replace("1 PackStatus", "9 Twin"), name="two.dbc")
     (tmp_path / "other.log").write_text("(1.000000) can0 7FF#00\n")
+    (tmp_path / "other.csv").write_text("time,a\n0,1\n1,2\n")
+    (tmp_path / "two.csv").write_text("time,PackCurrent\n0,1\n1,2\n")
     (tmp_path / "there.toml").write_text("kept")
     for arguments, said in (
         ((tmp_path / "none.dbc",), "no such file"),
         ((dbc, "--log", tmp_path / "other.log"), "none of its identifiers is in"),
+        ((dbc, "--log", tmp_path / "other.csv"), "none of its columns is in"),
+        (
+            (two, "--log", tmp_path / "two.csv"),
+            "column 'PackCurrent' could be PackStatus.PackCurrent and Twin.PackCurr",
+        ),
         ((tmp_path / "other.log", "--log", dbc), "the database comes first"),
         ((dbc, "--out", tmp_path / "there.toml"), "exists, and is not overwritten"),
     ):

@@ -65,6 +65,10 @@ def zipped(path: Path) -> None:
         archive.writestr("bench/x.csv", frame().to_csv(index=False))
 
 
+def thousands(form: str) -> pd.DataFrame:
+    return frame(**{"Ibat [mA]": 1e3 * BATTERY_A}).drop(columns="Ibat [A]").map(form.format)
+
+
 UNITS = {"Ibat [A]": "Ibat", "Imot (A)": "Imot", "Iheat_A": "Iheat"}
 TABLES: dict[str, tuple[str, Callable[[Path], None]]] = {
     "CSV": ("x.csv", csv(frame())),
@@ -72,6 +76,9 @@ TABLES: dict[str, tuple[str, Callable[[Path], None]]] = {
     "tabs, UTF-16": ("x.tsv", csv(frame(), sep="\t", encoding="utf-16")),
     "blanks": ("x.txt", csv(frame().rename(columns=UNITS), sep=" ")),
     "quoted decimal commas": ("x.csv", csv(frame().map(lambda x: f"{x:.6f}".replace(".", ",")), quoting=1)),
+    "thousands": ("x.csv", csv(thousands("{:,.3f}"), sep=";")),
+    "German thousands": ("x.csv", csv(thousands("{:,.3f}").map(lambda x: x.translate({44: ".", 46: ","})), sep=";")),
+    "quoted thousands": ("x.csv", csv(thousands("{:,.3f}"), quoting=1)),
     "BOM": ("x.csv", csv(frame(), encoding="utf-8-sig")),
     "archive": ("x.zip", zipped),
     "gzip": ("x.csv.gz", csv(frame())),
@@ -139,6 +146,24 @@ def test_what_was_found_of_a_table_is_said(tmp_path: Path) -> None:
     csv(frame(time=np.arange(ROWS) * 100), sep=";", decimal=",")(tmp_path / "x.csv")
     (found,) = [text for text in before(tmp_path / "x.csv", "--branches", BRANCHES)["notices"] if "rows" in text]
     assert found == "100 rows, columns between ';', decimal ',', utf-8-sig; time 'time' in ms"
+
+
+def test_times_without_their_fractions_are_said(tmp_path: Path) -> None:
+    csv(frame(time=TIME_S.astype(int)))(tmp_path / "x.csv")
+    told = " ".join(before(tmp_path / "x.csv", "--branches", BRANCHES)["notices"])
+    assert "10 rows share each time: write its fractions of a second" in told
+    sparse(tmp_path / "sparse.csv")
+    assert "share" not in " ".join(before(tmp_path / "sparse.csv", "--branches", BRANCHES)["notices"])
+
+
+def test_column_of_texts_is_named_beside_the_others(tmp_path: Path) -> None:
+    (tmp_path / "car.toml").write_text(LAYOUT)
+    csv(powers().assign(**{"Ibat [A]": [f"{value:.1f} A" for value in BATTERY_A]}))(tmp_path / "x.csv")
+    why = "column 'Ibat [A]': its cells are no numbers, such as '0.0 A' in line 2"
+    for command in ("kirchhoff", "doctor"):
+        table = (tmp_path / "x.csv",) if command == "kirchhoff" else ("--log", tmp_path / "x.csv")
+        assert why in calibrator(command, *table, "--layout", tmp_path / "car.toml").stdout
+    assert why.partition(": ")[2] in calibrator("layout", "init", tmp_path / "x.csv").stderr
 
 
 def test_rate_of_the_table_gives_period_and_timeouts(tmp_path: Path) -> None:
@@ -263,6 +288,7 @@ def test_tables_are_imported(tmp_path: Path) -> None:
         ("a,b\n3,1\n2,2\n3,1\n", "a,b", "x.csv: no column is the time: none has it in its name and increases"),
         ("time,a\n0,1x\n1,2y\n", "a,b", "x.csv: no column of numbers beside the time"),
         ("time,Ibat,Imot\n0,1,2\n1,2,3\n", "Ibatt,Imot", "no column 'Ibatt'; the columns are 'Ibat', 'Imot'"),
+        ("time,Ibat,Imot\n0,1 A,2\n1,2 A,3\n", "Ibat,Imot", "column 'Ibat': its cells are no numbers, such as '1 A' i"),
         ("time,Ibat,Imot\n0,1,2\n1,2,3\n", "Ibat", "--branches Ibat: two or more are expected, such as battery=Ibat"),
         ("time,Ibat,Imot\n0,1,2\n1,2,3\n", "Ibat,Ibat", "Ibat is named twice"),
         ("time,I [A],I (mA)\n0,1,2\n1,2,3\n", "I,Imot", "'I' stands for 'I [A]', 'I (mA)'; write it in full"),

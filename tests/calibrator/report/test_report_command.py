@@ -53,11 +53,20 @@ def test_options_that_do_not_belong_together_are_refused(
 
 
 def test_a_pipe_is_not_replaced_by_a_page(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pipe = tmp_path / "pipe"
+    pipe = tmp_path / "pipe.html"
     os.mkfifo(pipe)
     assert run_command(["report", str(result), "--out", str(pipe)]) == 1
     assert "is no file but a device, pipe or socket" in capsys.readouterr().err
     assert pipe.is_fifo()
+
+
+def test_a_recording_is_not_replaced_by_a_page(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "drive.csv").write_text("t,a")
+    assert run_command(["report", str(result), "--out", str(tmp_path / "drive.csv")]) == 2
+    assert "drive.csv: expected a file name that ends with .html" in capsys.readouterr().err
+    assert (tmp_path / "drive.csv").read_text() == "t,a"
 
 
 @pytest.mark.parametrize(
