@@ -51,8 +51,9 @@ experiments: setup       ## docs/results anew, ten repetitions; TRIPS=folder of 
 	$(BIN)/python tools/import_bmw_i3.py $(TRIPS) --layout dbc/hv_powertrain.toml --out build/i3
 	$(BIN)/calibrator experiment all --drives build/i3 --layout dbc/hv_powertrain.toml --out docs/results
 
-soak: setup              ## the node at the full load of a CAN FD bus, 10^7 frames (a quarter of an hour)
+soak: setup              ## the node at the full load of a CAN FD bus, 10^7 frames; its watch on 24 h of real drives (hours)
 	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m bench.all --only node --out build/soak.json
+	HV_WATCH_HOURS=24 $(BIN)/python -m pytest -n 2 tests/real/test_watch_on_real_drives.py
 
 fuzz: setup              ## 10^7 random frames through the node, 10^6 changed parameter files (hours)
 	PYTHONPATH=tools $(BIN)/python -m bench.trust_fuzz

@@ -8,10 +8,7 @@ import sys
 
 from calibrator.processes.interrupts import ending_at_sigterm, importing, interrupted_message
 from ecu_node.errors import UserError
-from ecu_node.failures import say_error
-from ecu_node.interrupts import INTERRUPTED
-from ecu_node.python_can import load_python_can
-from ecu_node.standard_output import drop_output, flush_output
+from ecu_node.program import INTERRUPTED, drop_output, flush_output, load_python_can, say_error
 
 __all__ = ["main"]
 

@@ -50,8 +50,8 @@ app = command_app(
     no_args_is_help=True,
     epilog=example("calibrator kirchhoff table.csv --branches battery=Ibat,-motor=Imot"),
 )
-app.add_typer(layout_commands, name="layout")
-app.add_typer(keys, name="keys")
+app.add_typer(layout_commands, name="layout", epilog=example("calibrator layout init my_car.dbc --out my_car.toml"))
+app.add_typer(keys, name="keys", epilog=example("calibrator keys new alice --out keys"))
 for function, lines in (
     (doctor, ["calibrator doctor --layout my_car.toml --log drive.blf"]),
     (

@@ -6,7 +6,17 @@ __all__ = ["ContradictionError", "DriveError", "ExportError", "FleetError", "Log
 
 
 class LogError(UserError):
-    """A log file cannot be used (unreadable, truncated, empty, none of the signals in it)."""
+    """A log file cannot be used (unreadable, truncated, empty, none of the signals in it).
+
+    Attributes
+    ----------
+    what, remedy : str
+        The two parts of the message: what is wrong, and what to do, empty if `what` says it.
+    """
+
+    def __init__(self, what: str, remedy: str = "") -> None:
+        super().__init__(f"{what}; {remedy}" if remedy else what)
+        self.what, self.remedy = what, remedy
 
 
 class DriveError(UserError):

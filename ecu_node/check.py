@@ -1,21 +1,20 @@
-"""What ``ecu-node check`` reports: whether parameters fit, and what the node would compute with them.
+"""Commands without a bus: what ``ecu-node check`` reports, and the file that ``ecu-node template`` prints."""
 
-The node is built as ``ecu-node run`` builds it, so that what is accepted here is accepted there.
-"""
-
+import json
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ecu_node.branch_plans import branch_plan
+from ecu_node import __version__
+from ecu_node.bus.guard import Mode, needs_fd
+from ecu_node.bus.in_force import InForce, branch_plan, choose_parameters, not_published, sensor_fault
+from ecu_node.bus.wiring import wire
 from ecu_node.database import VehicleDatabase, node_database
-from ecu_node.errors import printable
-from ecu_node.guard import Mode, needs_fd
-from ecu_node.in_force import InForce, not_published, sensor_fault
+from ecu_node.errors import LayoutError, printable
 from ecu_node.layout import Branch
-from ecu_node.parameter_file import choose_parameters
-from ecu_node.wiring import wire
 
-__all__ = ["check_report", "report_text", "warnings_of"]
+__all__ = ["check_report", "report_text", "template_text", "warnings_of"]
+
 
 _WHY_NOT_PUBLISHED = "the parameters apply a fault to it, but the layout has no 'corrected' for it"
 
@@ -110,3 +109,56 @@ def _branch(database: VehicleDatabase, branch: Branch, in_force: InForce, mode: 
         if plan is None
         else {"gain": plan.gain, "voltage_gain": plan.voltage_gain, "bias": plan.bias, "shift": plan.shift},
     }
+
+
+def template_text(database: "VehicleDatabase", vehicle: str, now: datetime) -> str:
+    """Make a parameter file that corrects nothing yet.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        Layout and DBC of the vehicle.
+    vehicle : str
+        Its identity.
+    now : datetime
+        Time of day.
+
+    Returns
+    -------
+    str
+        JSON without what can be left out. The sum that right sensors show is the layout's unmeasured load: it takes
+        current out of the junction, so what the branches measure sums to as much above 0 A. The verdict is that of a
+        file that corrects, as it is to be once it is filled in.
+    """
+    layout = database.layout
+    load = layout.unmeasured_load
+    if load is not None and load.mean_a > layout.offset_limit_a:
+        raise LayoutError(
+            f"{layout.path}: [unmeasured_load] mean_a = {load.mean_a:g} is beyond the layout's limit of "
+            f"{layout.offset_limit_a:g} A ([limits] offset_a), so that no parameters would fit; correct one of them"
+        )
+    document = {
+        "schema_version": 1,
+        "vehicle": vehicle,
+        "number": 1,
+        "layout": {"name": layout.path.name, "sha256": layout.digest},
+        "dbc": {"name": layout.dbc_path.name, "sha256": database.digest},
+        "verdict": "corrected",
+        "branches": {name: {"drift": 0.0, "offset_a": 0.0, "apply": False} for name in layout.branch_names},
+        "hardware_fault": {"suspected": False},
+        "junction_residual": {
+            "measured_a": 0.0,
+            "corrected_a": 0.0,
+            "expected_a": load.mean_a if load is not None else 0.0,
+        },
+        "provenance": {
+            "tool": f"ecu-node template {__version__}",
+            "method": "by hand",
+            "created": now.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+            "fleet": "none",
+            "fleet_size": 1,
+            "drives": [],
+            "duration_s": 0.0,
+        },
+    }
+    return json.dumps(document, indent=2)

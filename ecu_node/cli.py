@@ -12,16 +12,29 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 from ecu_node import __version__
-from ecu_node.command_parser import CommandParser
-from ecu_node.failures import DEBUG, DEBUG_HELP, DEBUG_HINT, end_of, say_error, split_debug
-from ecu_node.interrupts import ending_at_interrupt, ignoring_hangups
-from ecu_node.python_can import load_python_can
-from ecu_node.standard_output import drop_output, flush_output, write_output, write_text
-from ecu_node.template import add_template_command
+from ecu_node.program import (
+    DEBUG,
+    DEBUG_HELP,
+    DEBUG_HINT,
+    CommandParser,
+    drop_output,
+    end_of,
+    ending_at_interrupt,
+    flush_output,
+    ignoring_hangups,
+    load_python_can,
+    say_error,
+    split_debug,
+    write_output,
+    write_text,
+)
 from ecu_node.trust.commands import add_trust_commands
 
 __all__ = ["main"]
@@ -30,6 +43,8 @@ _VEHICLE_VARIABLE = "ECU_NODE_VEHICLE"
 _LONGEST_ONCE_S = 86400.0
 """For ``monitor --once``. [s]"""
 _LARGEST_PORT = 65535
+_LONGEST_VEHICLE = 64
+"""Characters, as in the parameter file."""
 _EXIT_CODES = (
     "Exit codes: 0 done (also when ended by a signal), 1 failed, 2 wrong use, 70 internal error, 130 interrupted at "
     "start."
@@ -84,8 +99,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(commands)
     _add_monitor(commands)
     add_trust_commands(commands)
+    _add_faults(commands)
     _add_check(commands)
-    add_template_command(commands)
+    _add_template(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of the parameter file")
     schema.set_defaults(command=_schema)
     for command in commands.choices.values():
@@ -116,10 +132,41 @@ def _add_run(commands: "argparse._SubParsersAction[CommandParser]") -> None:
         "the corrected current in place, all others as they are",
     )
     run.add_argument("--shadow", action="store_true", help="compute and report the corrected sum, but change nothing")
+    run.add_argument("--dry-run", action="store_true", help="print what would be opened, read and sent; open nothing")
     run.add_argument(
         "--metrics-port", type=_port, metavar="PORT", help="let Prometheus ask here (needs prometheus-client)"
     )
+    run.add_argument(
+        "--telemetry",
+        type=_outlet,
+        metavar="TARGET",
+        help="a line of JSON per second, added to a file or sent to udp://HOST:PORT",
+    )
+    run.add_argument(
+        "--realtime", action="store_true", help="run as a real-time process: SCHED_FIFO, locked memory, one processor"
+    )
     run.set_defaults(command=_run)
+
+
+def _add_faults(commands: "argparse._SubParsersAction[CommandParser]") -> None:
+    faults = commands.add_parser(
+        "faults",
+        help="why the node fell back: first, last, how often, with which currents",
+        description="Prints the fault memory of a state folder, the last fault first. What is active keeps a node from "
+        "correcting, also after a restart.",
+        epilog="Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted.",
+    )
+    faults.add_argument("--json", action="store_true", help="print JSON")
+    clear = commands.add_parser(
+        "clear",
+        help="forget the faults, and correct again",
+        description="Empties the fault memory of a state folder. A node that runs corrects again within a second; find "
+        "out first what was wrong.",
+        epilog="Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted.",
+    )
+    for command, run in ((faults, _faults), (clear, _clear)):
+        command.add_argument("--state", type=Path, required=True, metavar="FOLDER", help="state of this vehicle")
+        command.set_defaults(command=run)
 
 
 def _add_check(commands: "argparse._SubParsersAction[CommandParser]") -> None:
@@ -141,7 +188,7 @@ def _add_monitor(commands: "argparse._SubParsersAction[CommandParser]") -> None:
         "monitor",
         help="show the branches, their sum and the node, live",
         description="Listens to a bus, and never sends: measured and corrected currents, frame rates, faults, the "
-        "Kirchhoff sum, and what the node says of itself. A table in a terminal (needs rich), else a block of text "
+        "Kirchhoff sum, and what the node says of itself. A table in a terminal, else a block of text "
         "per second.",
         epilog="Exit codes: 0 done (also when ended by a signal), 1 failed, or with --once no branch was seen, "
         "2 wrong use, 70 internal error, 130 interrupted at start.",
@@ -153,6 +200,32 @@ def _add_monitor(commands: "argparse._SubParsersAction[CommandParser]") -> None:
     )
     monitor.add_argument("--json", action="store_true", help="print JSON; with --once")
     monitor.set_defaults(command=_monitor, error=monitor.error)
+
+
+def _add_template(commands: "argparse._SubParsersAction[CommandParser]") -> None:
+    template = commands.add_parser(
+        "template",
+        help="print a parameter file to be filled in by hand",
+        description="Prints a parameter file that fits the layout and corrects nothing yet. Where the fault of a "
+        "sensor was measured, write it there: drift [1], offset_a [A, positive into the junction], and "
+        '"apply": true; measured = (1 + drift) * true + offset. A load that no branch measures stands in '
+        "expected_a [A], as [unmeasured_load] of the layout says. Take out branches that this vehicle does not have: "
+        "the node would wait for their frames. All else can stay as it is.",
+        epilog="Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted.",
+    )
+    _add_layout(template)
+    template.add_argument(
+        "--vehicle", required=True, type=_template_vehicle, metavar="ID", help="identity of the vehicle"
+    )
+    template.set_defaults(command=_template)
+
+
+def _template_vehicle(text: str) -> str:
+    if not text.strip() or len(text) > _LONGEST_VEHICLE or not text.isprintable():
+        raise argparse.ArgumentTypeError(
+            f"the identity of the vehicle is expected, of at most {_LONGEST_VEHICLE} characters that can be printed"
+        )
+    return text
 
 
 def _seconds(text: str) -> float:
@@ -170,6 +243,16 @@ def _add_bus(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
     parser.add_argument("--channel", required=True, type=_name, help="channel of the interface, such as can0 or vcan0")
     parser.add_argument("--fd", action="store_true", help="open the bus for CAN FD")
+    for name, what in (("--bitrate", "bit rate"), ("--data-bitrate", "bit rate of the data of CAN FD frames")):
+        parser.add_argument(
+            name,
+            type=int,
+            metavar="BIT_PER_S",
+            help=f"{what}, where the adapter sets it; this and other settings may stand in python-can's can.conf",
+        )
+    parser.add_argument(
+        "--listen-only", action="store_true", help="send nothing; adapters that can do so acknowledge no frame either"
+    )
 
 
 def _add_layout(parser: argparse.ArgumentParser) -> None:
@@ -178,6 +261,17 @@ def _add_layout(parser: argparse.ArgumentParser) -> None:
 
 def _add_gateway(parser: argparse.ArgumentParser, words: str) -> None:
     parser.add_argument("--gateway", type=_name, metavar="CHANNEL", help=words)
+
+
+def _bus_options(options: argparse.Namespace) -> dict[str, Any]:
+    """What :func:`_add_bus` has added, as the options of a run or a monitor."""
+    return {
+        "interface": options.interface,
+        "channel": options.channel,
+        "fd": options.fd,
+        "listen_only": options.listen_only,
+        "bitrates": {"bitrate": options.bitrate, "data_bitrate": options.data_bitrate},
+    }
 
 
 def _name(text: str) -> str:
@@ -200,6 +294,16 @@ def _port(text: str) -> int:
     return int(text)
 
 
+def _outlet(text: str) -> Path | tuple[str, int]:
+    if text.strip() and "://" not in text:
+        return Path(text)
+    with suppress(ValueError):  # a port that is none
+        found = urlsplit(text)
+        if found.scheme == "udp" and found.hostname and found.port and text.endswith(f":{found.port}"):
+            return found.hostname, found.port
+    raise argparse.ArgumentTypeError(f"a file or udp://HOST:PORT is expected, found {text!r}")
+
+
 def _add_files(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--params", type=Path, required=True, metavar="FILE", help="parameter file of this vehicle")
     _add_layout(parser)
@@ -217,10 +321,13 @@ def _add_vehicle(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from ecu_node.run import RunOptions, run_node  # noqa: PLC0415  # after load_python_can
+    from ecu_node.bus.run import RunOptions, run_node  # noqa: PLC0415  # after load_python_can
 
     if options.gateway == options.channel:
         say_error(f"ecu-node: --gateway {options.gateway} is the bus of the sensors itself; two buses are expected")
+        return 2
+    if options.gateway is not None and options.listen_only:
+        _say("--listen-only sends nothing, and a gateway must pass frames on; leave one of them out")
         return 2
     if (options.params is not None) != options.unsigned:
         _say(
@@ -235,12 +342,13 @@ def _run(options: argparse.Namespace) -> int:
             state=options.state,
             layout=options.layout,
             vehicle=options.vehicle,
-            interface=options.interface,
-            channel=options.channel,
+            **_bus_options(options),
             gateway=options.gateway,
-            fd=options.fd,
             shadow=options.shadow,
+            dry_run=options.dry_run,
             metrics_port=options.metrics_port,
+            telemetry=options.telemetry,
+            realtime=options.realtime,
         ),
         vehicle_hint=f"give --vehicle or ${_VEHICLE_VARIABLE}",
     )
@@ -254,9 +362,7 @@ def _monitor(options: argparse.Namespace) -> int:
     return run_monitor(
         MonitorOptions(
             layout=options.layout,
-            interface=options.interface,
-            channel=options.channel,
-            fd=options.fd,
+            **_bus_options(options),
             once_s=options.once,
             as_json=options.json,
         )
@@ -264,8 +370,8 @@ def _monitor(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
+    from ecu_node.bus.guard import Mode  # noqa: PLC0415
     from ecu_node.check import check_report, report_text  # noqa: PLC0415  # after load_python_can
-    from ecu_node.guard import Mode  # noqa: PLC0415
 
     mode = Mode.OVERLAY if options.gateway is None else Mode.GATEWAY
     report = check_report(options.params, options.layout, options.vehicle, mode)
@@ -274,6 +380,35 @@ def _check(options: argparse.Namespace) -> int:
     else:
         write_text(report_text(report))
     return 0 if report["fit"] else 1
+
+
+def _faults(options: argparse.Namespace) -> int:
+
+    from ecu_node.bus.faults import faults_text, read_faults  # noqa: PLC0415  # after load_python_can
+
+    faults = read_faults(options.state)
+    if options.json:
+        write_output(
+            json.dumps([{name: getattr(fault, name) for name in fault.__struct_fields__} for fault in faults], indent=2)
+        )
+    else:
+        write_text(faults_text(faults))
+    return 0
+
+
+def _clear(options: argparse.Namespace) -> int:
+    from ecu_node.bus.faults import clear_faults  # noqa: PLC0415  # after load_python_can
+
+    clear_faults(options.state)
+    return 0
+
+
+def _template(options: argparse.Namespace) -> int:
+    from ecu_node.check import template_text  # noqa: PLC0415  # after load_python_can
+    from ecu_node.database import node_database  # noqa: PLC0415
+
+    write_output(template_text(node_database(options.layout), options.vehicle, datetime.now(UTC)))
+    return 0
 
 
 def _schema(options: argparse.Namespace) -> int:  # noqa: ARG001

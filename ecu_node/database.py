@@ -3,14 +3,14 @@
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cantools
 from cantools.database.can import Database, Message, Signal
 from cantools.database.conversion import BaseConversion
 
-from ecu_node.codes import impossible_values
+from ecu_node.core.signals import impossible_values
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import Layout, read_layout, split_signal
 from ecu_node.units import AMPERE, VOLT, WATT, unit_factor
@@ -27,12 +27,10 @@ class VehicleDatabase:
     """The messages of a layout's DBC, with look-ups whose errors name file, message and signal."""
 
     layout: Layout
-    database: Database
-    """That of the only bus; empty where there is none or several."""
+    databases: Mapping[str, Database]
+    """By name of the bus, ``""`` where the layout names none; empty where it has no DBC."""
     digest: str
     """SHA-256 of the DBC file; see :attr:`.Layout.dbc_digest`."""
-    buses: Mapping[str, Database] = field(default_factory=dict)
-    """By name of the bus, where the layout names buses."""
 
     def message(self, name: str, place: str = "") -> Message:
         """Return the message of this name, which stands at this place of the layout, or raise DatabaseError."""
@@ -46,11 +44,10 @@ class VehicleDatabase:
     def _found(self, name: str, place: str) -> tuple[str, Message]:
         """Bus and message of this name."""
         wanted, _, bare = name.rpartition(":")
-        buses = self.buses or {"": self.database}
         found = []
-        for bus in [wanted] if wanted in buses else buses:
+        for bus in [wanted] if wanted in self.databases else self.databases:
             with suppress(KeyError):
-                found.append((bus, buses[bus].get_message_by_name(bare)))
+                found.append((bus, self.databases[bus].get_message_by_name(bare)))
         if len(found) == 1:
             return found[0]
         where = f" in {place}" if place else ""
@@ -78,14 +75,13 @@ class VehicleDatabase:
             return Message(0, name, 8, [column]), column
         message_name, signal_name = split_signal(name)
         message = self.message(message_name)
-        for signal in message.signals:
-            if signal.name == signal_name:
-                return message, signal
-        known = ", ".join(signal.name for signal in message.signals)
-        raise DatabaseError(
-            f"{self.layout.dbc_path}: message {message_name} has no signal {signal_name!r}, which {self.layout.path} "
-            f"names; it has {known}"
-        )
+        signals = {signal.name: signal for signal in message.signals}
+        if signal_name not in signals:
+            raise DatabaseError(
+                f"{self.layout.dbc_path}: message {message_name} has no signal {signal_name!r}, which "
+                f"{self.layout.path} names; it has {', '.join(signals)}"
+            )
+        return message, signals[signal_name]
 
     def current_step_a(self, branch: str) -> float:
         """Step of the signal of a branch [A]; 0 where its current is computed of several, or any number."""
@@ -118,14 +114,12 @@ def read_database(layout: Layout) -> VehicleDatabase:
     """
     loaded = {bus: _load(layout, file) for bus, file in layout.dbc_files.items()}
     digests = [digest for _, digest in loaded.values()]
-    databases = {bus: database for bus, (database, _) in loaded.items()}
     vehicle = VehicleDatabase(
         layout=layout,
-        database=next(iter(databases.values())) if len(databases) == 1 else Database(),
+        databases={bus: database for bus, (database, _) in loaded.items()},
         digest=digests[0] if len(digests) == 1 else text_digest("".join(digests).encode()),
-        buses=databases if layout.bus else {},
     )
-    if databases:
+    if loaded:
         for branch in layout.branch:
             if branch.unit is not None:
                 vehicle.signal(branch.source)[1].unit = branch.unit
@@ -189,7 +183,26 @@ def _load(layout: Layout, file: str) -> tuple[Database, str]:
         raise DatabaseError(f"{path}: a diagnostics database; a CAN database (DBC) is needed")
     if not database.messages:
         raise DatabaseError(f"{path}: the DBC has no message; check that it is the one that {layout.path} needs")
+    for message in database.messages:
+        _complete_multiplexers(message)
     return database, text_digest(content)
+
+
+def _complete_multiplexers(message: Message) -> None:
+    """Give the multiplexer of each signal its whole name.
+
+    DBCs keep names of more than 32 characters in an attribute; cantools takes the signals' from it, and leaves those of
+    their multiplexers cut.
+    """
+    names = {signal.name for signal in message.signals}
+    wanted = {signal.multiplexer_signal for signal in message.signals if signal.multiplexer_signal is not None} - names
+    for cut in wanted:
+        whole = [s.name for s in message.signals if s.is_multiplexer and s.name.startswith(cut)]
+        for signal in message.signals:
+            if whole and signal.multiplexer_signal == cut:
+                signal.multiplexer_signal = min(whole, key=len)
+    if wanted:
+        message.refresh(strict=False)
 
 
 def _parsed(path: Path, content: bytes) -> cantools.database.Database | object:
@@ -255,16 +268,14 @@ def look_everything_up(vehicle: VehicleDatabase) -> None:
 def _check_values(vehicle: VehicleDatabase) -> None:
     """Refuse values of inputs that their signals can never have: what waits for them would wait for ever."""
     layout = vehicle.layout
-    signals = {item.name: item.signal for item in layout.input}
-    wanted = []
+    wanted = [("[watch] valid", layout.watch.input, layout.watch.valid)]
     if layout.contactor is not None:
         wanted.append(("[contactor] open", layout.contactor.input, layout.contactor.open))
-    if layout.watch.input is not None:
-        wanted.append(("[watch] valid", layout.watch.input, layout.watch.valid))
     for key, name, values in wanted:
-        _, signal = vehicle.signal(signals[name])
-        if never := impossible_values(signal, values):
-            raise LayoutError(
-                f"{layout.path}: {key}: {', '.join(f'{value:g}' for value in never)} is no value of {signals[name]}, "
-                f"which has {signal.length} bits, scale {signal.scale:g} and offset {signal.offset:g}"
-            )
+        for item in layout.input:
+            _, signal = vehicle.signal(item.signal)
+            if item.name == name and (never := impossible_values(signal, values)):
+                raise LayoutError(
+                    f"{layout.path}: {key}: {', '.join(f'{value:g}' for value in never)} is no value of {item.signal}, "
+                    f"which has {signal.length} bits, scale {signal.scale:g} and offset {signal.offset:g}"
+                )

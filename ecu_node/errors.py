@@ -3,7 +3,7 @@
 The command line turns every :class:`UserError` into that line and an exit code; nothing else is caught.
 """
 
-from ecu_node.status import Reason
+from ecu_node.core.status import Reason
 
 __all__ = [
     "BusError",

@@ -1,32 +1,602 @@
-"""``ecu-node monitor``: bus, clock and terminal around :mod:`ecu_node.monitor_model`; it listens, and never sends."""
+"""``ecu-node monitor``: what a listener sees of the junction and of the node. It listens, and never sends.
+
+Nothing of the node is asked: measured and corrected currents, their sums, rates and faults are worked out from what is
+on the bus. Sums are taken as the node takes them, of all branches in one instant of the junction, and both in the same
+one: an answer counts at the time of the frame that it answers. The calibrated delays of the branches are in the
+parameter file alone, and not known here. Currents are positive into the junction. Times are those of one steady
+clock. [s]
+"""
 
 import json
 import os
+import shutil
+import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
-import can
+from cantools.database.can import Message
 
-from ecu_node.buses import open_bus
-from ecu_node.clocks import steady_time_s
-from ecu_node.counters import Counters
-from ecu_node.database import node_database
-from ecu_node.errors import UserError
-from ecu_node.failures import say_error
-from ecu_node.guard import Mode
-from ecu_node.monitor_model import BusMonitor
-from ecu_node.monitor_table import picture
-from ecu_node.monitor_text import as_json, plain_block
-from ecu_node.monitor_view import View
-from ecu_node.service import Log, Requests
-from ecu_node.standard_output import write_output, write_text
-from ecu_node.steady_bus import SteadyBus
+from ecu_node.bus.adapters import acknowledgement
+from ecu_node.bus.guard import Mode, key_of, received, transmitted
+from ecu_node.bus.in_force import branch_signals
+from ecu_node.bus.links import open_bus
+from ecu_node.bus.node import steady_time_s
+from ecu_node.bus.service import Log, Requests
+from ecu_node.bus.steady_bus import SteadyBus
+from ecu_node.core.branch import REMEMBERED_FRAMES, Auxiliary, Frames, LiveBranch
+from ecu_node.core.e2e import Check, Receiver, protection_of
+from ecu_node.core.frames import FrameKey
+from ecu_node.core.junction import simultaneous_currents
+from ecu_node.core.signals import Codes, PlacedSignal, bit_place, placed_signal, read_codes
+from ecu_node.core.status import Counters, Quality, Reason, State
+from ecu_node.database import VehicleDatabase, node_database
+from ecu_node.layout import Branch, SignalName, StatusMessage
+from ecu_node.program import say_error, wrapped, write_output, write_text
+from ecu_node.units import AMPERE
 
-__all__ = ["MonitorOptions", "listen", "run_monitor"]
+__all__ = [
+    "BranchView",
+    "BusMonitor",
+    "MonitorOptions",
+    "NodeView",
+    "Sums",
+    "View",
+    "listen_until",
+    "run_monitor",
+    "view_lines",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BranchView:
+    """One branch.
+
+    Attributes
+    ----------
+    name : str
+        As in the layout.
+    is_seen : bool
+        Whether an intact frame of it ever came; a vehicle may lack a branch of its layout.
+    measured_a, corrected_a : float or None
+        In the last intact frames [A]; None where there is none, or it is no value. A measured frame that came since
+        the last corrected one is not shown before it is answered, or the other one is stale.
+    correction_a : float or None
+        Corrected less measured current, both as shown. [A]
+    quality : str or None
+        Name in :class:`~ecu_node.core.status.Quality`, of the corrected current; None where it is not known.
+    rate_hz, corrected_rate_hz : float
+        Frames of the measured and of the corrected message. [1/s]
+    age_s : float or None
+        Of the last intact measured frame. [s]
+    is_stale, corrected_is_stale : bool
+        Whether intact frames came, but none for longer than the branch's timeout.
+    faults, corrected_faults : mapping of str to int
+        Frames of the measured and of the corrected message that failed their end-to-end check since the start:
+        ``corrupt`` (wrong CRC, impossible counter, or too short for their header), ``repeated`` (counter of the one
+        before), ``lost`` (times that the counter showed lost frames, few or many).
+    """
+
+    name: str
+    is_seen: bool
+    measured_a: float | None
+    corrected_a: float | None
+    correction_a: float | None
+    quality: str | None
+    rate_hz: float
+    corrected_rate_hz: float
+    age_s: float | None
+    is_stale: bool
+    corrected_is_stale: bool
+    faults: Mapping[str, int]
+    corrected_faults: Mapping[str, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sums:
+    """Kirchhoff sum of all branches, measured and corrected, in one instant [A]; None where it is not known."""
+
+    measured_a: float | None = None
+    corrected_a: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeView:
+    """What the node says of itself in its last intact status message.
+
+    Attributes
+    ----------
+    state, reason : str, int or None
+        Name in :class:`~ecu_node.core.status.State` or :class:`~ecu_node.core.status.Reason`; the code where it is
+        none of them, None if the message was too short.
+    parameter_set : int or None
+        None if the layout leaves it out.
+    sums : Sums
+        As the node publishes them.
+    age_s : float
+        Of the message. [s]
+    is_silent : bool
+        Whether the message is so old that the node must be gone.
+    faults : mapping of str to int
+        Of the status message, as in :class:`BranchView`.
+    """
+
+    state: str | int | None
+    reason: str | int | None
+    parameter_set: int | None
+    sums: Sums
+    age_s: float
+    is_silent: bool
+    faults: Mapping[str, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Everything that is shown of one instant.
+
+    Attributes
+    ----------
+    branches : tuple of BranchView
+        All of the layout, in its order.
+    sums : Sums
+        Worked out from the branches' frames.
+    node : NodeView or None
+        None if no status message ever came.
+    has_status : bool
+        Whether the layout has a status message at all.
+    publishes_corrected : bool
+        Whether a corrected message ever came; there is none on the buses of a gateway.
+    is_bus_open : bool
+        Whether the bus can be listened to; if not, all this was heard before.
+    """
+
+    branches: tuple[BranchView, ...]
+    sums: Sums
+    node: NodeView | None
+    has_status: bool
+    publishes_corrected: bool
+    is_bus_open: bool = True
+
+    @property
+    def is_any_branch_seen(self) -> bool:
+        """Whether anything of the junction was seen."""
+        return any(branch.is_seen for branch in self.branches)
+
+
+_RATE_WINDOW_S = 2.0
+"""Frame rates are means over about this long. [s]"""
+_FAULTS = {Check.CORRUPT: "corrupt", Check.REPEATED: "repeated", Check.LOST: "lost", Check.JUMPED: "lost"}
+
+
+class _HeardMessage:
+    """A message of the DBC: its frames, whether they are intact, and how many come.
+
+    Attributes
+    ----------
+    rate_hz : float
+        Of its frames, intact or not, as of the last :meth:`count_rate`. [1/s]
+    frames : deque
+        Times [s] and payloads of the last intact frames.
+    answers_to : list of _HeardMessage
+        Of a corrected message: what it answers.
+    """
+
+    def __init__(self, database: VehicleDatabase, message: Message, start_s: float) -> None:
+        protection = protection_of(database, message)
+        self._check = Receiver(protection).check if protection is not None else None
+        self._count = 0
+        self._counts = deque([(start_s, 0)])
+        self.rate_hz = 0.0
+        self.frames: Frames = deque(maxlen=REMEMBERED_FRAMES)
+        self.faults = dict.fromkeys(_FAULTS.values(), 0)
+        self.answers_to: list[_HeardMessage] = []
+
+    def take(self, payload: bytearray, time_s: float) -> None:
+        """Take a frame; like the node, use it only if it is intact, new, and not after a jump of its counter."""
+        self._count += 1
+        found = self._check(payload) if self._check is not None else Check.OK
+        if found in _FAULTS:
+            self.faults[_FAULTS[found]] += 1
+        if found in (Check.OK, Check.LOST):
+            self.frames.append((time_s, payload))
+
+    def count_rate(self, now_s: float) -> None:
+        """Work out the frame rate."""
+        counts = self._counts
+        while len(counts) > 1 and counts[1][0] <= now_s - _RATE_WINDOW_S:
+            counts.popleft()
+        since_s, before = counts[0]
+        self.rate_hz = (self._count - before) / (now_s - since_s) if now_s > since_s else 0.0
+        counts.append((now_s, self._count))
+
+
+class _Followed(NamedTuple):
+    """A signal, and the frames that it is in."""
+
+    signal: PlacedSignal
+    heard: _HeardMessage
+
+
+def _followed(database: VehicleDatabase, name: SignalName, heard: Mapping[FrameKey, _HeardMessage]) -> _Followed:
+    message, signal = database.signal(name)
+    return _Followed(placed_signal(message, signal), heard[key_of(message)])
+
+
+class BusMonitor:
+    """Listens; the pure core of ``ecu-node monitor``: frames and times in, a view out.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        Layout and DBC; corrected messages and the status may be missing in the layout.
+    start_s : float
+        Now; rates count from here. [s]
+
+    Raises
+    ------
+    LayoutError, DatabaseError
+        If a signal cannot be read, or a message cannot carry its protection.
+    """
+
+    def __init__(self, database: VehicleDatabase, start_s: float) -> None:
+        messages = {**received(database), **transmitted(database, Mode.OVERLAY)}
+        heard = {key: _HeardMessage(database, message, start_s) for key, message in messages.items()}
+        self._heard: Mapping[tuple[int, bool], _HeardMessage] = dict(heard.items())
+        self._branches = [_Pair(database, branch, heard) for branch in database.layout.branch]
+        status = database.layout.status
+        self._status = _Status(database, status, heard) if status is not None else None
+
+    def take(self, key: tuple[int, bool], payload: bytearray, time_s: float) -> None:
+        """Take a frame.
+
+        Parameters
+        ----------
+        key : tuple of int and bool
+            Its identifier, and whether that has 29 bits; others than those of the layout are left alone.
+        payload : bytearray
+            Its data; not changed, now or later.
+        time_s : float
+            When it came. [s]
+        """
+        if key in self._heard:
+            self._heard[key].take(payload, time_s)
+
+    def look(self, now_s: float) -> View:
+        """Work out what is to be shown now [s], and begin a new step of the frame rates."""
+        for heard in self._heard.values():
+            heard.count_rate(now_s)
+        publishes = any(pair.corrected is not None and pair.corrected.seen for pair in self._branches)
+        return View(
+            branches=tuple(pair.view(now_s) for pair in self._branches),
+            sums=_sums([pair for pair in self._branches if pair.measured.seen], now_s, publishes=publishes),
+            node=self._status.view(now_s) if self._status is not None else None,
+            has_status=self._status is not None,
+            publishes_corrected=publishes,
+        )
+
+
+class _Pair:
+    """One branch: the measured current, and the corrected one if the layout gives it a signal."""
+
+    def __init__(self, database: VehicleDatabase, branch: Branch, heard: Mapping[FrameKey, _HeardMessage]) -> None:
+        signals = branch_signals(database, branch, Mode.OVERLAY)
+        self._branch, self._target_codes = branch, signals.target
+        self._voltage = None
+        if branch.voltage is not None and signals.voltage is not None:
+            voltage = _followed(database, branch.voltage, heard)
+            self._voltage = Auxiliary(signals.voltage, branch.timeout_s)
+            self._voltage.follow(voltage.signal, voltage.heard.frames)
+        self._source = _followed(database, branch.source, heard)
+        self.measured = self._live(signals.source, self._source.signal, self._source.heard.frames)
+        self._target = self.corrected = None
+        if branch.corrected is not None:
+            self._target = _followed(database, branch.corrected, heard)
+            self._target.heard.answers_to.append(self._source.heard)
+            self.corrected = self._live(signals.target, self._target.signal, self._target.heard.frames)
+        self._quality = bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None
+
+    def _live(self, codes: Codes, signal: PlacedSignal, frames: Frames) -> LiveBranch:
+        branch = self._branch
+        live = LiveBranch(
+            name=branch.name, codes=codes, sign=branch.sign, timeout_s=branch.timeout_s, voltage=self._voltage
+        )
+        live.follow(signal, frames)
+        return live
+
+    def answered(self) -> LiveBranch:
+        """What counts in the corrected sum: the measured current where the layout publishes no corrected one.
+
+        Each answer stands at the time of the newest frame before it that no later answer has: a node that was held up
+        answers several frames at once. Answers to frames without the current repeat what was said before, and are left
+        out.
+        """
+        if self._target is None:
+            return self.measured
+        own = self._source.heard
+        asked = [
+            (time_s, heard is own and self._source.signal.code(payload) is not None)
+            for heard in dict.fromkeys(self._target.heard.answers_to)
+            for time_s, payload in heard.frames
+        ]
+        newest_first = iter(sorted(asked, reverse=True))
+        answers: Frames = deque()
+        for answer_s, answer in reversed(self._target.heard.frames):
+            asked_s, has_current = next((frame for frame in newest_first if frame[0] <= answer_s), (0.0, False))
+            if has_current:
+                answers.appendleft((asked_s, answer))
+        return self._live(self._target_codes, self._target.signal, answers)
+
+    def view(self, now_s: float) -> BranchView:
+        """What is to be shown."""
+        source, target = self._source.heard, self._target.heard if self._target is not None else None
+        measured_a, corrected_a = self._currents(now_s)
+        return BranchView(
+            name=self._branch.name,
+            is_seen=self.measured.seen,
+            measured_a=measured_a,
+            corrected_a=corrected_a,
+            correction_a=corrected_a - measured_a if measured_a is not None and corrected_a is not None else None,
+            quality=self._shown_quality(),
+            rate_hz=source.rate_hz,
+            corrected_rate_hz=target.rate_hz if target is not None else 0.0,
+            age_s=max(now_s - self.measured.time_s, 0.0) if self.measured.seen else None,
+            is_stale=self.measured.is_stale(now_s),
+            corrected_is_stale=self.corrected is not None and self.corrected.is_stale(now_s),
+            faults=dict(source.faults),
+            corrected_faults=dict.fromkeys(_FAULTS.values(), 0) if target is None else dict(target.faults),
+        )
+
+    def _currents(self, now_s: float) -> tuple[float | None, float | None]:
+        """Measured and corrected current, the one made of the other where it goes on being corrected. [A]"""
+        measured, corrected = self.measured, self.corrected
+        if corrected is None or not corrected.seen:
+            return _current_at(measured, measured.time_s), None
+        answered_s = self.answered().time_s
+        shown_s = answered_s if now_s - answered_s <= self._branch.timeout_s else measured.time_s
+        return _current_at(measured, shown_s), _current_at(corrected, corrected.time_s)
+
+    def _shown_quality(self) -> str | None:
+        if self._quality is None or self._target is None or not self._target.heard.frames:
+            return None
+        code = self._quality.extract(self._target.heard.frames[-1][1])
+        return Quality(code).name if code in set(Quality) else None
+
+
+def _current_at(branch: LiveBranch, time_s: float) -> float | None:
+    """Current at a time [A]; None if no value is known of then."""
+    currents = branch.currents_at(time_s)
+    return currents[0] if currents is not None else None
+
+
+def _sums(pairs: Sequence[_Pair], now_s: float, *, publishes: bool) -> Sums:
+    """Sums in the newest instant that all have reached; None while a branch is stale or has no value. [A]"""
+    measured = [pair.measured for pair in pairs]
+    after = simultaneous_currents([pair.answered() for pair in pairs], {}, now_s) if publishes else None
+    found = after or simultaneous_currents(measured, {}, now_s)
+    if found is None:
+        return Sums()
+    currents = [_current_at(branch, found[0]) for branch in measured]
+    known = [current_a for current_a in currents if current_a is not None]
+    return Sums(
+        measured_a=sum(known) if len(known) == len(currents) else None,
+        corrected_a=sum(current_a for current_a, _ in after[1].values()) if after is not None else None,
+    )
+
+
+_SILENT_PERIODS, _LEAST_SILENCE_S = 5.0, 1.0
+"""Without a status for so many of its periods, and at least so long [s], the node is taken for gone."""
+
+
+class _Status:
+    """The node's status message."""
+
+    def __init__(
+        self, database: VehicleDatabase, status: StatusMessage, heard: Mapping[FrameKey, _HeardMessage]
+    ) -> None:
+        self._heard = heard[key_of(database.message(status.message))]
+        self._silent_s = max(_SILENT_PERIODS * status.period_s, _LEAST_SILENCE_S)
+        where = f"{database.layout.path}: status"
+        fields = {
+            field: database.signal(f"{status.message}.{name}")[1]
+            for field in ("state", "reason", "parameter_set", "sum_measured", "sum_corrected")
+            if (name := getattr(status, field)) is not None
+        }
+        self._places = {field: bit_place(signal) for field, signal in fields.items()}
+        self._sums = {field: read_codes(fields[field], AMPERE, where) for field in fields if field.startswith("sum_")}
+
+    def view(self, now_s: float) -> NodeView | None:
+        """What is to be shown."""
+        if not self._heard.frames:
+            return None
+        time_s, payload = self._heard.frames[-1]
+        codes = {field: place.extract(payload) for field, place in self._places.items()}
+        sums_a = {
+            field: float(known.worth(code))
+            for field, known in self._sums.items()
+            if (code := codes[field]) is not None and known.is_value(code)
+        }
+        age_s = max(now_s - time_s, 0.0)
+        return NodeView(
+            state=_name(State, codes["state"]),
+            reason=_name(Reason, codes["reason"]),
+            parameter_set=codes.get("parameter_set"),
+            sums=Sums(measured_a=sums_a.get("sum_measured"), corrected_a=sums_a.get("sum_corrected")),
+            age_s=age_s,
+            is_silent=age_s > self._silent_s,
+            faults=dict(self._heard.faults),
+        )
+
+
+def _name(names: type[Reason | State], code: int | None) -> str | int | None:
+    return names(code).name if code in set(names) else code
+
+
+_STATES = {
+    "STARTING": "starting: waiting for the first frames of all branches",
+    "CORRECTING": "correcting",
+    "PASSING_THROUGH": "passing measured values through",
+    "SHADOW": "shadow mode: computing, but passing measured values through",
+    "ASLEEP": "asleep: no branch sends",
+    "PARTLY_CORRECTING": "partly correcting: something of it cannot be corrected now",
+}
+_REASONS = {
+    "NO_PARAMETERS": "there is no parameter file",
+    "MALFORMED_PARAMETERS": "the parameter file cannot be read",
+    "WRONG_VEHICLE": "the parameters are of another vehicle",
+    "WRONG_LAYOUT": "the parameters are for another layout",
+    "WRONG_DBC": "the parameters are for another DBC",
+    "IMPLAUSIBLE_PARAMETERS": "the parameters are beyond the limits of the layout",
+    "BRANCH_STALE": "a branch has sent nothing for longer than its timeout",
+    "CORRECTION_WORSE": "the corrected Kirchhoff sum is worse than the measured one",
+    "BRANCH_STUCK": "a branch never changes while the others do",
+    "INPUT_MISSING": "a voltage, or a value of a branch, is missing; not everything is corrected",
+    "NOT_SIGNED": "the parameters are not what trusted signers have signed",
+    "NOT_VALID_NOW": "the parameters have expired, or do not hold yet",
+    "REPLAYED": "the parameters are older than what was accepted before",
+    "REVOKED": "the parameters were revoked",
+    "ON_TRIAL": "the parameters are on trial",
+    "SUM_IMPLAUSIBLE": "the corrected Kirchhoff sum is not what it may be: a sensor is wrong",
+    "E2E_INVALID": "so many frames of a message fail their end-to-end check that it is not used",
+    "FOREIGN_FRAMES": "another node sends frames that only this gateway may send; they are dropped",
+}
+_COLUMNS = (  # "rate" of the measured frames, "answers" of the corrected ones
+    ("branch", ""),
+    ("measured", "[A]"),
+    ("corrected", "[A]"),
+    ("correction", "[A]"),
+    ("quality", ""),
+    ("rate", "[1/s]"),
+    ("answers", "[1/s]"),
+    ("age", "[s]"),
+    ("faults", ""),
+)
+"""Name and unit; those without unit are words, and stand at the left."""
+_BOLD, _DIM, _YELLOW = "1", "2", "33"
+"""Styles as in the terminal's control sequence "select graphic rendition"."""
+
+
+class ShownLine(NamedTuple):
+    """One line for people."""
+
+    text: str
+    style: str = ""
+    """How a terminal shows it: a parameter of "select graphic rendition"."""
+
+
+def view_lines(view: View, where: str, more: Sequence[str] = ()) -> list[ShownLine]:
+    """Say what is seen: node, a table with a row per branch and the sums, and what else a reader should know.
+
+    Parameters
+    ----------
+    view : View
+        What is to be shown.
+    where : str
+        Name of the bus.
+    more : sequence of str
+        Further lines.
+
+    Returns
+    -------
+    list of ShownLine
+        A number that is not known is "-". Yellow: a fault that lasts; dim: a branch that was never seen.
+    """
+    node = view.node
+    head = [([name if unit else "" for name, unit in _COLUMNS], ""), ([unit or name for name, unit in _COLUMNS], "")]
+    table = [*head, *map(_branch_row, view.branches), (_sum_cells("sum", view.sums), "")]
+    if node is not None and not node.is_silent:
+        table.append((_sum_cells("node's sum", node.sums), ""))
+    widths = [max(map(len, column)) for column in zip(*(cells for cells, _ in table), strict=True)]
+    lines = [ShownLine(f"{where}: {_node_text(view)}", _BOLD)]
+    for cells, style in table:
+        columns = zip(_COLUMNS, cells, widths, strict=True)
+        padded = [cell.rjust(width) if unit else cell.ljust(width) for (_, unit), cell, width in columns]
+        lines.append(ShownLine(" ".join(padded).rstrip(), style))
+    return [*lines, *map(ShownLine, [*_notes(view), *more])]
+
+
+def _node_text(view: View) -> str:
+    """What the node does, and why; or that the bus cannot be listened to."""
+    node = view.node
+    if not view.is_bus_open:
+        return "this computer's interface failed or is down; trying to open it again; what is shown was heard before"
+    if not view.has_status:
+        return "the layout has no status message: nothing is known of a node"
+    if node is None:
+        return "no node on this bus"
+    if node.is_silent:
+        return f"no node on this bus any more: its last status came {node.age_s:.1f} s ago"
+    words = _words(_STATES, node.state, "state")
+    if node.reason not in (None, "NONE"):
+        words += f", because {_words(_REASONS, node.reason, 'reason')}"
+    which = f"; parameter set {node.parameter_set}" if node.parameter_set else ""
+    faults = _fault_texts(node.faults)
+    return f"node: {words}{which}; status {node.age_s:.1f} s ago{'; ' if faults else ''}{', '.join(faults)}"
+
+
+def _notes(view: View) -> list[str]:
+    """What else a reader should know."""
+    if not view.is_any_branch_seen and view.is_bus_open:
+        return ["no frame of any branch: is the bus awake, and its bit rate the right one?"]
+    notes = []
+    if not view.publishes_corrected:
+        notes.append("no corrected messages on this bus: the currents are shown as they are on it")
+    node = view.node
+    is_passing = node is not None and not node.is_silent and node.state in ("PASSING_THROUGH", "SHADOW")
+    if node is not None and is_passing and node.sums.corrected_a != node.sums.measured_a:
+        notes.append("node's sum, corrected: what its parameters would make of it; it publishes what was measured")
+    return notes
+
+
+def _branch_row(branch: BranchView) -> tuple[list[str], str]:
+    """Cells and style of a branch."""
+    if not branch.is_seen:
+        faults = ["not fitted?", *_fault_texts(branch.faults)]
+        return [branch.name, *["-"] * (len(_COLUMNS) - 2), ", ".join(faults)], _DIM
+    lasting = []
+    if branch.is_stale:
+        lasting.append("stale")
+    elif branch.measured_a is None:
+        lasting.append("not available")
+    if branch.corrected_is_stale and not branch.is_stale:
+        lasting.append("corrected: stale")
+    corrected_faults = [f"corrected: {text}" for text in _fault_texts(branch.corrected_faults)]
+    is_answered = branch.corrected_rate_hz or branch.corrected_a is not None
+    cells = [
+        branch.name,
+        *map(_number, (branch.measured_a, branch.corrected_a, branch.correction_a)),
+        branch.quality.lower().replace("_", " ") if branch.quality is not None else "-",
+        f"{branch.rate_hz:.1f}",
+        f"{branch.corrected_rate_hz:.1f}" if is_answered else "-",
+        f"{branch.age_s:.2f}",
+        ", ".join([*lasting, *_fault_texts(branch.faults), *corrected_faults]),
+    ]
+    return cells, _YELLOW if lasting else ""
+
+
+def _sum_cells(name: str, sums: Sums) -> list[str]:
+    known = sums.measured_a is not None and sums.corrected_a is not None
+    correction_a = sums.corrected_a - sums.measured_a if known else None  # type: ignore[operator]
+    cells = [name, *map(_number, (sums.measured_a, sums.corrected_a, correction_a))]
+    return [*cells, *[""] * (len(_COLUMNS) - len(cells))]
+
+
+def _fault_texts(faults: Mapping[str, int]) -> list[str]:
+    return [f"{name} {count}" for name, count in faults.items() if count]
+
+
+def _number(value_a: float | None) -> str:
+    return f"{value_a:+.2f}" if value_a is not None else "-"
+
+
+def _words(table: Mapping[Any, str], code: str | int | None, what: str) -> str:
+    return table.get(code, f"{what} {code}, which this version does not know")
+
 
 _WITHOUT_CURSOR = ("dumb", "unknown")
 """Terminals on which nothing can be drawn anew."""
@@ -34,9 +604,18 @@ _LIVE_PERIOD_S, _PLAIN_PERIOD_S = 0.25, 1.0
 """Between two pictures. [s]"""
 _LONGEST_WAIT_S = 0.25
 """A wake-up at least this often, so that a request to stop is seen. [s]"""
+_ENTER_SCREEN, _LEAVE_SCREEN = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
+"""A screen of its own, without a cursor; and the one before back."""
+_HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 
-_Show = Callable[[View, list[str]], None]
-"""Takes what is to be shown, and further lines."""
+
+def _draw(lines: Sequence[ShownLine]) -> None:
+    """Show lines in place of those before, broken at words; but for the terminal's last line, which would scroll."""
+    width, height = shutil.get_terminal_size()
+    shown = [ShownLine(part[:width], line.style) for line in lines for part in wrapped(line.text, width).split("\n")]
+    if (missing := len(shown) - (height - 2)) > 1:
+        shown = [*shown[:-missing], ShownLine(f"{missing} more lines do not fit"[:width], _YELLOW)]
+    write_output(_HOME + "\n".join(f"\x1b[{style}m{text}\x1b[m{_CLEAR_LINE}" for text, style in shown) + _CLEAR_BELOW)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,22 +630,26 @@ class MonitorOptions:
         Bus, as python-can names it.
     fd : bool
         Whether to open it for CAN FD.
+    listen_only, bitrates :
+        As for :func:`ecu_node.bus.adapters.bus_config`.
     once_s : float or None
-        Listen this long, and tell once what was seen [s]; None: until interrupted.
+        Listen this long, and print once what was seen [s]; None: until interrupted.
     as_json : bool
-        Tell it as JSON.
+        Print it as JSON.
     """
 
     layout: Path
     interface: str
     channel: str
     fd: bool
+    listen_only: bool
+    bitrates: Mapping[str, int | None]
     once_s: float | None
     as_json: bool
 
 
 def run_monitor(options: MonitorOptions) -> int:
-    """Show what is on a bus until SIGINT, SIGTERM or SIGHUP.
+    """Show what is on a bus until SIGINT, SIGTERM or SIGHUP: a live table in a terminal, else a block per second.
 
     Parameters
     ----------
@@ -81,43 +664,69 @@ def run_monitor(options: MonitorOptions) -> int:
     Raises
     ------
     UserError
-        If layout, DBC or bus cannot be used, or rich is missing for a live table.
+        If layout, DBC or bus cannot be used.
     """
     database = node_database(options.layout)
-    where = f"{options.interface} {options.channel}"
-    requests = Requests()
-    was_hung_up = False
-
-    def stop() -> bool:
-        nonlocal was_hung_up
-        was_hung_up |= requests.take_reload()  # SIGHUP: the terminal was closed
-        return was_hung_up or requests.stop()
-
+    stop = Requests().stop
+    signal.signal(signal.SIGHUP, signal.getsignal(signal.SIGTERM))  # the terminal was closed
     counters = Counters()
-
-    def opened() -> can.BusABC:
-        interface, channel = options.interface, options.channel
-        return open_bus(database, interface=interface, channel=channel, fd=options.fd, mode=Mode.OVERLAY)
-
-    with _display(options, where) as (show, period_s):
+    interface, channel = options.interface, options.channel
+    where = f"{interface} {channel}"
+    opened = partial(
+        open_bus,
+        database,
+        interface=interface,
+        channel=channel,
+        fd=options.fd,
+        mode=Mode.OVERLAY,
+        listen_only=options.listen_only,
+        bitrates=options.bitrates,
+    )
+    if options.listen_only:
+        Log().say(acknowledgement(interface, channel))
+    is_once = options.once_s is not None
+    is_live = (
+        not is_once and sys.stdout is not None and sys.stdout.isatty() and os.environ.get("TERM") not in _WITHOUT_CURSOR
+    )
+    period_s = options.once_s or (_LIVE_PERIOD_S if is_live else _PLAIN_PERIOD_S)
+    with _own_screen() if is_live else nullcontext():
         bus = SteadyBus(opened, counters, Log().say)
         try:
             monitor = BusMonitor(database, time.monotonic())
             view = None
-            while view is None or (options.once_s is None and not stop()):
-                listen(bus, monitor, time.monotonic() + period_s, stop)
+            while view is None or (not is_once and not stop()):
+                listen_until(bus, monitor, time.monotonic() + period_s, stop)
                 view = replace(monitor.look(time.monotonic()), is_bus_open=bus.is_open)
                 bus.count_dropped()
-                show(view, _bus_notes(counters))
+                lines = view_lines(view, where, _bus_notes(counters))
+                text = "\n".join(line.text for line in lines)
+                if is_live:
+                    _draw(lines)
+                elif options.as_json:
+                    write_output(json.dumps(asdict(view), indent=2))
+                else:
+                    write_text(text if is_once else f"{text}\n")
         finally:
             bus.close()
-    if options.once_s is not None and not view.is_any_branch_seen:
+    if is_live:
+        write_text(text)  # what was seen last stays on the screen
+    if is_once and not view.is_any_branch_seen:
         say_error(f"ecu-node: {where}: no branch of {options.layout} was seen; see that the bus is the right one")
         return 1
     return 0
 
 
-def listen(bus: SteadyBus, monitor: BusMonitor, until_s: float, stop: Callable[[], bool]) -> None:
+@contextmanager
+def _own_screen() -> Iterator[None]:
+    sys.stdout.write(_ENTER_SCREEN)
+    try:
+        yield
+    finally:
+        sys.stdout.write(_LEAVE_SCREEN)
+        sys.stdout.flush()
+
+
+def listen_until(bus: SteadyBus, monitor: BusMonitor, until_s: float, stop: Callable[[], bool]) -> None:
     """Take what comes until a time of the steady clock.
 
     Parameters
@@ -149,46 +758,3 @@ def _bus_notes(counters: Counters) -> list[str]:
     if counters.dropped:
         lines.append(f"frames that this computer was too slow to read: {counters.dropped}; they count as lost above")
     return lines
-
-
-@contextmanager
-def _display(options: MonitorOptions, where: str) -> Iterator[tuple[_Show, float]]:
-    """How views are shown, and after how long the first and each further one. [s]"""
-    if options.once_s is None and sys.stdout.isatty() and os.environ.get("TERM") not in _WITHOUT_CURSOR:
-        with _live_table(where) as show:
-            yield show, _LIVE_PERIOD_S
-        return
-
-    def show_plainly(view: View, more: list[str]) -> None:
-        if options.as_json:
-            write_output(json.dumps(as_json(view), indent=2))
-        else:
-            write_text(f"{plain_block(view, where, more)}{'' if options.once_s is not None else chr(10)}")
-
-    yield show_plainly, options.once_s or _PLAIN_PERIOD_S
-
-
-@contextmanager
-def _live_table(where: str) -> Iterator[_Show]:
-    try:
-        from rich.console import Group  # noqa: PLC0415  # optional
-        from rich.live import Live  # noqa: PLC0415
-        from rich.text import Text  # noqa: PLC0415
-    except ImportError:
-        raise UserError(
-            "a live table needs rich; install it with pip install 'hv-current-correction[monitor]', "
-            "or give --once SECONDS"
-        ) from None
-
-    last = ""
-    with Live(auto_refresh=False, screen=True) as live:
-
-        def show(view: View, more: list[str]) -> None:
-            nonlocal last
-            last = plain_block(view, where, more)
-            lines = picture(view, where, more, width=live.console.width, height=live.console.height)
-            drawn = [Text(line.text, style=line.style, no_wrap=True, overflow="crop") for line in lines]
-            live.update(Group(*drawn), refresh=True)
-
-        yield show
-    write_output(last)  # what was seen last stays on the screen

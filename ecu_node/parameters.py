@@ -2,6 +2,7 @@
 
 JSON, UTF-8, one file per vehicle. The structures below are the schema: ``ecu-node schema`` prints the JSON Schema
 made from them, which stands in ``ecu_node/parameters.schema.json``. Currents are positive into the junction.
+:func:`check_fit` says whether parameters may be applied here.
 """
 
 import math
@@ -10,10 +11,11 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
+from ecu_node.core.status import Reason
+from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError, UnfitError, printable, shown_name
-from ecu_node.field_errors import field_error, json_error, quoted_place
-from ecu_node.repeated_keys import repeated_key
-from ecu_node.status import Reason
+from ecu_node.fields import field_error, json_error, quoted_place, repeated_key
+from ecu_node.layout import Layout
 from ecu_node.user_files import UnsuitableFileError, read_user_file, write_atomically
 
 __all__ = [
@@ -27,6 +29,7 @@ __all__ = [
     "Provenance",
     "VehicleParameters",
     "Verdict",
+    "check_fit",
     "decode_parameters",
     "encode_parameters",
     "parameter_bytes",
@@ -34,6 +37,7 @@ __all__ = [
     "read_parameters",
     "write_parameters",
 ]
+
 
 MAX_FILE_BYTES = 1_000_000
 """A parameter file has some kilobytes; a larger one is not one."""
@@ -138,6 +142,20 @@ class JunctionResidual(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     expected_a: Annotated[
         _MeanSum, msgspec.Meta(description="mean sum that right sensors show: a load that none of them sees [A]")
     ] = 0.0
+    corrected_sd_a: Annotated[
+        _RmsSum | None,
+        msgspec.Meta(
+            description="standard deviation about expected_a of single corrected sums, as the node takes them, while "
+            "no current flows; null: not known [A]"
+        ),
+    ] = None
+    corrected_sd_per_a: Annotated[
+        _Share | None,
+        msgspec.Meta(
+            description="how much of it grows with the throughput, half the sum of the magnitudes of all currents: "
+            "sd^2 = corrected_sd_a^2 + (corrected_sd_per_a * throughput)^2; null: not known [1]"
+        ),
+    ] = None
 
     def about_expected(self) -> tuple[float, float]:
         """Root mean squares of measured and corrected sum less what is expected; as they are if no means are known."""
@@ -210,7 +228,7 @@ def read_parameters(path: Path) -> VehicleParameters:
     Returns
     -------
     VehicleParameters
-        The parameters; nothing is applied yet, see :func:`~ecu_node.parameter_fit.check_fit`.
+        The parameters; nothing is applied yet, see :func:`~ecu_node.parameters.check_fit`.
 
     Raises
     ------
@@ -271,7 +289,7 @@ def _why_not(error: Exception, content: bytes) -> str:
     if isinstance(document, dict) and {"payload", "payloadType", "signatures"} <= document.keys():
         return _SIGNED
     why = field_error(error, document, VehicleParameters, quoted_place)
-    return f"{why}: {_NO_MODELS}" if str(error).endswith(".sensor_model`") else why
+    return f"{why}: {_NO_MODELS}" if "'sensor_model': null is expected" in why else why
 
 
 def encode_parameters(parameters: VehicleParameters, where: str) -> bytes:
@@ -331,3 +349,96 @@ def parameter_schema() -> dict[str, Any]:
     """JSON Schema (2020-12) of the parameter file, made from the structures of this module."""
     schema = msgspec.json.schema(VehicleParameters)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Vehicle parameter file", **schema}
+
+
+_LARGEST_DELAY_S = 5.0
+"""Branches of one vehicle do not lag each other by more. [s]"""
+_UNDECIDED: tuple[Verdict, ...] = ("cannot tell", "not enough data")
+"""Verdicts with which nothing was found that could be applied."""
+
+
+def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:
+    """Check that parameters were made for this vehicle, layout and DBC, decided on, and within the layout's limits.
+
+    A file whose verdict is "cannot tell" or "not enough data" fits only if it applies no branch. Limits are those of
+    what is applied.
+
+    Parameters
+    ----------
+    parameters : VehicleParameters
+        From :func:`~ecu_node.parameters.read_parameters`.
+    database : VehicleDatabase
+        Layout and DBC in use.
+    vehicle : str or None
+        Identity of the vehicle that the node rides in; None: not checked.
+
+    Raises
+    ------
+    UnfitError
+        With the reason that the node then publishes; the message gives both values.
+    """
+    _check_belongs(parameters, database, vehicle)
+    layout = database.layout
+    if not abs(parameters.junction_residual.expected_a) <= layout.offset_limit_a:
+        raise UnfitError(
+            Reason.IMPLAUSIBLE_PARAMETERS,
+            f"an expected Kirchhoff sum of {parameters.junction_residual.expected_a:+.4g} A is beyond the layout's "
+            f"limit of offsets, {layout.offset_limit_a:g} A",
+        )
+    applied = [name for name, branch in parameters.branches.items() if branch.apply]
+    if parameters.verdict in _UNDECIDED and applied:
+        raise UnfitError(
+            Reason.IMPLAUSIBLE_PARAMETERS,
+            f"verdict {parameters.verdict!r}, yet branch {', '.join(map(shown_name, applied))} has 'apply': true; "
+            f"nothing was found to apply, calibrate with more drives",
+        )
+    for name, branch in parameters.branches.items():
+        _check_branch(name, branch, layout)
+
+
+def _check_belongs(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:
+    """Check that parameters were made for this vehicle, layout and DBC."""
+    layout = database.layout
+    if vehicle is not None and parameters.vehicle != vehicle:
+        raise UnfitError(
+            Reason.WRONG_VEHICLE, f"parameters are for vehicle {parameters.vehicle!r}, this is {vehicle!r}"
+        )
+    if parameters.layout.sha256 != layout.digest:
+        raise UnfitError(
+            Reason.WRONG_LAYOUT,
+            f"parameters were made with layout {shown_name(parameters.layout.name)} ({parameters.layout.sha256[:12]}), "
+            f"this is {layout.path} ({layout.digest[:12]}); calibrate with this layout; for a file "
+            "made by hand print a new 'ecu-node template'",
+        )
+    if parameters.dbc.sha256 != database.digest:
+        raise UnfitError(
+            Reason.WRONG_DBC,
+            f"parameters were made with DBC {shown_name(parameters.dbc.name)} ({parameters.dbc.sha256[:12]}), "
+            f"this is {layout.dbc_path} ({database.digest[:12]}); calibrate with this DBC; for a file "
+            "made by hand print a new 'ecu-node template'",
+        )
+
+
+def _check_branch(name: str, branch: BranchParameters, layout: Layout) -> None:
+    """Check that the layout has a branch, and that what is applied to it is within the limits."""
+    if name not in layout.branch_names:
+        raise UnfitError(
+            Reason.WRONG_LAYOUT, f"parameters for branch {shown_name(name)!r}, which {layout.path} does not have"
+        )
+    if abs(branch.delay_s or 0.0) > _LARGEST_DELAY_S:
+        raise UnfitError(
+            Reason.IMPLAUSIBLE_PARAMETERS, f"branch {name}: delay {branch.delay_s:g} s is beyond {_LARGEST_DELAY_S:g} s"
+        )
+    if not branch.apply:
+        return
+    if not abs(branch.drift) <= layout.limits.drift:
+        raise UnfitError(
+            Reason.IMPLAUSIBLE_PARAMETERS,
+            f"branch {name}: drift {branch.drift:+.4g} is beyond the layout's limit of {layout.limits.drift:g}",
+        )
+    if not abs(branch.offset_a) <= layout.offset_limit_a:
+        raise UnfitError(
+            Reason.IMPLAUSIBLE_PARAMETERS,
+            f"branch {name}: offset {branch.offset_a:+.4g} A is beyond the layout's limit of "
+            f"{layout.offset_limit_a:g} A",
+        )

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ecu_node.errors import UserError
 
-__all__ = ["UnsuitableFileError", "read_user_file", "require_user_file", "text_digest", "write_atomically"]
+__all__ = ["UnsuitableFileError", "read_user_file", "text_digest", "write_atomically"]
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -26,26 +26,6 @@ class UnsuitableFileError(UserError):
     """What a name leads to is no regular file, or too large; the message says what it is."""
 
 
-def require_user_file(path: Path, *, largest_bytes: int) -> None:
-    """Refuse what is no regular file, or too large, without opening it.
-
-    Parameters
-    ----------
-    path : Path
-        As the user wrote it.
-    largest_bytes : int
-        Size that is still accepted. [byte]
-
-    Raises
-    ------
-    UnsuitableFileError
-        If it is something else, or larger; its text is to stand behind the name of the file.
-    OSError
-        If there is no such file.
-    """
-    _require_suitable(path.stat(), largest_bytes)
-
-
 def _require_suitable(found: os.stat_result, largest_bytes: int) -> None:
     if not stat.S_ISREG(found.st_mode):
         kind = next((name for is_kind, name in _KINDS if is_kind(found.st_mode)), "no regular file")
@@ -55,8 +35,28 @@ def _require_suitable(found: os.stat_result, largest_bytes: int) -> None:
 
 
 def read_user_file(path: Path, *, largest_bytes: int) -> bytes:
-    """Content of a file; parameters and errors as for :func:`require_user_file`, and OSError if it cannot be read."""
-    require_user_file(path, largest_bytes=largest_bytes)
+    """Read a file; what is no regular one is not opened.
+
+    Parameters
+    ----------
+    path : Path
+        As the user wrote it.
+    largest_bytes : int
+        Size that is still accepted. [byte]
+
+    Returns
+    -------
+    bytes
+        Its content.
+
+    Raises
+    ------
+    UnsuitableFileError
+        If it is something else, or larger; its text is to stand behind the name of the file.
+    OSError
+        If there is no such file, or it cannot be read.
+    """
+    _require_suitable(path.stat(), largest_bytes)
     with open(path, "rb", opener=_open_without_waiting) as file:
         _require_suitable(os.fstat(file.fileno()), largest_bytes)  # the folder's owner may have put another one there
         content = file.read(largest_bytes + 1)  # the kernel's own files have no size

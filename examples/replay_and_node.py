@@ -14,11 +14,11 @@ import pandas as pd
 from typer.testing import CliRunner
 
 from calibrator.cli import app
-from calibrator.recordings.replay import messages_of, read_log
+from calibrator.recordings.frames import read_frames
+from ecu_node.bus.in_force import choose_parameters
+from ecu_node.bus.wiring import wire
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
-from ecu_node.parameter_file import choose_parameters
-from ecu_node.wiring import wire
 
 calibrator, layout, out = CliRunner().invoke, Path("../dbc/hv_powertrain.toml"), Path(mkdtemp())
 calibrator(app, f"simulate --vehicles 2 --minutes 2 --unseen-minutes 1 --seed 3 --layout {layout} --out {out}/fleet")
@@ -30,7 +30,7 @@ print(calibrator(app, f"calibrate {out}/fleet/logs/V002 {known} --layout {layout
 database = read_database(read_layout(layout))
 node = wire(database, choose_parameters(out / "result/params/V002.json", database, "V002")[0], 0.0)
 with can.Logger(out / "both.log") as log:
-    for frame in messages_of(read_log(out / "fleet/unseen/V002/drive.log.gz")):
+    for frame in read_frames(out / "fleet/unseen/V002/drive.log.gz").messages():
         log(frame)
         source = node.sources.get((frame.arbitration_id, frame.is_extended_id))
         for answer in source.answer(frame.data, frame.timestamp) if source else ():

@@ -22,6 +22,7 @@ from tests.ecu_node.vehicles import LAYOUT
 DOCUMENT = Path(__file__).parents[1] / "docs" / "json.md"
 WITHOUT = {
     "ecu-node run": "works until it is ended, and publishes its state on the bus",
+    "ecu-node clear": "prints nothing",
     "ecu-node template": "prints JSON anyway",
     "ecu-node schema": "prints JSON anyway",
 }

@@ -1,5 +1,6 @@
 """Mistakes of a user, over all commands: one line each, which says what, where, and what to do; never a traceback."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -17,8 +18,16 @@ MISTAKES = [
     # layouts
     ("calibrator import logs --layout none.toml --out x", 1, "none.toml: cannot read the layout: No such file"),
     ("calibrator import logs --layout folder --out x", 1, "folder: cannot read the layout: it is a folder; a file is"),
-    ("calibrator import logs --layout empty --out x", 1, "empty: 'schema' is missing; see docs/layout.md"),
-    ("calibrator import logs --layout noise --out x", 1, "noise: not a layout: the file is not UTF-8 text; see docs"),
+    (
+        "calibrator import logs --layout empty --out x",
+        1,
+        "empty: 'schema' is missing; see the page 'Layout' of the documentation",
+    ),
+    (
+        "calibrator import logs --layout noise --out x",
+        1,
+        "noise: not a layout: the file is not UTF-8 text; see the page",
+    ),
     ("calibrator import logs --layout cut.json --out x", 1, "cut.json: not TOML: "),
     ("ecu-node template --layout DBC --vehicle v", 1, "hv_powertrain.dbc: not TOML: "),
     # numbers
@@ -32,7 +41,7 @@ MISTAKES = [
     ("ecu-node run LAYOUT --channel c --state s --metrics-port 0", 2, "a TCP port from 1 to 65535 is expected"),
     # options and commands
     ("calibrator fly", 2, "No such command 'fly'; see 'calibrator --help'"),
-    ("calibrator calibrate LAYOUT --out x", 2, "Missing argument 'fleet'; see 'calibrator calibrate --help'"),
+    ("calibrator calibrate LAYOUT --out x", 2, "Missing argument 'FLEET'; see 'calibrator calibrate --help'"),
     ("calibrator calibrate a b LAYOUT --out x", 2, "unexpected extra argument"),
     ("calibrator calibrate a LAYOUT --out x --method both", 2, "'both' is not one of 'posterior', 'published'"),
     ("calibrator score folder --truth", 2, "--truth"),
@@ -52,6 +61,37 @@ MISTAKES = [
     ("calibrator summarise logs LAYOUT --out x --bank cut.json", 1, "cut.json: no filter bank"),
     ("calibrator identify logs LAYOUT --out folder", 1, "folder: is a folder; name a file in it"),
     ("calibrator import none LAYOUT --out x", 1, "none of the logs could be used, for the reasons given above"),
+    # looking at a recording
+    ("calibrator kirchhoff none.csv --branches battery=I,motor=J", 1, "none.csv: no such file"),
+    ("calibrator kirchhoff empty.csv --branches battery=I,motor=J", 1, "empty.csv: "),
+    ("calibrator kirchhoff noise --branches battery=I,motor=J", 2, "a log of frames and a bus need --layout"),
+    ("calibrator kirchhoff texts.csv --branches battery=I,motor=J", 1, "texts.csv: "),
+    ("calibrator kirchhoff drive.csv", 2, "--branches"),
+    ("calibrator kirchhoff drive.csv --branches battery=Ibat", 1, "two or more are expected"),
+    ("calibrator kirchhoff drive.csv --branches battery,motor", 1, "there is no column 'battery'; the columns are"),
+    ("calibrator kirchhoff drive.csv --branches battery=Ibat,motor=Iother", 1, "Iother"),
+    ("calibrator kirchhoff drive.csv --branches battery=Ibat,motor=Ibat", 1, "both read Ibat"),
+    ("calibrator kirchhoff drive.csv --branches battery=Ibat,battery=Imot", 1, "battery is named twice"),
+    ("calibrator kirchhoff drive.csv CURRENTS --plot folder", 2, "folder: expected a file name that ends with .png"),
+    ("calibrator kirchhoff drive.csv CURRENTS --plot drive.csv", 2, "drive.csv"),
+    ("calibrator kirchhoff drive.csv CURRENTS --plot sum.doc", 2, "sum.doc"),
+    ("calibrator kirchhoff drive.csv CURRENTS --table drive.csv", 2, "drive.csv"),
+    ("calibrator kirchhoff drive.csv CURRENTS --parameters noise", 2, "--parameters belong to a layout"),
+    ("calibrator layout init none.dbc --log drive.csv --out x", 1, "none.dbc"),
+    ("calibrator layout init noise --log drive.csv --out x", 1, "noise"),
+    ("calibrator layout init drive.csv CURRENTS --out drive.csv", 1, "drive.csv"),
+    ("calibrator layout init still.csv --out x.toml --yes", 1, "still.csv"),
+    ("calibrator doctor LAYOUT --log none.log", 1, "none.log: no such file"),
+    ("calibrator doctor LAYOUT --log empty", 1, "empty: not a known log format"),
+    ("calibrator report folder", 1, "not a result of 'calibrator calibrate'"),
+    ("calibrator report none", 1, "none"),
+    # one junction
+    ("calibrator calibrate drive.csv CAR --out x --trusted gearbox", 1, "--trusted gearbox: no such branch"),
+    ("calibrator calibrate drive.csv CAR --out x --load=-3:0.1", 2, "expected what flows out of the junction"),
+    ("calibrator calibrate drive.csv CAR --out x --charge battery=3", 2, "give its standard deviation"),
+    ("calibrator calibrate drive.csv CAR --out x --meter battery", 1, "--meter battery: one folder of recordings"),
+    ("calibrator calibrate drive.csv CAR --out x --readings none.csv", 1, "none.csv"),
+    ("calibrator calibrate short.csv CAR --out x", 1, "at least 5 s are needed"),
     # parameter files
     ("calibrator export none.json LAYOUT --format dcm --out x", 1, "no such parameter file; name one that is there"),
     ("calibrator export empty LAYOUT --format dcm --out x", 1, "empty: not a parameter file: it is empty; correct it"),
@@ -83,6 +123,17 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with what a user may name by mistake, in which the commands run."""
     write_parameters(parameters_for(read_database(read_layout(LAYOUT)), battery=(0.05, 2.3)), tmp_path / "v1.json")
     (tmp_path / "empty").touch()
+    (tmp_path / "empty.csv").touch()
+    (tmp_path / "texts.csv").write_text("time_s,I,J\n0.0,on,off\n0.1,on,off\n")
+    rows = [f"{0.1 * k:.1f},{10 * math.sin(k / 7):.2f},{10 * math.sin(k / 7):.2f},0.0" for k in range(600)]
+    for name, number in {"drive.csv": 600, "short.csv": 30}.items():
+        (tmp_path / name).write_text("\n".join(["time_s,Ibat,Imot,Iheat", *rows[:number]]))
+    (tmp_path / "still.csv").write_text("\n".join(["time_s,speed", *(f"{0.1 * k:.1f},0.0" for k in range(600))]))
+    branches = "".join(
+        f'[[branch]]\nname = "{name}"\nsignal = "{column}"\nsign = {sign}\n'
+        for name, column, sign in (("battery", "Ibat", 1), ("motor", "Imot", -1))
+    )
+    (tmp_path / "car.toml").write_text(f'schema = 1\nname = "car"\nfull_scale_a = 100.0\n{branches}')
     (tmp_path / "folder").mkdir()
     (tmp_path / "logs" / "v1").mkdir(parents=True)
     (tmp_path / "logs" / "v1" / "drive.log").touch()
@@ -93,6 +144,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run(command: str) -> int:
+    command = command.replace("CURRENTS", "--branches battery=Ibat,-motor=Imot").replace("CAR", "--layout car.toml")
     words = command.replace("LAYOUT", f"--layout {LAYOUT}").replace("DBC", str(LAYOUT.with_suffix(".dbc"))).split()
     if words[0] == "calibrator":
         return run_app(app, "calibrator", words[1:])

@@ -26,8 +26,8 @@ DOORS = frozenset({"__init__", "__main__", "cli"})
 """They import every room, to start it."""
 NODE_PACKAGES = frozenset({"_typeshed", "can", "cantools", "cryptography", "e2e", "fastcrc", "msgspec", "rfc8785"})
 """What the base install has, and what only type checkers see."""
-NODE_EXTRAS = {"monitor": frozenset({"rich"}), "metrics": frozenset({"prometheus_client"})}
-"""What modules whose name begins so may import besides: an extra brings it, and only their command needs it."""
+NODE_EXTRAS = {"service": frozenset({"prometheus_client"})}
+"""What rooms or modules of this name may import besides: an extra brings it, and only their command needs it."""
 BOX_HEIGHT, ROW_HEIGHT, CHARACTER, GAP, WIDTH = 30, 92, 8.2, 22, 900
 """Sizes of the picture. [px]"""
 
@@ -63,7 +63,7 @@ def problems_of_node() -> list[str]:
     """What ``ecu_node`` imports that it must not."""
     found = []
     for path in sorted((ROOT / "ecu_node").rglob("*.py")):
-        extras = NODE_EXTRAS.get(path.stem.partition("_")[0], frozenset())
+        extras = frozenset().union(*(NODE_EXTRAS.get(name, ()) for name in (path.parent.name, path.stem)))
         allowed = NODE_PACKAGES | extras | sys.stdlib_module_names | {"ecu_node"}
         heavy = [module for module in imported_modules(path) if module.partition(".")[0] not in allowed]
         found += [f"{path.relative_to(ROOT)} imports {module}, which its base install lacks" for module in heavy]

@@ -25,19 +25,20 @@ from matplotlib.figure import Figure
 from calibrator.errors import FleetError
 from calibrator.estimator.vehicle_report import explained
 from calibrator.fleet_truth import FleetTruth, read_truth
-from calibrator.recordings.replay import messages_of, read_log, replay
+from calibrator.recordings.frames import read_frames
+from calibrator.recordings.live import play_frames
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import progress_bar
-from ecu_node.buses import open_bus
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.in_force import choose_parameters
+from ecu_node.bus.links import open_bus
+from ecu_node.bus.node import OverlayNode
+from ecu_node.bus.steady_bus import SteadyBus
+from ecu_node.bus.wiring import wire
 from ecu_node.database import read_database
 from ecu_node.errors import UserError
-from ecu_node.guard import Mode
 from ecu_node.layout import read_layout
-from ecu_node.overlay_node import OverlayNode
-from ecu_node.parameter_file import choose_parameters
 from ecu_node.parameters import read_parameters
-from ecu_node.steady_bus import SteadyBus
-from ecu_node.wiring import wire
 
 ROOT = Path(__file__).resolve().parent.parent
 LAYOUT = "dbc/hv_powertrain.toml"
@@ -231,11 +232,11 @@ def node_thread(parameters: Path, vehicle: str, interface: str, channel: str) ->
 
 def play(log: Path, bus: can.BusABC) -> None:
     """Send the first seconds of a log with its timing."""
-    messages = messages_of(read_log(log))
+    messages = read_frames(log).messages()
     first = next(messages)
     frames = chain([first], takewhile(lambda message: message.timestamp < first.timestamp + SECONDS, messages))
     with progress_bar("drive", int(SECONDS), "s") as progress:
-        replay(frames, bus, progress=lambda _, age_s: progress(int(age_s) + 1))
+        play_frames(frames, bus, progress=lambda _, age_s: progress(int(age_s) + 1))
 
 
 def put_in(truth: FleetTruth, vehicle: str) -> str:

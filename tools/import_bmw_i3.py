@@ -1,31 +1,84 @@
 #!/usr/bin/env python3
-"""Recordings of a BMW i3 (CSV) as drives, and as CAN logs where asked. Each trip counts as a vehicle of its own."""
+"""Recordings of one BMW i3 (CSV, 10 Hz) as drives, and as CAN logs where asked; each trip is a vehicle.
+
+Source: Steinstraeter, Buberger, Trifonov, "Battery and Heating Data in Real Driving Cycles", IEEE DataPort,
+DOI 10.21227/6jr9-5235. The car measures the battery current and the powers of heater and air conditioning; there is no
+inverter and no DC/DC current. Into the junction, with V the battery voltage and (19) of the paper:
+
+    i_battery   = -(Battery Current)                          discharge is negative in the file
+    i_auxiliary = -(heater power + air conditioning power) / V
+    i_motor     = -(i_battery + i_auxiliary)                  the DC/DC converter's 1 to 2 A included
+
+So the motor's current is not independent of the battery's sensor. For the air conditioning the file has no request, and
+the heater's request is often set while the heater is off; both demand inputs are therefore the powers themselves.
+
+Known faults of the recordings, found in the data and labelled:
+
+* heater power reads exactly 5.52 kW for single seconds (a default of the signal), often at the end of a straight
+  line of up to ten seconds that comes from interpolation over a gap;
+* a value beyond the range of its signal in the DBC: no frame could have carried it;
+* heater power that does not flow: with the inverter idle, battery power minus heater minus air conditioning is what the
+  DC/DC converter takes; in sound trips its median is 330 W or more, in trips with a stuck heater signal below 100 W.
+"""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
+from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.drives.plain_names import require_plain_name
 from calibrator.drives.store import has_drive, write_drive
-from calibrator.errors import LogError
+from calibrator.errors import DriveError, LogError
 from calibrator.files.folders import require_possible_folder
-from calibrator.recordings.bmw_i3 import BRANCHES, INPUTS, ImportedTrip, trip_from_table
-from calibrator.recordings.drive_log import write_drive_log
-from calibrator.recordings.signal_range import signal_ranges
-from calibrator.recordings.tables import read_table
+from calibrator.recordings.canlog import write_drive_log
+from calibrator.recordings.decode import SignalRange, signal_range
+from calibrator.recordings.tables import Table, read_table
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import told_once
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError, UserError
-from ecu_node.failures import say_error
 from ecu_node.layout import read_layout
-from ecu_node.standard_output import write_output, write_text
+from ecu_node.program import say_error, write_output, write_text
+from ecu_node.units import AMPERE, unit_factor
 
+COLUMNS = {
+    "speed": "Velocity [km/h]",
+    "accelerator": "Throttle [%]",
+    "torque": "Motor Torque [Nm]",
+    "acceleration": "Longitudinal Acceleration [m/s^2]",
+    "voltage": "Battery Voltage [V]",
+    "current": "Battery Current [A]",
+    "heater": "Heating Power CAN [kW]",
+    "aircon": "AirCon Power [kW]",
+}
+"""Columns that every file must have."""
+BRANCHES = ("battery", "motor", "auxiliary")
+INPUTS = ("voltage", "torque", "speed", "acceleration", "accelerator", "heater_demand", "aircon_demand")
+
+SHORTEST_S = 10.0
+"""A shorter piece holds no change of load to learn from. [s]"""
+HEATER_DEFAULT_KW = 5.52
+HEATER_RESOLUTION_KW = 0.005
+"""Half a step of the heater signal, which the file gives to 0.01 kW."""
+IDLE_TORQUE_NM = 1.0
+"""Below this the inverter takes next to nothing."""
+LEAST_DCDC_W = 200.0
+"""The control units of a running car take more than this; sound trips have 330 W or more."""
+IMPOSSIBLE_JUMP_KW = 3.0
+"""No heater does this within one sample."""
+NEAR_DEFAULT_KW = 0.6
+"""One sample of an interpolation over one second, from the default to zero."""
+_HEATER_CHANNELS = "auxiliary, motor and heater_demand"
+_MADE_OF = {"auxiliary": ("voltage", "heater_demand", "aircon_demand"), "motor": ("battery", "auxiliary")}
+"""Branches that are computed, in this order, and from what: good only where all of that is."""
+_JUDGED_SAMPLES = 100
+"""10 s with the inverter idle suffice to judge the heater signal."""
 _SUFFIXES = (".csv", ".csv.gz")
 
 
@@ -61,6 +114,22 @@ def main(
         account.failed[""] = str(error)
     _print_account(account, as_json=as_json)
     raise typer.Exit(1 if account.failed else 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedTrip:
+    """A trip as a drive, and what of the file could not be used.
+
+    Attributes
+    ----------
+    drive : Drive
+        The drive; samples that cannot be used are labelled.
+    notices : tuple of str
+        What could not be used and why, one text each.
+    """
+
+    drive: Drive
+    notices: tuple[str, ...]
 
 
 @dataclass(kw_only=True)
@@ -149,6 +218,166 @@ def _print_account(account: Account, *, as_json: bool) -> None:
         write_text("\n".join([*lines, summary, origin]))
     for text in failed.values():
         say_error(f"import_bmw_i3: {text}")
+
+
+def trip_from_table(table: Table, *, vehicle: str, name: str, ranges: Mapping[str, SignalRange]) -> ImportedTrip:
+    """Turn one file into a drive.
+
+    Parameters
+    ----------
+    table : Table
+        The file.
+    vehicle, name : str
+        Identity of vehicle and drive.
+    ranges : mapping of str to SignalRange
+        What the DBC allows, by branch and input; a channel without one may have any value.
+
+    Returns
+    -------
+    ImportedTrip
+        Drive with the branches of :data:`BRANCHES` and the inputs of :data:`INPUTS`.
+
+    Raises
+    ------
+    LogError
+        If a column is missing.
+    DriveError
+        If the file is too short, or the battery current, of which the motor's is made, has no usable value.
+    """
+    columns = {key: table.columns[table.column(header)] for key, header in COLUMNS.items()}
+    time_s = table.time_s
+    if time_s[-1] < SHORTEST_S:
+        raise DriveError(f"{table.path}: only {time_s[-1]:.1f} s long; at least {SHORTEST_S:g} s are needed")
+    notices = [
+        f"column '{COLUMNS[key]}': {np.sum(bad)} cells without a number, the first at {time_s[np.argmax(bad)]:.1f} s; "
+        f"labelled as not good"
+        for key, values in columns.items()
+        if (bad := ~np.isfinite(values)).any()
+    ]
+    values = _values(columns)
+    good = {key: np.isfinite(value) for key, value in values.items()}
+    good["heater_demand"] &= _heater_good(columns, notices)
+    _label_ranges(values, good, ranges, notices)
+    for key, sources in _MADE_OF.items():
+        good[key] &= np.logical_and.reduce([good[source] for source in sources])
+    if not good["battery"].any():
+        raise DriveError(f"{table.path}: column '{COLUMNS['current']}' has no usable value; leave the file out")
+    channels = {key: Channel(time_s=time_s, value=value, good=good[key]) for key, value in values.items()}
+    drive = Drive(
+        vehicle=vehicle,
+        name=name,
+        branches={key: channels[key] for key in BRANCHES},
+        inputs={key: channels[key] for key in INPUTS},
+    )
+    return ImportedTrip(drive=drive, notices=tuple(notices))
+
+
+def _values(columns: Mapping[str, Array]) -> dict[str, Array]:
+    """Branch currents and inputs from the columns of the file."""
+    voltage = np.where(columns["voltage"] > 0.0, columns["voltage"], np.nan)
+    heater_w, aircon_w = 1e3 * columns["heater"], 1e3 * columns["aircon"]
+    battery = -columns["current"]
+    auxiliary = -(heater_w + aircon_w) / voltage
+    return {
+        "battery": battery,
+        "auxiliary": auxiliary,
+        "motor": -(battery + auxiliary),
+        "voltage": voltage,
+        "heater_demand": heater_w,
+        "aircon_demand": aircon_w,
+        **{key: columns[key] for key in ("torque", "speed", "acceleration", "accelerator")},
+    }
+
+
+def _label_ranges(
+    values: Mapping[str, Array], good: Mapping[str, Mask], ranges: Mapping[str, SignalRange], notices: list[str]
+) -> None:
+    """Label what the DBC does not allow."""
+    for key, limits in ranges.items():
+        if key not in values:
+            continue
+        beyond = good[key] & ~limits.holds(values[key])
+        if beyond.any():
+            good[key][beyond] = False
+            notices.append(
+                f"{key}: {np.sum(beyond)} samples beyond the DBC's {limits.low:g} to {limits.high:g}; "
+                f"labelled as not good"
+            )
+
+
+def _heater_good(columns: Mapping[str, Array], notices: list[str]) -> Mask:
+    """Where the heater's power can be believed; adds to the notices why not."""
+    default = _defaults(columns["heater"])
+    spoilt = _with_ramps(default, columns["heater"])
+    if default.any():
+        notices.append(
+            f"heater power reads its default of {HEATER_DEFAULT_KW} kW {_runs(default)} times: "
+            f"{np.sum(spoilt)} samples of {_HEATER_CHANNELS} not good"
+        )
+    power_w = -columns["voltage"] * columns["current"] - 1e3 * (columns["heater"] + columns["aircon"])
+    idle = ~spoilt & (np.abs(columns["torque"]) < IDLE_TORQUE_NM) & np.isfinite(power_w)
+    if np.sum(idle) < _JUDGED_SAMPLES:
+        notices.append("heater power not judged: the inverter is never idle for long")
+        return ~spoilt
+    rest_w = float(np.median(power_w[idle]))
+    if rest_w >= LEAST_DCDC_W:
+        return ~spoilt
+    notices.append(
+        f"heater power is implausible over the whole trip: with the inverter idle it leaves {rest_w:.0f} W for the "
+        f"DC/DC converter, at least {LEAST_DCDC_W:.0f} W expected; no sample of {_HEATER_CHANNELS} is good"
+    )
+    return np.zeros_like(spoilt)
+
+
+def _defaults(heater_kw: Array) -> Mask:
+    """Where the heater's power is its default, or a jump to nearly the default: interpolation cut it short."""
+    exact = np.abs(heater_kw - HEATER_DEFAULT_KW) < HEATER_RESOLUTION_KW
+    jump = np.abs(np.diff(heater_kw)) > IMPOSSIBLE_JUMP_KW
+    beside_jump = np.concatenate([jump, [False]]) | np.concatenate([[False], jump])
+    near = np.abs(heater_kw - HEATER_DEFAULT_KW) < NEAR_DEFAULT_KW
+    return np.asarray(exact | (beside_jump & near))
+
+
+def _with_ramps(default: Mask, heater_kw: Array) -> Mask:
+    """Defaults together with the straight lines that lead to or from them."""
+    step = np.diff(heater_kw)
+    bend = np.abs(np.diff(step, prepend=0.0)) > 4.2 * HEATER_RESOLUTION_KW
+    line = np.cumsum(bend)
+    edge = default[1:] != default[:-1]
+    touching = np.convolve(edge, np.ones(3), mode="same") > 0.0  # a line may end between two samples
+    ramp = np.isin(line, line[touching & (step != 0.0)]) & (step != 0.0)
+    spoilt = default.copy()
+    spoilt[1:] |= ramp
+    spoilt[:-1] |= ramp
+    return spoilt
+
+
+def _runs(mask: Mask) -> int:
+    return int(np.sum(np.diff(mask.astype(np.int8), prepend=0) == 1))
+
+
+def signal_ranges(database: VehicleDatabase) -> dict[str, SignalRange]:
+    """Ranges of branches and inputs.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        DBC and layout.
+
+    Returns
+    -------
+    dict of str to SignalRange
+        By name: branches in A, positive into the junction; inputs in the unit of the DBC. Branches that are computed
+        from a power are absent.
+    """
+    layout = database.layout
+    ranges = {item.name: signal_range(database.signal(item.signal)[1]) for item in layout.input}
+    for branch in layout.branch:
+        if branch.signal is not None:
+            _, signal = database.signal(branch.signal)
+            factor = branch.sign * unit_factor(signal, AMPERE, f"{layout.path}: branch {branch.name}")
+            ranges[branch.name] = signal_range(signal, factor)
+    return ranges
 
 
 if __name__ == "__main__":

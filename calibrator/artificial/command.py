@@ -32,7 +32,7 @@ from calibrator.terminal.options import (
 )
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import dumps
-from ecu_node.standard_output import write_output, write_text
+from ecu_node.program import write_output, write_text
 
 if TYPE_CHECKING:
     from calibrator.fleet_truth import FleetTruth

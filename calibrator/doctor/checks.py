@@ -1,30 +1,33 @@
 """What the doctor complains of: a list of checks, each a function from the facts to findings.
 
-A new check is one function more in :data:`CHECKS`. A finding says what is wrong with its figure, and what to do.
+A new check is one function more in :data:`CHECKS`, or :data:`SUM_CHECKS`. A finding says what is wrong with its
+figure, and what to do.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
 from calibrator.doctor.facts import MOST_MINUTES, Facts
 from calibrator.doctor.junction import JunctionFacts
-from calibrator.doctor.words import words_of
+from calibrator.doctor.words import POSITIONS, places_of, words_of
 from calibrator.drive import Array, Mask
 from calibrator.drives.align import TIME_RESOLUTION_S, base_inputs, choose_inputs
 from calibrator.drives.delays import MAX_DELAY_S
-from calibrator.estimator.junction import LEAST_DURATION_S
+from calibrator.errors import DriveError, LogError
+from calibrator.estimator.junction import summarise_junction
+from calibrator.kirchhoff.conditions import STILL_A
 from calibrator.terminal.text import counted, figure
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.in_force import InForce
+from ecu_node.bus.wiring import wire
 from ecu_node.errors import UserError
-from ecu_node.guard import Mode
-from ecu_node.in_force import InForce
-from ecu_node.wiring import wire
 
-__all__ = ["CHECKS", "Finding", "Severity", "findings_of", "next_steps", "stands_still"]
+__all__ = ["CHECKS", "Diagnosis", "Severity", "findings_of", "readiness"]
 
 MANY_BAD, SOME_BAD = 0.05, 0.001
 """Shares of frames that cannot be used: worth a warning, worth a hint. [1]"""
@@ -32,14 +35,6 @@ TIMEOUT_PERIODS = 5.0
 """A time-out of this many periods bridges some lost frames. [1]"""
 LEAST_OF_SCALE = 0.02
 """Greatest current seen, as a share of full scale, below which one of the two is probably wrong. [1]"""
-SHORT_S, ENOUGH_S = 20.0, 60.0
-"""Shorter recordings tell no signs; shorter ones than the second neither delays nor gains. [s]"""
-STILL_A, STILL_SHARE, STILL_STEPS = 0.5, 0.01, 0.5
-"""Currents that move by less than this [A], this share of full scale, or this many of their steps stand still. [1]"""
-STILL_SPEED = 0.5
-"""Below this a car stands. [km/h, or whatever the unit is]"""
-NEAR_ZERO = 0.05
-"""Share of full scale below which a current that stands still is near zero. [1]"""
 LEAST_DELAY_S, LONG_DELAY_S = 0.02, 0.1
 """Shorter delays change no result: two frames of a fast message. 300 ms bend the gains of the junction law by 3 %; a
 third of that is worth a warning. [s]"""
@@ -56,6 +51,10 @@ LEAST_MEAN_A, LEAST_MEAN, LARGE_MEAN = 0.5, 0.001, 0.05
 are more than loads without a sensor usually are. [A], [1]"""
 NO_SUM = 0.3
 """Share of the variation that is left in the sum, above which branches do not belong together. [1]"""
+SAME = 1.2
+"""A sum that varies by less than so much more with the other sign of a branch does not tell it. [1]"""
+CLEAR = 2.0
+"""By so much less the sum must vary with branches in each other's place, to be sure. [1]"""
 WELL_EXPLAINED = 0.5
 """Share of a current's variation that model inputs should explain at least. [1]"""
 STUCK_S = 10.0
@@ -79,7 +78,7 @@ class Severity(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class Diagnosis:
     """One thing that is wrong, or worth knowing.
 
     Attributes
@@ -93,7 +92,7 @@ class Finding:
     text : str
         What, with its figure.
     remedy : str
-        What to do: which line of the layout to change, where it is the layout.
+        What to do: which line of the layout to change, where it is the layout; empty if the text says it.
     figures : dict
         The figures of the text, with their units in their names.
     """
@@ -108,17 +107,19 @@ class Finding:
     @property
     def line(self) -> str:
         """The finding as one line, without its severity."""
-        return f"{self.subject}: {self.text}; {self.remedy}"
+        return f"{self.subject}: {self.text}" + (f"; {self.remedy}" if self.remedy else "")
 
 
-Findings = Iterator[Finding]
-error, warning, hint = (partial(Finding, severity) for severity in Severity)
+Findings = Iterator[Diagnosis]
+error, warning, hint = (partial(Diagnosis, severity) for severity in Severity)
 
 
-def findings_of(facts: Facts) -> list[Finding]:
+def findings_of(facts: Facts) -> list[Diagnosis]:
     """All findings, errors first."""
-    order = list(Severity)
-    return sorted((item for check in CHECKS for item in check(facts)), key=lambda item: order.index(item.severity))
+    order, junction = list(Severity), _judged(facts)
+    found = [item for check in CHECKS for item in check(facts)]
+    found += [item for check in SUM_CHECKS if junction is not None for item in check(facts, junction)]
+    return sorted(found, key=lambda item: order.index(item.severity))
 
 
 # ---- layout, logs, single branches and inputs
@@ -136,8 +137,9 @@ def logs_as_a_whole(facts: Facts) -> Findings:
     for log in facts.logs:
         report, drive = log.report, log.drive
         if drive is None:
-            why, _, remedy = log.why.removeprefix(f"{log.name}: ").rpartition("; ")
-            yield (warning if facts.drives else error)("no branch", log.name, why, remedy, {"count": 0})
+            say, why = warning if facts.drives else error, log.why or LogError("")
+            what = why.what.removeprefix(f"{log.name}: ")
+            yield say("no branch", log.name, what, why.remedy, {"count": 0})
         if log.cut:
             text = f"only its first {MOST_MINUTES:g} minutes were looked at"
             yield hint("length", log.name, text, "they tell enough of a layout", {"count": 0})
@@ -145,8 +147,8 @@ def logs_as_a_whole(facts: Facts) -> Findings:
             remedy = "each step becomes a gap; record with a steady clock"
             yield warning("time", log.name, f"its clock was set {counted(count, 'time')}", remedy, {"count": count})
         if report.unfit:
-            text, _, remedy = report.unfit.rpartition("; ")
-            yield warning("unfit", log.name, text, remedy)
+            what, remedy = report.unfit
+            yield warning("unfit", log.name, what, remedy)
         nothing = "nothing has to be done"
         for count, kind, text, remedy in (
             (report.disordered, "time", f"of {report.frames:,} frames come with an earlier time stamp than one before "
@@ -162,7 +164,6 @@ def logs_as_a_whole(facts: Facts) -> Findings:
 
 def absent(facts: Facts) -> Findings:
     """Branches and inputs that no log has."""
-    needed = base_inputs(facts.database.layout, facts.database.layout.model_inputs)
     is_table = not facts.layout.dbc_files
     what, where = (
         ("column of numbers", "name the column that has it")
@@ -176,7 +177,7 @@ def absent(facts: Facts) -> Findings:
         if item in facts.branches:
             remedy = f"{where}; if the vehicle does not have it, it may stay in the layout"
             yield warning("not in log", item.name, text, remedy)
-        elif item.name in needed:
+        elif item.name in facts.needed:
             remedy = f"{where}, or name other inputs: without it what is derived from it is left out"
             yield warning("not in log", item.name, text, remedy)
         else:
@@ -206,7 +207,8 @@ BAD_REMEDY = {
     "E2E check failed": "check profile and data identifiers in [e2e] of the layout",
     "too short": "the frames are shorter than the DBC says: take the DBC of this vehicle",
     "not available": "its control unit says that it has no value: choose another signal, or record while it is awake",
-    "out of range": "values lie outside [minimum|maximum] of the DBC: correct the range, or choose another signal",
+    "out of range": "values outside [minimum|maximum] of the DBC are left out: right for codes of 'no value', else "
+    "correct the range",
     "no voltage": "there is no fresh voltage to divide by: choose another voltage, or raise timeout_s",
     "no number": "its column has texts: correct the table",
     "no value": "what its formula is made of is not fresh: look at the inputs",
@@ -215,14 +217,13 @@ BAD_REMEDY = {
 
 def bad_frames(facts: Facts) -> Findings:
     """Frames that cannot be used."""
-    needed = base_inputs(facts.database.layout, facts.database.layout.model_inputs)
     for item in (*facts.branches, *facts.inputs):
         share = item.bad_frames / max(item.frames, 1)
         if share < SOME_BAD:
             continue
         say = error if not item.good else warning if share >= MANY_BAD else hint
         if item in facts.inputs:
-            say = hint if item.name not in needed else say if say is hint else warning
+            say = hint if item.name not in facts.needed else say if say is hint else warning
         reasons = ", ".join(f"{reason} {count:,}" for reason, count in item.bad.items())
         text = f"{item.bad_frames:,} of {item.frames:,} frames ({figure(100.0 * share, 2)} %) cannot be used: {reasons}"
         remedy = BAD_REMEDY.get(max(item.bad, key=lambda reason: item.bad[reason]), "choose another signal")
@@ -243,23 +244,13 @@ def clipped(facts: Facts) -> Findings:
 
 def constant(facts: Facts) -> Findings:
     """Branches, and inputs of the model, that never change."""
-    needed = base_inputs(facts.database.layout, facts.database.layout.model_inputs)
-    if stands_still(facts):
+    if facts.conditions.stands_still:
         return
-    for item in (*facts.branches, *(item for item in facts.inputs if item.name in needed)):
+    for item in (*facts.branches, *(item for item in facts.inputs if item.name in facts.needed)):
         if item.good and not item.moves:
             text = f"it never changes: {figure(item.low)} {item.unit} in all of {item.good:,} frames"
             remedy = "check that it is the right signal; nothing can be told of it from these logs"
             yield warning("constant", item.name, text, remedy, {"value": item.low})
-
-
-def same_time(facts: Facts) -> Findings:
-    """Frames with the time stamp of the one before."""
-    for item in facts.branches:
-        if item.same_time:
-            text = f"{item.same_time:,} of {item.frames:,} frames have the time stamp of the frame before"
-            remedy = "of several at one instant the last counts; is the log recorded twice, or its clock coarse?"
-            yield hint("time", item.name, text, remedy, {"frames": item.same_time})
 
 
 def impossible_voltage(facts: Facts) -> Findings:
@@ -284,7 +275,7 @@ def full_scale(facts: Facts) -> Findings:
             text = f"it reaches {figure(peak_a)} A, and full_scale_a is {figure(scale_a)} A"
             remedy = "raise full_scale_a in the layout to the nominal maximum of the junction, if the value is right"
             yield warning("full scale", name, text, remedy, {"peak_a": peak_a})
-    if seen and (most_a := max(seen.values())) < LEAST_OF_SCALE * scale_a and not stands_still(facts):
+    if seen and (most_a := max(seen.values())) < LEAST_OF_SCALE * scale_a and not facts.conditions.stands_still:
         text = f"no branch exceeds {figure(most_a)} A, and full_scale_a is {figure(scale_a)} A"
         yield warning(
             "full scale", "all branches", text, "record a drive, or check units and full_scale_a", {"peak_a": most_a}
@@ -294,28 +285,6 @@ def full_scale(facts: Facts) -> Findings:
 # ---- the junction sum
 
 
-def stands_still(facts: Facts) -> bool:
-    """Whether no current moves by more than its sensor can show; a speed that moves says otherwise."""
-    if not facts.steps_a or not facts.comparisons:
-        return False
-    least_a = min(STILL_A, STILL_SHARE * facts.layout.full_scale_a)
-    moving = any(facts.movement_a[name] > max(least_a, STILL_STEPS * step_a) for name, step_a in facts.steps_a.items())
-    return not moving and _speed(facts) in {None, 0.0}
-
-
-def _speed(facts: Facts) -> float | None:
-    """Greatest speed [in its unit], 0 for none; None where it is not recorded."""
-    named = [
-        item
-        for item in facts.inputs
-        if {"speed", "velocity", "geschwindigkeit"} & set(words_of(item.name, item.signal))
-    ]
-    seen = [
-        max(abs(item.low), abs(item.high)) for item in named if item.good and item.unit in {"km/h", "kph", "mph", "m/s"}
-    ]
-    return (max(seen) if max(seen) > STILL_SPEED else 0.0) if seen else None
-
-
 def enough(facts: Facts) -> Findings:
     """Whether there is a sum, whether it is long enough, and whether anything moves in it."""
     if len(facts.usable) < 2:
@@ -323,48 +292,41 @@ def enough(facts: Facts) -> Findings:
         remedy = "a junction needs two branches: record the buses that carry them, or name other signals"
         yield error("too few branches", "sum", text, remedy)
         return
-    names, junction, figures = ", ".join(facts.usable), facts.junction, {"valid_s": facts.valid_s}
-    if facts.valid_s < SHORT_S:
-        text = f"only {figure(facts.valid_s)} s in which {names} have values: signs, units and gains cannot be told"
-        yield warning("too short", "sum", text, "record a minute of driving or more", figures)
-    elif junction is not None and not len(junction.bands.block):
-        text = f"signs, units and delays cannot be told: no 20 s in which {names} have no gap"
-        yield warning("too short", "sum", text, "record a minute of driving or more without loss", figures)
-    elif facts.valid_s < ENOUGH_S:
-        text = f"{figure(facts.valid_s)} s are short: delays cannot be told, and gains hardly"
-        yield hint("too short", "sum", text, "record a minute of driving or more", figures)
-    if stands_still(facts):
-        moves_a = max(facts.movement_a.values())
-        mean_a = max(abs(float(c.figures["before"][name].mean_a)) for c in facts.comparisons for name in facts.usable)
-        if mean_a < NEAR_ZERO * facts.layout.full_scale_a:
-            what, remedy = "the car stands still", "record a drive; such a log tells offsets, where no current flows"
-        else:
-            what = f"the currents stand still, the greatest at {figure(mean_a)} A"
-            remedy = "record one in which they change; this one tells their ratio, if their offsets are known"
-        speed = ", and its speed is 0" if _speed(facts) == 0.0 else ""
-        text = f"{what}: no current varies by more than {figure(moves_a, 2)} A{speed}; signs and gains cannot be told"
-        yield hint("stands still", "sum", text, remedy, {"moves_a": moves_a, "mean_a": mean_a})
+    seen = facts.conditions
+    record, figures = "record a minute of driving or more", {"valid_s": seen.valid_s}
+    if seen.short:
+        yield warning("too short", "sum", seen.how_short, record, figures)
+    elif facts.junction is not None and not len(facts.junction.bands.block):
+        text = f"signs, units and delays cannot be told: no 20 s in which {', '.join(facts.usable)} have no gap"
+        yield warning("too short", "sum", text, f"{record} without loss", figures)
+    elif seen.how_short:
+        yield hint("too short", "sum", seen.how_short, record, figures)
+    if seen.stands_still:
+        remedy = "record one in which they change; this one tells their ratio, if their offsets are known"
+        if seen.near_zero:
+            remedy = "record a drive; such a log tells offsets, where no current flows"
+        figures = {"moves_a": max(seen.moves_a.values()), "mean_a": seen.mean_a}
+        yield hint("stands still", "sum", seen.how_still, remedy, figures)
 
 
 def _judged(facts: Facts) -> JunctionFacts | None:
     """What the sum tells, where currents move."""
     junction = facts.junction
-    return None if junction is None or not len(junction.bands.block) or stands_still(facts) else junction
+    return None if junction is None or not len(junction.bands.block) or facts.conditions.stands_still else junction
 
 
-def signs_and_units(facts: Facts) -> Findings:
+def signs_and_units(facts: Facts, junction: JunctionFacts) -> Findings:
     """Branches with the wrong sign, or a slip of a unit."""
-    junction = _judged(facts)
-    if junction is None:
+    multipliers, bands = junction.multipliers, junction.bands
+    if _exchanged(facts):
         return
-    multipliers, bands = junction.best.multipliers, junction.bands
-    if junction.best.changed and np.all(multipliers == -1.0):
+    if junction.changed and np.all(multipliers == -1.0):
         text = "all signs are inverted: the battery's voltage falls while energy would flow into it"
         remedy = "turn the sign of every [[branch]]: the current of a battery that is discharged is positive"
-        yield error("sign", "all branches", text, remedy)
+        yield warning("sign", "all branches", text, remedy)
         return
     after_a = bands.rms_a(multipliers)
-    for k in junction.best.changed:
+    for k in junction.changed:
         branch, wanted = facts.layout.find_branch(junction.branches[k]), float(multipliers[k])
         factor, name = abs(wanted), branch.name
         turn = f'set sign = {-branch.sign} in the [[branch]] "{name}" of the layout'
@@ -382,13 +344,43 @@ def signs_and_units(facts: Facts) -> Findings:
                 yield error(kind, name, f"{what}: the sum of all {varies}", remedy, figures)
 
 
-def sum_cancels(facts: Facts) -> Findings:
+def exchanged(facts: Facts) -> Findings:
+    """Branches of which each has the signal that the other is named after."""
+    junction, layout = _judged(facts), facts.layout
+    for one, other in _exchanged(facts):
+        first, second = layout.find_branch(one), layout.find_branch(other)
+        text = f"it reads {first.source}, and {other} reads {second.source}, as if the two were exchanged"
+        remedy = f'exchange what [[branch]] "{one}" and "{other}" read (signal or power and voltage), not their signs'
+        say, figures = warning, dict[str, float]()
+        if first.sign == second.sign:
+            text += "; their sum is the same, but the parameters of each would be those of the other"
+        elif junction is not None:
+            right = np.array([-1.0 if name in {one, other} else 1.0 for name in junction.branches])
+            before_a, after_a = junction.bands.rms_a(np.ones(len(right))), junction.bands.rms_a(right)
+            text += f": the sum of all varies by {figure(before_a)} A, by {figure(after_a)} A with each in its place"
+            figures = {"rms_before_a": before_a, "rms_after_a": after_a}
+            say = error if before_a > CLEAR * after_a else warning
+        yield say("exchanged", one, text, remedy, figures)
+
+
+def _exchanged(facts: Facts) -> list[tuple[str, str]]:
+    said: dict[str, list[set[str]]] = {}
+    for branch in facts.layout.branch:
+        if branch.name in facts.usable and not branch.computed:
+            name, signal = words_of(branch.name), words_of(branch.source)
+            said[branch.name] = [places_of(words) | (set(POSITIONS) & set(words)) for words in (name, signal)]
+    return [
+        (one, other)
+        for one, other in combinations(said, 2)
+        if said[one][0] != said[one][1] and said[one] == said[other][::-1] and all(said[one])
+    ]
+
+
+def sum_cancels(facts: Facts, junction: JunctionFacts) -> Findings:
     """Branches that do not belong to one junction."""
-    if (junction := _judged(facts)) is None:
-        return
-    rest_a = junction.bands.rms_a(junction.best.multipliers)
-    parts_a = junction.best.multipliers * junction.rms_a
-    noise_a = np.abs(junction.best.multipliers) * [facts.steps_a[name] for name in junction.branches]
+    rest_a = junction.bands.rms_a(junction.multipliers)
+    parts_a = junction.multipliers * junction.rms_a
+    noise_a = np.abs(junction.multipliers) * [facts.conditions.steps_a[name] for name in junction.branches]
     all_a, least_a = float(np.linalg.norm(parts_a)), max(STILL_A, float(np.linalg.norm(noise_a)))
     if rest_a > least_a and (rest_a / all_a) ** 2 > NO_SUM:
         text = (
@@ -402,14 +394,13 @@ def sum_cancels(facts: Facts) -> Findings:
         yield error("sum", "sum", text, remedy, {"rms_parts_a": all_a, "rms_sum_a": rest_a})
 
 
-def cannot_tell(facts: Facts) -> Findings:
+def cannot_tell(_: Facts, junction: JunctionFacts) -> Findings:
     """Small branches of which another sign or unit would do nearly as well."""
-    if (junction := _judged(facts)) is None:
-        return
-    rest_a, changed = junction.bands.rms_a(junction.best.multipliers), set(junction.best.changed)
+    rest_a = junction.bands.rms_a(junction.multipliers)
     for k, name in enumerate(junction.branches):
-        open_ = any(set(rival.changed) - changed == {k} for rival in junction.rivals)
-        if k not in changed and junction.rms_a[k] > 0.0 and open_ and _is_small(junction, name):
+        turned = np.where(np.arange(len(junction.branches)) == k, -1.0, 1.0) * junction.multipliers
+        open_ = junction.bands.rms_a(turned) < SAME * rest_a
+        if k not in junction.changed and junction.rms_a[k] > 0.0 and open_ and _is_small(junction, name):
             rms_a = float(junction.rms_a[k])
             text = (
                 f"its sign and unit cannot be told: it varies by {figure(rms_a, 2)} A, and the sum of all by "
@@ -420,14 +411,14 @@ def cannot_tell(facts: Facts) -> Findings:
 
 
 def _is_small(junction: JunctionFacts, name: str) -> bool:
-    right_a = junction.rms_a * np.abs(junction.best.multipliers)
+    right_a = junction.rms_a * np.abs(junction.multipliers)
     return bool(right_a[junction.branches.index(name)] < LEAST_SHARE * np.max(right_a))
 
 
-def delays(facts: Facts) -> Findings:
+def delays(_: Facts, junction: JunctionFacts) -> Findings:
     """Branches that come late."""
-    found = junction.delays if (junction := _judged(facts)) is not None else None
-    if junction is None or found is None:
+    found = junction.delays
+    if found is None:
         return
     apart = np.abs(found.delay_s[:, None] - found.delay_s[None, :]) < LEAST_DELAY_S
     usual = int(np.argmax(np.where(found.known, (apart & found.known).sum(axis=1), 0)))
@@ -448,9 +439,9 @@ def delays(facts: Facts) -> Findings:
         yield say("delay", found.branches[k], text, remedy, {"delay_s": late_s, "sd_s": sd_s})
 
 
-def gains(facts: Facts) -> Findings:
+def gains(_: Facts, junction: JunctionFacts) -> Findings:
     """Branches whose gains differ."""
-    if (junction := _judged(facts)) is None or not junction.gains or junction.delays is None:
+    if not junction.gains or junction.delays is None:
         return
     first = junction.delays.branches[0]
     large = {
@@ -486,7 +477,7 @@ def _off(gains: Mapping[str, tuple[float, float]], reference: str) -> dict[str, 
 def mean_of_sum(facts: Facts) -> Findings:
     """What flows where no branch measures it."""
     load, scale_a = facts.layout.unmeasured_load, facts.layout.full_scale_a
-    if not len(facts.sum_a) or ((junction := _judged(facts)) is not None and junction.best.changed):
+    if not len(facts.sum_a) or ((junction := _judged(facts)) is not None and junction.changed):
         return
     mean_a, sd_a = float(facts.sum_a.mean()), float(facts.sum_a.std())
     unexplained_a = abs(mean_a - (load.mean_a if load is not None else 0.0))
@@ -504,7 +495,7 @@ def mean_of_sum(facts: Facts) -> Findings:
 
 def stuck(facts: Facts) -> Findings:
     """The longest stretch of each branch in which it stands still though the others move."""
-    scale_a, longest = facts.layout.full_scale_a, dict[str, Finding]()
+    scale_a, longest = facts.layout.full_scale_a, dict[str, Diagnosis]()
     for comparison in facts.comparisons:
         time_s, currents_a = comparison.time_s, comparison.currents_a["before"]
         for k, name in enumerate(comparison.branches):
@@ -541,54 +532,53 @@ def inputs_matter(facts: Facts) -> Findings:
         "give the model what drives this current (docs/layout.md, 'Inputs matter'): its torque times speed, its demand"
     )
     for name, share in facts.explained.items():
-        if share < WELL_EXPLAINED and not stands_still(facts):
+        if share < WELL_EXPLAINED and not facts.conditions.stands_still:
             text = f"the model inputs explain {100.0 * share:.0f} % of how its current varies"
             yield warning("inputs", name, text, remedy, {"share": share})
 
 
 CHECKS: Sequence[Callable[[Facts], Findings]] = (
-    not_in_dbc, logs_as_a_whole, absent, late, bad_frames, clipped, constant, same_time, impossible_voltage, enough,
-    signs_and_units, sum_cancels, cannot_tell, delays, gains, mean_of_sum, stuck, full_scale, inputs_matter,
+    not_in_dbc, logs_as_a_whole, absent, late, bad_frames, clipped, constant, impossible_voltage, enough, exchanged,
+    mean_of_sum, stuck, full_scale, inputs_matter,
 )  # fmt: skip
+SUM_CHECKS: Sequence[Callable[[Facts, JunctionFacts], Findings]] = (
+    signs_and_units, sum_cancels, cannot_tell, delays, gains,
+)  # fmt: skip
+"""What can be told only where currents move long enough."""
 
 
 # ---- what can be done next
 
 
-def next_steps(facts: Facts, findings: Sequence[Finding]) -> dict[str, str]:
+def readiness(facts: Facts, findings: Sequence[Diagnosis]) -> dict[str, str]:
     """Commands in the order in which they are used, and for each what is missing; empty where nothing is."""
     errors = [finding for finding in findings if finding.severity is Severity.ERROR]
     wrong = f"of the errors above ({', '.join(dict.fromkeys(item.subject for item in errors))})" if errors else ""
+    stale = ", ".join(finding.subject for finding in errors if finding.kind == "rate")
+    together = "" if len(facts.sum_a) else f"at no instant all of {', '.join(facts.usable)} are fresh"
+    if len(facts.usable) < 2:
+        together = f"a sum needs two branches with usable frames, and there is {', '.join(facts.usable) or 'none'}"
     return {
-        "kirchhoff": _for_kirchhoff(facts, errors),
+        "kirchhoff": f"{stale} is always stale" if stale else together,
         "import": wrong if facts.drives else "no log has a branch",
-        "calibrate --trusted": wrong or _for_junction(facts),
-        "calibrate": wrong or _for_fleet(facts),
+        "calibrate --trusted": wrong or together or _for_junction(facts),
+        "calibrate": wrong or together or _for_fleet(facts),
         "ecu-node": wrong or _for_node(facts, Mode.OVERLAY),
         "ecu-node --gateway": wrong or _for_node(facts, Mode.GATEWAY),
     }
 
 
-def _for_kirchhoff(facts: Facts, errors: Sequence[Finding]) -> str:
-    if len(facts.usable) < 2:
-        return f"a sum needs two branches with usable frames, and there is {', '.join(facts.usable) or 'none'}"
-    if always_stale := [finding.subject for finding in errors if finding.kind == "rate"]:
-        return f"{', '.join(always_stale)} is always stale"
-    return "" if len(facts.sum_a) else f"at no instant all of {', '.join(facts.usable)} are fresh"
-
-
 def _for_junction(facts: Facts) -> str:
-    if len(facts.usable) < 2:
-        return "it needs two branches with usable frames"
-    if facts.valid_s < LEAST_DURATION_S:
-        return f"it needs {LEAST_DURATION_S:g} s with values of all branches, and there are {figure(facts.valid_s)} s"
+    """What calibrate says of these drives."""
+    try:
+        summarise_junction(facts.whole_drives, facts.usable, facts.database)
+    except DriveError as error_:
+        return str(error_)
     return ""
 
 
 def _for_fleet(facts: Facts) -> str:
     layout = facts.layout
-    if len(facts.usable) < 2:
-        return "it needs two branches with usable frames"
     if not layout.model_inputs:
         return "the layout has no model_inputs ([[input]], [[derived]])"
     kept, lacking = choose_inputs(layout, facts.available)

@@ -13,10 +13,10 @@ from calibrator.files.layout_files import chosen_layout
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import DbcOption, JsonOption, LayoutOption
 from calibrator.terminal.text import counted, dumps, figure, table
-from ecu_node.standard_output import write_output, write_text
+from ecu_node.program import write_output, write_text
 
 if TYPE_CHECKING:
-    from calibrator.doctor.checks import Finding
+    from calibrator.doctor.checks import Diagnosis
     from calibrator.doctor.facts import ChannelFacts, Facts
 
 __all__ = ["doctor", "doctor_json", "doctor_text"]
@@ -39,12 +39,12 @@ def doctor(
     units, delays. Exit code 1 if there is an error among the findings.
     """
     with importing():
-        from calibrator.doctor.checks import findings_of, next_steps
-        from calibrator.doctor.facts import examine
+        from calibrator.doctor.checks import findings_of, readiness
+        from calibrator.doctor.facts import facts_of
 
-    facts = examine(chosen_layout(layout, dbc), log)
+    facts = facts_of(chosen_layout(layout, dbc), log)
     findings = findings_of(facts)
-    steps = next_steps(facts, findings)
+    steps = readiness(facts, findings)
     if json:
         write_output(doctor_json(facts, findings, steps))
     else:
@@ -53,7 +53,7 @@ def doctor(
         raise typer.Exit(1)
 
 
-def doctor_text(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
+def doctor_text(facts: "Facts", findings: Sequence["Diagnosis"], steps: Mapping[str, str]) -> str:
     """Tables of branches and inputs, findings, and what can be done next; long lines are for the terminal to fold."""
     seconds, frames = sum(log.duration_s for log in facts.logs), sum(log.report.frames for log in facts.logs)
     shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in facts.explained.items())
@@ -88,7 +88,8 @@ def _next_commands(facts: "Facts", ready: Sequence[str]) -> list[str]:
         log = facts.logs[0].name if len(facts.logs) == 1 else "FOLDER"
         poor = f" ({', '.join(computed)}: computed from other signals, a poor reference)" if computed else ""
         found.append(
-            f"one vehicle and a sensor you trust{poor}: calibrator calibrate {shlex.quote(log)} {layout} --trusted "
+            f"one vehicle and a sensor you trust{poor}; --load A:SD, what flows where nobody measures, tells offsets: "
+            f"calibrator calibrate {shlex.quote(log)} {layout} --trusted "
             f"{trusted} --out result"
         )
     if "calibrate" in ready:
@@ -98,7 +99,7 @@ def _next_commands(facts: "Facts", ready: Sequence[str]) -> list[str]:
     return found
 
 
-def doctor_json(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
+def doctor_json(facts: "Facts", findings: Sequence["Diagnosis"], steps: Mapping[str, str]) -> str:
     """The report for programs: facts by branch and input, findings with their figures, next steps."""
     return dumps(
         {
@@ -107,7 +108,14 @@ def doctor_json(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[st
             "branches": {item.name: asdict(item) for item in facts.branches},
             "inputs": {item.name: asdict(item) for item in facts.inputs},
             "explained": facts.explained,
-            "sum": facts.sum_json(),
+            "sum": None
+            if not len(facts.sum_a)
+            else {
+                "mean_a": float(facts.sum_a.mean()),
+                "sd_a": float(facts.sum_a.std()),
+                "instants": sum(len(comparison.valid) for comparison in facts.comparisons),
+                "valid": len(facts.sum_a),
+            },
             "findings": [asdict(finding) for finding in findings],
             "ready": [name for name, why in steps.items() if not why],
             "not_ready": {name: why for name, why in steps.items() if why},

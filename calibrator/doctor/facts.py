@@ -11,18 +11,19 @@ import msgspec
 import numpy as np
 from cantools.database.can import Signal
 
-from calibrator.doctor.junction import JunctionFacts, junction_facts
+from calibrator.doctor.junction import JunctionFacts, junction_facts, multiplied
 from calibrator.doctor.words import is_battery
-from calibrator.drive import Array, Channel, Drive, Mask
+from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.align import TIME_RESOLUTION_S, align, base_inputs, choose_inputs
 from calibrator.errors import DriveError, LogError
-from calibrator.kirchhoff.sums import Comparison, compare_kirchhoff, sensor_of, with_voltages
+from calibrator.kirchhoff.conditions import Conditions, conditions_of
+from calibrator.kirchhoff.sums import Comparison, compare_kirchhoff, with_voltages
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.log_time import repaired_time
 from calibrator.recordings.readers import (
     FrameSource,
     RecordingReport,
-    Source,
+    SignalSource,
     TableSource,
     drive_from_frames,
     drive_from_table,
@@ -32,7 +33,7 @@ from ecu_node.database import VehicleDatabase, look_everything_up, read_database
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import Branch, Input, Layout
 
-__all__ = ["ChannelFacts", "Facts", "Log", "examine"]
+__all__ = ["ChannelFacts", "ExaminedLog", "Facts", "facts_of"]
 
 NOTHING = Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_))
 VOLTAGE = "_junction_voltage"
@@ -43,12 +44,8 @@ FEWEST_CLIPPED = 3
 """In a row at the end of the range: one or two may be the true peak."""
 LEAST_V, GREATEST_V, USUAL_V = 30.0, 1500.0, 400.0
 """From 48 V systems to the highest that road vehicles have; a slip is a power of ten that leads nearest to most. [V]"""
-AVERAGED_S = 2.0
-"""Noise is averaged out over this long, to see whether currents move. [s]"""
 FEWEST_INSTANTS = 300
 """Of aligned samples, to say how well inputs explain a current: half a minute at 0.1 s."""
-COARSEST = 0.01
-"""Share of full scale; a coarser step is a slip of a unit. [1]"""
 LEAST_SHARE = 0.05
 """Of the greatest branch's variation: that of a smaller one is mostly noise. [1]"""
 
@@ -111,21 +108,21 @@ class ChannelFacts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Log:
+class ExaminedLog:
     """One log or table.
 
     Attributes
     ----------
     name : str
         Its file.
-    source : Source
+    source : SignalSource
         Look-ups of signals in it.
     report : RecordingReport
         Its account.
     drive : Drive or None
         None if it has no branch of the layout; `why` then tells what it has.
-    why : str
-        Empty if there is a drive.
+    why : LogError or None
+        None if there is a drive.
     duration_s : float
         From the first to the last frame. [s]
     cut : bool
@@ -133,10 +130,10 @@ class Log:
     """
 
     name: str
-    source: Source
+    source: SignalSource
     report: RecordingReport
     drive: Drive | None
-    why: str
+    why: LogError | None
     duration_s: float
     cut: bool
 
@@ -163,8 +160,10 @@ class Facts:
         Signal of a voltage that is impossible, its median [V], and the power of ten that makes it usual.
     comparisons : tuple of Comparison
         The currents of each log on one time base, with such a slip put right.
-    steps_a : mapping of str to float
-        Step of the signal of each usable branch, at most :data:`COARSEST`. [A]
+    whole_drives : tuple of Drive
+        Those with all usable branches, with such a slip put right.
+    conditions : Conditions
+        How long the usable branches have values together, and whether they move.
     junction : JunctionFacts or None
         What the sum tells; None with fewer than two usable branches.
     explained : mapping of str to float
@@ -174,13 +173,14 @@ class Facts:
     layout: Layout
     database: VehicleDatabase
     missing: Mapping[tuple[str, str], str]
-    logs: tuple[Log, ...]
+    logs: tuple[ExaminedLog, ...]
     branches: tuple[ChannelFacts, ...]
     inputs: tuple[ChannelFacts, ...]
     usable: tuple[str, ...]
     slip: tuple[str, float, float] | None
     comparisons: tuple[Comparison, ...]
-    steps_a: Mapping[str, float]
+    whole_drives: tuple[Drive, ...]
+    conditions: Conditions
     junction: JunctionFacts | None
     explained: Mapping[str, float] = field(default_factory=dict)
 
@@ -194,41 +194,18 @@ class Facts:
         """Sum of the branches at all valid instants. [A]"""
         return np.concatenate([np.zeros(0), *(c.sums_a["before"][c.valid] for c in self.comparisons)])
 
-    @property
-    def valid_s(self) -> float:
-        """How long all usable branches have values together. [s]"""
-        return self.layout.period_s * len(self.sum_a)
-
-    @cached_property
-    def movement_a(self) -> dict[str, float]:
-        """Standard deviation of each usable branch, noise averaged out. [A]"""
-        length = max(round(AVERAGED_S / self.layout.period_s), 1)
-        found = {}
-        for k, name in enumerate(self.usable):
-            parts = [c.currents_a["before"][c.valid, k] for c in self.comparisons]
-            whole = [part[: len(part) // length * length].reshape(-1, length).mean(axis=1) for part in parts]
-            found[name] = float(np.std(np.concatenate([np.zeros(0), *whole]))) if sum(map(len, whole)) > 1 else 0.0
-        return found
-
     @cached_property
     def available(self) -> set[str]:
         """Inputs that were recorded."""
         return {name for drive in self.drives for name in drive.inputs}
 
-    def sum_json(self) -> dict[str, float] | None:
-        """Figures of the sum."""
-        if not len(self.sum_a):
-            return None
-        instants = sum(len(c.valid) for c in self.comparisons)
-        return {
-            "mean_a": float(self.sum_a.mean()),
-            "sd_a": float(self.sum_a.std()),
-            "instants": instants,
-            "valid": len(self.sum_a),
-        }
+    @cached_property
+    def needed(self) -> set[str]:
+        """Inputs that the model is made of."""
+        return base_inputs(self.database.layout, self.database.layout.model_inputs)
 
 
-def examine(layout: Layout, paths: Sequence[Path]) -> Facts:
+def facts_of(layout: Layout, paths: Sequence[Path]) -> Facts:
     """Gather the facts of a layout and logs of one vehicle.
 
     Parameters
@@ -261,21 +238,19 @@ def examine(layout: Layout, paths: Sequence[Path]) -> Facts:
     right = drives
     if slip is not None:
         divided = {item.name for item in database.layout.branch if item.voltage == voltage}
-        right = [_divided(drive, divided, slip[2]) for drive in drives]
+        right = [multiplied(drive, dict.fromkeys(divided, 1.0 / slip[2])) for drive in drives]
     whole = [drive for drive in right if {name for name in usable if drive.branches[name].good.any()} == set(usable)]
-    comparisons, junction, steps_a = [], None, dict[str, float]()
+    comparisons, junction = [], None
+    for drive in whole if len(usable) > 1 else ():
+        with suppress(DriveError):
+            comparisons.append(compare_kirchhoff(drive, extended))
+    conditions = conditions_of(whole, comparisons, extended)
     if len(usable) > 1:
-        for drive in whole:
-            with suppress(DriveError):
-                comparisons.append(compare_kirchhoff(drive, extended))
-        for name in usable if whole else []:
-            step_a = max(sensor_of(extended, name, drive).step_a for drive in whole)
-            steps_a[name] = min(step_a, COARSEST * layout.full_scale_a)
         junction = junction_facts(
             right,
             usable,
             full_scale_a=layout.full_scale_a,
-            least_a=float(np.linalg.norm([*steps_a.values()])),
+            least_a=float(np.linalg.norm([*conditions.steps_a.values()])),
             battery=next((name for name in usable if is_battery(name, layout.find_branch(name).source)), None),
             voltage=VOLTAGE,
         )
@@ -289,7 +264,8 @@ def examine(layout: Layout, paths: Sequence[Path]) -> Facts:
         usable=tuple(usable),
         slip=slip,
         comparisons=tuple(comparisons),
-        steps_a=steps_a,
+        whole_drives=tuple(whole),
+        conditions=conditions,
         junction=junction,
         explained=_explained_shares(drives, database.layout, usable) if usable else {},
     )
@@ -341,11 +317,11 @@ def _usable_part(layout: Layout) -> tuple[VehicleDatabase, dict[tuple[str, str],
     return replace(bare, layout=pruned), missing or {("layout", layout.path.name): reason}
 
 
-def _read(path: Path, database: VehicleDatabase) -> Log:
+def _read(path: Path, database: VehicleDatabase) -> ExaminedLog:
     names, cut = {"vehicle": database.layout.name, "name": path.name.partition(".")[0]}, False
     if is_table(path):
         table = read_table(path)
-        source: Source = TableSource(table, database)
+        source: SignalSource = TableSource(table, database)
         duration_s, make = float(table.time_s[-1]), partial(drive_from_table, table, database, **names)
     else:
         whole = read_frames(path)
@@ -354,17 +330,19 @@ def _read(path: Path, database: VehicleDatabase) -> Log:
         frames, cut = whole.take(np.sort(time.order[:first])), first < len(whole)  # in the order of the file
         source, duration_s = FrameSource(frames, database, str(path)), float(time.time_s[first - 1])
         make = partial(drive_from_frames, frames, database, **names, where=str(path))
-    drive, why, report = None, "", source.report(())
+    drive, why, report = None, None, source.report(())
     try:
         recording = make()
         drive, report = recording.drive, recording.report
     except LogError as error:
-        why = str(error)
-    return Log(name=str(path), source=source, report=report, drive=drive, why=why, duration_s=duration_s, cut=cut)
+        why = error
+    return ExaminedLog(
+        name=str(path), source=source, report=report, drive=drive, why=why, duration_s=duration_s, cut=cut
+    )
 
 
 def _channel_facts(
-    item: Branch | Input, timeout_s: float, logs: Sequence[Log], database: VehicleDatabase
+    item: Branch | Input, timeout_s: float, logs: Sequence[ExaminedLog], database: VehicleDatabase
 ) -> ChannelFacts:
     """Gather what logs hold of one branch [A], or of one input in the unit of its signal."""
     is_branch = isinstance(item, Branch)
@@ -378,8 +356,8 @@ def _channel_facts(
         made = (log.drive.branches if is_branch else log.drive.inputs).get(name)
         if made is not None:
             values.append(made.value[made.good])
-        raw = made or NOTHING if computed else log.source.channel(signal)
-        reasons = {"no value": ~raw.good} if computed else log.source.bad(signal)
+        raw, reasons = (made or NOTHING, {}) if computed else log.source.samples(signal)
+        reasons = {"no value": ~raw.good} if computed else reasons
         counted = np.zeros(len(raw.time_s), np.bool_)
         for reason, mask in reasons.items():
             bad[reason] = bad.get(reason, 0) + int((mask & ~counted).sum())
@@ -423,14 +401,9 @@ def _clipped(signal: Signal, value: Array) -> int:
     if signal.minimum or signal.maximum:
         low = max(low, float(signal.minimum) if signal.minimum is not None else low)
         high = min(high, float(signal.maximum) if signal.maximum is not None else high)
-    return sum(_in_a_row(np.abs(value - end) < 0.5 * abs(float(signal.scale))) for end in (low, high) if end)
-
-
-def _in_a_row(mask: Mask) -> int:
-    """How many are true with at least :data:`FEWEST_CLIPPED` in a row."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    lengths = edges[1::2] - edges[::2]
-    return int(lengths[lengths >= FEWEST_CLIPPED].sum())
+    at_end = [np.abs(value - end) < 0.5 * abs(float(signal.scale)) for end in (low, high) if end]
+    runs = (run for mask in at_end for run in np.split(mask, np.flatnonzero(np.diff(mask)) + 1))
+    return sum(len(run) for run in runs if len(run) >= FEWEST_CLIPPED and run.all())
 
 
 def _voltage_signal(database: VehicleDatabase) -> str | None:
@@ -447,15 +420,6 @@ def _voltage_slip(drives: Sequence[Drive], signal: str, database: VehicleDatabas
     if database.signal(signal)[1].unit != "V" or median_v <= 0.0 or LEAST_V <= median_v <= GREATEST_V:
         return None
     return signal, median_v, 10.0 ** float(np.rint(np.log10(USUAL_V / median_v)))
-
-
-def _divided(drive: Drive, names: set[str], divisor: float) -> Drive:
-    """Put the currents right that were made of powers by dividing by such a voltage."""
-    right = {
-        name: replace(channel, value=channel.value / divisor) if name in names else channel
-        for name, channel in drive.branches.items()
-    }
-    return replace(drive, branches=right)
 
 
 def _explained_shares(drives: Sequence[Drive], layout: Layout, branches: Sequence[str]) -> dict[str, float]:

@@ -8,20 +8,20 @@ nothing of a sign that all share; what else is known of the branches must tell t
 right, come the delays as the calibrator estimates them, and without the delays the gains.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.drive import Array, Drive
+from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.charge import Band, charge_curve
 from calibrator.drives.delay_search import covered
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
 
-__all__ = ["Bands", "Explanation", "JunctionFacts", "Known", "branch_bands", "explanations", "junction_facts"]
+__all__ = ["WELL_CORRELATED", "Bands", "JunctionFacts", "branch_bands", "junction_facts", "multiplied", "sag"]
 
 BAND = Band(short_s=0.75, long_s=10.0)
 """Half widths of the averages: several times the delays of real cars, and as long as driving keeps its pace. [s]"""
@@ -38,8 +38,6 @@ CHANGE_PRICE = 0.7
 """Each branch that is changed must halve V / N: its variation must then be above that of the sum's rest. [1]"""
 UNIT_PRICE = 0.3
 """What a slip of a unit costs beyond a wrong sign: where both explain the same, the sign is wrong. [1]"""
-RIVAL_PRICE = 1.5 * CHANGE_PRICE
-"""An explanation that costs less than this beyond the best one is a rival: one change for next to nothing. [1]"""
 PLAUSIBLE_PRICE = 2.0
 """For each branch whose current would be beyond what the layout calls full scale, or almost nothing of it. [1]"""
 ORIENTATION_PRICE = 1.5
@@ -120,90 +118,23 @@ def branch_bands(drives: Sequence[Drive], branches: Sequence[str]) -> Bands:
     return Bands(branches=tuple(branches), current_a=np.concatenate(parts), block=np.concatenate(blocks))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Known:
-    """What is known of the branches besides their sum.
-
-    Attributes
-    ----------
-    peak_share : ndarray of shape (K,)
-        Greatest magnitude of each current, as a share of full scale. [1]
-    source : int or None
-        Number of the branch that feeds the others: the battery.
-    orientation : float
-        Evidence, from -1 to 1, that its sign is right as the layout has it (1) or inverted (-1). [1]
-    """
-
-    peak_share: Array
-    source: int | None = None
-    orientation: float = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Explanation:
-    """One set of multipliers.
-
-    Attributes
-    ----------
-    multipliers : ndarray of shape (K,)
-        +-10^n per branch; 1 where nothing is wrong. [1]
-    price : float
-        Logarithm of V / N, and what is held against these multipliers. [1]
-    """
-
-    multipliers: Array
-    price: float
-
-    @property
-    def changed(self) -> tuple[int, ...]:
-        """Numbers of the branches that are not as the layout has them."""
-        return tuple(int(k) for k in np.flatnonzero(self.multipliers != 1.0))
-
-
-def explanations(bands: Bands, known: Known) -> list[Explanation]:
-    """Find what would explain the junction sum best, and what else would as well.
+def _signs_and_units(moments: Array, price_besides: Callable[[Array], float]) -> Array:
+    """Multipliers with the least price: the logarithm of V / N, and what else is held against them.
 
     The search changes one branch, or two at a time, as long as V / N falls by much more than chance.
-
-    Parameters
-    ----------
-    bands : Bands
-        Currents of the K branches.
-    known : Known
-        What else is known of them.
-
-    Returns
-    -------
-    list of Explanation
-        The best one first, and after it those of one more or less changed branch that are nearly as good.
     """
-    moments = bands.moments
-    best = _rated(np.ones(len(bands.branches)), moments, known)
+
+    def price(multipliers: Array) -> float:
+        return float(np.log(_ratios(moments.sum(axis=0, keepdims=True), multipliers)[0])) + price_besides(multipliers)
+
+    best: Array = np.ones(moments.shape[1])
     while True:
-        tried = [_rated(m, moments, known) for m in _neighbours(best.multipliers)]
-        found = min(tried, key=lambda each: each.price)
-        only_turned = np.array_equal(found.multipliers, -best.multipliers)  # of which the sum tells nothing
-        if found.price >= best.price - 1e-9 or not (only_turned or _is_sure(best, found, moments)):
-            break
+        found = min(_neighbours(best), key=price)
+        fall = price(best) - price(found)
+        only_turned = np.array_equal(found, -best)  # of which the sum tells nothing
+        if fall <= 1e-9 or not (only_turned or _is_sure(best, found, moments, fall)):
+            return best
         best = found
-    near = {tuple(each.multipliers.tolist()): each for each in tried if each.price < best.price + RIVAL_PRICE}
-    near.pop(tuple(best.multipliers.tolist()), None)
-    return [best, *sorted(near.values(), key=lambda each: each.price)]
-
-
-def _rated(multipliers: Array, moments: Array, known: Known) -> Explanation:
-    total = moments.sum(axis=0)
-    share = np.abs(multipliers) * known.peak_share
-    changes = min(np.sum(multipliers != 1.0), 1 + np.sum(multipliers != -1.0))  # all signs turned are one change
-    sign = 0.0 if known.source is None else float(np.sign(multipliers[known.source]))
-    price = (
-        float(np.log(_ratios(total[None], multipliers)[0]))
-        + CHANGE_PRICE * changes
-        + UNIT_PRICE * np.sum(np.abs(multipliers) != 1.0)
-        + PLAUSIBLE_PRICE * (np.sum(share > LARGEST_SHARE) + (share.max() < LEAST_SHARE))
-        + ORIENTATION_PRICE * max(-sign * known.orientation, 0.0)
-    )
-    return Explanation(multipliers=multipliers, price=float(price))
 
 
 def _ratios(moments: Array, multipliers: Array) -> Array:
@@ -224,19 +155,29 @@ def _neighbours(multipliers: Array) -> Iterator[Array]:
             yield tried
 
 
-def _is_sure(before: Explanation, after: Explanation, moments: Array) -> bool:
+def _is_sure(before: Array, after: Array, moments: Array, fall: float) -> bool:
     """Whether the sum gets far smaller, or does so in one block of time after the other."""
     if len(moments) < FEWEST_BLOCKS:
         return False
-    gain = np.log(_ratios(moments, before.multipliers) / _ratios(moments, after.multipliers))
+    gain = np.log(_ratios(moments, before) / _ratios(moments, after))
     often = gain.mean() > SURE * gain.std(ddof=1) / np.sqrt(len(gain))
-    return bool(often or before.price - after.price > OVERWHELMING)
+    return bool(often or fall > OVERWHELMING)
 
 
 def _values(drives: Sequence[Drive], branch: str) -> Array:
     """Good values of a branch over all drives. [A]"""
     channels = [drive.branches[branch] for drive in drives if branch in drive.branches]
     return np.concatenate([np.zeros(0), *(channel.value[channel.good] for channel in channels)])
+
+
+def sag(currents: Sequence[Channel], voltages: Sequence[Channel]) -> float:
+    """Correlation of a battery's currents with its voltages [1]: -1 where these fall under load; 0 if nothing tells."""
+    drives = [
+        Drive(vehicle="", name="", branches={"i": current, "u": voltage}, inputs={})
+        for current, voltage in zip(currents, voltages, strict=True)
+    ]
+    band = branch_bands(drives, ("i", "u")).current_a
+    return float(np.corrcoef(band[:, 0], band[:, 1])[0, 1]) if len(band) and np.all(band.std(axis=0) > 0.0) else 0.0
 
 
 def _orientation(drives: Sequence[Drive], battery: str | None, voltage: str) -> float:
@@ -247,16 +188,10 @@ def _orientation(drives: Sequence[Drive], battery: str | None, voltage: str) -> 
     """
     if battery is None:
         return 0.0
-    together = [
-        replace(drive, branches={"i": drive.branches[battery], "u": drive.inputs[voltage]})
-        for drive in drives
-        if battery in drive.branches and voltage in drive.inputs
-    ]
-    band = branch_bands(together, ("i", "u")).current_a
-    if len(band) and np.all(band.std(axis=0) > 0.0):
-        correlation = float(np.corrcoef(band[:, 0], band[:, 1])[0, 1])
-        if abs(correlation) > WELL_CORRELATED:
-            return -correlation
+    both = [drive for drive in drives if battery in drive.branches and voltage in drive.inputs]
+    correlation = sag([drive.branches[battery] for drive in both], [drive.inputs[voltage] for drive in both])
+    if abs(correlation) > WELL_CORRELATED:
+        return -correlation
     value = _values(drives, battery)
     spread = float(np.sqrt(np.mean(value**2))) if len(value) else 0.0
     return float(np.mean(value)) / spread / 3.0 if spread > 0.0 else 0.0
@@ -274,12 +209,10 @@ class JunctionFacts:
         How much each varies, as the layout has it. [A]
     bands : Bands
         As the layout has them, but for the delays.
-    best : Explanation
-        Multipliers with which the sum varies least, in the order of `branches`.
-    rivals : tuple of Explanation
-        What would explain the sum nearly as well.
+    multipliers : ndarray of shape (K,)
+        +-10^n with which the sum varies least; 1 where nothing is wrong. [1]
     delays : BranchDelays or None
-        With the signs and units of `best`; None where too little was recorded.
+        With these signs and units; None where too little was recorded.
     gains : mapping of str to (float, float)
         Number by which each branch must be multiplied so that the sum varies least, and its standard deviation; 1 and 0
         for the one that moves most; empty where too little was recorded. [1]
@@ -288,10 +221,14 @@ class JunctionFacts:
     branches: tuple[str, ...]
     rms_a: Array
     bands: Bands
-    best: Explanation
-    rivals: tuple[Explanation, ...]
+    multipliers: Array
     delays: BranchDelays | None
     gains: Mapping[str, tuple[float, float]]
+
+    @property
+    def changed(self) -> list[int]:
+        """Numbers of the branches that are not as the layout has them."""
+        return [int(k) for k in np.flatnonzero(self.multipliers != 1.0)]
 
 
 def junction_facts(
@@ -326,20 +263,28 @@ def junction_facts(
         What was found.
     """
     peaks_a = [np.quantile(np.abs(_values(drives, name)), PEAK_QUANTILE) for name in branches]
-    known = Known(
-        peak_share=np.array(peaks_a) / full_scale_a,
-        source=branches.index(battery) if battery is not None else None,
-        orientation=_orientation(drives, battery, voltage),
-    )
-    bands, whole = branch_bands(drives, branches), [drive for drive in drives if set(branches) <= drive.branches.keys()]
+    peak_share = np.array(peaks_a) / full_scale_a
+    orientation = _orientation(drives, battery, voltage)
 
-    def explained() -> list[Explanation]:
+    def price(multipliers: Array) -> float:
+        share = np.abs(multipliers) * peak_share
+        turned = 0.0 if battery is None else float(np.sign(multipliers[branches.index(battery)]))
+        changes = min(np.sum(multipliers != 1.0), 1 + np.sum(multipliers != -1.0))  # all signs turned are one change
+        return float(
+            CHANGE_PRICE * changes
+            + UNIT_PRICE * np.sum(np.abs(multipliers) != 1.0)
+            + PLAUSIBLE_PRICE * (np.sum(share > LARGEST_SHARE) + (share.max() < LEAST_SHARE))
+            + ORIENTATION_PRICE * max(-turned * orientation, 0.0)
+        )
+
+    def explained() -> Array:
         ones = np.ones(len(branches))
-        return explanations(bands, known) if bands.rms_a(ones) > least_a else [_rated(ones, bands.moments, known)]
+        return _signs_and_units(bands.moments, price) if bands.rms_a(ones) > least_a else ones
 
-    best, delays = explained()[0], None
-    right = [multiplied(drive, dict(zip(branches, best.multipliers.tolist(), strict=True))) for drive in whole]
-    power = np.sum((bands.current_a * best.multipliers) ** 2, axis=0)
+    bands, whole = branch_bands(drives, branches), [drive for drive in drives if set(branches) <= drive.branches.keys()]
+    best, delays = explained(), None
+    right = [multiplied(drive, dict(zip(branches, best.tolist(), strict=True))) for drive in whole]
+    power = np.sum((bands.current_a * best) ** 2, axis=0)
     try:
         order = [branches[k] for k in np.argsort(-power, kind="stable")]
         delays = estimate_delays(right, order) if len(bands.block) else None
@@ -348,15 +293,14 @@ def junction_facts(
             bands = branch_bands([without_delays(drive, late_s) for drive in whole], branches)
     except DriveError:
         delays = None
-    best, *rivals = explained()
+    best = explained()
     return JunctionFacts(
         branches=tuple(branches),
         rms_a=np.sqrt(np.mean(bands.current_a**2, axis=0)) if len(bands.block) else np.zeros(len(branches)),
         bands=bands,
-        best=best,
-        rivals=tuple(rivals),
+        multipliers=best,
         delays=delays,
-        gains={} if delays is None else _gains(bands, best.multipliers, branches.index(delays.branches[0])),
+        gains={} if delays is None else _gains(bands, best, branches.index(delays.branches[0])),
     )
 
 

@@ -9,7 +9,7 @@ import re
 import unicodedata
 from collections.abc import Iterable
 
-__all__ = ["CURRENT", "PLACES", "POWER", "VOLTAGE", "is_battery", "places_of", "word_set", "words_of"]
+__all__ = ["CURRENT", "PLACES", "POSITIONS", "POWER", "VOLTAGE", "is_battery", "places_of", "word_set", "words_of"]
 
 _SPLIT = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+")
 
@@ -38,6 +38,8 @@ PLACES: dict[str, frozenset[str]] = {
     ),
 }
 """Where a current may flow, and words for it."""
+POSITIONS = ("front", "rear", "left", "right")
+"""Of branches that a vehicle has twice; numbers count where two signals differ in nothing else."""
 CURRENT = frozenset(
     {"current", "curr", "crnt", "cur", "amp", "amps", "i", "strom", "courant", "corriente", "corrente", "stroom"}
 )

@@ -6,6 +6,7 @@ fleet says how much of each is usual; the junction says that something is wrong,
 Equations: (M22) to (M25) of docs/method.md, section "Does the best explanation fit?".
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -260,7 +261,7 @@ class _Misfits:
     misfit_a : ndarray of shape (N, C)
         Root mean square of what each cause explains beyond gains and offsets. [A]
     branch_fit : ndarray of shape (N, C, K)
-        Logarithm of the likelihood that the sensor of branch k has it, by the fleet model.
+        Logarithm of the likelihood that the sensor of branch k has it, by the fleet model; 0 without one.
     residual_a2 : ndarray of shape (N, C + 1)
         Mean square of what each cause, or none (last), leaves of the junction law. [A^2]
     fast_a2 : ndarray of shape (N,)
@@ -314,7 +315,9 @@ def _measure_misfits(summaries: Sequence[DriveSummary], read_out: Array, full_sc
         causes=found,
         model=model,
         misfit_a=np.sqrt(found.explained_a2 / samples[:, None]) / unit[:, None],
-        branch_fit=model.whose(found.pattern, found.square, weights),
+        branch_fit=model.whose(found.pattern, found.square, weights)
+        if len(read_out) > 1
+        else np.zeros((len(weights), len(CAUSES), len(read_out[0]))),
         residual_a2=left / (samples * unit**2)[:, None],
         fast_a2=white / (WHITE_GAIN * samples * unit**2),
         mean_a=fleet.mean_a,
@@ -552,7 +555,7 @@ def check_fit(
     summaries : sequence of N DriveSummary
         Of the vehicles; one without fit sums has no findings.
     read_out : ndarray of shape (M + 1, K)
-        Of the fleet model, its branches in the order of the summaries. [A]
+        Of the fleet model, its branches in the order of the summaries; zeros of shape (1, K) without one. [A]
     usual : UsualMisfits or None
         Of the fleet; None: nothing is found.
     full_scale_a : float
@@ -598,7 +601,7 @@ def _posterior(odds: ArrayLike) -> Array:
 def _probability(misfit_a: Array, usual_a: Array, largest_a: float) -> Array:
     """Probability of a misfit of this size: log-uniform against half a Student's t of the usual size."""
     z = np.maximum(misfit_a / usual_a, 1.0)
-    alternative = 1.0 / (z * np.log(np.maximum(largest_a / usual_a, np.e)))
+    alternative = 1.0 / (z * np.log(np.maximum(largest_a / usual_a, math.e)))
     return _posterior(PRIOR * alternative / np.maximum(2.0 * student_t.pdf(z, TAIL), 1e-300))
 
 
@@ -690,7 +693,8 @@ class _Vehicle:
             f"{50.0 * abs(size):.0f} % of |{self.branches[level]}|",
             "clipped": f"it shows no more than about {place:.0f} A" if place else "it shows currents of one sign only",
             "saturating": f"its gain changes by {percent} beyond about {place:.0f} A",
-            "step": f"its gain or offset changed after {100.0 * place:.0f} % of the recordings",
+            "step": f"its gain or offset changed after {100.0 * place:.0f} % of the recordings, or a load without a "
+            f"sensor was switched",
             "ramp": "its gain or offset drifts with time",
             "temperature": f"its gain or offset drifts with temperature (standard deviation {place:.0f} K)",
         }[cause]

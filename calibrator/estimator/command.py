@@ -2,6 +2,7 @@
 
 import math
 import re
+import shlex
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -30,9 +31,8 @@ from calibrator.terminal.options import (
     number_option,
 )
 from calibrator.terminal.text import counted, dumps, print_report, told_once
-from ecu_node.failures import INTERNAL_ERROR, say_error
 from ecu_node.layout import UnmeasuredLoad
-from ecu_node.standard_output import write_output
+from ecu_node.program import INTERNAL_ERROR, say_error, write_output
 from ecu_node.user_files import write_atomically
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ def calibrate(
         harm_limit=harm_limit,
         trusted=_named(trusted),
         readings=readings,
-        load=None if load is None else UnmeasuredLoad(mean_a=_value(load, "--load")[0], sd_a=_value(load, "--load")[1]),
+        load=None if load is None else _load(load),
         charge_ah=dict(_charge(item) for item in charge or ()),
         meter=meter,
         expected_faults=expected_faults,
@@ -208,6 +208,7 @@ def calibrate(
         lines = "; ".join(told_once(failed.items())[:MOST_NAMED])
         say_error(f"calibrator: internal error in {counted(len(failed), 'vehicle')}, which are left out: {lines}")
         raise typer.Exit(INTERNAL_ERROR)
+    say_error(f"next: calibrator report {shlex.quote(str(out))}")
 
 
 def params(
@@ -246,6 +247,16 @@ def _value(text: str, option: str) -> tuple[float, float]:
             f"{text!r}: expected a number and its standard deviation, such as 1.5:0.3", param_hint=option
         )
     return found
+
+
+def _load(text: str) -> UnmeasuredLoad:
+    mean_a, sd_a = _value(text, "--load")
+    if mean_a < 0.0:
+        raise typer.BadParameter(
+            f"{text!r}: expected what flows out of the junction, 0 A or more; a source is a branch of its own",
+            param_hint="--load",
+        )
+    return UnmeasuredLoad(mean_a=mean_a, sd_a=sd_a)
 
 
 def _charge(text: str) -> tuple[str, tuple[float, float]]:

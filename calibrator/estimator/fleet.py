@@ -192,8 +192,6 @@ class Junction:
         """Layout and DBC; without a layout one that stands for data frames, whose signals are on no bus."""
         if self.database is not None:
             return self.database
-        from cantools.database.can import Database
-
         from ecu_node.database import VehicleDatabase
 
         age_s = max(MOST_MISSED * period_s, LEAST_AGE_S)
@@ -209,7 +207,7 @@ class Junction:
             path=Path("the junction"),
             digest=hashlib.sha256(repr(self).encode()).hexdigest(),
         )
-        return VehicleDatabase(layout=layout, database=Database(), digest=hashlib.sha256(b"").hexdigest())
+        return VehicleDatabase(layout=layout, databases={}, digest=hashlib.sha256(b"").hexdigest())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -471,12 +469,11 @@ class _Calibrator:
             warnings.warn(NO_NODE_FILES, stacklevel=2)
         return Path(folder)
 
-    def _readings(self, folder: Path) -> Path | None:
-        """Path of the bench readings, which may be given as a data frame."""
+    def _readings(self) -> Path | str | None:
+        """Path of the bench readings, or their text if they are a data frame."""
         readings: Any = self.get_params()["readings"]
         if hasattr(readings, "to_csv"):
-            readings.to_csv(folder / "readings.csv", index=False)
-            readings = folder / "readings.csv"
+            return str(readings.to_csv(index=False))
         if readings is None:
             return None
         path = _path(readings, "readings", "a DataFrame or the path of a CSV table")
@@ -573,14 +570,14 @@ class FleetCalibrator(_Calibrator):
         _require(isinstance(fleet, Fleet), "fleet", fleet, "Fleet.from_frames(...) or Fleet.from_folder(...)")
         progress = nullcontext() if self.verbose else no_progress()
         with TemporaryDirectory(prefix="calibrator-") as folder, progress, _errors_in_python():
-            settings, out = self._settings(Path(folder)), Path(folder) / "result"
+            settings, out = self._settings(), Path(folder) / "result"
             # frames are so few that another process takes longer to start than they take here
             workers = Workers(processes=1 if fleet.in_memory else self.workers, scheduler=self.scheduler)
             report = calibrate_fleet(fleet.place, fleet.database, out, settings, workers=workers)
             self._keep(out, report, has_layout=fleet.has_layout)
         return self
 
-    def _settings(self, folder: Path) -> "CalibrationSettings":
+    def _settings(self) -> "CalibrationSettings":
         """Parameters of the constructor as the command takes them; FleetError if one makes no sense."""
         from calibrator.estimator.settings import CalibrationSettings
 
@@ -595,7 +592,7 @@ class FleetCalibrator(_Calibrator):
         )
         return CalibrationSettings(
             harm_limit=self.harm_limit,
-            readings=self._readings(folder),
+            readings=self._readings(),
             expected_faults=self.expected_faults,
             trusted=trusted,
             hold_out=hold_out,
@@ -685,7 +682,7 @@ class JunctionCalibrator(_Calibrator):
             junction = Junction.from_layout(_path(junction, "junction", "a Junction, or the path of a layout (TOML)"))
         with TemporaryDirectory(prefix="calibrator-") as folder, no_progress(), _errors_in_python():
             place, out = Path(folder) / "recordings", Path(folder) / "result"
-            settings = self._settings(Path(folder))
+            settings = self._settings()
             if isinstance(recordings, (str, os.PathLike)):
                 _require(junction.database is not None, "junction", junction, "a layout, as the recordings are on disk")
                 place, database = Path(recordings), junction.as_database((), 0.1)
@@ -697,24 +694,27 @@ class JunctionCalibrator(_Calibrator):
             self._keep(out, report, has_layout=junction.layout is not None)
         return self
 
-    def _settings(self, folder: Path) -> "CalibrationSettings":
+    def _settings(self) -> "CalibrationSettings":
         from calibrator.estimator.settings import CalibrationSettings
         from ecu_node.layout import UnmeasuredLoad
 
-        def pair(given: Any, name: str) -> tuple[float, float]:
-            good = isinstance(given, Sequence) and len(given) == 2 and _is_number(given[0], -1e6, 1e6)
-            _require(good and _is_number(given[1], 0.0, 1e6), name, given, "a value with its standard deviation")
+        def pair(given: Any, name: str, least: float = -1e6) -> tuple[float, float]:
+            good = isinstance(given, Sequence) and len(given) == 2 and _is_number(given[0], least, 1e6)
+            above = " from 0" if least == 0.0 else ""
+            _require(
+                good and _is_number(given[1], 0.0, 1e6), name, given, f"a value{above} with its standard deviation"
+            )
             return float(given[0]), float(given[1])
 
         _require(_is_number(self.harm_limit, 0, 1), "harm_limit", self.harm_limit, "a number from 0 to 1")
         _require(self.meter is None or isinstance(self.meter, str), "meter", self.meter, "the name of a branch")
         _require(isinstance(self.charge_ah or {}, Mapping), "charge_ah", self.charge_ah, "charges by branch")
-        load = None if self.load is None else pair(self.load, "load")
+        load = None if self.load is None else pair(self.load, "load", 0.0)
         names = [self.trusted] if isinstance(self.trusted, str) else () if self.trusted is None else self.trusted
         return CalibrationSettings(
             alone=True,
             harm_limit=self.harm_limit,
-            readings=self._readings(folder),
+            readings=self._readings(),
             trusted=frozenset(_names(names, "trusted", sets=True)),
             load=None if load is None else UnmeasuredLoad(mean_a=load[0], sd_a=load[1]),
             charge_ah={str(name): pair(given, "charge_ah") for name, given in (self.charge_ah or {}).items()},

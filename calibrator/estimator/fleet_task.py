@@ -25,7 +25,7 @@ from calibrator.estimator.results import internal_error
 from calibrator.estimator.rows import VehicleEvidence
 from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.estimator.vehicle_report import deciding_evidence, faults_of, impossible
-from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
+from calibrator.files.parameter_files import RunIdentity, by_branch, junction_residual
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.errors import UserError
 from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, HeldBack, VehicleParameters, Verdict
@@ -192,7 +192,7 @@ def parameters_of(
         deciding_evidence=deciding,
         findings=list(estimate.findings[j]),
         junction_residual=junction_residual(
-            current_moments(vehicle.summary.mean_a, vehicle.summary.mean_product_a2),
+            vehicle.summary.moments[:, vehicle.summary.inputs :, vehicle.summary.inputs :],
             gain=np.where(corrected, 1.0 + estimate.drift[j], 1.0)[None],
             offset_a=np.where(corrected, estimate.offset_a[j], 0.0),
             expected_a=expected_a,

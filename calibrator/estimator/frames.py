@@ -118,7 +118,9 @@ def store_frames(folder: Path, frames: Mapping[str, Any], junction: "Junction") 
         try:
             require_columns(frame, list(junction.branches), where)
         except DriveError as error:
-            raise DriveError(f"{error}; name the branches that were recorded: branches=[...] of the Junction") from None
+            raise DriveError(
+                f"{error}; rename its columns, positive into the junction, or name those in Junction(branches=...)"
+            ) from None
     times = {where: _seconds(frame, where) for where, frame in labelled}
     database = junction.as_database((), _period_s(times, junction))
     contactor = database.layout.contactor

@@ -12,7 +12,7 @@ Gaussian: no zero is exact) or present, of any size; each choice is one explanat
 with its standard deviation, and is not corrected.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 from typing import NamedTuple
@@ -28,8 +28,9 @@ from calibrator.drives.align import Samples, align
 from calibrator.drives.charge import GAP_PERIODS
 from calibrator.drives.delays import MAX_DELAY_S, estimate_delays, without_delays
 from calibrator.errors import DriveError, FleetError
+from calibrator.estimator.checks import CAUSES, UsualMisfits, check_fit
 from calibrator.estimator.decision import Points, harm_probability
-from calibrator.estimator.fleet_estimate import CONFIDENT, SUSPECTED, FleetEstimate
+from calibrator.estimator.fleet_estimate import SUSPECTED, FleetEstimate
 from calibrator.estimator.fleet_task import parameters_of
 from calibrator.estimator.moments import junction_law, stack_summaries
 from calibrator.estimator.readings import (
@@ -53,7 +54,7 @@ from calibrator.summaries.vehicle_summary import VehicleSummary, most_moving_fir
 from calibrator.summaries.zero_current import weighted_mean, zero_current_offsets
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout, UnmeasuredLoad
-from ecu_node.parameters import Explanation
+from ecu_node.parameters import Explanation, Finding, VehicleParameters
 
 __all__ = ["JunctionEstimate", "Known", "Reading", "calibrate_junctions", "estimate_junction", "read_junction"]
 
@@ -82,6 +83,15 @@ MOST_OFFSETS, MARGIN = 3, 12.0
 """Most offsets of one explanation, and the logarithm of the weight below the best from which on it is left out."""
 DRAWS, FEWEST_DRAWS = 8192, 64
 """Draws in all, by weight of the explanations, and of each at least: the harm limit is some of them."""
+USUAL_MISFIT, USUAL_RESIDUAL, USUAL_SPREAD = 0.0002, 0.002, 0.5
+"""What curvature of good sensors, and noise and switched loads, leave in the sum, over full scale, and by how much the
+logarithm of the latter's square differs between cars. [1]"""
+STILL = 0.003
+"""Standard deviation of all currents, over full scale, up to which the car stands still. [1]"""
+SOUND_GAIN_SD, SOUND_OFFSET_SD = 0.01, 0.0025
+"""Standard deviations up to which a sensor without a fault is called right: gain, and offset over full scale. [1]"""
+UNCLEAR = (0.1, 0.9)
+"""Probabilities of an offset between which it may be another sensor's. [1]"""
 SEEN = 3.0
 """Standard deviations from which on a fault is clear. [1]"""
 MOST_SHOWN = 5
@@ -134,7 +144,7 @@ class JunctionEstimate:
     estimate : FleetEstimate
         As of a fleet; drifts and offsets are the means of the posterior, also where no fault is suspected.
     ratios : sequence of N mappings of str to Reading
-        Gain of the branch that moves most over that of each other one. [1]
+        Gain of a branch over that of another, by their names: "battery / motor". [1]
     constant_a : sequence of N Reading
         Sum of the measured currents at zero current: offsets and loads without a sensor together. [A]
     deciding : sequence of N str
@@ -187,7 +197,7 @@ def summarise_junction(drives: Sequence[Drive], branches: Sequence[str], databas
     if duration_s < LEAST_DURATION_S:
         raise DriveError(
             f"{duration_s:.1f} s in which all branches have usable samples; at least {LEAST_DURATION_S:g} s are "
-            f"needed; 'calibrator doctor' says which lacks them: rows farther apart than its timeout_s are stale"
+            f"needed; rows farther apart than the timeout_s of their branch are stale"
         )
     block_s = max(min(BLOCK_S, duration_s / BLOCKS), SHORTEST_BLOCK_S, layout.period_s)
     summary = summarise(samples, period_s=layout.period_s, block_s=block_s)
@@ -238,11 +248,15 @@ class _Law(NamedTuple):
     """Of (ratio, constant), shape (K, K)."""
 
 
-def _law(summary: DriveSummary, branches: Sequence[str], where: str) -> _Law:
+def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: float) -> _Law:
     order = np.argsort(-summary.variance_a2, kind="stable").tolist()
     fit = junction_law(stack_summaries([summary], order))
     covariance = fit.influence.T @ fit.influence + fit.prior_covariance[0]
     sign = np.append(-np.ones(len(order) - 1), 1.0)
+    if summary.variance_a2.max() < (STILL * scale_a) ** 2:  # the ratios are open, and the sum tells the constant
+        open_ratio = np.diag(np.append(np.ones(len(order) - 1), covariance[-1, -1]))
+        mean_a = summary.mean_a
+        return _Law(order, np.ones(len(order) - 1), float(mean_a.sum()), mean_a[order[1:]], open_ratio)
     *ratio, constant_a = fit.estimate[0] * sign
     for k, value, sd in zip(order[1:], ratio, np.sqrt(np.diagonal(covariance)), strict=False):
         if not 1.0 / MOST_RATIO < value < MOST_RATIO and sd < SURE_SD:
@@ -484,7 +498,7 @@ def estimate_junction(
     """
     N, K, scale_a = len(vehicles), len(branches), full_scale_a
     places = _places(N, branches, meter)
-    laws = [_law(each.summary, branches, each.vehicle) for each in vehicles]
+    laws = [_law(each.summary, branches, each.vehicle, scale_a) for each in vehicles]
     system = _system(vehicles, places, branches, known, laws=laws, full_scale_a=scale_a)
     names = [branches[k] if k < K else f"{meter} ({vehicles[k - K + 1].vehicle})" for k in range(system.sensors)]
     contradictions = _contradictions(system, names, scale_a)
@@ -499,7 +513,7 @@ def estimate_junction(
     offset_fault = np.where(system.read[S : 2 * S], offset_fault, posterior.offset_probability)
     fault = (1.0 - (1.0 - gain_fault) * (1.0 - offset_fault))[places]
     drift, offset, gain_sd, offset_sd = np.expm1(mean[places]), mean[S + places], sd[places], sd[S + places]
-    harm, confidence, points = np.zeros((N, K)), np.zeros(N), []
+    harm, harm_of_gain, confidence, points = np.zeros((N, K)), np.zeros((N, K)), np.zeros(N), []
     for j, vehicle in enumerate(vehicles):
         faults = np.concatenate([np.expm1(draws[:, places[j]]), draws[:, S + places[j]]], axis=1)
         kinds = np.arange(posterior.explanation[-1] + 1)
@@ -507,13 +521,21 @@ def estimate_junction(
         own = (vehicle.summary.mean_a / scale_a - offset[j]) / (1.0 + drift[j])
         spread = vehicle.summary.variance_a2 / scale_a**2 / (1.0 + drift[j]) ** 2
         estimate = np.append(drift[j], offset[j])
-        harm[j] = harm_probability(points[j], estimate, own[None], (own**2 + spread)[None])
+        true = own[None], (own**2 + spread)[None]
+        harm[j] = harm_probability(points[j], estimate, *true)
+        harm_of_gain[j] = harm_probability(points[j], np.append(drift[j], np.zeros(K)), *true)
         confidence[j] = _recovered(points[j], estimate)
     vague = bool(gain_sd.min() > KNOWN_GAIN_SD)
-    known_well = (gain_sd <= KNOWN_GAIN_SD) & (offset_sd <= KNOWN_OFFSET_SD)
+    known_well = (gain_sd <= SOUND_GAIN_SD) & (offset_sd <= SOUND_OFFSET_SD)
+    # Where it is open whose an offset is, the gain alone may be corrected.
+    gain_alone = (harm >= harm_limit) & (harm_of_gain < harm_limit) & (gain_fault[places] > SUSPECTED)
+    harm = np.where(gain_alone, harm_of_gain, harm)
     faulty = fault > SUSPECTED
+    findings = _misfits([each.summary for each in vehicles], branches, scale_a)
+    unfit = np.array([[bool(mine)] for mine in findings])
     reasons = {  # the first that applies is reported
         "": ~faulty,
+        "does not fit": np.broadcast_to(unfit, (N, K)),
         "reference in doubt": np.full((N, K), not scale_known or bool(contradictions) or vague),
         "moved too little": gain_sd > KNOWN_GAIN_SD,
         "harm limit": ~(harm < harm_limit),
@@ -521,7 +543,24 @@ def estimate_junction(
     }
     held_back = np.select(list(reasons.values()), list(reasons), "")
     corrected = faulty & (held_back == "")
-    sound = ((fault < 1.0 - CONFIDENT) & known_well).all(axis=1) & scale_known & (not contradictions)
+    deciding = [
+        "; ".join(
+            [each.text for each in findings[j][:1]]
+            + _deciding(
+                branches,
+                gain_sd[j],
+                offset_sd[j],
+                offset[j] * scale_a,
+                offset_fault[places[j]],
+                scale_known=scale_known,
+                load_known=known.load is not None,
+            )
+        )
+        for j in range(N)
+    ]
+    offset_sd = np.where(gain_alone & corrected, np.hypot(offset_sd, offset), offset_sd)
+    offset = np.where(gain_alone & corrected, 0.0, offset)
+    sound = (~faulty & known_well).all(axis=1) & ~unfit[:, 0] & scale_known & (not contradictions)
     verdicts = np.select([corrected.any(axis=1), sound], ["corrected", "no sensor fault"], "cannot tell")
     return JunctionEstimate(
         estimate=FleetEstimate(
@@ -547,7 +586,7 @@ def estimate_junction(
             held_back=held_back,
             verdicts=verdicts.tolist(),
             explanations=[_explanations(each, branches, scale_a) for each in points],
-            findings=[[] for _ in vehicles],
+            findings=findings,
             evidence=[],
         ),
         ratios=[_named_ratios(law, branches) for law in laws],
@@ -555,14 +594,27 @@ def estimate_junction(
             Reading(law.constant_a, float(np.hypot(np.sqrt(law.covariance[-1, -1]), LAW_OFFSET_SD * scale_a)))
             for law in laws
         ],
-        deciding=[
-            _deciding(branches, gain_sd[j], offset_sd[j], scale_known=scale_known, load_known=known.load is not None)
-            for j in range(N)
-        ],
+        deciding=deciding,
         contradictions=(f"what is known contradicts itself, so nothing is corrected: {'; '.join(contradictions)}",)
         if contradictions
         else (),
     )
+
+
+def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a: float) -> list[list[Finding]]:
+    """What linear sensors do not explain, by current, time or temperature; whose it is, only a fleet tells."""
+    K = len(branches)
+    usual = UsualMisfits(
+        misfit_a=np.full(len(CAUSES), USUAL_MISFIT * scale_a),
+        residual_a2=(USUAL_RESIDUAL * scale_a) ** 2,
+        fast_a2=(USUAL_RESIDUAL * scale_a) ** 2,
+        residual_spread=USUAL_SPREAD,
+        slope_spread=np.ones(K),
+        model_error_a=np.full(K, scale_a),
+        spike_rate=1.0,
+    )
+    found = check_fit(summaries, np.zeros((1, K)), usual, full_scale_a=scale_a, branches=branches)
+    return [[each for each in mine if each.cause != "noise"] for mine in found]
 
 
 def _recovered(points: Points, estimate: Array) -> float:
@@ -575,10 +627,14 @@ def _recovered(points: Points, estimate: Array) -> float:
 
 
 def _named_ratios(law: _Law, branches: Sequence[str]) -> dict[str, Reading]:
-    sd = np.hypot(np.sqrt(np.diagonal(law.covariance)[:-1]) / law.ratio, LAW_GAIN_SD) * law.ratio
-    return {
-        branches[k]: Reading(*each) for k, *each in zip(law.order[1:], law.ratio.tolist(), sd.tolist(), strict=True)
-    }
+    """Gain ratios "a / b" with a before b in the layout, whichever branch moves most."""
+    first, *others = law.order
+    relative_sd = np.hypot(np.sqrt(np.diagonal(law.covariance)[:-1]) / law.ratio, LAW_GAIN_SD)
+    found = {}
+    for k, ratio, sd in sorted(zip(others, law.ratio.tolist(), relative_sd.tolist(), strict=True)):
+        above, below, value = (first, k, ratio) if first < k else (k, first, 1.0 / ratio)
+        found[f"{branches[above]} / {branches[below]}"] = Reading(value, value * sd)
+    return found
 
 
 def _explanations(points: Points, branches: Sequence[str], scale_a: float) -> list[Explanation]:
@@ -601,24 +657,54 @@ def _explanations(points: Points, branches: Sequence[str], scale_a: float) -> li
     ]
 
 
-def _deciding(branches: Sequence[str], gain_sd: Array, offset_sd: Array, *, scale_known: bool, load_known: bool) -> str:
+def _deciding(
+    branches: Sequence[str],
+    gain_sd: Array,
+    offset_sd: Array,
+    offset_a: Array,
+    offset_probability: Array,
+    *,
+    scale_known: bool,
+    load_known: bool,
+) -> list[str]:
     """What is not known of the sensors, and what would tell."""
     if not scale_known:
-        return (
+        return [
             f"only ratios of gains are known: name a sensor that you trust (--trusted {branches[0]}), or give bench "
             f"readings (--readings)"
-        )
+        ]
     if gain_sd.min() > KNOWN_GAIN_SD:
-        return f"no gain is known better than to +-{gain_sd.min():.1%}: a better reference would decide"
+        return [f"no gain is known better than to +-{gain_sd.min():.1%}: a better reference would decide"]
     texts = []
     if gains := [name for name, sd in zip(branches, gain_sd, strict=True) if sd > KNOWN_GAIN_SD]:
         texts.append(f"the gain of {', '.join(gains)} needs a drive in which that current varies more")
-    if offsets := [name for name, sd in zip(branches, offset_sd, strict=True) if sd > KNOWN_OFFSET_SD]:
+    unclear = [k for k, p in enumerate(offset_probability) if load_known and UNCLEAR[0] < p < UNCLEAR[1]]
+    if len(unclear) > 1:
+        whose = " or ".join(branches[k] for k in unclear)
+        texts.append(
+            f"an offset of {offset_a[unclear].sum():+.1f} A is of {whose}: a zero-current window (contactors open), or "
+            f"a bench reading of one of them, would decide"
+        )
+    elif offsets := [name for name, sd in zip(branches, offset_sd, strict=True) if sd > KNOWN_OFFSET_SD]:
         load = "" if load_known else ", or the load that no branch measures (--load)"
         texts.append(
             f"the offset of {', '.join(offsets)} needs a zero-current window (contactors open), a bench reading{load}"
         )
-    return "; ".join(texts)
+    return texts
+
+
+def _same_error(parameters: VehicleParameters, trusted: Collection[str]) -> list[str]:
+    """Say where all gains are wrong alike against one sensor that is trusted: then that one may be wrong."""
+    others = [branch for name, branch in parameters.branches.items() if name not in trusted]
+    drifts = np.array([branch.drift for branch in others])
+    sds = np.array([branch.drift_sd for branch in others], dtype=float)
+    if len(trusted) != 1 or len(others) < 2 or not (np.abs(drifts) > SEEN * sds).all():
+        return []
+    if np.ptp(drifts) > SEEN * np.hypot(*np.sort(sds)[-2:]):
+        return []
+    (reference,), error = trusted, drifts.mean()
+    own = 1.0 / (1.0 + error) - 1.0
+    return [f"all others read {error:+.1%} against {reference}: a gain error of its own of {own:+.1%} looks the same"]
 
 
 def calibrate_junctions(
@@ -662,14 +748,7 @@ def calibrate_junctions(
         If no vehicle can be used, or something is said to be known that is not there.
     """
     layout = identity.database.layout
-    if drives:
-        vehicles = [summarise_junction(mine, branches, identity.database) for mine in drives.values()]
-        left_out = dict(fleet.left_out)
-    else:
-        equipment = Equipment(branches=branches, inputs=(), fleet_inputs=(), notices=())
-        vehicles, left_out = read_vehicles(
-            read_junction, fleet, equipment, identity.database, workers=workers, limit_s=settings.time_limit_s
-        )
+    vehicles, left_out = _summaries(fleet, drives, branches, identity.database, settings.time_limit_s, workers=workers)
     known = _known(settings, layout, branches, [each.vehicle for each in vehicles], left_out)
     if settings.charge_ah:
         if len(drives) != 1:
@@ -718,14 +797,38 @@ def calibrate_junctions(
             if len(vehicles) <= MOST_SHOWN:
                 sensors = parameters[-1].branches.items()
                 notices += [f"{vehicle.vehicle}: {name}: {sensor_text(branch)}" for name, branch in sensors]
-                notices.append(_shown(vehicle.vehicle, found.ratios[j], found.constant_a[j], branches))
+                notices.append(_shown(vehicle.vehicle, found.ratios[j], found.constant_a[j]))
+                notices += [f"{vehicle.vehicle}: {text}" for text in _same_error(parameters[-1], settings.trusted)]
     return encode_chunk(parameters, left_out), {"junction": junctions}, tuple(notices)
 
 
-def _shown(vehicle: str, ratios: Mapping[str, Reading], constant_a: Reading, branches: Sequence[str]) -> str:
+def _summaries(
+    fleet: FleetSource,
+    drives: Mapping[str, Sequence[Drive]],
+    branches: tuple[str, ...],
+    database: VehicleDatabase,
+    limit_s: float,
+    *,
+    workers: int,
+) -> tuple[list[VehicleSummary], dict[str, str]]:
+    """Summaries of the vehicles that can be used, and why the others cannot."""
+    if not drives:
+        equipment = Equipment(branches=branches, inputs=(), fleet_inputs=(), notices=())
+        return read_vehicles(read_junction, fleet, equipment, database, workers=workers, limit_s=limit_s)
+    found, left_out = list[VehicleSummary](), dict(fleet.left_out)
+    for name, mine in drives.items():
+        try:
+            found.append(summarise_junction(mine, branches, database))
+        except DriveError as error:
+            left_out[name] = last = str(error)
+    if not found:
+        raise DriveError(last)
+    return found, left_out
+
+
+def _shown(vehicle: str, ratios: Mapping[str, Reading], constant_a: Reading) -> str:
     """Gain ratios and constant of a vehicle in words."""
-    (first,) = set(branches) - ratios.keys()
-    said = ", ".join(f"{value.mean:.4f} +- {value.sd:.4f} ({first} / {name})" for name, value in ratios.items())
+    said = ", ".join(f"{value.mean:.4f} +- {value.sd:.4f} ({pair})" for pair, value in ratios.items())
     return (
         f"{vehicle}: gain ratios {said}; at zero current the sensors sum to {constant_a.mean:+.2f} +- "
         f"{constant_a.sd:.2f} A: their offsets, and loads without a sensor"

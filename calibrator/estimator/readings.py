@@ -136,13 +136,22 @@ BenchTable = Mapping[tuple[str, str], BenchReading]
 """Bench readings by vehicle and branch."""
 
 
-def read_bench_table(path: Path, branches: Names, *, full_scale_a: float) -> BenchTable:
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise FleetError(f"{path}: cannot read the bench readings: {error.strerror}; give a CSV table") from None
+    except UnicodeDecodeError:
+        raise FleetError(f"{path}: not a table of bench readings: the file is not UTF-8 text") from None
+
+
+def read_bench_table(source: Path | str, branches: Names, *, full_scale_a: float) -> BenchTable:
     """Read a table of bench readings.
 
     Parameters
     ----------
-    path : Path
-        CSV file with a header.
+    source : Path or str
+        CSV file with a header; or the text of one, which a data frame was written to.
     branches : collection of str
         Names of the K branches.
     full_scale_a : float
@@ -159,35 +168,36 @@ def read_bench_table(path: Path, branches: Names, *, full_scale_a: float) -> Ben
         Naming file, line, what was expected.
     """
     bench: dict[tuple[str, str], BenchReading] = {}
-    try:
-        lines = csv.reader(path.read_text(encoding="utf-8-sig").splitlines(), skipinitialspace=True)
-    except OSError as error:
-        raise FleetError(f"{path}: cannot read the bench readings: {error.strerror}; give a CSV table") from None
-    except UnicodeDecodeError:
-        raise FleetError(f"{path}: not a table of bench readings: the file is not UTF-8 text") from None
+    text, where = (source, "readings") if isinstance(source, str) else (_text(source), str(source))
+    lines = csv.reader(text.splitlines(), skipinitialspace=True)
+
+    def place() -> str:
+        if isinstance(source, str):  # rows of a data frame count from 0, without the header
+            return f"{where}: row {lines.line_num - 2}" if lines.line_num > 1 else where
+        return f"{where}: line {lines.line_num}"
+
     try:
         header = [cell.strip() for cell in next(lines, [])]
         complete = {"vehicle", "branch"} <= set(header) <= set(COLUMNS) and len(set(header)) == len(header)
         if not complete or not any(set(pair) <= set(header) for pair in PAIRS):
             raise FleetError(
-                f"{path}: line 1: columns {', '.join(header) or 'none'}; expected each of {', '.join(COLUMNS)} once, "
+                f"{place()}: columns {', '.join(header) or 'none'}; expected each of {', '.join(COLUMNS)} once, "
                 f"one pair of the last four may be left out"
             )
         for cells in filter(any, lines):
-            place = f"{path}: line {lines.line_num}"
             if len(cells) > len(header):
-                raise FleetError(f"{place}: {len(cells)} cells, and the header has {len(header)} columns")
+                raise FleetError(f"{place()}: {len(cells)} cells, and the header has {len(header)} columns")
             row = dict.fromkeys(COLUMNS, "") | dict(zip(header, map(str.strip, cells), strict=False))
             vehicle, branch = row["vehicle"], row["branch"]
             if branch not in branches:
-                raise FleetError(f"{place}: no branch {branch!r} in this fleet; known are {few(sorted(branches))}")
+                raise FleetError(f"{place()}: no branch {branch!r} in this fleet; known are {few(sorted(branches))}")
             if (vehicle, branch) in bench:
-                raise FleetError(f"{place}: the {branch} sensor of {vehicle} stands there twice; give it one line")
-            bench[vehicle, branch] = _reading(row, place, full_scale_a)
+                raise FleetError(f"{place()}: the {branch} sensor of {vehicle} stands there twice; give it one line")
+            bench[vehicle, branch] = _reading(row, place(), full_scale_a)
     except csv.Error as error:
-        raise FleetError(f"{path}: line {lines.line_num}: not a table of bench readings: {error}") from None
+        raise FleetError(f"{place()}: not a table of bench readings: {error}") from None
     if not bench:
-        raise FleetError(f"{path}: no reading below the header; leave --readings out if there is none")
+        raise FleetError(f"{where}: no reading below the header; leave --readings out if there is none")
     return bench
 
 

@@ -504,7 +504,7 @@ def report_of(result: Path, run: RunRecord, *, parameters: str, shown: Path) -> 
     def corrected(rows: Rows) -> str:
         names, confidence = ", ".join(row["branch"] for row in rows), rows[0]["confidence"]
         unsure = confidence is not None and confidence < CONFIDENT
-        return f"{names} (all of its faults: confidence {confidence:.2f})" if unsure else names
+        return f"{names} (all of its faults within 10 %: probability {confidence:.2f})" if unsure else names
 
     def suspected(rows: Rows) -> str:
         probability = rows[0]["hardware_probability"]

@@ -11,7 +11,7 @@ Faults of the program in single vehicles (:mod:`calibrator.estimator.fleet_task`
 import hashlib
 import shutil
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -70,7 +70,6 @@ from calibrator.summaries.identity import StoreIdentity, read_identity, store_id
 from calibrator.summaries.open_store import open_store
 from calibrator.summaries.record import Outline, Record, drives_digest, joined_records
 from calibrator.summaries.store import SummaryStore
-from calibrator.summaries.unity import UNITY_FILE, keep_unity_window
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.terminal.progress import numbered_passes, progress_bar
 from calibrator.terminal.text import few, few_reasons
@@ -80,7 +79,6 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout, file_digest
 from ecu_node.parameters import VehicleParameters, decode_parameters
-from ecu_node.user_files import write_atomically
 
 __all__ = [
     "Census",
@@ -150,12 +148,12 @@ def calibrate_fleet(
     identity = require_fleet(storage, place, database)
     if identity is None:
         fleet = _find_drives(Path(storage.url))
-        alone = _stands_alone(fleet, settings, database.layout)
+        alone = _stands_alone(fleet, settings, database.layout, since)
         if alone:
             _require_alone(settings, since)
         elif since is None:
             _require_vehicles(fleet, settings)
-        passes = 3 if alone or settings.method is Method.PUBLISHED else 5
+        passes = 2 if alone else 3 if settings.method is Method.PUBLISHED else 5
     else:
         _require_summaries_enough(storage, settings)
         passes = 4  # look, learn, calibrate, write
@@ -201,14 +199,17 @@ def _find_drives(path: Path) -> FleetSource:
     return fleet
 
 
-def _stands_alone(fleet: FleetSource, settings: CalibrationSettings, layout: Layout) -> bool:
-    """Whether each vehicle is calibrated by itself: there is but one, or what is known is of branches."""
+def _stands_alone(fleet: FleetSource, settings: CalibrationSettings, layout: Layout, since: Path | None) -> bool:
+    """Whether each vehicle is calibrated by itself: there is but one, or what is known is of branches.
+
+    With an earlier result of a fleet, one vehicle may be the only one that has driven since.
+    """
     if settings.method is Method.PUBLISHED:
         return False
     of_branches = bool(settings.trusted) and not settings.trusted & fleet.vehicles.keys()
     of_branches = of_branches and settings.trusted <= set(layout.branch_names)
     alone = settings.alone or settings.meter is not None or bool(settings.charge_ah)
-    return alone or len(fleet.vehicles) == 1 or of_branches
+    return alone or of_branches or (len(fleet.vehicles) == 1 and since is None)
 
 
 def _require_alone(settings: CalibrationSettings, since: Path | None) -> None:
@@ -343,10 +344,17 @@ class _Run:
 
         drives: dict[str, list[Drive]] = {}
         if len(fleet.vehicles) <= MOST_READ_HERE:  # other processes would take longer to start
+            left_out = dict(fleet.left_out)
             with progress_bar("read drives", len(fleet.vehicles), "vehicles") as progress:
                 for number, (vehicle, entries) in enumerate(fleet.vehicles.items(), start=1):
-                    drives[vehicle] = [load_drive(entry, self.database) for entry in entries]
+                    try:
+                        drives[vehicle] = [load_drive(entry, self.database) for entry in entries]
+                    except UserError as error:
+                        if len(fleet.vehicles) == 1:
+                            raise
+                        left_out[vehicle] = str(error)
                     progress(number)
+            fleet = replace(fleet, vehicles={name: fleet.vehicles[name] for name in drives}, left_out=left_out)
         equipment = probe_equipment(
             fleet,
             self.database,
@@ -369,7 +377,6 @@ class _Run:
         if everyone:  # a slip in the table is reported before the drives are read
             self._check(self._bench_table(store), fleet.vehicles, fleet.left_out)
         add_drives(store, fleet, self.database, workers=self.workers.processes, time_limit_s=limit_s, exactly=everyone)
-        keep_unity_window(store, fleet, self.database, time_limit_s=limit_s)
         return self.summaries(store, self._about(fleet, store.identity.equipment), fleet.left_out)
 
     def _own_store(self, fleet: FleetSource) -> SummaryStore:
@@ -455,8 +462,8 @@ class _Run:
                 raise FleetError(f"fleet {fleet}: no usable vehicle {few(missing)} to {what}{reasons}")
 
     def _bench_table(self, store: SummaryStore) -> BenchTable:
-        path, scale_a = self.settings.readings, self.database.layout.full_scale_a
-        return {} if path is None else read_bench_table(path, store.identity.branches, full_scale_a=scale_a)
+        given, scale_a = self.settings.readings, self.database.layout.full_scale_a
+        return {} if given is None else read_bench_table(given, store.identity.branches, full_scale_a=scale_a)
 
     def _check(self, bench: BenchTable, vehicles: Collection[str], left_out: Mapping[str, str]) -> None:
         """Refuse bench readings of vehicles that there are not, or against the trust in one."""
@@ -487,8 +494,6 @@ class _Run:
         if unfinished.summaries.exists():
             copy = folder / unfinished.summaries.name
             shutil.copytree(unfinished.summaries, copy, ignore=shutil.ignore_patterns(".*"))
-        if store is not None and (window := store.storage.read_if_there(UNITY_FILE)) is not None:
-            write_atomically(folder / UNITY_FILE, window)
         run = RunRecord(
             tool=identity.tool,
             method=identity.method.value,

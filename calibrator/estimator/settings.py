@@ -11,6 +11,7 @@ from calibrator.options import Classifier, Method
 from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.terminal.text import counted, few, few_reasons
 from ecu_node.layout import UnmeasuredLoad, file_digest
+from ecu_node.user_files import text_digest
 
 __all__ = ["FEWEST_VEHICLES", "HARM_LIMIT", "CalibrationSettings", "require_learning"]
 
@@ -35,8 +36,8 @@ class CalibrationSettings:
     trusted : frozenset of str
         Vehicles whose sensors were found faultless on a bench; they carry the reference of the posterior. Of single
         junctions: branches whose sensor is right.
-    readings : Path or None
-        Table of bench readings (CSV).
+    readings : Path, str or None
+        Table of bench readings (CSV), or its text.
     alone : bool
         Whether each vehicle is calibrated by itself in any case.
     load : UnmeasuredLoad or None
@@ -77,7 +78,7 @@ class CalibrationSettings:
     branches: tuple[str, ...] | None = None
     hold_out: frozenset[str] = field(default_factory=frozenset)
     trusted: frozenset[str] = field(default_factory=frozenset)
-    readings: Path | None = None
+    readings: Path | str | None = None
     alone: bool = False
     load: UnmeasuredLoad | None = None
     charge_ah: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -108,7 +109,7 @@ class CalibrationSettings:
         return found | {
             "harm_limit": self.harm_limit,
             "trusted": sorted(self.trusted),
-            "readings": None if self.readings is None else [self.readings.name, file_digest(self.readings)],
+            "readings": None if self.readings is None else _named_digest(self.readings),
             "expected_faults": self.expected_faults,
             "load": None if self.load is None else [self.load.mean_a, self.load.sd_a],
             "charge_ah": dict(self.charge_ah),
@@ -136,3 +137,9 @@ def require_learning(
             f"{reasons}"
         )
     return learning
+
+
+def _named_digest(table: Path | str) -> list[str]:
+    if isinstance(table, str):
+        return ["data frame", text_digest(table.encode())]
+    return [table.name, file_digest(table)]

@@ -11,7 +11,7 @@ from calibrator.files.folders import require_possible_folder
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import JsonOption, SeedOption, WorkersOption, given_options, whole_option
 from calibrator.terminal.text import print_report
-from ecu_node.standard_output import write_output
+from ecu_node.program import write_output
 
 __all__ = ["RECORDED_EXPERIMENTS", "ExperimentName", "experiment", "score"]
 

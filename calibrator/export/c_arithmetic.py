@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from calibrator.errors import ExportError
 from calibrator.export.c_bits import literal
 from calibrator.export.c_model import CBranch
-from ecu_node.codes import Codes
-from ecu_node.correction import IntegerPlan
+from ecu_node.core.correction import IntegerPlan
+from ecu_node.core.signals import Codes
 
 __all__ = ["Arithmetic", "arithmetic_of", "is_no_value", "outcome"]
 

@@ -7,7 +7,7 @@ is shifted that is signed, and nothing converted that does not fit.
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from ecu_node.bits import BitPlace, PlacedSignal
+from ecu_node.core.signals import BitPlace, PlacedSignal
 
 __all__ = ["literal", "presence_function", "put_function", "reading_function"]
 

@@ -10,14 +10,13 @@ from cantools.database.can import Message
 
 from calibrator.errors import ExportError
 from calibrator.export.checked import Checked
-from ecu_node.bits import PlacedSignal, placed_signal
-from ecu_node.branch_plans import branch_plan, branch_signals
-from ecu_node.codes import Codes, read_codes
-from ecu_node.correction import IntegerPlan
-from ecu_node.guard import Mode, rewritten
+from ecu_node.bus.guard import Mode, rewritten
+from ecu_node.bus.in_force import branch_plan, branch_signals
+from ecu_node.bus.wiring import wire
+from ecu_node.core.correction import IntegerPlan
+from ecu_node.core.signals import Codes, PlacedSignal, placed_signal, read_codes
 from ecu_node.layout import Branch, SignalName, split_signal
 from ecu_node.units import VOLT
-from ecu_node.wiring import wire
 
 __all__ = ["CBranch", "CInput", "CMessage", "CProgram", "c_program"]
 

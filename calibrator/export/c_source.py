@@ -10,7 +10,7 @@ from calibrator.export.c_arithmetic import Arithmetic, arithmetic_of, is_no_valu
 from calibrator.export.c_bits import literal, presence_function, put_function, reading_function
 from calibrator.export.c_header import branch_prototype, input_prototype, message_prototype
 from calibrator.export.c_model import CBranch, CInput, CMessage, CProgram
-from ecu_node.bits import BitPlace
+from ecu_node.core.signals import BitPlace
 
 __all__ = ["source_body"]
 

@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from ecu_node.bus.in_force import InForce, sensor_fault
+from ecu_node.core.correction import NO_FAULT, SensorFault
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError, printable
-from ecu_node.in_force import InForce, sensor_fault
-from ecu_node.parameter_fit import check_fit
-from ecu_node.parameters import VehicleParameters, decode_parameters, parameter_bytes
-from ecu_node.sensor_fault import NO_FAULT, SensorFault
+from ecu_node.parameters import VehicleParameters, check_fit, decode_parameters, parameter_bytes
 from ecu_node.trust.statements import SignedParameters, open_statement
 from ecu_node.user_files import text_digest
 

@@ -21,8 +21,7 @@ from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps
 from ecu_node.database import node_database
 from ecu_node.errors import printable
-from ecu_node.failures import say_error
-from ecu_node.standard_output import write_output
+from ecu_node.program import say_error, write_output
 
 __all__ = ["export", "exported_files"]
 

@@ -1,5 +1,6 @@
 """What every parameter file of one run has in common."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,6 +18,14 @@ __all__ = [
     "current_moments",
     "junction_residual",
 ]
+
+
+QUIET_SHARE = 0.25
+"""Share of the blocks, those with the least throughput, that tell how far sums are from what is expected at rest."""
+STABILITY = 0.01
+"""By how much gains change with temperature between drives, at least: the node is not to take that for a fault. [1]"""
+TINY_A2 = 1e-12
+"""Least throughput, squared. [A^2]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +106,7 @@ def junction_residual(moments: Array, *, gain: Array, offset_a: Array, expected_
     ----------
     moments : ndarray of shape (B, K + 1, K + 1)
         Sums or means of products of (i_m,1 ... i_m,K, 1), of each block of the drives. [A^2]
-    gain : ndarray of shape (B, K)
+    gain : ndarray of shape (B, K) or (1, K)
         What each current is divided by, 1 where it is not corrected. [1]
     offset_a : ndarray of shape (K,)
         What is taken from it before. [A]
@@ -109,7 +118,7 @@ def junction_residual(moments: Array, *, gain: Array, offset_a: Array, expected_
     JunctionResidual
         Of sum_k i_m,k and sum_k (i_m,k - o_k) / gain_k over all valid samples.
     """
-    weight = 1.0 / gain
+    weight = np.broadcast_to(1.0 / gain, (len(moments), gain.shape[1]))
     corrected = np.column_stack([weight, -weight @ offset_a])
     measured = np.column_stack([np.ones_like(weight), np.zeros(len(weight))])
     samples = float(moments[:, -1, -1].sum())
@@ -120,6 +129,7 @@ def junction_residual(moments: Array, *, gain: Array, offset_a: Array, expected_
     def mean(sums: Array) -> float:
         return float(np.einsum("bk,bk->", sums, moments[:, :, -1])) / samples
 
+    sd_a, sd_per_a = _spread(moments / samples, corrected - np.append(np.zeros_like(offset_a), expected_a))
     return JunctionResidual(
         measured_a=rms(measured),
         corrected_a=rms(corrected),
@@ -127,4 +137,22 @@ def junction_residual(moments: Array, *, gain: Array, offset_a: Array, expected_
         measured_mean_a=mean(measured),
         corrected_mean_a=mean(corrected),
         expected_a=expected_a,
+        corrected_sd_a=sd_a,
+        corrected_sd_per_a=sd_per_a,
     )
+
+
+def _spread(moments: Array, sums: Array) -> tuple[float, float]:
+    """Standard deviation of single sums, at rest [A] and per ampere of throughput [1], from moments (B, K + 1, K + 1).
+
+    The quarter of the blocks with the least throughput gives that at rest; what others have more grows with it.
+    The square of the throughput is taken for half the sum of the squares of the currents, which is not more.
+    """
+    share, weight = moments[:, -1, -1], sums[:, :-1]
+    square_a2 = np.maximum(np.einsum("bk,bkl,bl->b", sums, moments, sums), 0.0)
+    throughput_a2 = 0.5 * np.einsum("bk,bkk->b", weight**2, moments[:, :-1, :-1])
+    level = throughput_a2 / share
+    quiet = level <= np.quantile(level, QUIET_SHARE)
+    rest_a2 = float(square_a2[quiet].sum() / share[quiet].sum())
+    growth = max(float(square_a2.sum()) - rest_a2, 0.0) / max(float(throughput_a2.sum()), TINY_A2)
+    return math.sqrt(rest_a2), math.hypot(math.sqrt(growth), STABILITY)

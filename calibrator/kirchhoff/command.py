@@ -1,6 +1,8 @@
 """``calibrator kirchhoff``: the sum of the branch currents, from a log, a table or a live bus."""
 
-from collections.abc import Callable, Iterable
+import shlex
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,24 +11,21 @@ import typer
 from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import DbcOption, JsonOption, number_option
-from ecu_node.standard_output import write_text
+from calibrator.terminal.text import dumps
+from ecu_node.program import say_error, write_text
 
 __all__ = ["kirchhoff"]
 
 
-def _file(*suffixes: str) -> Callable[[Path | None], Path | None]:
-    """See that a file to be written has one of these suffixes."""
+def _option(help_text: str, *suffixes: str) -> Any:
+    """Option with a file to be written, whose name has one of these suffixes."""
 
     def check(path: Path | None) -> Path | None:
         if path is not None and path.suffix.lower() not in suffixes:
             raise typer.BadParameter(f"{path}: expected a file name that ends with {', '.join(suffixes)}")
         return path
 
-    return check
-
-
-def _option(help_text: str, *suffixes: str) -> Any:
-    return typer.Option(help=f"{help_text} ({' '.join(suffixes)}).", callback=_file(*suffixes))
+    return typer.Option(help=f"{help_text} ({' '.join(suffixes)}).", callback=check)
 
 
 def _require_others(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
@@ -70,28 +69,31 @@ def kirchhoff(
     json: JsonOption = False,
 ) -> None:
     """Print the branch currents and their sum, before and after correction, and what is expected of right sensors."""
-    if (log is None) == (interface is None):
-        raise typer.BadParameter("give either a LOG, or --interface and --channel of a live bus")
-    if (layout is None) == (branches is None):
-        raise typer.BadParameter("give either --layout, or --branches with the columns of a table")
-    if full_scale is not None and branches is None:
-        raise typer.BadParameter("--full-scale goes with --branches; a layout has its own full_scale_a")
-    if parameters is not None and layout is None:
-        raise typer.BadParameter("--parameters belong to a layout; give --layout instead of --branches")
+    for wrong, what in (
+        ((log is None) == (interface is None), "give either a LOG, or --interface and --channel of a live bus"),
+        (
+            (layout is None) == (branches is None),
+            "give either --layout, which 'calibrator layout init' makes, or --branches with the columns of a table",
+        ),
+        (full_scale is not None and branches is None, "--full-scale goes with --branches; a layout has full_scale_a"),
+        (parameters is not None and layout is None, "--parameters belong to a layout; give --layout, not --branches"),
+    ):
+        if wrong:
+            raise typer.BadParameter(what)
     with importing():
+        from calibrator.kirchhoff.conditions import conditions_of
         from calibrator.kirchhoff.sums import compare_kirchhoff, with_voltages
-        from calibrator.kirchhoff.view import draw_kirchhoff, kirchhoff_json, kirchhoff_text, save_table
+        from calibrator.kirchhoff.view import draw_kirchhoff, kirchhoff_text, save_table
         from calibrator.recordings.frames import is_log
-        from calibrator.recordings.live import listen
+        from calibrator.recordings.live import record_bus
         from calibrator.recordings.log_files import files_in
         from calibrator.recordings.readers import drive_from_frames, read_recording
         from calibrator.recordings.tables import is_table, layout_from_branches, read_table
-        from ecu_node.parameter_fit import check_fit
-        from ecu_node.parameters import read_parameters
+        from ecu_node.parameters import check_fit, read_parameters
 
     logs = [] if log is None else [log, *filter(is_log, files_in(log))]
     _require_others(filter(None, (plot, table)), filter(None, (*logs, layout, dbc, parameters)))
-    found = None if parameters is None else read_parameters(parameters)
+    found = read_parameters(parameters) if parameters is not None else None
     if layout is not None:
         database = with_voltages(vehicle_database(layout, dbc))
     elif log is not None and (is_table(log) or not log.exists()):
@@ -100,18 +102,30 @@ def kirchhoff(
         raise typer.BadParameter("--branches names columns of a table; a log of frames and a bus need --layout")
     if found is not None:
         check_fit(found, database, None)
-    vehicle = database.layout.name
+    vehicle, where = database.layout.name, f"{interface}:{channel}" if log is None else log.name
     if log is not None:
-        recording = read_recording(log, database, vehicle=vehicle, name=log.name.partition(".")[0])
+        recording = read_recording(log, database, vehicle=vehicle, name=where.partition(".")[0])
     else:
-        frames = listen(str(interface), channel, duration)
-        where = f"{interface}:{channel}"
+        frames = record_bus(str(interface), channel, duration)
         recording = drive_from_frames(frames, database, vehicle=vehicle, name="live", where=where)
     comparison = compare_kirchhoff(recording.drive, database, recording.corrected, found)
     if plot is not None:
-        name = log.name if log is not None else f"{interface}:{channel}"
-        draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {name}")
+        draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {where}")
     if table is not None:
         save_table(comparison, table)
-    notices = recording.report.log_notices() + comparison.notices()
-    write_text(kirchhoff_json(comparison, notices) if json else kirchhoff_text(comparison, notices))
+    conditions = conditions_of([recording.drive], [comparison], database)
+    if conditions.short or conditions.stands_still:
+        comparison = replace(comparison, residual=dict.fromkeys(comparison.residual))
+    notices = [*map(str, recording.report.log_notices()), *comparison.notices()]
+    notices += filter(None, (conditions.how_short, conditions.how_still))
+    write_text(dumps(comparison.as_json() | {"notices": notices}) if json else kirchhoff_text(comparison, notices))
+    if not json and log is not None and "after" not in comparison.currents_a:
+        _say_next(log, layout, branches)
+
+
+def _say_next(log: Path, layout: Path | None, branches: str | None) -> None:
+    """Say how to have a correction."""
+    steps: dict[str, object] = {"calibrate": log, "--layout": layout, "--trusted": "BRANCH", "--out": "result"}
+    if layout is None:
+        steps = {"layout init": log, "--branches": branches, "--out": "my_car.toml"}
+    say_error(" ".join(["next: calibrator", *(f"{word} {shlex.quote(str(each))}" for word, each in steps.items())]))

@@ -14,13 +14,14 @@ Right sensors do not sum to exactly 0 A either. The standard deviation that is e
               + sum_k (u_k i_k(t))^2 + L^2
 
 with q_k the step of the signal of branch k, n the noise of S as fast changes of what gains and delays leave of it show
-it (:func:`noise_of`), T_k the period of the frames of branch k (a value is up to T_k old; 0 at instants between frames
+it (:func:`_noise`), T_k the period of the frames of branch k (a value is up to T_k old; 0 at instants between frames
 that all branches have at the same times, as in a table), tau_k the delay of branch k as S shows it, u_k the uncertainty
 of a formula that gives branch k, and L the spread of the declared load.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -34,8 +35,7 @@ from ecu_node.layout import Input
 from ecu_node.parameters import VehicleParameters
 from ecu_node.units import VOLT, WATT, unit_factor
 
-__all__ = ["SUM", "Comparison", "Expected", "Figures", "Residual", "Sensor", "compare_kirchhoff", "figures_of"]
-__all__ += ["noise_of", "rms", "sensor_of", "with_voltages"]
+__all__ = ["BAND", "SUM", "Comparison", "compare_kirchhoff", "sensor_of", "with_voltages"]
 
 SUM = "sum"
 """Name of the sum among the branches."""
@@ -49,8 +49,7 @@ FEWEST = 50
 """Valid instants, to divide the sum into shares."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Figures:
+class Figures(NamedTuple):
     """Root mean square, largest magnitude, mean and standard deviation of one current. [A]"""
 
     rmse_a: float
@@ -59,33 +58,12 @@ class Figures:
     sd_a: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sensor:
+class Sensor(NamedTuple):
     """What is known of one branch without any other: step and white noise [A], and the period of its frames [s]."""
 
     step_a: float
     noise_a: float
     period_s: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Expected:
-    """Sum that right sensors would show.
-
-    Attributes
-    ----------
-    mean_a : float
-        The declared load, or 0. [A]
-    sd_a : ndarray of shape (T,)
-        Standard deviation at each instant, see the top of this module. [A]
-    parts_a : mapping of str to float
-        Each part in the median: ``quantisation``, ``noise``, ``sampling``, ``delays``, ``formulas``,
-        ``load``. [A]
-    """
-
-    mean_a: float
-    sd_a: Array
-    parts_a: Mapping[str, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,9 +78,8 @@ class Residual:
     rest_a : float
         Root mean square of what remains. [A]
     alone : mapping of str to mapping of str to float
-        Each branch as if it alone were wrong: the ``gain_error`` [1] and the ``delay_s`` that the sum asks for, and the
-        shares of its variation that these explain, ``gain_share`` and ``delay_share`` [1]. Branches that move too
-        little to tell are absent.
+        By branch, as if its gain alone were wrong: the ``gain_error`` that the sum asks for, and ``gain_share``, the
+        share of the sum's variation that it explains. Branches that move too little to tell are absent. [1]
     """
 
     constant: float
@@ -135,8 +112,13 @@ class Comparison:
         How many instants are not valid for which reason.
     currents_a : mapping of str to ndarray of shape (T, K)
         Currents ``before`` and, if something is corrected, ``after``, positive into the junction. [A]
-    expected : Expected
-        The band of the sum.
+    expected_a : float
+        Sum that right sensors show: the declared load, or 0. [A]
+    expected_sd_a : ndarray of shape (T,)
+        Its standard deviation at each instant, see the top of this module. [A]
+    parts_a : mapping of str to float
+        Each part of that in the median: ``quantisation``, ``noise``, ``sampling``, ``delays``, ``formulas``,
+        ``load``. [A]
     residual : mapping of str to Residual or None
         Shares in the sum before and after; None of few instants, or of a sum that is exact.
     """
@@ -149,7 +131,9 @@ class Comparison:
     valid: Mask
     masked: Mapping[str, int]
     currents_a: Mapping[str, Array]
-    expected: Expected
+    expected_a: float
+    expected_sd_a: Array
+    parts_a: Mapping[str, float]
     residual: Mapping[str, Residual | None]
 
     @property
@@ -160,7 +144,7 @@ class Comparison:
             stages["change"] = stages["after"] - stages["before"]
         names = (*self.branches, SUM)
         return {
-            stage: dict(zip(names, map(figures_of, (*a.T, a.sum(axis=1))), strict=True)) for stage, a in stages.items()
+            stage: dict(zip(names, map(_figures, (*a.T, a.sum(axis=1))), strict=True)) for stage, a in stages.items()
         }
 
     @property
@@ -171,13 +155,13 @@ class Comparison:
     @property
     def usual_sd_a(self) -> float:
         """Standard deviation that is expected of the sum, in the median over the valid instants. [A]"""
-        return float(np.median(self.expected.sd_a[self.valid]))
+        return float(np.median(self.expected_sd_a[self.valid]))
 
     @property
     def in_band(self) -> dict[str, float]:
         """Share of the valid instants at which the sum lies within :data:`BAND` of what is expected. [1]"""
-        far_a = BAND * self.expected.sd_a + 1e-9 * self.full_scale_a  # rounding
-        inside = {stage: np.abs(sum_a - self.expected.mean_a) <= far_a for stage, sum_a in self.sums_a.items()}
+        far_a = BAND * self.expected_sd_a + 1e-9 * self.full_scale_a  # rounding
+        inside = {stage: np.abs(sum_a - self.expected_a) <= far_a for stage, sum_a in self.sums_a.items()}
         return {stage: float(np.mean(item[self.valid])) for stage, item in inside.items()}
 
     def notices(self) -> list[str]:
@@ -194,33 +178,36 @@ class Comparison:
     def as_json(self) -> dict[str, object]:
         """Everything but the samples, with figures in A and in percent of full scale."""
 
-        def both(figures: Figures) -> dict[str, float]:
-            percent = {f"{key[:-2]}_percent": 100.0 * value / self.full_scale_a for key, value in vars(figures).items()}
-            return vars(figures) | percent
+        def both(found: dict[str, float]) -> dict[str, float]:
+            percent = {f"{key[:-2]}_percent": 100.0 * value / self.full_scale_a for key, value in found.items()}
+            return found | percent
 
-        tables = {stage: {name: both(item) for name, item in found.items()} for stage, found in self.figures.items()}
+        tables = {
+            stage: {name: both(item._asdict()) for name, item in found.items()} for stage, found in self.figures.items()
+        }
         names = ("full_scale_a", "branches", "left_out", "uncorrected", "masked")
         return {
             **{name: getattr(self, name) for name in names},
             "instants": len(self.valid),
             "valid": int(self.valid.sum()),
             **(dict.fromkeys(("before", "after", "change")) | tables),
-            "expected": asdict(self.expected) | {"sd_a": self.usual_sd_a, "in_band": self.in_band},
-            "residual": {stage: item and asdict(item) for stage, item in self.residual.items()},
+            "expected": {
+                "mean_a": self.expected_a,
+                "sd_a": self.usual_sd_a,
+                "parts_a": self.parts_a,
+                "in_band": self.in_band,
+            },
+            "residual": self.residual,
         }
 
 
-def rms(values: Array) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
-def figures_of(a: Array) -> Figures:
+def _figures(a: Array) -> Figures:
     """Figures of one current of shape (n,), n > 0; the standard deviation is that of the n values, not n - 1. [A]"""
-    return Figures(rmse_a=rms(a), max_a=float(np.abs(a).max()), mean_a=float(a.mean()), sd_a=float(a.std()))
+    rmse_a = float(np.sqrt(np.mean(a**2)))
+    return Figures(rmse_a=rmse_a, max_a=float(np.abs(a).max()), mean_a=float(a.mean()), sd_a=float(a.std()))
 
 
-def noise_of(value: Array) -> float:
+def _noise(value: Array) -> float:
     """Standard deviation of white noise as fast changes show it, in the unit of the values, shape (n,).
 
     1.4826 / sqrt(20) times the median of the magnitudes of third differences: what changes smoothly drops out, and so
@@ -255,7 +242,7 @@ def sensor_of(database: VehicleDatabase, name: str, drive: Drive) -> Sensor:
         steps_a.append(scale_a)
     step_a = min(steps_a, default=0.0)
     period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
-    return Sensor(step_a=step_a, noise_a=max(noise_of(value), step_a / np.sqrt(12.0)), period_s=period_s)
+    return Sensor(step_a=step_a, noise_a=max(_noise(value), step_a / np.sqrt(12.0)), period_s=period_s)
 
 
 def compare_kirchhoff(
@@ -314,7 +301,8 @@ def compare_kirchhoff(
     currents_a = {"before": np.column_stack([values[name] for name in names])}
     if after or parameters is not None:
         currents_a["after"] = np.column_stack([after.get(name, values[name]) for name in names])
-    expected, residual = _explained(currents_a, time_s, valid, database, drive)
+    load = layout.unmeasured_load
+    sd_a, parts_a, residual = _explained(currents_a, time_s, valid, database, drive)
     return Comparison(
         full_scale_a=layout.full_scale_a,
         branches=names,
@@ -324,15 +312,17 @@ def compare_kirchhoff(
         valid=valid,
         masked={reason: int(mask.sum()) for reason, mask in reasons.items()},
         currents_a=currents_a,
-        expected=expected,
+        expected_a=load.mean_a if load is not None else 0.0,
+        expected_sd_a=sd_a,
+        parts_a=parts_a,
         residual=residual,
     )
 
 
 def _explained(
     currents_a: Mapping[str, Array], time_s: Array, valid: Mask, database: VehicleDatabase, drive: Drive
-) -> tuple[Expected, dict[str, Residual | None]]:
-    """The band of the sum, by the formula at the top of this module, and the shares in it."""
+) -> tuple[Array, dict[str, float], dict[str, Residual | None]]:
+    """Standard deviation of the sum by the formula at the top of this module, its parts, and the shares in the sum."""
     channels = {name: drive.branches[name] for name in database.layout.branch_names if name in drive.branches}
     sensors = {name: sensor_of(database, name, drive) for name, item in channels.items() if item.good.any()}
     load, measured_a = database.layout.unmeasured_load, currents_a["before"]
@@ -340,15 +330,15 @@ def _explained(
     slope = np.gradient(measured_a, time_s, axis=0) if len(time_s) > 1 else np.zeros_like(measured_a)
     # The noise of each branch is in the sum. Of rows seconds apart a current itself looks like noise, the sum less so,
     # and what gain errors and delays leave of the sum does not.
-    most_a = noise_of(measured_a.sum(axis=1)[valid])
+    most_a = _noise(measured_a.sum(axis=1)[valid])
     for _ in range(2):
         sensors = {
-            name: replace(sensor, noise_a=max(min(sensor.noise_a, most_a), sensor.step_a / np.sqrt(12.0)))
+            name: sensor._replace(noise_a=max(min(sensor.noise_a, most_a), sensor.step_a / np.sqrt(12.0)))
             for name, sensor in sensors.items()
         }
         shares = {name: _residual(a[valid], slope[valid], sensors, mean_a) for name, a in currents_a.items()}
         _, delay_s, left_a = shares["before"]
-        most_a = min(most_a, noise_of(left_a))
+        most_a = min(most_a, _noise(left_a))
     together = _together([channels[name] for name in sensors], time_s)
     parts = {
         "quantisation": np.array(sum(sensor.step_a**2 for sensor in sensors.values()) / 12.0),
@@ -361,8 +351,7 @@ def _explained(
     }
     parts_a = {name: float(np.median(np.sqrt(part if part.ndim == 0 else part[valid]))) for name, part in parts.items()}
     sd_a = np.sqrt(sum(parts.values()) - np.minimum(parts["quantisation"], parts["noise"]))
-    expected = Expected(mean_a=mean_a, sd_a=sd_a, parts_a=parts_a)
-    return expected, {stage: residual for stage, (residual, *_) in shares.items()}
+    return sd_a, parts_a, {stage: residual for stage, (residual, *_) in shares.items()}
 
 
 def _together(channels: Sequence[Channel], time_s: Array) -> Mask:
@@ -394,13 +383,8 @@ def _residual(
     for k, name in enumerate(sensors):
         if moving[k]:
             gain = float((covariance[k] - noise2[k]) / (variance[k] - noise2[k]))
-            late_s = -float(change[:, k] @ s / (change[:, k] @ change[:, k]))
-            alone[name] = {
-                "gain_error": gain / (1.0 - gain) if gain < 1.0 else np.inf,
-                "gain_share": _gone(s, s - gain * x[:, k]),
-                "delay_s": late_s,
-                "delay_share": _gone(s, s + late_s * change[:, k]),
-            }
+            error = gain / (1.0 - gain) if gain < 1.0 else np.inf
+            alone[name] = {"gain_error": error, "gain_share": _gone(s, s - gain * x[:, k])}
     others = np.flatnonzero(moving & (np.arange(len(moving)) != np.argmax(variance)))
     gram = x[:, others].T @ x[:, others] / len(s) - np.diag(noise2[others])
     straight = s - x[:, others] @ (np.linalg.pinv(gram) @ (covariance - noise2)[others])

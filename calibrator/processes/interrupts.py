@@ -12,8 +12,7 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from types import FrameType
 
-from ecu_node.interrupts import ending_at_interrupt
-from ecu_node.wrapping import fitted
+from ecu_node.program import ending_at_interrupt, fitted
 
 __all__ = ["TERMINATED", "ending_at_sigterm", "importing", "interrupted_message", "terminated_message"]
 

@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from calibrator.processes.messages import REMEDY, Begun, Raised, Unread
-from ecu_node.python_can import load_python_can
+from ecu_node.program import load_python_can
 
 __all__ = ["work"]
 

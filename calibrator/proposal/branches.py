@@ -1,31 +1,21 @@
 """Which candidates are the branches of the junction: a score with its reasons for each, a choice, and the signs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
-from calibrator.doctor.words import CURRENT, PLACES, POWER, places_of, word_set, words_of
-from calibrator.drive import Array, Channel
+from calibrator.doctor.junction import WELL_CORRELATED, branch_bands, sag
+from calibrator.doctor.words import CURRENT, PLACES, POSITIONS, POWER, places_of, word_set, words_of
+from calibrator.drive import Array, Channel, Drive
 from calibrator.proposal.candidates import Candidate
+from calibrator.terminal.text import figure
 
-__all__ = [
-    "TAKEN",
-    "Verdict",
-    "choose_branches",
-    "close_sum",
-    "closure",
-    "current_of",
-    "find_signs",
-    "judge",
-    "with_usual_sign",
-]
+__all__ = ["ONLY_CHARGING", "TAKEN", "Verdict", "close_sum", "closure", "find_signs", "judge_all", "with_usual_sign"]
 
 TAKEN = 50.0
 """Score from which on a candidate is a branch: names, comments or sender say where it flows."""
-POSITIONS = ("front", "rear", "left", "right")
-"""Of branches that a vehicle has twice; numbers count where two signals differ in nothing else."""
 NOT_MEASURED = word_set(
     "limit limits lim max maximum min minimum mx mn available avail target tgt request requested req rq command cmd "
     "soll grenze demand setpoint desired allowed budget capability predicted pred est optimal regen reg error "
@@ -52,22 +42,16 @@ NOWHERE = ""
 NAMED, NAMED_AROUND, HV, MEASURED, BESIDE = 35.0, 40.0, 15.0, 10.0, 20.0
 AGAINST, WEAK, STEADY, NEVER = -65.0, -30.0, -40.0, -150.0
 """Points: for a place in the name, in message or sender, ...; against a word, a range, and for what decides alone."""
-LEAST = {"current": 30.0, "power": 20e3}
-"""Ranges that a database gives to currents and powers of battery and motor. [A, W]"""
 LEAST_OF_LOADS = {"current": 3.0, "power": 500.0}
-"""The same of heaters, converters and chargers: valves and clutches have less. [A, W]"""
-PLAUSIBLE = {"current": (1.0, 3000.0), "power": (300.0, 1.5e6)}
-"""What these reach in a recording. [A, W]"""
+"""Ranges that a database gives to heaters, converters and chargers: valves and clutches have less. [A, W]"""
 CELL_V, LOW_V, HIGH_V = 6.0, 40.0, 60.0
 """A voltage beside a current is of a cell, of 12 or 24 V, of neither, or of a junction. [V]"""
 STEADY_SHARE = 0.1
 """Of its peak: a current that varies by less is steady, and how the sum varies says little. [1]"""
-ROUGH = 0.5
-"""Roughness above which values jump about as no current does. [1]"""
-FOLLOWS, IGNORES = 0.3, 0.15
-"""Correlation with the battery's current from which on a motor's speaks for it, and below which against it. [1]"""
-CLEAR, SAG = 2.0, 0.5
-"""By so much more the sum must vary with the other sign, and correlation with the voltage that tells the battery's."""
+ROUGH, ROUGH_POINTS = 0.5, -50.0
+"""Root mean square of steps over that of white noise of the same spread: beyond it no current jumps. [1]"""
+CLEAR = 2.0
+"""By so much more the sum must vary with the other sign. [1]"""
 OWN_GAIN, FEWEST_BINS = 1.3, 20
 """Gain errors that a load which closes the sum may leave to any branch, and means that it takes to tell. [1]"""
 MEANS = 50
@@ -75,8 +59,6 @@ MEANS = 50
 MOST_TURNED = 12
 """Branches of which all combinations of signs are tried."""
 ONLY_CHARGING = "carries nothing while the car drives, which a log of charging would show (--log)"
-BIN_S, SLOW_S, LOST_S = 0.5, 10.0, 2.0
-"""Currents are compared as means over the first, less those over the second; longer gaps are left out. [s]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,58 +91,16 @@ class Verdict:
     sign: int = 1
     sign_reason: str = ""
 
-
-@dataclass(frozen=True)
-class _Around:
-    """The candidates of the same message and of the same sender."""
-
-    found: Sequence[Candidate]
-    everything: Sequence[Candidate]
-    words: dict[str, set[str]] = field(default_factory=dict)
-    volts: dict[str, list[Candidate]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for item in self.everything:
-            if item.message is not None:
-                for sender in {*item.message.senders, item.message.name} - {"XXX", "Vector__XXX"}:
-                    self.words.setdefault(sender, set()).update(item.words)
-        for item in self.found:
-            if item.message is not None and item.quantity == "voltage" and not {"cell", "brick", "ref"} & set(item.own):
-                self.volts.setdefault(item.message.name, []).append(item)
-
-    def says_high_voltage(self, item: Candidate) -> bool:
-        assert item.message is not None
-        near = [self.words.get(name, set()) for name in (item.message.name, *item.message.senders)]
-        return bool(HIGH_VOLTAGE & set().union(set(item.words), *near))
-
-    def volts_beside(self, item: Candidate) -> tuple[float, str]:
-        """Greatest voltage of the same message and its name; NaN without any."""
-        beside = self.volts.get(item.message.name, []) if item.message is not None else []
-        rated = [(float(np.median(v.good)) if len(v.good) else max(abs(v.low), abs(v.high)), v.name) for v in beside]
-        return max(rated, default=(np.nan, ""))
+    @property
+    def points(self) -> float:
+        """Score as people see it, 0 to 100."""
+        return min(max(self.score, 0.0), 100.0)
 
 
-def judge(item: Candidate, place: str, around: _Around, battery: Array | None = None) -> tuple[float, str]:
-    """Score of a candidate as the branch at a place, and what speaks most against it, or for it.
-
-    Parameters
-    ----------
-    item : Candidate
-        A current or power.
-    place : str
-        Where it may flow.
-    around : _Around
-        All candidates.
-    battery : ndarray of shape (2, T), optional
-        Comparable currents of the battery and this candidate.
-
-    Returns
-    -------
-    score : float
-        See :class:`Verdict`.
-    why : str
-        In words.
-    """
+def _score(
+    item: Candidate, place: str, everything: Sequence[Candidate], volts: Sequence[Candidate]
+) -> tuple[float, str]:
+    """Score of a current or power as the branch at a place, and what speaks most against it, or for it."""
     own, near = set(item.own), set(item.words)
     named = PLACES.get(place, frozenset())
     points = [(NAMED * bool(own & named) + NAMED_AROUND * bool(near & named), "")]
@@ -169,107 +109,85 @@ def judge(item: Candidate, place: str, around: _Around, battery: Array | None = 
         points.append((-20.0, "neither name, comment nor sender says where it flows"))
     points.append((HV * bool(near & {"hv", "high", "dc", "traction", "trac"}), ""))
     points.append((MEASURED * bool(own & (CURRENT | POWER)) + MEASURED * (item.quantity == "current"), ""))
-    points.append((-5.0 * item.multiplexed - 0.3 * len(item.name), ""))
-    points.append((-15.0 * ("raw" in own), "raw"))
+    points.append((-0.3 * len(item.name) - 15.0 * ("raw" in own), ""))
     # "Iheat" of a table is a heater's current; in a database, or beside a motor, heat is a loss.
     if words := own & NOT_MEASURED - (named if item.message is None and places_of(near) == {place} else set()):
         points.append((AGAINST * len(words), f"{_quoted(words)}: a limit, demand, estimate or part of one"))
     elif words := (near - own) & LIMITS:
         points.append((AGAINST, f"its message has {_quoted(words)}: no measured flow"))
-    away = ELSEWHERE | PLACES["charger"] if place in {*MAIN, "auxiliary"} else ELSEWHERE
-    if words := near & (_OTHER_SIDE.get(place, away) - named) - ({"charge"} if place == "battery" else set()):
+    if words := near & (_OTHER_SIDE.get(place, ELSEWHERE) - named):
         points.append((AGAINST, f"{_quoted(words)}: another circuit"))
-    points += _of_range(item, place) if item.channel is None else _of_recording(item, place)
-    points += _of_voltage(item, place, around)
-    if battery is not None and place == "motor":
-        points.append(_of_company(battery))
+    points.append(_of_range(item, place) if item.channel is None else _of_recording(item, item.channel))
+    if item.message is not None:
+        points.append(_of_voltage(item, place, everything, volts))
     score = sum(value for value, _ in points)
     worst, best = min(points, key=lambda point: point[0]), max(points, key=lambda point: point[0] * bool(point[1]))
     return score, worst[1] if worst[0] < 0.0 and score < TAKEN else best[1]
 
 
-def _of_range(item: Candidate, place: str) -> list[tuple[float, str]]:
+def _of_range(item: Candidate, place: str) -> tuple[float, str]:
     reach = max(abs(item.low), abs(item.high))
-    if place not in MAIN:
-        too_small = reach < LEAST_OF_LOADS[item.quantity]
-        return [(AGAINST, f"its range ends at {reach:g} {_unit(item)}: no load of a junction")] if too_small else []
-    ranged = item.signal is not None and bool(item.signal.minimum or item.signal.maximum)
-    points = [(0.0, "")]
-    if item.low >= 0.0:
-        points.append((WEAK if ranged else 0.5 * WEAK, "in the database it cannot be negative"))
-    if reach < LEAST[item.quantity]:
-        points.append((0.5 * WEAK, f"its range ends at {reach:g} {_unit(item)}"))
-    return points
+    if place not in MAIN and reach < LEAST_OF_LOADS[item.quantity]:
+        return AGAINST, f"its range ends at {reach:g} {_unit(item)}: no load of a junction"
+    if place in MAIN and item.low >= 0.0:
+        ranged = item.signal is not None and bool(item.signal.minimum or item.signal.maximum)
+        return WEAK if ranged else 0.5 * WEAK, "in the database it cannot be negative"
+    return 0.0, ""
 
 
 def _unit(item: Candidate) -> str:
     return "A" if item.quantity == "current" else "W"
 
 
-def _of_recording(item: Candidate, place: str) -> list[tuple[float, str]]:
-    assert item.channel is not None
+def _of_recording(item: Candidate, channel: Channel) -> tuple[float, str]:
     value, unit = item.good, _unit(item)
-    if len(value) < 0.5 * len(item.channel.value):
-        if item.signal is None and item.comment:
-            return [(NEVER, item.comment)]
-        return [(NEVER, f"{1.0 - len(value) / len(item.channel.value):.0%} of its values are not usable")]
+    if len(value) < 0.5 * len(channel.value):
+        unusable = f"{1.0 - len(value) / len(channel.value):.0%} of its values are not usable"
+        return NEVER, item.comment if item.signal is None and item.comment else unusable
     if np.ptp(value) == 0.0:
         empty = 0.0 if item.signal is None else item.factor * float(item.signal.offset)
-        against = NEVER if value[0] in {0.0, empty} else STEADY
-        return [(against, f"reads {value[0]:g} {unit} throughout the recording")]
-    points = [(5.0, f"{value.min():.4g} to {value.max():.4g} {unit}")]
-    least, greatest = PLAUSIBLE[item.quantity]
-    least = least if place in MAIN else 0.02 * least
-    if not least <= item.peak <= greatest:
-        points.append((NEVER, f"reaches {item.peak:.3g} {unit} in the recording: no current of a junction"))
-    if item.roughness > ROUGH:
-        points.append((-50.0, "jumps about as no current does"))
-    if place == "battery" and value.min() < 0.0 < value.max():
-        points.append((MEASURED, f"{value.min():.4g} to {value.max():.4g} {unit}, both signs"))
-    return points
+        return NEVER if value[0] in {0.0, empty} else STEADY, f"reads {value[0]:g} {unit} throughout the recording"
+    if np.sqrt(np.mean(np.diff(value) ** 2) / 2.0) > ROUGH * value.std():
+        return ROUGH_POINTS, "jumps about as no current does"
+    return 5.0, f"{figure(value.min())} to {figure(value.max())} {unit}"
 
 
-def _of_voltage(item: Candidate, place: str, around: _Around) -> list[tuple[float, str]]:
-    volts, name = around.volts_beside(item)
-    if CELL_V < volts < LOW_V and place != "dcdc":
-        return [(NEVER, f"{name.rpartition('.')[2]} beside it is at most {volts:.3g} V: not at the junction")]
-    if place not in {"battery", "charger"} or item.message is None:
-        return []
-    if volts >= HIGH_V:
-        return [(BESIDE, "")]
+def _of_voltage(
+    item: Candidate, place: str, everything: Sequence[Candidate], volts: Sequence[Candidate]
+) -> tuple[float, str]:
+    """What the greatest voltage of the same message says of it."""
+    beside = [v for v in volts if v.message is item.message and not {"cell", "brick", "ref"} & set(v.own)]
+    rated = [(float(np.median(v.good)) if len(v.good) else max(abs(v.low), abs(v.high)), v.name) for v in beside]
+    greatest_v, name = max(rated, default=(np.nan, ""))
+    if CELL_V < greatest_v < LOW_V and place != "dcdc":
+        return NEVER, f"{name.rpartition('.')[2]} beside it is at most {greatest_v:.3g} V: not at the junction"
+    if place not in {"battery", "charger"} or greatest_v >= HIGH_V:
+        return BESIDE * (place in {"battery", "charger"}), ""
     if place == "charger":
         setting = item.channel is None and item.quantity == "current"
-        return [(1.5 * WEAK, "no voltage is beside it: perhaps a setting")] if setting else []
-    if around.says_high_voltage(item):
-        return []
-    return [(AGAINST, "nothing says that it is of a high-voltage battery")]
-
-
-def _of_company(bands: Array) -> tuple[float, str]:
-    if bands.shape[1] < 20 or np.any(np.ptp(bands, axis=1) == 0.0):
+        return 1.5 * WEAK * setting, "no voltage is beside it: perhaps a setting"
+    around = _names(item)
+    if any(HIGH_VOLTAGE & set(other.words) for other in everything if other is item or around & _names(other)):
         return 0.0, ""
-    spread = bands.std(axis=1)
-    r = abs(_correlation(bands.T))
-    if r < IGNORES and spread[1] > 0.1 * spread[0]:
-        return 2.0 * AGAINST, f"does not follow the battery's current (correlation {r:.2f})"
-    return (BESIDE + 20.0 * r if r > FOLLOWS else 0.0), f"follows the battery's current (correlation {r:.2f})"
+    return AGAINST, "nothing says that it is of a high-voltage battery"
+
+
+def _names(item: Candidate) -> set[str]:
+    """Message and senders."""
+    return {item.message.name, *item.message.senders} - {"XXX", "Vector__XXX"} if item.message is not None else set()
 
 
 def _quoted(words: set[str]) -> str:
     return ", ".join(f"'{word}'" for word in sorted(words))
 
 
-def choose_branches(
-    found: Sequence[Candidate], voltage: Candidate | None, everything: Sequence[Candidate]
-) -> list[Verdict]:
+def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> list[Verdict]:
     """Judge all currents and powers, and choose branches among them.
 
     Parameters
     ----------
     found : sequence of Candidate
         Of a database, of what a log holds of it, or of a table.
-    voltage : Candidate or None
-        What powers are divided by.
     everything : sequence of Candidate
         Also what the log does not hold: it says whose signals these are.
 
@@ -278,16 +196,10 @@ def choose_branches(
     list of Verdict
         The branches first, in the order of a layout; then the rest, the best first. Signs are not looked at.
     """
-    around = _Around(found, everything)
-    flows = [item for item in found if item.quantity in {"current", "power"}]
-    batteries = {item.name: judge(item, "battery", around) for item in flows}
-    best = max(flows, key=lambda item: batteries[item.name][0], default=None)
-    battery = current_of(best, voltage) if best is not None and batteries[best.name][0] >= TAKEN else None
+    volts = [item for item in found if item.quantity == "voltage"]
     verdicts = []
-    for item in flows:
-        channel = current_of(item, voltage)
-        both = bands([battery, channel]).T if battery is not None and channel is not None else None
-        rated = {place: judge(item, place, around, both) for place in places_of(item.words) or [NOWHERE]}
+    for item in (item for item in found if item.quantity in {"current", "power"}):
+        rated = {place: _score(item, place, everything, volts) for place in places_of(item.words) or [NOWHERE]}
         place = max(rated, key=lambda name: rated[name][0])
         verdicts.append(Verdict(candidate=item, place=place, score=rated[place][0], why=rated[place][1]))
     verdicts.sort(key=lambda verdict: -verdict.score)
@@ -347,9 +259,8 @@ def close_sum(verdicts: Sequence[Verdict], voltage: Candidate | None) -> list[Ve
         is_free = not verdict.branch and verdict.place == NOWHERE and verdict.score > 0.5 * AGAINST
         if not is_free or verdict.candidate.quantity != "current" or len(taken) < 2 or taken[0].place != "battery":
             continue
-        found = [current_of(v.candidate, voltage) for v in (*taken, verdict)]
-        channels = [channel for channel in found if channel is not None]
-        if len(channels) < len(found) or len(current := bands(channels)) < FEWEST_BINS:
+        channels = _channels((*taken, verdict), voltage)
+        if not channels or len(current := bands(channels)) < FEWEST_BINS:
             continue
         battery, others = current[:, 0], current[:, 1:]
         gain = np.abs(np.linalg.lstsq(others, battery)[0])
@@ -391,43 +302,26 @@ def with_usual_sign(verdict: Verdict) -> Verdict:
     return replace(verdict, sign=sign, sign_reason=f"if {what} counts as positive; else {-sign}")
 
 
-def current_of(item: Candidate | None, voltage: Candidate | None) -> Channel | None:
+def _current_of(item: Candidate, voltage: Candidate | None) -> Channel | None:
     """Current of a candidate in a recording, a power divided by the voltage [A]; None without what it takes."""
-    if item is None or item.channel is None or item.quantity == "current":
-        return item.channel if item is not None else None
-    if voltage is None or voltage.channel is None or not voltage.channel.good.any():
-        return None
-    by = voltage.channel
-    volts = np.interp(item.channel.time_s, by.time_s[by.good], by.value[by.good])
+    if item.channel is None or item.quantity == "current":
+        return item.channel
+    volts = voltage.at(item.channel.time_s) if voltage is not None else np.full(len(item.channel.time_s), np.nan)
     good = item.channel.good & (np.abs(volts) > 1.0)
     return replace(item.channel, value=np.divide(item.channel.value, volts, out=np.zeros_like(volts), where=good))
 
 
-def bands(channels: Sequence[Channel]) -> Array:
-    """Comparable currents: means over half a second without their slow part, shape (T, K).
+def _channels(verdicts: Sequence[Verdict], voltage: Candidate | None) -> list[Channel]:
+    """Currents of some verdicts; empty if the recording does not have all of them."""
+    found = [_current_of(verdict.candidate, voltage) for verdict in verdicts]
+    channels = [channel for channel in found if channel is not None and channel.good.any()]
+    return channels if len(channels) == len(found) else []
 
-    Means are left out because a load that no sensor sees would be taken for a wrong sign; fast changes because a delay
-    between two branches would.
-    """
-    parts = [(c.time_s[c.good], c.value[c.good]) for c in channels]
-    if min(len(time_s) for time_s, _ in parts) < 2:
-        return np.zeros((0, len(parts)))
-    start, stop = max(t[0] for t, _ in parts), min(t[-1] for t, _ in parts)
-    edges = np.arange(start, max(stop, start), BIN_S)
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    columns, near = [], np.ones(len(middle), np.bool_)
-    for time_s, value in parts:
-        charge = np.concatenate([[0.0], np.cumsum(np.diff(time_s) * 0.5 * (value[1:] + value[:-1]))])
-        columns.append(np.diff(np.interp(edges, time_s, charge)) / BIN_S)
-        after = np.clip(np.searchsorted(time_s, middle), 1, len(time_s) - 1)
-        near &= time_s[after] - time_s[after - 1] <= LOST_S
-    current = np.stack(columns, axis=1)[near]
-    window = np.ones(int(SLOW_S / BIN_S) + 1)
-    if len(current) < len(window):
-        return np.zeros((0, len(parts)))
-    count = np.convolve(np.ones(len(current)), window, "same")
-    slow = [np.convolve(column, window, "same") / count for column in current.T]
-    return np.asarray(current - np.stack(slow, axis=1))
+
+def bands(channels: Sequence[Channel]) -> Array:
+    """Comparable currents, as the doctor compares them, shape (T, K); without slow changes: loads may be in these."""
+    branches = {str(k): channel for k, channel in enumerate(channels)}
+    return branch_bands([Drive(vehicle="", name="", branches=branches, inputs={})], list(branches)).current_a
 
 
 def find_signs(chosen: Sequence[Verdict], voltage: Candidate | None) -> list[Verdict]:
@@ -445,17 +339,18 @@ def find_signs(chosen: Sequence[Verdict], voltage: Candidate | None) -> list[Ver
     list of Verdict
         The same with signs and how they are known; the usual ones where the recording does not tell.
     """
-    channels = [current_of(verdict.candidate, voltage) for verdict in chosen]
-    known = [channel for channel in channels if channel is not None and channel.good.any()]
+    known = _channels(chosen, voltage)
     battery = next((k for k, verdict in enumerate(chosen) if verdict.place == "battery"), None)
-    if battery is None or len(known) < len(chosen) or len(chosen) > MOST_TURNED:
+    if battery is None or not known or len(chosen) > MOST_TURNED:
         return list(chosen)
     current = _with_means(known)
     usual = np.array([verdict.sign for verdict in chosen], np.float64)
-    sag = _sag(known[battery], voltage)
+    volts = voltage.channel if voltage is not None else None
+    falls = 0.0 if volts is None else sag([known[battery]], [volts])
     charger = next((k for k, verdict in enumerate(chosen) if verdict.place == "charger"), battery)
-    sure = battery if abs(sag) >= SAG else charger  # which only feeds
-    usual[sure] = -np.sign(sag) if abs(sag) >= SAG else usual[sure]
+    by_voltage = abs(falls) >= WELL_CORRELATED
+    sure = battery if by_voltage else charger  # which only feeds
+    usual[sure] = -np.sign(falls) if by_voltage else usual[sure]
     tried = [np.array(signs) for signs in product((1.0, -1.0), repeat=len(chosen)) if signs[sure] == usual[sure]]
     best = min(tried, key=lambda signs: (_rms(current @ signs), -float(signs @ usual)))
     told = []
@@ -464,7 +359,7 @@ def find_signs(chosen: Sequence[Verdict], voltage: Candidate | None) -> list[Ver
         with_it, without = _rms(current @ best), _rms(current @ other)
         sign, reason = int(best[k]), f"with it the sum of all varies by {with_it:.2g} A, else by {without:.2g} A"
         if k == sure:
-            reason = "with it the voltage falls when the current rises" if abs(sag) >= SAG else verdict.sign_reason
+            reason = "with it the voltage falls when the current rises" if by_voltage else verdict.sign_reason
         elif without < CLEAR * with_it or without == 0.0:
             sign, reason = verdict.sign, f"{verdict.sign_reason}; too little current for the sum to tell"
         told.append(replace(verdict, sign=sign, sign_reason=reason))
@@ -480,27 +375,12 @@ def _with_means(channels: Sequence[Channel]) -> Array:
 
 def closure(chosen: Sequence[Verdict], voltage: Candidate | None) -> float:
     """How much the sum of all varies, as a share of the greatest current [1]; NaN where no recording tells."""
-    channels = [current_of(verdict.candidate, voltage) for verdict in chosen]
-    known = [channel for channel in channels if channel is not None]
-    if len(known) < len(channels) or not known:
+    if not (known := _channels(chosen, voltage)):
         return float("nan")
     current = bands(known) * np.array([verdict.sign for verdict in chosen])
     steady = [STEADY_SHARE * float(np.abs(channel.value[channel.good]).max(initial=0.0)) for channel in known]
     greatest = max(float(current.std(axis=0).max()), *steady) if len(current) else 0.0
     return _rms(current.sum(axis=1)) / greatest if greatest > 0.0 else float("nan")
-
-
-def _sag(battery: Channel | None, voltage: Candidate | None) -> float:
-    """Correlation of the battery's current with its voltage; 0 without one."""
-    if battery is None or voltage is None or voltage.channel is None:
-        return 0.0
-    both = bands([battery, voltage.channel])
-    return _correlation(both) if len(both) and np.all(both.std(axis=0) > 0.0) else 0.0
-
-
-def _correlation(both: Array) -> float:
-    """Of two columns. [1]"""
-    return float(np.asarray(np.corrcoef(both.T))[0, 1])
 
 
 def _rms(value: Array) -> float:

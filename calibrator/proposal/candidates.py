@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from calibrator.doctor.words import CURRENT, POWER, VOLTAGE, words_of
 from calibrator.drive import Array, Channel, Mask
 from calibrator.errors import LogError
-from calibrator.recordings.decode import decode_signal, raw_values
+from calibrator.recordings.decode import decode_signal, raw_values, signal_range
 from calibrator.recordings.frame_arrays import Frames, frame_key
 from calibrator.recordings.log_time import repaired_time
-from calibrator.recordings.signal_range import signal_range
 from calibrator.recordings.tables import Table
 from ecu_node.errors import DatabaseError
 from ecu_node.units import AMPERE, VOLT, WATT, unit_factor
@@ -92,11 +91,6 @@ class Candidate:
         comment = " ".join(self.comment.split())
         return (self.unit or "no unit") + (f', "{comment}"' if comment else "")
 
-    @property
-    def multiplexed(self) -> bool:
-        """Whether only some frames of its message carry it."""
-        return self.signal is not None and bool(self.signal.multiplexer_ids)
-
     @cached_property
     def good(self) -> Array:
         """Good values of the recording, shape (n,)."""
@@ -107,18 +101,11 @@ class Candidate:
         """Greatest magnitude but for wild samples; 0 without any. [A, V, W]"""
         return float(np.quantile(np.abs(self.good), 0.999)) if len(self.good) else 0.0
 
-    @cached_property
-    def roughness(self) -> float:
-        """Root mean square of steps over that of white noise of the same spread: near 1 for what jumps about. [1]"""
-        value = self.good
-        spread = float(value.std()) if len(value) > 1 else 0.0
-        return float(np.sqrt(np.mean(np.diff(value) ** 2) / 2.0)) / spread if spread > 0.0 else 0.0
-
-    @property
-    def rough_steps_s(self) -> tuple[float, float]:
-        """Median and longest distance of its samples; NaN without any. [s]"""
-        steps_s = np.diff(self.channel.time_s) if self.channel is not None else np.zeros(0)
-        return (float(np.median(steps_s)), float(steps_s.max())) if len(steps_s) else (np.nan, np.nan)
+    def at(self, time_s: Array) -> Array:
+        """Good values of the recording at some instants, interpolated; NaN without any."""
+        if self.channel is None or not self.channel.good.any():
+            return np.full(len(time_s), np.nan)
+        return np.interp(time_s, self.channel.time_s[self.channel.good], self.good)
 
 
 def of_database(database: Database) -> list[Candidate]:
@@ -166,15 +153,11 @@ def _quantity(signal: Signal) -> tuple[str, float]:
             factor = unit_factor(signal, units, "")
         except DatabaseError:
             continue
-        return (quantity, factor) if signal.unit else (_by_name(signal), 1.0)
+        if signal.unit:
+            return quantity, factor
+        is_state = signal.length < _FEWEST_BITS or bool(signal.choices)
+        return "" if is_state else _named_quantity(words_of(signal.name)), 1.0
     return _other(signal.unit or ""), 1.0
-
-
-def _by_name(signal: Signal) -> str:
-    named = words_of(signal.name)
-    if signal.length < _FEWEST_BITS or signal.choices or not named:
-        return ""
-    return _named_quantity(named)
 
 
 def _named_quantity(named: Sequence[str]) -> str:
@@ -186,7 +169,7 @@ def _named_quantity(named: Sequence[str]) -> str:
 
 
 def _other(unit: str) -> str:
-    plain = re.sub(r"^(unit_|\w+:)|\s", "", unit.lower())
+    plain = re.sub(r"^(unit_|\w+:)|\s", "", unit.lower()).partition("*0")[0]  # "Nm *0.5": as the scale has it
     return next((quantity for quantity, units in _OTHERS.items() if plain in units), "")
 
 
@@ -206,54 +189,45 @@ def with_log(found: Sequence[Candidate], frames: Frames) -> list[Candidate]:
         Without those whose message, or multiplexed part of it, never comes.
     """
     time = repaired_time(frames.time_ns)
-    ordered = frames.take(time.order)
+    ordered, kept = frames.take(time.order), list[Candidate]()
     rows: dict[int, NDArray[np.intp]] = {}
-    kept: list[Candidate] = []
     for item in found:
         if item.message is None or item.signal is None or not item.quantity:
             continue
         key = frame_key(item.message.frame_id, extended=item.message.is_extended_frame)
         if key not in rows:
             rows[key] = _on_one_bus(np.flatnonzero(ordered.key == np.uint32(key)), ordered)
-        if len(rows[key]):
-            seen = _seen(item, item.message, item.signal, ordered.take(rows[key]), time.time_s[rows[key]])
-            kept += [seen] if seen is not None else []
+        part, is_flow = ordered.take(rows[key]), item.quantity in FLOWS
+        unlimited = copy.copy(item.signal)
+        unlimited.minimum = unlimited.maximum = None
+        named = frozenset(map(int, item.signal.choices or {})) if is_flow else None
+        every = decode_signal(item.message, unlimited, part.data, part.length, named)
+        if not every.present.any():
+            continue
+        turned = _signed(item.signal, part, every.good) if is_flow else None
+        value = item.factor * (every.value if turned is None else turned)
+        inside = signal_range(item.signal).holds(every.value) | (turned is not None)
+        here = every.present
+        seen = _recorded(
+            item, Channel(time_s=time.time_s[rows[key]][here], value=value[here], good=every.good[here]), inside[here]
+        )
+        kept.append(seen if turned is None else replace(seen, wrong="sign"))
     return kept
 
 
 def _on_one_bus(rows: NDArray[np.intp], frames: Frames) -> NDArray[np.intp]:
-    if not len(rows):
-        return rows
     channels = frames.channel[rows]
-    return np.asarray(rows[channels == np.bincount(channels).argmax()])
+    return np.asarray(rows[channels == np.bincount(channels).argmax()]) if len(rows) else rows
 
 
-def _seen(item: Candidate, message: Message, signal: Signal, frames: Frames, time_s: Array) -> Candidate | None:
-    """The candidate with its values; a range that these show to be wrong is not applied to them."""
-    named = frozenset(map(int, signal.choices or {})) if item.quantity in FLOWS else None
-    unlimited = copy.copy(signal)
-    unlimited.minimum = unlimited.maximum = None
-    every = decode_signal(message, unlimited, frames.data, frames.length, named)
-    if not every.present.any():
-        return None
-    inside = signal_range(signal).holds(every.value)
-    wrong = _wrong_range(every.value, every.good, inside)
-    value = every.value
-    turned = _signed(signal, frames, every.good) if item.quantity in FLOWS else None
-    if turned is not None:
-        wrong, value = "sign", turned
-    channel = Channel(
-        time_s=time_s[every.present],
-        value=(item.factor * value)[every.present],
-        good=(every.good & (inside | bool(wrong)))[every.present],
+def _recorded(item: Candidate, channel: Channel, inside: Mask) -> Candidate:
+    """The candidate with its values; a range of the database that these show to be wrong is not applied to them."""
+    outside = channel.good & ~inside
+    wrong = (
+        outside.sum() > WRONG_RANGE * channel.good.sum() and len(np.unique(channel.value[outside])) >= FEWEST_OUTSIDE
     )
-    return replace(item, channel=channel, wrong=wrong)
-
-
-def _wrong_range(value: Array, good: Mask, inside: Mask) -> str:
-    outside = good & ~inside
-    many = outside.sum() > WRONG_RANGE * good.sum() and len(np.unique(value[outside])) >= FEWEST_OUTSIDE
-    return "range" if many else ""
+    channel = replace(channel, good=channel.good & (inside | wrong))
+    return replace(item, channel=channel, wrong="range" if wrong else "")
 
 
 def with_table(found: Sequence[Candidate], table: Table) -> list[Candidate]:
@@ -287,10 +261,8 @@ def with_table(found: Sequence[Candidate], table: Table) -> list[Candidate]:
                 f"message and signal"
             )
         value = table.columns[header] * FLOWS.get(item.quantity, {}).get(table.units.get(header, ""), item.factor)
-        good, inside = np.isfinite(value), signal_range(item.signal, item.factor).holds(value)
-        wrong = _wrong_range(value, good, inside)
-        channel = Channel(time_s=table.time_s, value=value, good=good & (inside | bool(wrong)))
-        kept[header] = replace(item, channel=channel, wrong=wrong)
+        inside = signal_range(item.signal, item.factor).holds(value)
+        kept[header] = _recorded(item, Channel(time_s=table.time_s, value=value, good=np.isfinite(value)), inside)
     return list(kept.values())
 
 

@@ -16,8 +16,7 @@ from calibrator.terminal.command_line import example
 from calibrator.terminal.options import JsonOption
 from calibrator.terminal.text import dumps
 from ecu_node.errors import printable
-from ecu_node.failures import say_error
-from ecu_node.standard_output import write_output
+from ecu_node.program import say_error, write_output
 from ecu_node.user_files import write_atomically
 
 if TYPE_CHECKING:
@@ -111,7 +110,7 @@ def _as_json(verdicts: "Sequence[Verdict]", out: Path | None, text: str | None, 
                 "signal": verdict.candidate.name,
                 "unit": verdict.candidate.unit,
                 "place": verdict.place or None,
-                "score": round(min(max(verdict.score, 0.0), 100.0), 1),
+                "score": round(verdict.points, 1),
                 "branch": verdict.branch or None,
                 "sign": verdict.sign if verdict.branch else None,
                 "why": verdict.why,

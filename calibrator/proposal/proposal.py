@@ -5,9 +5,11 @@ import json
 import math
 import os
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from calibrator.doctor.words import PLACES, places_of, words_of
 from calibrator.errors import LogError, ProposalError
@@ -15,21 +17,14 @@ from calibrator.proposal.branches import (
     ONLY_CHARGING,
     TAKEN,
     Verdict,
-    choose_branches,
     close_sum,
     closure,
     find_signs,
+    judge_all,
     with_usual_sign,
 )
 from calibrator.proposal.candidates import Candidate, of_database, of_table, with_log, with_table
-from calibrator.proposal.inputs import (
-    Derived,
-    Input,
-    computed_motor,
-    derive,
-    find_inputs,
-    find_voltage,
-)
+from calibrator.proposal.inputs import FOR_FLEETS, computed_motor, derive, find_inputs
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.tables import bare_name, is_table, layout_from_branches, read_table
 from ecu_node.database import read_database
@@ -49,6 +44,8 @@ COMPUTED = 0.1
 """Relative standard deviation of a current that is computed from torque and speed: the losses. [1]"""
 OPEN = 0.6
 """Share of the greatest current that the sum still varies by, from which on a branch must be missing. [1]"""
+OTHER_UNIT = 100.0
+"""Times the battery's current that no other branch reaches in the same unit. [1]"""
 TIMEOUT_PERIODS, GAP_TIMES = 5.0, 1.5
 """A time-out bridges four lost frames, and the gaps that a recording shows. [1]"""
 LEAST_TIMEOUT_S, USUAL_TIMEOUT_S, LONGEST_TIMEOUT_S = 0.1, 0.5, 2.0
@@ -98,15 +95,21 @@ class Proposal:
         return sorted(taken, key=lambda verdict: (order.get(verdict.place, len(order)), -verdict.score))
 
     @property
-    def source(self) -> str:
-        """The files, for messages."""
-        return " and ".join(str(path) for path in (self.database, self.recording) if path is not None)
+    def battery(self) -> Candidate | None:
+        """Current or power of the battery, if it is taken."""
+        return next((v.candidate for v in self.branches if v.place == "battery"), None)
+
+    @property
+    def files(self) -> str:
+        """Names of the files, for messages."""
+        return " and ".join(path.name for path in (self.database, self.recording) if path is not None)
 
     def with_branches(self, chosen: Mapping[int, str]) -> "Proposal":
-        """The same with other verdicts as branches, by number and name, and with the signs that fit these."""
+        """The same with other verdicts as branches, by number and name, with signs that fit these."""
         verdicts = [with_usual_sign(replace(v, branch=chosen.get(k, ""))) for k, v in enumerate(self.verdicts)]
         signed = iter(find_signs([verdict for verdict in verdicts if verdict.branch], self.voltage))
-        return replace(self, verdicts=tuple(next(signed) if v.branch else v for v in verdicts))
+        verdicts = [next(signed) if verdict.branch else verdict for verdict in verdicts]
+        return replace(self, verdicts=tuple(verdicts))
 
     def unready(self) -> str:
         """Why the branches cannot be written; empty if they can."""
@@ -121,7 +124,7 @@ class Proposal:
 
     def problem(self) -> str:
         """Why the branches make no layout that can be trusted without a look; empty if they do."""
-        battery = next((v.candidate for v in self.branches if v.place == "battery"), None)
+        battery = self.battery
         if battery is None:
             return "no pack current found: no candidate is the current or power of a high-voltage battery"
         if not any(verdict.place in {"motor", "charger"} for verdict in self.branches):
@@ -131,10 +134,19 @@ class Proposal:
         share = closure(self.branches, self.voltage)
         if share > OPEN:
             names = ", ".join(verdict.branch for verdict in self.branches)
+            reach = {verdict.candidate.name: _reach(verdict.candidate) for verdict in self.branches}
+            most = max(reach, key=reach.__getitem__)
+            unit = f"; {most} reaches {reach[most]:,.0f}: in mA?" if reach[most] > OTHER_UNIT * _reach(battery) else ""
             return (
                 f"the sum of {names} still varies by {share:.0%} of the greatest of them: a branch is missing or wrong"
+                f"{unit}"
             )
         return self.unready()
+
+
+def _reach(candidate: Candidate) -> float:
+    channel = candidate.channel
+    return 0.0 if channel is None or not channel.good.any() else float(np.abs(channel.value[channel.good]).max())
 
 
 def look_at(source: Path, log: Path | None, name: str) -> Proposal:
@@ -170,7 +182,7 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
         if not source.is_file():
             raise DatabaseError(f"{source}: no such file; a database (DBC, KCD, SYM, ARXML) or a table is expected")
         database = source
-        everything = found = of_database(read_database(_bare_layout(name, source)).database)
+        everything = found = of_database(read_database(_bare_layout(name, source)).databases[""])
         if log is not None:
             if is_table(log):
                 found, what = with_table(everything, read_table(log)), "columns"
@@ -178,11 +190,9 @@ def look_at(source: Path, log: Path | None, name: str) -> Proposal:
                 found, what = with_log(everything, read_frames(log)), "identifiers"
             if not found:
                 raise LogError(f"{log}: none of its {what} is in {source}; check that both belong to the same vehicle")
-    voltage = find_voltage(found)
-    verdicts = choose_branches(found, voltage, everything)
+    verdicts = judge_all(found, everything)
     battery = next((verdict.candidate for verdict in verdicts if verdict.place == "battery" and verdict.branch), None)
-    if battery is not None and (near := find_voltage(found, battery)) is not None and near is not voltage:
-        voltage, verdicts = near, choose_branches(found, near, everything)
+    voltage = find_inputs(found, battery=battery, roles=["voltage"]).get("voltage")
     if battery is not None and not any(verdict.branch.startswith("motor") for verdict in verdicts):
         computed = computed_motor(found, voltage)
         if computed is not None:
@@ -230,8 +240,9 @@ def parsed_branches(text: str, proposal: Proposal) -> Proposal:
         place = next(iter(places_of(words_of(branch.name))), place)
         said = Verdict(candidate=item, place=place, score=100.0, why="", branch=branch.name, sign=branch.sign)
         chosen.append(replace(said, sign_reason="as --branches says"))
-    battery = next((verdict.candidate for verdict in chosen if verdict.place == "battery"), None)
-    return replace(proposal, verdicts=tuple(chosen), voltage=find_voltage(proposal.found, battery))
+    made = replace(proposal, verdicts=tuple(chosen))
+    voltages = find_inputs(proposal.found, battery=made.battery, roles=["voltage"])
+    return replace(made, voltage=voltages.get("voltage"))
 
 
 def _named(wanted: str, proposal: Proposal) -> Candidate:
@@ -244,7 +255,7 @@ def _named(wanted: str, proposal: Proposal) -> Candidate:
         return item if item.quantity else replace(item, quantity="current")
     near = same or difflib.get_close_matches(wanted, known, n=3, cutoff=0.4) or list(known)[:8]
     what = "stands for several" if same else "is no current or power there"
-    raise ProposalError(f"{proposal.source}: {wanted!r} {what}; there are {', '.join(near) or 'none'}")
+    raise ProposalError(f"{proposal.files}: {wanted!r} {what}; there are {', '.join(near) or 'none'}")
 
 
 def _bare_layout(name: str, database: Path) -> Layout:
@@ -255,16 +266,14 @@ def _bare_layout(name: str, database: Path) -> Layout:
 # ---- text
 
 
-def _inputs(proposal: Proposal) -> list[Input]:
-    """The inputs that go with the branches."""
-    battery = next((verdict.candidate for verdict in proposal.branches if verdict.place == "battery"), None)
+def _inputs(proposal: Proposal) -> dict[str, Candidate]:
+    """The inputs that go with the branches, by name."""
     taken = {verdict.candidate.name for verdict in proposal.branches}
-    inputs = find_inputs(proposal.found, battery=battery, taken=taken)
+    inputs = find_inputs(proposal.found, battery=proposal.battery, taken=taken)
     computed = computed_motor(proposal.found, proposal.voltage)
     if computed is None or not any(verdict.candidate.formula for verdict in proposal.branches):
         return inputs
-    needed = {item.name for item in computed[1]}
-    return [*computed[1], *(item for item in inputs if item.name not in needed)]
+    return computed[1] | {name: item for name, item in inputs.items() if name not in computed[1]}
 
 
 def layout_text(proposal: Proposal, out: Path | None) -> str:
@@ -291,21 +300,22 @@ def layout_text(proposal: Proposal, out: Path | None) -> str:
         lines += _folded(f"confirm: {', '.join(checked)} seem to be protected end to end: say how in [e2e]")
     for verdict in proposal.branches:
         lines += ["", *_branch(proposal, verdict)]
-    for item in inputs:
-        lines += ["", "[[input]]", f"name = {_text(item.name)}"]
-        lines += _guess(item.candidate.about, f"signal = {_text(item.candidate.name)}")
-    for each in derived:
-        lines += ["", "[[derived]]", f"name = {_text(each.name)}", f"formula = {_text(each.formula)}"]
+    for name, item in inputs.items():
+        lines += ["", "[[input]]", f"name = {_text(name)}"]
+        lines += _guess(item.about, f"signal = {_text(item.name)}")
+    for name, formula in derived.items():
+        lines += ["", "[[derived]]", f"name = {_text(name)}", f"formula = {_text(formula)}"]
     return "\n".join(lines) + "\n"
 
 
-def _head(proposal: Proposal, inputs: Sequence[Input], derived: Sequence[Derived], out: Path | None) -> list[str]:
-    files = " and ".join(path.name for path in (proposal.database, proposal.recording) if path is not None)
+def _head(
+    proposal: Proposal, inputs: Mapping[str, Candidate], derived: Mapping[str, str], out: Path | None
+) -> list[str]:
     scale_a, reason = _full_scale(proposal)
     lines = [
         *_folded(
-            f"Guessed by 'calibrator layout init' from {files}. Confirm or correct what is marked so; then 'calibrator "
-            f"doctor' compares it with a recording. What the keys mean: docs/layout.md"
+            f"Guessed by 'calibrator layout init' from {proposal.files}. Confirm or correct what is marked so; then "
+            f"'calibrator doctor' compares it with a recording. What the keys mean: docs/layout.md"
         ),
         "schema = 1",
         f"name = {_text(proposal.name)}",
@@ -314,17 +324,16 @@ def _head(proposal: Proposal, inputs: Sequence[Input], derived: Sequence[Derived
         folder = out.absolute().parent if out is not None else Path.cwd()
         lines.append(f"dbc = {_text(os.path.relpath(proposal.database.absolute(), folder))}")
     lines += _guess(reason, f"full_scale_a = {scale_a:g}")
-    used = [v.candidate for v in proposal.branches] + [item.candidate for item in inputs]
+    used = [v.candidate for v in proposal.branches] + [*inputs.values()]
     if wrong := [item.name for item in used if item.wrong == "range"]:
         lines += _guess("the recording goes beyond the ranges of the database", f"wrong_ranges = {json.dumps(wrong)}")
-    temperature = next((item.name for item in inputs if item.role == "sensor_temperature"), None)
-    if temperature is not None:
-        lines += _guess("it is that of the current sensors", f"temperature = {_text(temperature)}")
+    if "sensor_temperature" in inputs:
+        lines += _guess("it is that of the current sensors", 'temperature = "sensor_temperature"')
     if not derived:
         return [*lines, "# model_inputs = [...]   # nothing found to drive a model: a fleet needs [[input]]s"]
     lines.append("# Which inputs below drive the model of one vehicle, and that of the fleet.")
-    lines += _names("model_inputs", [item.name for item in derived if item.for_vehicle])
-    return lines + _names("fleet_inputs", [item.name for item in derived])
+    lines += _names("model_inputs", [name for name in derived if not name.startswith(FOR_FLEETS)])
+    return lines + _names("fleet_inputs", [*derived])
 
 
 def _full_scale(proposal: Proposal) -> tuple[float, str]:
@@ -334,7 +343,7 @@ def _full_scale(proposal: Proposal) -> tuple[float, str]:
         decade = 10.0 ** math.floor(math.log10(least))
         scale_a = next(step * decade for step in ROUND if step * decade >= least * (1.0 - 1e-9))
         return scale_a, f"the recording reaches {peak_a:.0f} A; give the nominal maximum"
-    battery = next((v.candidate for v in proposal.branches if v.place == "battery"), None)
+    battery = proposal.battery
     if battery is not None and battery.quantity == "current":
         reach_a = max(abs(battery.low), abs(battery.high))
         if reach_a <= LARGEST_A:
@@ -358,7 +367,8 @@ def _branch(proposal: Proposal, verdict: Verdict) -> list[str]:
     if item.quantity == "power":
         assert proposal.voltage is not None
         lines.append(f"voltage = {_text(proposal.voltage.name)}")
-    for other in [v for v in proposal.verdicts if not v.branch and v.place == verdict.place and "fits better" in v.why]:
+    others = [v for v in proposal.verdicts if not v.branch and v.place == verdict.place and v.score >= TAKEN]
+    for other in others:
         lines += _folded(f"or: {_text(other.candidate.name)} ({other.candidate.about})")
     lines += _guess(verdict.sign_reason, f"sign = {verdict.sign}")
     lines.append(f"timeout_s = {_timeout_s(item):g}")
@@ -367,11 +377,11 @@ def _branch(proposal: Proposal, verdict: Verdict) -> list[str]:
 
 def _timeout_s(item: Candidate) -> float:
     """From the cycle time, or from what a recording shows."""
-    period_s, gap_s = item.rough_steps_s
-    if not math.isfinite(period_s):
-        period_s = (item.message.cycle_time or 0) * 1e-3 if item.message is not None else 0.0
-        gap_s = 0.0
-    wanted_s = max(TIMEOUT_PERIODS * period_s, GAP_TIMES * gap_s) if period_s else USUAL_TIMEOUT_S
+    steps_s = np.diff(item.channel.time_s) if item.channel is not None else np.zeros(0)
+    period_s = (item.message.cycle_time or 0) * 1e-3 if item.message is not None else 0.0
+    wanted_s = TIMEOUT_PERIODS * period_s or USUAL_TIMEOUT_S
+    if len(steps_s):
+        wanted_s = max(TIMEOUT_PERIODS * float(np.median(steps_s)), GAP_TIMES * float(steps_s.max()))
     wanted_s = min(wanted_s, LONGEST_TIMEOUT_S)
     return max(round(math.ceil(wanted_s / TIMEOUT_STEP_S - 1e-9) * TIMEOUT_STEP_S, 3), LEAST_TIMEOUT_S)
 

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
+from calibrator.errors import LogError
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import JsonOption, number_option
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import dumps
-from ecu_node.failures import say_error
-from ecu_node.standard_output import write_output
+from ecu_node.program import say_error, write_output
 
 __all__ = ["replay"]
 
@@ -37,11 +37,14 @@ def replay(
     The log is read whole before the first frame is sent. Error and remote frames are left out.
     """
     with importing():
-        from calibrator.recordings import replay as core
-        from ecu_node.buses import connect
+        from calibrator.recordings.frames import LOG_SUFFIXES, read_frames
+        from calibrator.recordings.live import play_frames
+        from ecu_node.bus.links import connect
 
     logging.getLogger("can").addHandler(logging.NullHandler())
-    frames, sent = core.read_log(log), 0
+    if log.is_dir():
+        raise LogError(f"{log}: a folder; give one log file ({' '.join(LOG_SUFFIXES)}, each also .gz)")
+    frames, sent = read_frames(log), 0
 
     def count(so_far: int, _: float) -> None:
         nonlocal sent
@@ -50,14 +53,14 @@ def replay(
 
     try:
         with (
-            progress_bar("replay", len(frames.time_ns), "frames") as progress,
+            progress_bar("replay", len(frames), "frames") as progress,
             connect(interface, channel, fd=fd) as bus,
         ):
             begin_s = time.monotonic()
-            core.replay(core.messages_of(frames), bus, speed=speed, progress=count)
+            play_frames(frames.messages(), bus, speed=speed, progress=count)
             duration_s = time.monotonic() - begin_s
     except KeyboardInterrupt:
-        say_error(f"calibrator replay: {sent} of {len(frames.time_ns)} frames were sent")
+        say_error(f"calibrator replay: {sent} of {len(frames)} frames were sent")
         raise
     facts = {"frames": sent, "duration_s": duration_s}
     write_output(dumps(facts) if json else f"{sent} frames in {duration_s:.1f} s")

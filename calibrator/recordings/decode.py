@@ -1,4 +1,4 @@
-"""Signals of a DBC decoded from whole columns of payloads.
+"""Signals of a DBC decoded, and end-to-end protection checked, over whole columns of payloads.
 
 A signal is a run of bits: little-endian (Intel) from its lowest bit upwards, big-endian (Motorola) from its highest bit
 downwards. The bytes it touches are joined to one integer, shifted and masked; physical = raw * scale + offset.
@@ -9,6 +9,7 @@ long enough, the raw value does not stand for "no value", and the physical value
 as on the node, any name and the layout's ``no_value``.
 """
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,15 +19,27 @@ from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
-from calibrator.recordings.signal_range import signal_range
+from ecu_node.core.e2e import protection_of
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError
-from ecu_node.layout import SignalName
+from ecu_node.layout import ProfileP01, SignalName
 
-__all__ = ["Decoded", "bad_values", "codes_of_no_value", "decode_signal", "means_not_available", "raw_values"]
+__all__ = [
+    "Decoded",
+    "SignalRange",
+    "codes_of_no_value",
+    "decode_signal",
+    "means_not_available",
+    "message_is_sound",
+    "p01_is_sound",
+    "raw_values",
+    "signal_range",
+]
 
 Raw = NDArray[np.int64] | NDArray[np.uint64] | NDArray[np.float64]
 
+SLACK = 1e-6
+"""Rounding of decimal scales must not push a value out of its range. [steps of the signal]"""
 _WORD_BITS = 64
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 _NOT_AVAILABLE = re.compile(
@@ -46,13 +59,19 @@ class Decoded:
         Physical values in the unit of the DBC; NaN where the frame is too short.
     present : ndarray of bool of shape (n,)
         Whether the frame carries the signal; False only for multiplexed signals.
-    good : ndarray of bool of shape (n,)
-        Whether the value may be used; implies `present`.
+    bad : mapping of str to ndarray of bool, shape (n,)
+        Why values may not be used, by reason: ``too short``, ``not available`` (a code that is no value),
+        ``out of range`` (of the DBC, or no number).
     """
 
     value: Array
     present: Mask
-    good: Mask
+    bad: Mapping[str, Mask]
+
+    @property
+    def good(self) -> Mask:
+        """Whether each value is there and may be used, shape (n,)."""
+        return np.asarray(self.present & ~np.any(list(self.bad.values()), axis=0))
 
 
 def codes_of_no_value(database: VehicleDatabase, name: SignalName) -> frozenset[int]:
@@ -69,8 +88,8 @@ def codes_of_no_value(database: VehicleDatabase, name: SignalName) -> frozenset[
     -------
     frozenset of int
         Of a branch's current, power, voltage or corrected signal: every code with a name and, of the measured one, its
-        ``no_value``, as :mod:`ecu_node.codes` has it. Of others, as of a gear whose positions are named: codes with a
-        name that :func:`means_not_available`.
+        ``no_value``, as :mod:`ecu_node.core.signals` has it. Of other signals with named values (a gear selector):
+        codes with a name that :func:`means_not_available`.
     """
     signal = database.signal(name)[1]
     branches = [item for item in database.layout.branch if name in {item.source, item.voltage, item.corrected}]
@@ -114,34 +133,13 @@ def decode_signal(
     """
     present, known = _presence(message, signal, data, length)
     raw, complete = raw_values(signal, data, length)
-    value = _physical(signal, raw, complete)
-    bad = _bad_values(signal, raw, value, known & complete, no_value)
-    return Decoded(value=value, present=present, good=present & ~np.any(list(bad.values()), axis=0))
-
-
-def bad_values(
-    message: Message,
-    signal: Signal,
-    data: NDArray[np.uint8],
-    length: NDArray[np.uint8],
-    no_value: frozenset[int] | None = None,
-) -> Mapping[str, Mask]:
-    """Why values of one signal may not be used.
-
-    Parameters
-    ----------
-    message, signal, data, length, no_value :
-        As for :func:`decode_signal`.
-
-    Returns
-    -------
-    mapping of str to ndarray of bool, shape (n,)
-        By reason: ``too short``, ``not available`` (a code that is no value), ``out of range`` (of the DBC, or no
-        number); a frame that carries the signal and has none of them is good.
-    """
-    _, known = _presence(message, signal, data, length)
-    raw, complete = raw_values(signal, data, length)
-    return _bad_values(signal, raw, _physical(signal, raw, complete), known & complete, no_value)
+    with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN, or too large a number, in a float signal
+        value = np.where(complete, raw.astype(np.float64) * float(signal.scale) + float(signal.offset), np.nan)
+    whole = known & complete
+    named = whole & _is_one_of(signal, raw, _named_bad(signal) if no_value is None else no_value)
+    held = np.isfinite(value) & signal_range(signal).holds(value)
+    bad = {"too short": ~whole, "not available": named, "out of range": whole & ~named & ~held}
+    return Decoded(value=value, present=present, bad=bad)
 
 
 def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8]) -> tuple[Raw, Mask]:
@@ -189,6 +187,43 @@ def raw_values(signal: Signal, data: NDArray[np.uint8], length: NDArray[np.uint8
     return word, complete
 
 
+@dataclass(frozen=True, kw_only=True)
+class SignalRange:
+    """Least and greatest value of a signal, and what rounding may add to them."""
+
+    low: float
+    high: float
+    slack: float
+
+    def holds(self, value: Array) -> Mask:
+        """Which values lie inside; NaN does not."""
+        return np.asarray((value >= self.low - self.slack) & (value <= self.high + self.slack))
+
+
+def signal_range(signal: Signal, factor: float = 1.0) -> SignalRange:
+    """Range of one signal.
+
+    Parameters
+    ----------
+    signal : Signal
+        A signal of the DBC.
+    factor : float
+        What its physical values are multiplied by.
+
+    Returns
+    -------
+    SignalRange
+        Infinite on a side that the DBC does not limit. 0 to 0 limits neither: DBC files give it to signals without a
+        range.
+    """
+    low = -math.inf if signal.minimum is None else float(signal.minimum)
+    high = math.inf if signal.maximum is None else float(signal.maximum)
+    if not signal.minimum and not signal.maximum:
+        low, high = -math.inf, math.inf
+    ends = sorted((factor * low, factor * high))
+    return SignalRange(low=ends[0], high=ends[1], slack=abs(factor * float(signal.scale)) * SLACK)
+
+
 def means_not_available(name: str) -> bool:
     """Whether a name of a value table says that the value is not one.
 
@@ -207,19 +242,6 @@ def means_not_available(name: str) -> bool:
     """
     spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+", " ", name)
     return _NOT_AVAILABLE.fullmatch(spaced.strip().lower()) is not None
-
-
-def _physical(signal: Signal, raw: Raw, complete: Mask) -> Array:
-    with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN, or too large a number, in a float signal
-        return np.where(complete, raw.astype(np.float64) * float(signal.scale) + float(signal.offset), np.nan)
-
-
-def _bad_values(
-    signal: Signal, raw: Raw, value: Array, complete: Mask, no_value: frozenset[int] | None
-) -> dict[str, Mask]:
-    named = complete & _is_one_of(signal, raw, _named_bad(signal) if no_value is None else no_value)
-    held = np.isfinite(value) & signal_range(signal).holds(value)
-    return {"too short": ~complete, "not available": named, "out of range": complete & ~named & ~held}
 
 
 def _bit_run(signal: Signal) -> tuple[list[int], int]:
@@ -251,9 +273,7 @@ def _presence(
     everywhere = np.ones(len(data), np.bool_)
     if signal.multiplexer_ids is None or signal.multiplexer_signal is None:
         return everywhere, everywhere
-    # Where a DBC gives long names in attributes, cantools leaves the multiplexer's cut to 32 characters.
-    long = [s for s in message.signals if s.is_multiplexer and s.name.startswith(signal.multiplexer_signal)]
-    selector = min(long, key=lambda s: len(s.name), default=None)
+    selector = next((item for item in message.signals if item.name == signal.multiplexer_signal), None)
     if selector is None:
         return ~everywhere, everywhere
     present, known = _presence(message, selector, data, length)
@@ -275,3 +295,81 @@ def _is_one_of(signal: Signal, raw: Raw, codes: frozenset[int]) -> Mask:
         else:
             bad |= raw.view(np.uint64) & np.uint64(mask) == np.uint64(int(code) & mask)
     return bad
+
+
+# ---- end-to-end protection
+
+_POLYNOMIAL = 0x1D
+_NO_COUNTER = 15
+
+
+def _crc_table() -> NDArray[np.uint8]:
+    crc = np.arange(256)
+    for _ in range(8):
+        crc = ((crc << 1) ^ np.where(crc & 0x80, _POLYNOMIAL, 0)) & 0xFF
+    return crc.astype(np.uint8)
+
+
+_CRC = _crc_table()
+
+
+def p01_is_sound(data: NDArray[np.uint8], length: NDArray[np.uint8], data_id: int) -> Mask:
+    """Check CRC and range of the counter of frames of one message, protected by AUTOSAR E2E profile 1A.
+
+    There byte 0 is CRC-8 SAE J1850 (polynomial 0x1D, start and final value 0x00 in this profile) over the low and the
+    high byte of the data identifier and the bytes after the CRC. AUTOSAR, "E2E Protocol Specification", profile 1, both
+    bytes of the data identifier included.
+
+    Parameters
+    ----------
+    data : ndarray of uint8, shape (n, W)
+        Payloads, zeros after the length.
+    length : ndarray of uint8, shape (n,)
+        Payload bytes of each frame.
+    data_id : int
+        Data identifier of the message, 0 to 65535.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        True where byte 0 is the right CRC and the counter, the low half of byte 1, is not 15; False for frames shorter
+        than these 2 bytes.
+    """
+    crc = np.full(len(data), _CRC[_CRC[data_id & 0xFF] ^ (data_id >> 8)], np.uint8)
+    for column in range(1, data.shape[1]):
+        crc = np.where(length > column, _CRC[crc ^ data[:, column]], crc)
+    return np.asarray((length >= 2) & (crc == data[:, 0]) & (data[:, 1] & 0x0F != _NO_COUNTER))
+
+
+def message_is_sound(
+    database: VehicleDatabase, message: Message, data: NDArray[np.uint8], length: NDArray[np.uint8]
+) -> Mask:
+    """Check frames of one message as the layout says that it is protected.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        DBC and layout.
+    message : Message
+        That the frames are.
+    data, length :
+        As for :func:`p01_is_sound`.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        True where the frame is long enough and CRC and counter are possible; everywhere if it is not protected.
+    """
+    protection = protection_of(database, message)
+    if protection is None:
+        return np.ones(len(data), np.bool_)
+    entry = database.layout.protection(message.name)
+    if isinstance(entry, ProfileP01) and entry.data_id_mode == "both" and not entry.offset:
+        return p01_is_sound(data, length, entry.data_id.get(message.name, message.frame_id & 0xFFFF))
+    sound = np.zeros(len(data), np.bool_)
+    for index, (row, size) in enumerate(zip(data, length.tolist(), strict=True)):
+        if size >= protection.least_bytes:
+            payload = bytearray(row[:size].tobytes())
+            counter = payload[protection.counter_byte] >> protection.counter_shift & protection.counter_ones
+            sound[index] = counter < protection.modulus and protection.is_sound(payload)
+    return sound

@@ -4,9 +4,9 @@ A frame is kept as it was logged: time stamp, identifier, channel, length and pa
 payload; they and damaged lines are counted.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import can
 import numpy as np
@@ -18,12 +18,11 @@ __all__ = ["EXTENDED_BIT", "FrameCollector", "Frames", "concatenate_frames", "fr
 
 EXTENDED_BIT = 1 << 31
 """Set in a frame's key where the identifier has 29 bits, as in Linux' ``can_id``."""
+LARGEST_IDENTIFIER = (1 << 29) - 1
 CLASSIC_BYTES = 8
 FD_BYTES = 64
 LATEST_TIME_STAMP_NS = 9 * 10**18
 """Larger time stamps do not fit into 64 bits, and no log has them. [ns]"""
-
-_Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 def frame_key(frame_id: int, *, extended: bool) -> int:
@@ -67,46 +66,56 @@ class Frames:
         return len(self.time_ns)
 
     @property
-    def start_s(self) -> float:
-        """Time stamp of the first frame, as logged. [s]"""
-        return float(self.time_ns[0]) * 1e-9 if len(self) else 0.0
-
-    @property
     def time_s(self) -> Array:
         """Time since the first frame, in the order of the file, shape (n,). [s]"""
         return (self.time_ns - self.time_ns[:1]) * 1e-9
 
     def take(self, index: NDArray[np.int64] | Mask) -> "Frames":
         """Return some of the frames; the counts stay those of the log."""
-        return Frames(
-            time_ns=self.time_ns[index],
-            key=self.key[index],
-            channel=self.channel[index],
-            length=self.length[index],
-            data=self.data[index],
-            channels=self.channels,
-            error_frames=self.error_frames,
-            remote_frames=self.remote_frames,
-            damaged=self.damaged,
-        )
+        columns: dict[str, Any] = {name: getattr(self, name)[index] for name in _COLUMNS}
+        return replace(self, **columns)
+
+    def messages(self) -> Iterator[can.Message]:
+        """Yield the frames as messages to be sent, each with its time stamp [s]; CAN FD where longer than 8 bytes."""
+        for time_ns, key, length, data in zip(self.time_ns, self.key, self.length, self.data, strict=True):
+            yield can.Message(
+                timestamp=int(time_ns) * 1e-9,
+                arbitration_id=int(key) & ~EXTENDED_BIT,
+                is_extended_id=bool(int(key) & EXTENDED_BIT),
+                is_fd=int(length) > CLASSIC_BYTES,
+                data=data[: int(length)].tobytes(),
+                is_rx=False,
+            )
+
+
+_COLUMNS = ("time_ns", "key", "channel", "length", "data")
+_COUNTS = ("error_frames", "remote_frames", "damaged")
 
 
 def concatenate_frames(parts: Sequence[Frames]) -> Frames:
     """Join the pieces of one log; counts add up, channels are merged by name."""
+    parts = [FrameCollector().frames(), *parts]
     channels = tuple(dict.fromkeys(name for part in parts for name in part.channels))
     number = {name: index for index, name in enumerate(channels)}
-    width = max((part.data.shape[1] for part in parts), default=CLASSIC_BYTES)
+    width = max(part.data.shape[1] for part in parts)
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in ("time_ns", "key", "length")
+    }
+    counts: dict[str, Any] = {name: sum(getattr(part, name) for part in parts) for name in _COUNTS}
     return Frames(
-        time_ns=_join([part.time_ns for part in parts], np.int64),
-        key=_join([part.key for part in parts], np.uint32),
-        channel=_join([_renumbered(part, number) for part in parts], np.uint32),
-        length=_join([part.length for part in parts], np.uint8),
-        data=np.concatenate([np.zeros((0, width), np.uint8), *(_widened(part.data, width) for part in parts)]),
+        **columns,
+        **counts,
+        channel=np.concatenate(
+            [np.array([*map(number.get, part.channels)], np.uint32)[part.channel] for part in parts]
+        ),
+        data=np.concatenate([_widened(part.data, width) for part in parts]),
         channels=channels,
-        error_frames=sum(part.error_frames for part in parts),
-        remote_frames=sum(part.remote_frames for part in parts),
-        damaged=sum(part.damaged for part in parts),
     )
+
+
+def _widened(data: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    missing = width - data.shape[1]
+    return np.pad(data, ((0, 0), (0, missing))) if missing else data
 
 
 class FrameCollector:
@@ -118,24 +127,22 @@ class FrameCollector:
         self._channel: list[int] = []
         self._payload: list[bytes | bytearray] = []
         self._channels: dict[str, int] = {}
-        self.error_frames = 0
-        self.remote_frames = 0
-        self.damaged = 0
+        self.counts = dict.fromkeys(_COUNTS, 0)
 
     def __len__(self) -> int:
         return len(self._time_ns)
 
     def add(self, message: can.Message) -> None:
-        """Take one message. A frame shorter than it says, or with an impossible time stamp, is counted as damaged."""
+        """Take one message; one with an impossible length, identifier or time stamp is counted as damaged."""
         if message.is_error_frame:
-            self.error_frames += 1
+            self.counts["error_frames"] += 1
         elif message.is_remote_frame:
-            self.remote_frames += 1
-        elif not 0.0 <= message.timestamp <= 1e-9 * LATEST_TIME_STAMP_NS or _is_cut(message):
-            self.damaged += 1
+            self.counts["remote_frames"] += 1
+        elif not _is_possible(message):
+            self.counts["damaged"] += 1
         else:
             self._time_ns.append(round(message.timestamp * 1e9))
-            self._key.append(message.arbitration_id | (EXTENDED_BIT if message.is_extended_id else 0))
+            self._key.append(frame_key(message.arbitration_id, extended=message.is_extended_id))
             self._channel.append(self._channels.setdefault(str(message.channel), len(self._channels)))
             self._payload.append(message.data)
 
@@ -151,27 +158,15 @@ class FrameCollector:
             length=length,
             data=np.frombuffer(payload, np.uint8).reshape(-1, width),
             channels=tuple(self._channels),
-            error_frames=self.error_frames,
-            remote_frames=self.remote_frames,
-            damaged=self.damaged,
+            **self.counts,
         )
 
 
-def _is_cut(message: can.Message) -> bool:
-    """Whether the payload is shorter than the length of a classic frame says, or longer than any frame."""
-    if message.is_fd:
-        return len(message.data) > FD_BYTES
-    return len(message.data) != min(message.dlc, CLASSIC_BYTES)
-
-
-def _join(arrays: Sequence[NDArray[_Scalar]], dtype: type[_Scalar]) -> NDArray[_Scalar]:
-    return np.concatenate([np.zeros(0, dtype), *arrays])
-
-
-def _renumbered(part: Frames, number: dict[str, int]) -> NDArray[np.uint32]:
-    return np.array([number[name] for name in part.channels], np.uint32)[part.channel]
-
-
-def _widened(data: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    missing = width - data.shape[1]
-    return np.pad(data, ((0, 0), (0, missing))) if missing else data
+def _is_possible(message: can.Message) -> bool:
+    """Whether the payload has the length that a classic frame says, or fits into any, and identifier and time do."""
+    size = len(message.data)
+    return (
+        (size <= FD_BYTES if message.is_fd else size == min(message.dlc, CLASSIC_BYTES))
+        and 0 <= message.arbitration_id <= LARGEST_IDENTIFIER
+        and 0.0 <= message.timestamp <= 1e-9 * LATEST_TIME_STAMP_NS
+    )

@@ -1,23 +1,24 @@
-"""Frames from a live bus, as if they came from a log."""
+"""A live bus: its frames as if they came from a log, and a log played onto it."""
 
-import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 
 import can
 
 from calibrator.recordings.frame_arrays import FrameCollector, Frames
+from ecu_node.bus.links import connect
 from ecu_node.errors import BusError
 
-__all__ = ["listen"]
+__all__ = ["play_frames", "record_bus"]
 
 _POLL_S = 0.1
-"""How often the end of a live recording is checked. [s]"""
+"""Drivers that wait in C notice Ctrl-C only between calls. [s]"""
+_SEND_LIMIT_S = 1.0
+"""A bus that takes nothing for this long has nobody listening, or is off. [s]"""
+_SEND_PAUSE_S = 0.0005
 
 
-def listen(interface: str, channel: str | None, duration_s: float) -> Frames:
+def record_bus(interface: str, channel: str | None, duration_s: float) -> Frames:
     """Take everything that comes over a bus for some time.
 
     Parameters
@@ -37,21 +38,25 @@ def listen(interface: str, channel: str | None, duration_s: float) -> Frames:
     BusError
         If the bus cannot be opened, or nothing comes.
     """
-    collector = FrameCollector()
+    messages: list[can.Message] = []
     try:
-        with can.Bus(interface=interface, channel=channel) as bus, _interrupt_noted() as stopped:
+        with connect(interface, channel) as bus:
             end_s = time.monotonic() + duration_s
-            while not stopped.is_set() and (left_s := end_s - time.monotonic()) > 0.0:
+            while (left_s := end_s - time.monotonic()) > 0.0:
                 message = bus.recv(timeout=min(left_s, _POLL_S))
                 if message is not None:
-                    collector.add(message)
-    except (can.CanError, OSError, ValueError, TypeError) as error:
+                    messages.append(message)
+    except KeyboardInterrupt:
+        if not messages:
+            raise
+    except (can.CanError, OSError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise BusError(
             f"{interface}:{channel}: cannot listen to the bus: {reason}; check --interface and --channel"
         ) from None
-    if stopped.is_set() and not len(collector):
-        raise KeyboardInterrupt
+    collector = FrameCollector()
+    for message in messages:
+        collector.add(message)
     if not len(collector):
         raise BusError(
             f"{interface}:{channel}: no frame in {duration_s:g} s; check that something is sent, or listen longer"
@@ -59,16 +64,61 @@ def listen(interface: str, channel: str | None, duration_s: float) -> Frames:
     return collector.frames()
 
 
-@contextmanager
-def _interrupt_noted() -> Iterator[threading.Event]:
-    """Within the block Ctrl-C sets this event, so that no frame is half taken; what ignores Ctrl-C goes on doing so."""
-    stopped = threading.Event()
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
-        yield stopped
-        return
-    signal.signal(signal.SIGINT, lambda *_: stopped.set())
-    try:
-        yield stopped
-    finally:
-        signal.signal(signal.SIGINT, before)
+def play_frames(
+    messages: Iterable[can.Message],
+    bus: can.BusABC,
+    *,
+    speed: float = 1.0,
+    progress: Callable[[int, float], None] | None = None,
+) -> int:
+    """Send messages in their order, at their instants.
+
+    Parameters
+    ----------
+    messages : iterable of can.Message
+        Frames with timestamps [s]; error frames are left out, a bus makes its own.
+    bus : can.BusABC
+        Where to.
+    speed : float
+        1 keeps the timing, 2 halves the time, 0 goes as fast as the bus takes frames. [1]
+    progress : callable, optional
+        Called after each frame with the number of frames sent and the time since the first one in the log [s].
+
+    Returns
+    -------
+    int
+        Number of frames sent.
+
+    Raises
+    ------
+    BusError
+        If the bus takes no frame for a second.
+    """
+    sent = 0
+    begin_s = time.monotonic()
+    first_s: float | None = None
+    for message in messages:
+        if message.is_error_frame:
+            continue
+        first_s = message.timestamp if first_s is None else first_s
+        age_s = message.timestamp - first_s
+        if speed > 0.0 and (wait_s := begin_s + age_s / speed - time.monotonic()) > 0.0:
+            time.sleep(wait_s)
+        _send(bus, message)
+        sent += 1
+        if progress is not None:
+            progress(sent, age_s)
+    return sent
+
+
+def _send(bus: can.BusABC, message: can.Message) -> None:
+    give_up_s = time.monotonic() + _SEND_LIMIT_S
+    while True:
+        try:
+            bus.send(message)
+        except can.CanError as error:
+            if time.monotonic() > give_up_s:
+                raise BusError(f"{bus.channel_info}: the bus takes no frame: {error}") from None
+            time.sleep(_SEND_PAUSE_S)
+        else:
+            return

@@ -3,26 +3,51 @@
 A file inside an archive has the path ``fleet.zip/V0001/monday.log``, as if the archive were a folder.
 """
 
+import codecs
 import gzip
 import io
+import shlex
 import shutil
 import tempfile
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO, TextIO, cast
+
+import pandas as pd
 
 from calibrator.errors import LogError
 from ecu_node.errors import UserError
 
-__all__ = ["UNREADABLE", "exists", "file_on_disk", "files_in", "head_of", "opened", "readable", "suffix_of"]
+__all__ = [
+    "MAX_DAMAGED_SHARE",
+    "UNREADABLE",
+    "exists",
+    "file_on_disk",
+    "files_in",
+    "open_log",
+    "read_rows",
+    "read_undamaged",
+    "readable",
+    "reason_of",
+    "remedy_for",
+    "suffix_of",
+    "text_head",
+]
 
 UNREADABLE = (OSError, EOFError, zlib.error)
 """What opening and unpacking may raise; gzip.BadGzipFile is an OSError."""
+_NO_ARCHIVE = (*UNREADABLE, zipfile.BadZipFile, UnicodeError, RuntimeError, KeyError)
+"""What opening and unpacking an archive may raise; RuntimeError where it is encrypted."""
 _BINARY = (".mf4", ".parquet", ".feather", ".arrow")
 """Formats whose readers need a file that is not packed."""
+MAX_DAMAGED_SHARE = 0.05
+"""Of the lines of a text log. Recordings of a real car through a serial adapter had up to 3 % broken lines and decoded
+well. [1]"""
+_HEAD_BYTES = 1 << 16
 
 
 def suffix_of(path: Path) -> str:
@@ -30,23 +55,61 @@ def suffix_of(path: Path) -> str:
     return Path(path.name.lower().removesuffix(".gz")).suffix
 
 
-def opened(path: Path) -> BinaryIO:
+def open_log(path: Path) -> BinaryIO:
     """Open a file that is in no archive, gzipped or not."""
     return cast("BinaryIO", gzip.open(path, "rb") if path.name.lower().endswith(".gz") else path.open("rb"))
 
 
-def head_of(path: Path, size: int) -> bytes:
-    """Beginning of a file that is in no archive; of a damaged one what can be read."""
+def read_undamaged(file: BinaryIO, size: int) -> tuple[bytes, Exception | None]:
+    """As much of so many bytes as can be read, and what kept the rest; a single large read would lose it all."""
     parts: list[bytes] = []
-    with opened(path) as file:
-        try:
-            while size > 0 and (part := cast("io.BufferedIOBase", file).read1(size)):
-                parts.append(part)
-                size -= len(part)
-        except UNREADABLE:
-            if not parts:
-                raise
-    return b"".join(parts)
+    read1 = cast("io.BufferedIOBase", file).read1
+    try:
+        while size > 0 and (part := read1(size)):
+            parts.append(part)
+            size -= len(part)
+    except UNREADABLE as error:
+        return b"".join(parts), error
+    return b"".join(parts), None
+
+
+def text_head(path: Path) -> tuple[str, str]:
+    """Beginning of a text file that is in no archive, whole lines, and its encoding; of a damaged one what there is."""
+    with open_log(path) as file:
+        head, damage = read_undamaged(file, _HEAD_BYTES)
+    if damage is not None and not head:
+        raise damage
+    encoding = "utf-16" if head[:2] in {codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE} else "utf-8-sig"
+    try:
+        text = codecs.getincrementaldecoder(encoding)().decode(head)
+    except UnicodeDecodeError:
+        encoding = "cp1252"
+        text = head.decode(encoding, errors="replace")
+    return (text.rpartition("\n")[0] if len(head) == _HEAD_BYTES else text), encoding
+
+
+def read_rows(file: BinaryIO | TextIO, **options: Any) -> tuple[pd.DataFrame, int]:
+    """Rows of a CSV, with options of :func:`pandas.read_csv`, and how many had too many cells and are left out."""
+    with warnings.catch_warnings(record=True) as complaints:
+        warnings.simplefilter("always")
+        rows = pd.read_csv(file, index_col=False, skipinitialspace=True, on_bad_lines="warn", **options)
+    return rows, sum(str(complaint.message).count("Skipping line") for complaint in complaints)
+
+
+def reason_of(error: BaseException) -> str:
+    """One line that says what an error of a reader means."""
+    if isinstance(error, EOFError):
+        return "the compressed file is cut off"
+    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return str(text).splitlines()[0]
+
+
+def remedy_for(path: Path, frames: int) -> str:
+    """What to do with a text log of which only the first frames can be read."""
+    if not frames or not path.name.lower().endswith(".gz"):
+        return "copy the file again"
+    part = f"'gzip -dc {shlex.quote(path.name)} > {shlex.quote(path.stem)}'"
+    return f"copy the file again, or keep the readable part, {part}, and remove {path.name}"
 
 
 def exists(path: Path) -> bool:
@@ -69,10 +132,12 @@ def files_in(path: Path) -> list[Path]:
         return []
     try:
         with zipfile.ZipFile(path) as archive:
-            names = [PurePosixPath(item.filename) for item in archive.infolist() if not item.is_dir()]
-    except (*UNREADABLE, zipfile.BadZipFile) as error:
+            names = [PurePosixPath(name) for name in archive.namelist() if not name.endswith("/")]
+    except _NO_ARCHIVE as error:
         raise LogError(f"{path}: not a readable archive: {error}; pack or copy it again") from None
-    return sorted(path / name for name in names if name.name[0] != "." and ".." not in name.parts and name.root == "")
+    return sorted(
+        path / name for name in names if name.name[:1] not in {"", "."} and ".." not in name.parts and name.root == ""
+    )
 
 
 @contextmanager
@@ -90,12 +155,12 @@ def readable(path: Path) -> Iterator[Path]:
         try:
             if archive is None:
                 copy = copy.with_suffix("")
-                with opened(path) as packed, copy.open("wb") as file:
+                with open_log(path) as packed, copy.open("wb") as file:
                     shutil.copyfileobj(packed, file)
             else:
                 with zipfile.ZipFile(archive) as members, copy.open("wb") as file:
                     shutil.copyfileobj(members.open(path.relative_to(archive).as_posix()), file)
-        except (*UNREADABLE, zipfile.BadZipFile, RuntimeError, KeyError) as error:  # RuntimeError: it is encrypted
+        except _NO_ARCHIVE as error:
             raise LogError(f"{path}: cannot be unpacked: {str(error).strip(chr(39))}; copy the file again") from None
         try:
             if archive is not None and copy.name.lower().endswith(".gz"):

@@ -58,18 +58,16 @@ def repaired_time(time_ns: NDArray[np.int64]) -> LogTime:
         Order, time since the first frame, and what was repaired.
     """
     elapsed = (time_ns - time_ns[0]) * 1e-9
-    newest = np.maximum.accumulate(elapsed)
     step = np.diff(elapsed)
     jump = (step < -LARGEST_DISORDER_S) | (step > LONGEST_PAUSE_S)
     if jump.any():
         shift = np.concatenate([[0.0], np.cumsum(np.where(jump, CLOCK_GAP_S - step, 0.0))])
         elapsed = elapsed + shift
-        newest = np.maximum.accumulate(elapsed)
     order = np.argsort(elapsed, kind="stable")
     ordered = elapsed[order]
     return LogTime(
         order=order,
         time_s=ordered - ordered[0],
-        disordered=int(np.sum(elapsed < newest)),
+        disordered=int(np.sum(elapsed < np.maximum.accumulate(elapsed))),
         clock_steps=int(jump.sum()),
     )

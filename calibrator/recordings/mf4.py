@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,7 +20,7 @@ import pandas as pd
 from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import Frames
 
-__all__ = ["is_bus_log", "main", "read_mf4", "read_mf4_table"]
+__all__ = ["convert", "is_bus_log", "read_mf4", "read_mf4_table"]
 
 START_S = 60.0
 """Time for the process to start on a slow machine; asammdf imports much. [s]"""
@@ -56,17 +57,8 @@ def read_mf4(path: Path) -> Frames:
         If asammdf is not installed, the file is damaged, or reading takes too long.
     """
     with _converted(path, "frames.npz") as result, np.load(result, allow_pickle=False) as arrays:
-        return Frames(
-            time_ns=arrays["time_ns"],
-            key=arrays["key"],
-            channel=arrays["channel"],
-            length=arrays["length"],
-            data=arrays["data"],
-            channels=tuple(str(name) for name in arrays["channels"]),
-            error_frames=int(arrays["error_frames"]),
-            remote_frames=int(arrays["remote_frames"]),
-            damaged=int(arrays["damaged"]),
-        )
+        columns: dict[str, Any] = {name: value if value.ndim else int(value) for name, value in arrays.items()}
+    return Frames(**{**columns, "channels": tuple(map(str, columns["channels"]))})
 
 
 def read_mf4_table(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
@@ -111,7 +103,7 @@ def _converted(path: Path, name: str) -> Iterator[Path]:
         yield result
 
 
-def main(path: str, result: str) -> None:
+def convert(path: str, result: str) -> None:
     """Write frames (.npz) or decoded channels (.parquet) of `path` to `result`: what the process does."""
     if result.endswith(".parquet"):
         _write_channels(path, result)
@@ -146,4 +138,4 @@ def _write_channels(path: str, result: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    convert(*sys.argv[1:])

@@ -19,12 +19,10 @@ from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.drives.align import at_instants, base_inputs
 from calibrator.drives.derived import evaluate_formula
 from calibrator.errors import LogError
-from calibrator.recordings.decode import bad_values, codes_of_no_value, decode_signal
-from calibrator.recordings.e2e_profile import message_is_sound
+from calibrator.recordings.decode import codes_of_no_value, decode_signal, message_is_sound, signal_range
 from calibrator.recordings.frame_arrays import EXTENDED_BIT, Frames, frame_key
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.log_time import CLOCK_GAP_S, repaired_time
-from calibrator.recordings.signal_range import signal_range
 from calibrator.recordings.tables import Table, is_table, read_table
 from calibrator.terminal.text import Notice
 from ecu_node.database import VehicleDatabase
@@ -37,7 +35,7 @@ __all__ = [
     "FrameSource",
     "Recording",
     "RecordingReport",
-    "Source",
+    "SignalSource",
     "TableSource",
     "drive_from_frames",
     "drive_from_table",
@@ -61,16 +59,12 @@ class ChannelReport:
         Name in the layout; ``Message.Signal`` in the DBC.
     frames, not_good : int
         Frames that carry it, and how many of them are labelled as not good.
-    first_s, last_s : float
-        First and last instant since the start of the log; NaN without frames. [s]
     """
 
     name: str
     signal: str
     frames: int
     not_good: int
-    first_s: float
-    last_s: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +83,7 @@ class RecordingReport:
         Frames that come from other buses than those that the layout means, by channel.
     found : str
         How a table was read; empty for logs.
-    unfit : str
+    unfit : tuple of str
         What of the layout the recording cannot serve, and what to do: channels of a ``[[bus]]`` that the log does not
         have, columns of branches whose cells are no numbers; empty for nothing.
     """
@@ -103,40 +97,31 @@ class RecordingReport:
     clock_steps: int = 0
     ignored: Mapping[str, int] = field(default_factory=dict)
     found: str = ""
-    unfit: str = ""
+    unfit: tuple[str, ...] = ()
 
-    def notices(self) -> list[str]:
-        """Return what a user should know, one short text each; empty if the log is whole and sound."""
-        return [str(notice) for notice in self.counted_notices()]
-
-    def log_notices(self) -> list[str]:
-        """Return those of the notices that concern the log as a whole, not single channels."""
-        return [str(notice) for notice in self._counted_log_notices()]
-
-    def counted_notices(self) -> list[Notice]:
-        """Return the notices with their counts apart, so that those of many logs can be told together."""
+    def notices(self) -> list[Notice]:
+        """Return what a user should know; empty if the log is whole and sound."""
         absent = [item.name for item in self.channels if not item.frames]
-        spoilt = [item for item in self.channels if item.not_good]
-        notices = [Notice(text=f"no frames of {', '.join(absent)}")] if absent else []
-        notices += [
+        spoilt = [
             Notice(text=f"{item.name}: {{}} of {{}} frames not usable", counts=(item.not_good, item.frames))
-            for item in spoilt
+            for item in self.channels
+            if item.not_good
         ]
-        return notices + self._counted_log_notices()
+        return [*([Notice(text=f"no frames of {', '.join(absent)}")] if absent else []), *spoilt, *self.log_notices()]
 
-    def _counted_log_notices(self) -> list[Notice]:
+    def log_notices(self) -> list[Notice]:
+        """Return those of the notices that concern the log as a whole, not single channels."""
+        found, unfit = (text.replace("{", "{{").replace("}", "}}") for text in (self.found, "; ".join(self.unfit)))
         texts = {
+            f"{{}} rows, {found}": self.frames if found else 0,
             "{} damaged lines or frames left out": self.damaged,
             "{} error frames": self.error_frames,
             "{} frames out of order, sorted": self.disordered,
             f"the clock was set {{}} times, each step became a gap of {CLOCK_GAP_S:g} s": self.clock_steps,
             f"{{}} frames of other buses ignored ({', '.join(self.ignored)})": sum(self.ignored.values()),
         }
-        found = self.found.replace("{", "{{").replace("}", "}}")
-        told = [Notice(text=f"{{}} rows, {found}", counts=(self.frames,))] if found else []
-        unfit = self.unfit.replace("{", "{{").replace("}", "}}")
-        told += [Notice(text=unfit)] if unfit else []
-        return [*told, *(Notice(text=text, counts=(count,)) for text, count in texts.items() if count)]
+        told = [Notice(text=text, counts=(count,)) for text, count in texts.items() if count]
+        return [*told, Notice(text=unfit)] if unfit else told
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,21 +187,25 @@ def drive_from_table(table: Table, database: VehicleDatabase, *, vehicle: str, n
     return _recording(TableSource(table, database), vehicle, name)
 
 
-def _recording(source: "Source", vehicle: str, name: str) -> Recording:
+def _recording(source: "SignalSource", vehicle: str, name: str) -> Recording:
     layout = source.database.layout
     branches = {branch.name: source.branch(branch, branch.source) for branch in layout.branch}
     if not any(channel.time_s.size for channel in branches.values()):
-        raise LogError(f"{source.where}: no branch of {layout.path} in it; {source.found_and_expected()}")
-    inputs = {item.name: source.channel(item.signal) for item in layout.input}
+        what = f"{source.where}: no branch of {layout.path} in it; {source.found_and_expected()}"
+        raise LogError(what, "check that layout and log belong to the same vehicle and bus")
+    inputs = {item.name: source.samples(item.signal)[0] for item in layout.input}
     corrected = {branch.name: source.branch(branch, branch.corrected) for branch in layout.branch if branch.corrected}
     signals = {branch.name: branch.source for branch in layout.branch} | {i.name: i.signal for i in layout.input}
-    channels = tuple(_channel_report(key, signals[key], c) for key, c in (branches | inputs).items())
+    channels = tuple(
+        ChannelReport(name=key, signal=signals[key], frames=len(c.time_s), not_good=int(np.sum(~c.good)))
+        for key, c in (branches | inputs).items()
+    )
     available = {key: channel for key, channel in inputs.items() if channel.good.any()}
     drive = Drive(vehicle=vehicle, name=name, branches=_present(branches), inputs=available)
     return Recording(drive=drive, corrected=_present(corrected), report=source.report(channels))
 
 
-class Source(ABC):
+class SignalSource(ABC):
     """A recording in the order of time, with the look-ups that turn it into channels.
 
     Attributes
@@ -232,12 +221,11 @@ class Source(ABC):
         self.where = where
 
     @abstractmethod
-    def channel(self, signal_name: str) -> Channel:
-        """One signal in the unit of the DBC, at the frames or rows that carry it."""
+    def samples(self, signal_name: str) -> tuple[Channel, Mapping[str, Mask]]:
+        """One signal in the unit of the DBC, at the frames or rows that carry it, and why samples may not be used.
 
-    @abstractmethod
-    def bad(self, signal_name: str) -> Mapping[str, Mask]:
-        """Why samples of :meth:`channel` may not be used, by reason; what has no reason is good."""
+        What has no reason is good.
+        """
 
     @abstractmethod
     def unit(self, signal_name: str) -> str:
@@ -270,7 +258,7 @@ class Source(ABC):
 
     def _scaled(self, signal_name: str, units: Mapping[str, float], branch: Branch) -> Channel:
         """One signal in A, V or W."""
-        channel = self.channel(signal_name)
+        channel = self.samples(signal_name)[0]
         where = f"{self.database.layout.path}: branch {branch.name}"
         factor = factor_of(self.unit(signal_name), units, f"{where}: {signal_name}")
         return Channel(time_s=channel.time_s, value=channel.value * factor, good=channel.good)
@@ -279,7 +267,7 @@ class Source(ABC):
         """A branch by its formula, at the instants of what comes most often in it."""
         layout, tree = self.database.layout, parse_formula(formula)
         signals = {item.name: item.signal for item in layout.input}
-        channels = {name: self.channel(signals.get(name, name)) for name in base_inputs(layout, formula_names(tree))}
+        channels = {name: self.samples(signals.get(name, name))[0] for name in base_inputs(layout, formula_names(tree))}
         if not channels or not all(channel.good.any() for channel in channels.values()):
             return Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_))
         time_s = max(channels.values(), key=lambda channel: len(channel.time_s)).time_s
@@ -294,7 +282,7 @@ class Source(ABC):
         return Channel(time_s=time_s, value=value, good=good & np.isfinite(value))
 
 
-class FrameSource(Source):
+class FrameSource(SignalSource):
     """Frames of a log.
 
     Attributes
@@ -319,21 +307,14 @@ class FrameSource(Source):
             found = zip(frames.channels, counts, strict=True)
             self.ignored.update({channel: count for channel, count in found if channel not in known and count})
 
-    def channel(self, signal_name: str) -> Channel:  # noqa: D102 (as above)
+    def samples(self, signal_name: str) -> tuple[Channel, Mapping[str, Mask]]:  # noqa: D102 (as above)
         message, signal = self.database.signal(signal_name)
         frames, time_s, unspoilt = self._of_message(signal_name)
-        no_value = codes_of_no_value(self.database, signal_name)
-        decoded = decode_signal(message, signal, frames.data, frames.length, no_value)
-        kept = decoded.present
-        return Channel(time_s=time_s[kept], value=decoded.value[kept], good=(decoded.good & unspoilt)[kept])
-
-    def bad(self, signal_name: str) -> Mapping[str, Mask]:  # noqa: D102 (as above)
-        message, signal = self.database.signal(signal_name)
-        frames, _, unspoilt = self._of_message(signal_name)
-        no_value = codes_of_no_value(self.database, signal_name)
-        kept = decode_signal(message, signal, frames.data, frames.length, no_value).present
-        reasons = bad_values(message, signal, frames.data, frames.length, no_value)
-        return {reason: mask[kept] for reason, mask in {"E2E check failed": ~unspoilt, **reasons}.items()}
+        codes = codes_of_no_value(self.database, signal_name)
+        decoded = decode_signal(message, signal, frames.data, frames.length, codes)
+        kept = slice(None) if decoded.present.all() else decoded.present
+        channel = Channel(time_s=time_s[kept], value=decoded.value[kept], good=(decoded.good & unspoilt)[kept])
+        return channel, {reason: bad[kept] for reason, bad in {"E2E check failed": ~unspoilt, **decoded.bad}.items()}
 
     def unit(self, signal_name: str) -> str:  # noqa: D102 (as above)
         return self.database.signal(signal_name)[1].unit or ""
@@ -347,8 +328,7 @@ class FrameSource(Source):
         more = f" and {len(keys) - _MOST_LISTED} more" if len(keys) > _MOST_LISTED else ""
         return (
             f"it has the identifiers {', '.join(map(_hex, keys[:_MOST_LISTED]))}{more}{wanted[0]}; expected "
-            f"{expected or 'signals of the inputs'}{wanted[1]}; check that layout and log belong to the same vehicle "
-            f"and bus"
+            f"{expected or 'signals of the inputs'}{wanted[1]}"
         )
 
     def _channels(self) -> tuple[Sequence[str], Sequence[str]]:
@@ -368,11 +348,11 @@ class FrameSource(Source):
             unfit=self._unfit(),
         )
 
-    def _unfit(self) -> str:
+    def _unfit(self) -> tuple[str, ...]:
         here, named = self._channels()
         lacking = ", ".join(channel for channel in named if channel not in here)
-        remedy = "correct channel in [[bus]], or record that bus"
-        return f"no channel {lacking} in it, which has {', '.join(here)}; {remedy}" if lacking else ""
+        what = f"no channel {lacking} in it, which has {', '.join(here)}"
+        return (what, "correct channel in [[bus]], or record that bus") if lacking else ()
 
     def _of_message(self, signal_name: str) -> tuple[Frames, Array, Mask]:
         """Frames of the message of a signal, their times, and whether their end-to-end protection is right."""
@@ -405,7 +385,7 @@ class FrameSource(Source):
         return np.asarray(channel == main)
 
 
-class TableSource(Source):
+class TableSource(SignalSource):
     """Columns of a table; with a DBC they may be called ``Message.Signal`` or ``Signal``."""
 
     def __init__(self, table: Table, database: VehicleDatabase) -> None:
@@ -421,12 +401,6 @@ class TableSource(Source):
                     f"{table.path}: column {header!r} could be {owners[header]} and {name}; call columns after message "
                     f"and signal"
                 )
-
-    def channel(self, signal_name: str) -> Channel:  # noqa: D102 (as above)
-        return self._column(signal_name)[0]
-
-    def bad(self, signal_name: str) -> Mapping[str, Mask]:  # noqa: D102 (as above)
-        return self._column(signal_name)[1]
 
     def unit(self, signal_name: str) -> str:  # noqa: D102 (as above)
         unit = self.database.signal(signal_name)[1].unit
@@ -445,11 +419,11 @@ class TableSource(Source):
             disordered=self.table.disordered,
             clock_steps=self.table.clock_steps,
             found=self.table.found,
-            unfit=next(filter(None, map(self.table.no_numbers, names)), ""),
+            unfit=next(filter(None, map(self.table.no_numbers, names)), ()),
         )
 
-    def _column(self, signal_name: str) -> tuple[Channel, dict[str, Mask]]:
-        """A column in the unit of the DBC where both units are known, and why samples may not be used."""
+    def samples(self, signal_name: str) -> tuple[Channel, Mapping[str, Mask]]:
+        """A column, in the unit of the DBC where both units are known; see the class above."""
         header = self.table.header(signal_name)
         if header is None:
             return Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_)), {}
@@ -490,15 +464,3 @@ def _hex(key: int) -> str:
 
 def _present(channels: Mapping[str, Channel]) -> dict[str, Channel]:
     return {name: channel for name, channel in channels.items() if channel.time_s.size}
-
-
-def _channel_report(name: str, signal: str, channel: Channel) -> ChannelReport:
-    time_s = channel.time_s
-    return ChannelReport(
-        name=name,
-        signal=signal,
-        frames=len(time_s),
-        not_good=int(np.sum(~channel.good)),
-        first_s=float(time_s[0]) if time_s.size else float("nan"),
-        last_s=float(time_s[-1]) if time_s.size else float("nan"),
-    )

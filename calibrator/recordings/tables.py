@@ -4,18 +4,17 @@ Nothing has to be said about a file: delimiter, decimal sign, encoding, header, 
 :attr:`Table.found` tells what was found. Rows need not have a value in every column.
 """
 
-import codecs
 import csv
 import difflib
 import io
 import itertools
+import json
 import re
-import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,7 +24,16 @@ from calibrator.drive import Array, Mask
 from calibrator.drives.charge import GAP_PERIODS
 from calibrator.errors import LogError
 from calibrator.recordings.candump import is_candump
-from calibrator.recordings.log_files import UNREADABLE, exists, files_in, head_of, opened, readable, suffix_of
+from calibrator.recordings.log_files import (
+    UNREADABLE,
+    exists,
+    files_in,
+    open_log,
+    read_rows,
+    readable,
+    suffix_of,
+    text_head,
+)
 from calibrator.recordings.log_time import repaired_time
 from calibrator.recordings.mf4 import is_bus_log, read_mf4_table
 from ecu_node.database import VehicleDatabase, read_database
@@ -33,14 +41,13 @@ from ecu_node.errors import LayoutError
 from ecu_node.layout import layout_of
 from ecu_node.units import AMPERE, usual_unit
 
-__all__ = ["TABLE_SUFFIXES", "Table", "bare_name", "is_table", "layout_from_branches", "read_table", "text_head"]
+__all__ = ["TABLE_SUFFIXES", "Table", "bare_name", "is_table", "layout_from_branches", "read_table"]
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow", ".mf4")
 FRAME_COLUMNS = ("arbitration_id", "id", "canid", "can id")
 """Headers of identifiers, lower case: a text file that has one of them beside a time is a log of CAN frames."""
 MOST_SHARING = 1.5
 """Rows with the same time, on average, from which on the time is too coarse: loggers repeat a few instants. [1]"""
-_HEAD_BYTES = 1 << 16
 _DELIMITERS = ("\t", ";", "|", ",", " ")
 """In the order in which they are tried: a comma may be the decimal sign, a blank stand in a date."""
 _EMPTY = frozenset(("", "-", "--", "nan", "na", "n/a", "#n/a", "null", "none"))
@@ -49,31 +56,9 @@ _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _UNIT_BEHIND = re.compile(r"(.*\S)\s*[\[({<]([^\])}>]*)[\])}>]")
 _UNIT_SUFFIX = re.compile(r"(.*\w)\s*[_/, ]\s*(\w+)")
 _SUFFIXES = frozenset(["mA", "A", "kA", "mV", "V", "kV", "W", "kW", "ms", "us", "ns", "s"])
-_TIME_WORDS = frozenset(
-    [
-        "t",
-        "time",
-        "timestamp",
-        "timestamps",
-        "stamp",
-        "date",
-        "datetime",
-        "zeit",
-        "zeitstempel",
-        "datum",
-        "uhrzeit",
-        "temps",
-        "fecha",
-        "tiempo",
-        "tijd",
-        "elapsed",
-        "utc",
-        "epoch",
-        "seconds",
-        "sec",
-        "secs",
-        "millis",
-    ]
+_TIME_WORD = re.compile(
+    r"(?:^|[\W_])(t|time|timestamps?|stamp|date|datetime|zeit|zeitstempel|datum|uhrzeit|temps|fecha|tiempo|tijd|elapsed|utc"
+    r"|epoch|seconds|secs?|millis)(?:[\W_]|$)"
 )
 _TIME_UNITS = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), 1.0),
@@ -139,6 +124,7 @@ class Table:
         for same in (
             [header for header in bare if header == name],
             [header for header, text in bare.items() if text == whole],
+            [header for header, text in bare.items() if re.fullmatch(rf"{re.escape(bare_name(whole))}\.\d+", text)],
             [header for header, text in bare.items() if text.endswith(f".{whole}")],
             [header for header, text in bare.items() if text == whole.rpartition(".")[2]],
             [header for header, text in bare.items() if text.casefold() == whole.casefold()],
@@ -153,16 +139,16 @@ class Table:
         """As :meth:`header`; :class:`LogError` with the columns that are there if there is none."""
         header = self.header(name)
         if header is None:
-            why = self.no_numbers(name) or f"there is no column {name!r}; {self.known(name)}"
+            why = "; ".join(self.no_numbers(name) or (f"there is no column {name!r}", self.known(name)))
             raise LogError(f"{self.path}: {why}")
         return header
 
-    def no_numbers(self, name: str) -> str:
-        """What to say of a column that is there, without numbers; empty for others."""
+    def no_numbers(self, name: str) -> tuple[str, ...]:
+        """What to say of a column that is there, without numbers, and what to do; empty for others."""
         header = None if self.header(name) is not None else self._same(name, self.texts)
         if header is None:
-            return ""
-        return f"column {header!r}: {self.texts[header]}; write numbers, and the unit in the header"
+            return ()
+        return f"column {header!r}: {self.texts[header]}", "write numbers, and the unit in the header"
 
     def known(self, name: str = "") -> str:
         """The columns, those that look like a name first, as part of a message."""
@@ -248,7 +234,14 @@ def read_table(path: Path) -> Table:
                     frame, units = read_mf4_table(file)
                 case _:
                     frame, units, found = _read_text(file)
-    except (*UNREADABLE, pa.ArrowException, pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeError) as error:
+    except (
+        *UNREADABLE,
+        pa.ArrowException,
+        pd.errors.ParserError,
+        pd.errors.EmptyDataError,
+        UnicodeError,
+        json.JSONDecodeError,
+    ) as error:
         reason = (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0]
         raise LogError(f"{path}: not a readable table: {reason[:200]}; save or copy it again") from None
     frame.columns = [str(name).strip() for name in frame.columns]
@@ -383,7 +376,7 @@ def _numbers(column: "pd.Series[float]") -> tuple[Array, Mask]:
 
 def _time(path: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> tuple[list[str], Array, str]:
     """Headers of the time, the time [s] and what it was taken for."""
-    named = [name for name in frame if _TIME_WORDS.intersection(re.split(r"[\W_]+", bare_name(name).lower()))]
+    named = [name for name in frame if _TIME_WORD.search(bare_name(name).lower())]
     for first, second in itertools.pairwise(named):  # a date and the time of day beside it
         if "dat" in first.lower() and not pd.api.types.is_numeric_dtype(frame[second]):
             both = _dates(frame[first].astype("string") + " " + frame[second].astype("string"))
@@ -393,6 +386,8 @@ def _time(path: Path, frame: pd.DataFrame, units: Mapping[str, str]) -> tuple[li
         time_s, unit = _seconds(frame[name], name, units.get(name, ""))
         if (name in named or unit in {"date", "time of day"} or not _is_row_number(name)) and _increases(time_s):
             return [name], time_s, f"time '{name}' in {unit}" if unit in _TIME_UNITS else f"time '{name}', a {unit}"
+    if named:
+        raise LogError(f"{path}: the time does not increase in column '{named[0]}'; sort the rows by it")
     raise LogError(
         f"{path}: no column is the time: none has it in its name and increases; expected seconds, ms, us or dates "
         f"under a header such as 'time [s]'; the columns are {', '.join(map(repr, frame.columns[:12]))}"
@@ -458,18 +453,6 @@ def _dates(column: "pd.Series[str]") -> Array:
 # ---- text
 
 
-def text_head(path: Path) -> tuple[str, str]:
-    """Beginning of a text file, whole lines, and its encoding."""
-    head = head_of(path, _HEAD_BYTES)
-    encoding = "utf-16" if head[:2] in {codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE} else "utf-8-sig"
-    try:
-        text = codecs.getincrementaldecoder(encoding)().decode(head)
-    except UnicodeDecodeError:
-        encoding = "cp1252"
-        text = head.decode(encoding, errors="replace")
-    return (text.rpartition("\n")[0] if len(head) == _HEAD_BYTES else text), encoding
-
-
 def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
     head, encoding = text_head(path)
     if "\0" in head:
@@ -492,21 +475,12 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, dict[str, str], str]:
     body = [cell for row in rows[first:] for cell in row]
     commas = sum(_DECIMAL_COMMA.fullmatch(cell) is not None for cell in body)
     decimal = "," if commas > sum("." in cell and _NUMBER.fullmatch(cell) is not None for cell in body) else "."
-    with _text(path, encoding) as file, warnings.catch_warnings(record=True) as complaints:
-        warnings.simplefilter("always")
-        frame = pd.read_csv(
-            file,
-            sep=r"\s+" if delimiter == " " else delimiter,
-            decimal=decimal,
-            skiprows=first,
-            header=None,
-            names=names,
-            index_col=False,
-            skipinitialspace=True,
-            on_bad_lines="warn",
-            low_memory=False,
+    with io.TextIOWrapper(open_log(path), encoding=encoding, errors="replace", newline="") as file:
+        separator = r"\s+" if delimiter == " " else delimiter
+        frame, left_out = read_rows(
+            file, sep=separator, decimal=decimal, skiprows=first, header=None, names=names, low_memory=False
         )
-    frame.attrs["left out"] = sum(str(complaint.message).count("Skipping line") for complaint in complaints)
+    frame.attrs["left out"] = left_out
     frame = frame.drop(columns=[name for name in names if name not in header and frame[name].isna().all()])
     frame.attrs["line"] = first + 1
     for name in frame.select_dtypes(exclude="number"):
@@ -527,10 +501,6 @@ def _without_thousands(column: "pd.Series[str]", decimal: str) -> "pd.Series[str
         return column
     grouped = text.str.fullmatch(rf"[-+]?\d{{1,3}}({comma}\d{{3}})+({point}\d*)?").fillna(value=False)
     return text.mask(grouped, text.str.replace(comma, "", regex=True))
-
-
-def _text(path: Path, encoding: str) -> TextIO:
-    return io.TextIOWrapper(opened(path), encoding=encoding, errors="replace", newline="")
 
 
 def _cells(path: Path, head: str) -> tuple[str, list[list[str]]]:
@@ -569,11 +539,12 @@ def _are_units(cells: Sequence[str]) -> bool:
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
-    """Names of which none is empty and no two are alike."""
-    seen: Counter[str] = Counter()
+    """Names of which none is empty and no two are alike: of some that are, each has its number before its unit."""
+    filled = [text.strip() or f"column {place}" for place, text in enumerate(names, start=1)]
+    total, seen = Counter(filled), Counter[str]()
     result = []
-    for place, text in enumerate(names, start=1):
-        name = text.strip() or f"column {place}"
+    for name in filled:
         seen[name] += 1
-        result.append(name if seen[name] == 1 else f"{name}.{seen[name]}")
+        bare = bare_name(name)
+        result.append(name if total[name] == 1 else name.replace(bare, f"{bare}.{seen[name]}", 1))
     return result

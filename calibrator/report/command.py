@@ -7,15 +7,13 @@ import typer
 
 from calibrator.files.folders import require_possible_file
 from calibrator.processes.interrupts import importing
-from calibrator.terminal.options import JsonOption, given_options, number_option
+from calibrator.terminal.options import JsonOption, number_option
 from calibrator.terminal.text import dumps
-from ecu_node.standard_output import write_output
+from ecu_node.program import write_output
 from ecu_node.user_files import write_atomically
 
 __all__ = ["report"]
 
-OF_FLEET = ("battery", "limit", "voltage")
-"""Options that the page of one vehicle does not heed."""
 MAX_LIMIT_A, MAX_VOLTAGE_V = 10_000.0, 2000.0
 """Beyond any battery of a road vehicle. [A], [V]"""
 
@@ -33,12 +31,11 @@ LimitOption = Annotated[
 ]
 VoltageOption = Annotated[
     float | None,
-    number_option("--voltage", 1, MAX_VOLTAGE_V, "Voltage that makes kW of A [V]; that of the drives without it"),
+    number_option("--voltage", 1, MAX_VOLTAGE_V, "Voltage of the battery, to have its margin in kW [V]"),
 ]
 
 
 def report(
-    context: typer.Context,
     result: ResultArgument,
     out: PageOption = None,
     vehicle: VehicleOption = None,
@@ -51,9 +48,6 @@ def report(
     with importing():
         from calibrator.report.page import fleet_report, vehicle_report
 
-    if vehicle is not None and (given := given_options(context, OF_FLEET)):
-        what = "belongs to the page of the fleet; leave it out, or leave --vehicle out"
-        raise typer.BadParameter(what, param_hint=given[0])
     target = out if out is not None else Path(f"{vehicle or 'report'}.html")
     if target.suffix.lower() != ".html":
         raise typer.BadParameter(f"{target}: expected a file name that ends with .html", param_hint="--out")
@@ -63,13 +57,10 @@ def report(
         text, found = fleet_report(result, battery=battery, limit_a=limit, voltage_v=voltage)
         about = vars(found)
     else:
-        text, parameters = vehicle_report(result, vehicle)
+        text, parameters = vehicle_report(result, vehicle, battery=battery, limit_a=limit, voltage_v=voltage)
         about = {"parameters": parameters}
+    content = text.encode()
     target.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(target, text.encode())
-    size = len(text.encode())
-    write_output(
-        dumps({"page": str(target), "bytes": size, **about})
-        if json
-        else f"{target}: {size / 1e6:.2f} MB; open it in a browser"
-    )
+    write_atomically(target, content)
+    said = f"{target}: {len(content) / 1e6:.2f} MB; open it in a browser"
+    write_output(dumps({"page": str(target), "bytes": len(content), **about}) if json else said)

@@ -7,9 +7,8 @@ import numpy as np
 
 from calibrator.drive import Array
 from calibrator.report.fleet_table import FleetTable, ParameterDetails
-from calibrator.report.protection import Margins
 
-__all__ = ["MOST_POINTS", "junction_figure", "margin_figure", "sensor_figure"]
+__all__ = ["MOST_POINTS", "junction_figure", "sensor_figure"]
 
 Figure = dict[str, Any]
 
@@ -28,22 +27,42 @@ RIVAL = 0.02
 
 
 def junction_figure(before_a: Array, after_a: Array, *, expected_a: float | None) -> Figure:
-    """Distributions of the Kirchhoff sum's root mean square over vehicles, on a logarithmic axis."""
+    """Distributions of the Kirchhoff sum's root mean square over vehicles, on a logarithmic axis.
+
+    Counts in bins, so that a page holds no more for a million vehicles than for a hundred.
+    """
     before_a, after_a = (np.maximum(values[np.isfinite(values)], SMALLEST_A) for values in (before_a, after_a))
-    load_a = abs(expected_a or 0.0)
-    marks = [load_a] if load_a >= LEAST_LOAD_A else []
+    marks = [abs(expected_a)] if expected_a is not None and abs(expected_a) >= LEAST_LOAD_A else []
     both = np.concatenate([marks, before_a, after_a, [] if len(before_a) else [SMALLEST_A]])
-    edges = np.geomspace(both.min() / 1.05, both.max() * 1.05, _bins(len(before_a)) + 1)
-    figure = _histograms({"as measured": before_a, "after correction": after_a}, edges)
-    title = {"text": "RMS of a vehicle's Kirchhoff sum [A]"}
-    figure["layout"]["xaxis"] = {"type": "log", "dtick": "D2", "title": title}
-    figure["data"] += [_line(figure, x, f"load without a sensor: {x:.1f} A", OTHER) for x in marks]
-    return figure
+    bins = int(np.clip(3.0 * np.sqrt(len(before_a)), 12, 60))  # few bins for few vehicles
+    edges = np.geomspace(both.min() / 1.05, both.max() * 1.05, bins + 1)
+    line = {"type": "scatter", "mode": "lines"}
+    data: list[Figure] = [
+        {
+            **line,
+            "name": name,
+            "x": [float(edges[0]), *edges.tolist()],
+            "y": [0, *np.histogram(values, edges)[0].tolist(), 0],
+            "line": {"shape": "hv", "color": colour, "width": 1.5},
+            "fill": "tozeroy",
+            "hovertemplate": f"{name}<br>from %{{x:.3g}} A: %{{y}} vehicles<extra></extra>",
+        }
+        for name, values, colour in (("as measured", before_a, BEFORE), ("after correction", after_a, AFTER))
+    ]
+    for x in marks:
+        top, style = max(max(trace["y"]) for trace in data), {"color": OTHER, "dash": "dash", "width": 1.5}
+        data.append({**line, "name": f"load without a sensor: {x:.1f} A", "x": [x, x], "y": [0, top], "line": style})
+    axis = {"type": "log", "dtick": "D2", "title": {"text": "RMS of a vehicle's Kirchhoff sum [A]"}}
+    return {
+        "data": data,
+        "layout": {"height": 260, "xaxis": axis, "yaxis": {"title": {"text": "vehicles"}, "rangemode": "tozero"}},
+    }
 
 
 def sensor_figure(table: FleetTable, files: Mapping[int, ParameterDetails]) -> Figure:
     """Gain error over offset of the largest faults, one panel per branch, and what else the undecided ones may be."""
-    K, traces, error_a = len(table.branches), [], table.error_a
+    K, error_a = len(table.branches), table.error_a
+    traces: list[Figure] = []
     rows = -(-K // MOST_BESIDE)
     layout: Figure = {
         "height": 340 * rows,
@@ -66,7 +85,7 @@ def sensor_figure(table: FleetTable, files: Mapping[int, ParameterDetails]) -> F
                     "mode": "markers",
                     "name": label,
                     "legendgroup": label,
-                    "showlegend": k == 0,
+                    "showlegend": label not in {trace["name"] for trace in traces if trace["x"]},
                     "xaxis": f"x{axis}",
                     "yaxis": f"y{axis}",
                     "marker": {
@@ -82,7 +101,7 @@ def sensor_figure(table: FleetTable, files: Mapping[int, ParameterDetails]) -> F
         drift, offset_a = 100.0 * np.abs(table["drift"][:, k]), np.abs(table["offset_a"][:, k])
         layout[f"xaxis{axis}"] = {"title": {"text": f"{name}: gain error [%]"}, "range": _about_zero(drift)}
         layout[f"yaxis{axis}"] = {"title": {"text": "offset [A]" if k == 0 else ""}, "range": _about_zero(offset_a)}
-    return {"data": [trace for trace in traces if trace["x"] or trace["showlegend"]], "layout": layout}
+    return {"data": [trace for trace in traces if trace["x"]], "layout": layout}
 
 
 def _estimates(table: FleetTable, k: int, rows: Sequence[int]) -> Figure:
@@ -110,50 +129,6 @@ def _rivals(table: FleetTable, k: int, rows: Sequence[int], files: Mapping[int, 
     ]
     text = [f"{table.vehicle[j]}, {p:.0%}" for _, _, j, p in found]
     return {"x": [x for x, *_ in found], "y": [y for _, y, *_ in found], "text": text}
-
-
-def margin_figure(found: Margins) -> Figure:
-    """Distributions of the margins that vehicles need, and the margins that are one for all."""
-    largest_a = float(max(found.before_a.max(), found.after_a.max(), SMALLEST_A))
-    edges = np.linspace(0.0, 1.02 * largest_a, _bins(len(found.before_a)) + 1)
-    figure = _histograms({"as measured": found.before_a, "after correction": found.after_a}, edges)
-    figure["layout"]["xaxis"] = {"title": {"text": f"margin that a vehicle needs at {found.limit_a:g} A [A]"}}
-    for text, value_a, colour in (
-        ("as measured", found.common_before_a, BEFORE),
-        ("after correction", found.common_after_a, AFTER),
-    ):
-        figure["data"].append(_line(figure, value_a, f"one for all, {text}: {value_a:.1f} A", colour))
-    return figure
-
-
-def _bins(vehicles: int) -> int:
-    """Few bins for few vehicles."""
-    return int(np.clip(3.0 * np.sqrt(vehicles), 12, 60))
-
-
-def _histograms(values: Mapping[str, Array], edges: Array) -> Figure:
-    """Counts in bins as steps, so that a page holds no more for a million vehicles than for a hundred."""
-    traces = [
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "name": name,
-            "x": [float(edges[0]), *edges.tolist()],
-            "y": [0, *np.histogram(each, edges)[0].tolist(), 0],
-            "line": {"shape": "hv", "color": colour, "width": 1.5},
-            "fill": "tozeroy",
-            "hovertemplate": f"{name}<br>from %{{x:.3g}} A: %{{y}} vehicles<extra></extra>",
-        }
-        for (name, each), colour in zip(values.items(), (BEFORE, AFTER), strict=True)
-    ]
-    return {"data": traces, "layout": {"height": 260, "yaxis": {"title": {"text": "vehicles"}, "rangemode": "tozero"}}}
-
-
-def _line(figure: Figure, x: float, name: str, colour: str) -> Figure:
-    """Vertical line through a figure."""
-    top = max(max(trace["y"]) for trace in figure["data"])
-    style = {"color": colour, "dash": "dash", "width": 1.5}
-    return {"type": "scatter", "mode": "lines", "name": name, "x": [x, x], "y": [0, top], "line": style}
 
 
 def _about_zero(sizes: Array) -> list[float]:

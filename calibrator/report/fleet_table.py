@@ -7,9 +7,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pandas as pd
 import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
@@ -19,6 +18,9 @@ from calibrator.summaries.buckets import bucket_of
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import few_reasons
 from ecu_node.parameters import Explanation, Finding
+
+OPEN_GAIN, OPEN_OFFSET = 0.1, 0.05
+"""Standard deviations beyond which a gain, and an offset over full scale, are not known. [1]"""
 
 __all__ = ["Details", "FleetTable", "ParameterDetails", "read_details", "read_fleet_table"]
 
@@ -33,23 +35,26 @@ class FleetTable:
         Of the result.
     run : RunRecord
         How it was made.
-    vehicle : ndarray of str, shape (N,)
-        Names of the vehicles that have parameters, in the order of the result.
     columns : mapping of str to ndarray of shape (N, K)
-        Columns of ``results.parquet``: numbers (NaN where the method gives none), flags, texts (None where there is
-        none). What belongs to the vehicle as a whole is the same in all K places.
+        Columns of ``results.parquet``, in its order of the vehicles that have parameters: numbers (NaN where the method
+        gives none), flags, texts (empty where there is none). What belongs to the vehicle as a whole is the same in all
+        K places.
     left_out : mapping of str to str
         Vehicles, or files of unclear vehicle, without parameters, and why.
     """
 
     folder: Path
     run: RunRecord
-    vehicle: NDArray[np.object_]
     columns: Mapping[str, NDArray[Any]]
     left_out: Mapping[str, str]
 
     def __len__(self) -> int:
         return len(self.vehicle)
+
+    @property
+    def vehicle(self) -> NDArray[np.object_]:
+        """Names of the vehicles, shape (N,)."""
+        return self.of_vehicles("vehicle")
 
     def __getitem__(self, column: str) -> NDArray[Any]:
         """Return a column, shape (N, K)."""
@@ -63,12 +68,22 @@ class FleetTable:
         """Return the result of one of the vehicles alone."""
         chosen = self.vehicle == vehicle
         columns = {name: values[chosen] for name, values in self.columns.items()}
-        return replace(self, vehicle=self.vehicle[chosen], columns=columns, left_out={})
+        return replace(self, columns=columns, left_out={})
 
     @property
     def branches(self) -> Sequence[str]:
         """Names of the K branches."""
         return self.run.branches
+
+    @property
+    def open_gain(self) -> Mask:
+        """Sensors whose gain is as open as before the recordings, shape (N, K)."""
+        return np.asarray(~(self["drift_sd"] <= OPEN_GAIN))
+
+    @property
+    def open_offset(self) -> Mask:
+        """Sensors whose offset is as open as before the recordings, shape (N, K)."""
+        return np.asarray(~(self["offset_sd_a"] <= OPEN_OFFSET * self.run.full_scale_a))
 
     @property
     def faulty(self) -> Mask:
@@ -97,37 +112,32 @@ def read_fleet_table(result: Path) -> FleetTable:
     """Read the folder that ``calibrator calibrate`` wrote; FleetError if it is no result, or not a whole one."""
     run, path = read_run(result), result / "results.parquet"
     try:
-        table = pq.ParquetFile(path).read(use_threads=False)
+        frame = pd.read_parquet(path, use_threads=False)
     except FileNotFoundError:
         raise FleetError(f"{path}: is missing; give the whole folder that 'calibrator calibrate' wrote") from None
     except (OSError, pa.ArrowException) as error:
         why = str(error).partition("\n")[0]
         raise FleetError(f"{path}: cannot be read: {why}; give a folder that 'calibrator calibrate' wrote") from None
-    missing = [name for name in SCHEMA.names if name not in table.column_names]
+    missing = [name for name in SCHEMA.names if name not in frame]
     if missing:
         raise FleetError(f"{path}: no column {', '.join(missing)}; calibrate again with this version")
     if not run.full_scale_a:
         raise FleetError(f"{result / 'run.json'}: no full_scale_a, it is of an older version; calibrate again")
-    rows, K = table.filter(pc.field("branch").is_valid()), len(run.branches)
-    if not K or rows["branch"].to_pylist() != list(run.branches) * (rows.num_rows // K):
+    flags = dict.fromkeys((field.name for field in SCHEMA if field.type == pa.bool_()), False)
+    texts = dict.fromkeys((field.name for field in SCHEMA if field.type == pa.string()), "")
+    frame = frame.fillna(flags | texts).astype(dict.fromkeys(flags, bool) | dict.fromkeys(texts, object))
+    rows, K = frame[frame["branch"] != ""], len(run.branches)
+    if not K or rows["branch"].tolist() != list(run.branches) * (len(rows) // K):
         raise FleetError(
             f"{path}: the rows are not those of vehicles with the branches {', '.join(run.branches)} of run.json; "
             f"calibrate again"
         )
-    columns = {field.name: _values(rows[field.name], field.type).reshape(-1, K) for field in SCHEMA}
-    others = table.filter(pc.field("branch").is_null()).select(["vehicle", "reason"]).to_pylist()
-    left_out = {row["vehicle"]: row["reason"] or "no reason is stored" for row in others}
-    if not rows.num_rows:
+    others = frame[frame["branch"] == ""]
+    left_out = dict(zip(others["vehicle"], others["reason"].replace("", "no reason is stored"), strict=True))
+    if rows.empty:
         raise FleetError(f"{result}: no vehicle in it has parameters{few_reasons(left_out)}")
-    return FleetTable(folder=result, run=run, vehicle=columns["vehicle"][:, 0], columns=columns, left_out=left_out)
-
-
-def _values(column: pa.ChunkedArray, kind: pa.DataType) -> NDArray[Any]:
-    if kind == pa.bool_():
-        return np.asarray(pc.fill_null(column, False).to_numpy(zero_copy_only=False), np.bool_)
-    if kind == pa.float64():
-        return np.asarray(column.cast(kind).to_numpy(zero_copy_only=False), np.float64)
-    return np.array(column.to_pylist(), dtype=object)
+    columns = {name: rows[name].to_numpy().reshape(-1, K) for name in SCHEMA.names}
+    return FleetTable(folder=result, run=run, columns=columns, left_out=left_out)
 
 
 class _Identifiable(msgspec.Struct, frozen=True):
@@ -155,20 +165,13 @@ class Details:
         By the vehicle's place in the table.
     names : sequence of str
         Of the R rows of evidence: ratios [1], then constants [A]; none if the method keeps no evidence.
-    value, sd, explained : ndarray of shape (n, R)
+    rows : ndarray of shape (n, 3, R)
         What was measured, its standard deviation, and what the estimate predicts; NaN where it is not known.
     """
 
     files: Mapping[int, ParameterDetails]
     names: Sequence[str]
-    value: Array
-    sd: Array
-    explained: Array
-
-    @property
-    def ratios(self) -> int:
-        """How many rows of the evidence are ratios: those before the intercepts."""
-        return sum(not name.startswith(("intercept ", "junction ", "offset ")) for name in self.names)
+    rows: Array
 
 
 def read_details(table: FleetTable, listed: NDArray[np.int64]) -> Details:
@@ -176,7 +179,7 @@ def read_details(table: FleetTable, listed: NDArray[np.int64]) -> Details:
     run, names = table.run, table.run.details.get("evidence", [])
     order = {str(table.vehicle[j]): i for i, j in enumerate(listed.tolist())}
     files: dict[int, ParameterDetails] = {}
-    rows = np.full((3, len(listed), len(names)), np.nan)
+    rows = np.full((len(listed), 3, len(names)), np.nan)
     numbers = sorted({bucket_of(name, run.buckets) if run.buckets else 0 for name in order})
     for number in shown(numbers, "read parameters", len(numbers), "files"):
         part = part_file(table.folder, number)
@@ -189,11 +192,11 @@ def read_details(table: FleetTable, listed: NDArray[np.int64]) -> Details:
                 raise FleetError(f"{part}: damaged part of a result: {error}; calibrate again") from None
             evidence = written.evidence
             if evidence is not None and len(evidence.value) == len(names):
-                rows[:, i] = np.array([evidence.value, evidence.sd, evidence.explained], float)
+                rows[i] = np.array([evidence.value, evidence.sd, evidence.explained], float)
     if len(files) < len(listed):
         missing = next(str(table.vehicle[j]) for j in listed.tolist() if j not in files)
         raise FleetError(
             f"{table.folder / 'parameters'}: no parameters of vehicle {missing} there; give the whole folder that "
             f"'calibrator calibrate' wrote"
         )
-    return Details(files=files, names=names, value=rows[0], sd=rows[1], explained=rows[2])
+    return Details(files=files, names=names, rows=rows)

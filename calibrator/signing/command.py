@@ -21,8 +21,7 @@ from calibrator.terminal.options import JsonOption, whole_option
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps
 from ecu_node.errors import printable
-from ecu_node.failures import say_error
-from ecu_node.standard_output import write_output
+from ecu_node.program import say_error, write_output
 from ecu_node.trust.canonical import Expected, canonical_bytes, read_canonical
 from ecu_node.trust.key_set import SIGNER_NAME, KeySet, check_key_set
 from ecu_node.trust.statements import LAST_SEQUENCE, MAX_SEQUENCE, Revocation

@@ -14,7 +14,7 @@ from typing import cast
 
 from calibrator.drive import DriveFile
 from calibrator.drives.drive_file import drive_digest, drive_outline, is_drive_file
-from calibrator.recordings.log_files import UNREADABLE, opened, readable
+from calibrator.recordings.log_files import UNREADABLE, open_log, readable
 from calibrator.sources.fleet_source import FleetSource
 from ecu_node.errors import UserError
 
@@ -83,7 +83,7 @@ def _outline(path: Path) -> Hashable:
     """What is quickly seen of a recording; it differs between different ones, as a rule."""
     if is_drive_file(path):
         return drive_outline(path)
-    with readable(path) as copy, opened(copy) as file:
+    with readable(path) as copy, open_log(copy) as file:
         head = file.read(_HEAD_BYTES)
     if not head:
         raise EOFError  # an empty log is no recording
@@ -94,5 +94,5 @@ def _digest(path: Path) -> Hashable:
     """What tells a recording from all others."""
     if is_drive_file(path):
         return drive_digest(path)
-    with readable(path) as copy, opened(copy) as file:
+    with readable(path) as copy, open_log(copy) as file:
         return hashlib.file_digest(cast("io.BufferedIOBase", file), "blake2b").digest()

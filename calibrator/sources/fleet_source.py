@@ -18,7 +18,7 @@ from calibrator.processes.messages import Unread
 from calibrator.processes.reading import TIME_LIMIT_S, read_in_processes
 from calibrator.recordings.readers import read_drive
 from calibrator.sources.logs import find_logs
-from calibrator.terminal.text import few_reasons
+from calibrator.terminal.text import few, few_reasons
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout
@@ -206,7 +206,12 @@ def probe_equipment(
     if len(chosen) < 2:
         raise FleetError(f"{fleet.path}: branches found: {', '.join(chosen) or 'none'}; a junction needs two or more")
     if modelled and not inputs:
-        raise FleetError(f"{fleet.path}: none of the model inputs of {layout.path} was recorded")
+        named = few(layout.model_inputs)
+        why = f"none of the model_inputs of {{}} was recorded: {named}" if named else "no model_inputs in {}"
+        raise FleetError(
+            f"{fleet.path}: {why.format(layout.path)}; a fleet is compared by inputs that its currents follow from, "
+            f"such as torque: name some there, see docs/layout.md; or name a branch whose sensor is right (--trusted)"
+        )
     texts = {
         "branches not recorded, taken as not fitted": [b for b in layout.branch_names if b not in {*found, *chosen}],
         "branches recorded but not asked for, missing from the junction sum": [b for b in found if b not in chosen],

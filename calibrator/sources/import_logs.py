@@ -129,5 +129,5 @@ def _import_one(log: DriveFile, database: VehicleDatabase, store: Path) -> Impor
         name=drive.name,
         duration_s=drive.duration_s,
         branches=tuple(drive.branches),
-        notices=tuple(recording.report.counted_notices()),
+        notices=tuple(recording.report.notices()),
     )

@@ -11,7 +11,6 @@ from calibrator.sources.fleet_source import find_fleet, probe_equipment
 from calibrator.summaries.add_drives import add_drives
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.open_store import open_store, require_store_or_nothing
-from calibrator.summaries.unity import keep_unity_window
 from calibrator.terminal.text import counted, dumps, left_out_text
 from ecu_node.database import VehicleDatabase
 
@@ -90,8 +89,6 @@ def summarise_fleet(
     equipment = probe_equipment(source, database, branches, limit_s=time_limit_s)
     store = open_store(storage, equipment, database, source, bank=bank)
     added = add_drives(store, source, database, workers=workers, time_limit_s=time_limit_s, part=part)
-    if part[0] == 1:
-        keep_unity_window(store, source, database, time_limit_s=time_limit_s)
     return SummariseReport(
         store=out,
         vehicles=added.vehicles,

@@ -12,11 +12,12 @@ from typing import Any
 import typer
 
 from calibrator.errors import ContradictionError
-from ecu_node.failures import DEBUG_HINT, FAILED, end_of, say_error, split_debug
-from ecu_node.standard_output import drop_output, flush_output
+from ecu_node.program import DEBUG_HINT, FAILED, drop_output, end_of, flush_output, say_error, split_debug
 
 __all__ = ["EXIT_CODES", "command_app", "example", "run_app", "run_tool"]
 
+_PACKAGES = ("calibrator", "ecu_node", "tools")
+"""In which a fault of the program itself is looked for."""
 EXIT_CODES = (
     f"Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted, 143 ended by SIGTERM. {DEBUG_HINT}"
 )
@@ -93,9 +94,8 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
     for each in _all_commands(command):
         each.epilog = f"{each.epilog}\n\n{EXIT_CODES}" if each.epilog else EXIT_CODES
         each.short_help = (each.help or "").partition("\n\n")[0]  # whole in the list of commands, not cut
-        for option in each.params:
-            if getattr(option, "multiple", False):
-                option.help = f"{option.help} May be repeated."
+        for parameter in each.params:
+            _in_words(parameter)
     try:
         code = command.main(args=others, prog_name=program, standalone_mode=False)
     except SystemExit as end:
@@ -109,9 +109,23 @@ def run_app(app: typer.Typer, program: str, arguments: Sequence[str]) -> int:
         raise
     except Exception as error:  # noqa: BLE001 (each is told, and ends the program)
         flush_output()  # if it was standard output that failed, this says so
-        code = end_of(program, error, debug=debug)
+        code = end_of(program, error, debug=debug, packages=_PACKAGES)
         return WRONG_USE if isinstance(error, ContradictionError) else code
     return code if isinstance(code, int) else 0
+
+
+def _in_words(parameter: Any) -> None:
+    """Say in help what to give, as people call it: ``LOG`` and ``PATH``, not ``{log} <Path>``."""
+    if parameter.param_type_name == "option":
+        if parameter.multiple:
+            parameter.help = f"{parameter.help} May be repeated."
+        kind = parameter.bare_type().removeprefix("list[").rstrip("]")
+        parameter.metavar = parameter.metavar or {"Path": "PATH", "str": "TEXT"}.get(kind)
+        return
+    parameter.metavar = parameter.metavar or parameter.name.upper()
+    name = parameter.metavar + ("..." if parameter.nargs != 1 else "")
+    parameter.get_usage_pieces = lambda ctx: [name if parameter.required else f"[{name}]"]  # noqa: ARG005
+    parameter.display_type_rich = lambda ctx: ""  # noqa: ARG005
 
 
 def run_tool(app: typer.Typer, program: str) -> None:
@@ -125,7 +139,7 @@ def run_tool(app: typer.Typer, program: str) -> None:
         drop_output()
         code = 1
     except Exception as error:  # noqa: BLE001 (standard output that cannot be written)
-        code = end_of(program, error, debug=False)
+        code = end_of(program, error, debug=False, packages=_PACKAGES)
     if code == INTERRUPTED:
         say_error(f"{program}: interrupted")
     sys.exit(code)

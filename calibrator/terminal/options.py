@@ -35,6 +35,8 @@ MAX_VEHICLES = 100_000
 MAX_CURRENTS = 16
 MAX_SEED = 2**32 - 1
 MAX_WORKERS = 256
+FAR = 1e9
+"""Upper bounds from here on tell nobody anything, and do not stand in the help."""
 MAX_TIME_LIMIT_S = 86_400.0
 """A day. [s]"""
 
@@ -75,10 +77,11 @@ def _bounded(name: str, low: float, high: float, meaning: str, *, read: Callable
         except ValueError:
             value = math.nan
         if not low <= value <= high:  # nor is not-a-number
-            raise typer.BadParameter(f"{given}: expected {what} from {low:.12g} to {high:.12g}")
+            raise typer.BadParameter(f"{given}: expected {what} from {low:.16g} to {high:.16g}")
         return value
 
-    return typer.Option(name, parser=parse, metavar="NUMBER", help=f"{meaning}, {low:.12g} to {high:.12g}.")
+    bounds = f"{low:g} to {high:.12g}" if high < FAR else f"{low:g} or more"
+    return typer.Option(name, parser=parse, metavar="NUMBER", help=f"{meaning}, {bounds}.")
 
 
 def _branches(value: str | None) -> str | None:

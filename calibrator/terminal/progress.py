@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar with rate and time left on a terminal, a line now and then elsewhere.
+"""Progress on stderr: a bar with count and time left on a terminal, a line now and then elsewhere.
 
 A command of several passes says of each which one it is. Nothing of all this goes to standard output.
 """
@@ -7,16 +7,16 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from itertools import count
 from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
-from rich.text import Text
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Column
 
-__all__ = ["no_progress", "numbered_passes", "one_pass", "progress_bar", "rate_text", "shown"]
+__all__ = ["no_progress", "numbered_passes", "one_pass", "progress_bar", "shown"]
 
 LINE_EVERY_S = 10.0
 DRAWN_EVERY_S = 0.1
@@ -24,7 +24,7 @@ DRAWN_EVERY_S = 0.1
 WORTH_A_LINE_S = 1.0
 """A step that is done sooner is not told in a log. [s]"""
 NARROW = 70
-"""A terminal of fewer columns gets shorter figures. [1]"""
+"""A terminal of fewer columns gets no units. [1]"""
 _Item = TypeVar("_Item")
 _active: ContextVar[Progress | None] = ContextVar("active", default=None)
 """The bars on the terminal; a step within a step adds its own to them."""
@@ -35,34 +35,28 @@ _silent: ContextVar[bool] = ContextVar("silent", default=False)
 
 
 @contextmanager
-def no_progress() -> Iterator[None]:
-    """Within the block no progress is shown, as in a library."""
-    before = _silent.set(True)
+def _within(variable: ContextVar[_Item], value: _Item) -> Iterator[None]:
+    before = variable.set(value)
     try:
         yield
     finally:
-        _silent.reset(before)
+        variable.reset(before)
 
 
-@contextmanager
-def numbered_passes(total: int) -> Iterator[None]:
+def no_progress() -> AbstractContextManager[None]:
+    """Within the block no progress is shown, as in a library."""
+    return _within(_silent, True)
+
+
+def numbered_passes(total: int) -> AbstractContextManager[None]:
     """Within the block every bar says which of so many passes it is: ``2/3 calibrate``."""
     numbers = count(1)
-    before = _number.set(lambda: f"{next(numbers)}/{total} ")
-    try:
-        yield
-    finally:
-        _number.reset(before)
+    return _within(_number, lambda: f"{next(numbers)}/{total} ")
 
 
-@contextmanager
-def one_pass(number: int, total: int) -> Iterator[None]:
+def one_pass(number: int, total: int) -> AbstractContextManager[None]:
     """Within the block every bar belongs to the same pass; a single one has no number."""
-    before = _number.set(lambda: f"{number}/{total} " if total > 1 else "")
-    try:
-        yield
-    finally:
-        _number.reset(before)
+    return _within(_number, lambda: f"{number}/{total} " if total > 1 else "")
 
 
 @contextmanager
@@ -91,12 +85,12 @@ def progress_bar(label: str, total: int | None, unit: str = "", *, begun: int = 
     label, console = f"{_number.get()()}{label}", Console(stderr=True)
     if console.is_terminal and not console.is_dumb_terminal:
         with _bars(console) as bars:
-            yield _Bar(bars, label, total, unit, begun)
+            yield _moving(bars, label, total, unit, begun)
     elif total is None:
         print(label, file=sys.stderr, flush=True)
         yield lambda _: None
     else:
-        yield _Lines(label, total, unit, begun)
+        yield _writing(label, total, unit, begun)
 
 
 @contextmanager
@@ -105,27 +99,28 @@ def _bars(console: Console) -> Iterator[Progress]:
     if (bars := _active.get()) is not None:
         yield bars
         return
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), _Figures(console.width))
-    with Progress(*columns, console=console, expand=True, redirect_stdout=False) as bars:
-        before = _active.set(bars)
-        try:
-            yield bars
-        finally:
-            _active.reset(before)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=None),
+        TextColumn("{task.fields[count]}", table_column=Column(no_wrap=True)),
+        TimeRemainingColumn(compact=True, elapsed_when_finished=True, table_column=Column(no_wrap=True)),
+    )
+    with Progress(*columns, console=console, expand=True, redirect_stdout=False) as bars, _within(_active, bars):
+        yield bars
 
 
-class _Bar:
-    """A bar on the terminal."""
+def _moving(bars: Progress, label: str, total: int | None, unit: str, begun: int) -> Callable[[float], None]:
+    """A bar on the terminal; a narrow terminal gets no unit."""
+    unit, moved_s = "" if bars.console.width < NARROW else f" {unit}", -math.inf
+    task = bars.add_task(label, total=total, completed=begun, count="")
 
-    def __init__(self, bars: Progress, label: str, total: float | None, unit: str, begun: int) -> None:
-        self._bars, self._total, self._moved_s = bars, total, -math.inf
-        self._task = bars.add_task(label, total=total, completed=begun, unit=unit, begun=begun)
+    def move(done: float) -> None:
+        nonlocal moved_s
+        if done == total or time.monotonic() - moved_s >= DRAWN_EVERY_S:
+            moved_s = time.monotonic()
+            bars.update(task, completed=done, count="" if total is None else f"{done:.0f}/{total}{unit}")
 
-    def __call__(self, done: float) -> None:
-        now_s = time.monotonic()
-        if now_s - self._moved_s >= DRAWN_EVERY_S or done == self._total:
-            self._moved_s = now_s
-            self._bars.update(self._task, completed=done)
+    return move
 
 
 def shown(items: Iterable[_Item], label: str, total: int, unit: str) -> Iterator[_Item]:
@@ -139,60 +134,19 @@ def shown(items: Iterable[_Item], label: str, total: int, unit: str) -> Iterator
             progress(done)
 
 
-def rate_text(per_s: float) -> str:
-    """How fast it goes, in two to three digits: per second, per minute or per hour."""
-    for factor, name in ((1.0, "s"), (60.0, "min"), (3600.0, "h")):
-        rate = per_s * factor
-        if rate >= 1.0 or name == "h":
-            break
-    return f"{rate:.0f}/{name}" if rate >= 10.0 else f"{rate:.1f}/{name}"
-
-
-class _Figures(ProgressColumn):
-    """How far, how fast and how long it goes on, at the end of the line of a bar."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self._is_narrow = width < NARROW
-
-    def render(self, task: Task) -> Text:
-        """Say it; a narrow terminal gets no unit and no rate."""
-        elapsed_s = (task.finished_time if task.finished else task.elapsed) or 0.0
-        if task.total is None:
-            return Text(_clock(elapsed_s), no_wrap=True)
-        per_s = (task.completed - task.fields["begun"]) / elapsed_s if elapsed_s else 0.0
-        left = f", {_clock((task.total - task.completed) / per_s)} left" if per_s else ""
-        rate = f", {rate_text(per_s)}" if per_s and not self._is_narrow else ""
-        unit = "" if self._is_narrow else f" {task.fields['unit']}"
-        return Text(f"{task.completed:.0f}/{task.total:.0f}{unit}{rate}{left}", no_wrap=True)
-
-
-class _Lines:
+def _writing(label: str, total: int, unit: str, begun: int) -> Callable[[float], None]:
     """A line now and then, for a log."""
+    started_s = printed_s = time.monotonic()
 
-    def __init__(self, label: str, total: int, unit: str, begun: int) -> None:
-        self._label, self._total, self._unit, self._begun = label, total, unit, begun
-        self._started_s = self._printed_s = time.monotonic()
-
-    def __call__(self, done: float) -> None:
-        now_s = time.monotonic()
-        finished = done >= self._total
-        since_s, due_s = (self._started_s, WORTH_A_LINE_S) if finished else (self._printed_s, LINE_EVERY_S)
-        if self._printed_s == math.inf or now_s - since_s < due_s:  # nothing is said after the last line
+    def write(done: float) -> None:
+        nonlocal printed_s
+        now_s, finished = time.monotonic(), done >= total
+        since_s, due_s = (started_s, WORTH_A_LINE_S) if finished else (printed_s, LINE_EVERY_S)
+        if now_s - since_s < due_s or printed_s == math.inf:  # nothing is said after the last line
             return
-        self._printed_s = math.inf if finished else now_s
-        elapsed_s = max(now_s - self._started_s, 1e-3)  # a millisecond: no step is shorter
-        per_s = (done - self._begun) / elapsed_s
-        left = f"{(self._total - done) / per_s:.0f} s left" if per_s > 0.0 else "time left unknown"
-        print(
-            f"{self._label}: {done:.0f} of {self._total} {self._unit}, {rate_text(per_s)}, {elapsed_s:.0f} s, {left}",
-            file=sys.stderr,
-            flush=True,
-        )
+        printed_s = math.inf if finished else now_s
+        elapsed_s, new = now_s - started_s, done - begun
+        left = f"{elapsed_s * (total - done) / new:.0f} s left" if new > 0 else "time left unknown"
+        print(f"{label}: {done:.0f} of {total} {unit}, {elapsed_s:.0f} s, {left}", file=sys.stderr, flush=True)
 
-
-def _clock(seconds: float) -> str:
-    """Minutes and seconds, with hours where there are some."""
-    minutes, s = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{s:02}" if hours else f"{minutes}:{s:02}"
+    return write

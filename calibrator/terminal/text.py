@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import msgspec
 
-from ecu_node.standard_output import write_output, write_text
+from ecu_node.program import write_output, write_text
 
 __all__ = [
     "Notice",

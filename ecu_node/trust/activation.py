@@ -15,7 +15,7 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UnfitError
 from ecu_node.trust.audit import REFUSED, add_entry, event_now
 from ecu_node.trust.commit import commit, opened
-from ecu_node.trust.judgement import ALL_KINDS, Accepted, Arrival, judge
+from ecu_node.trust.judgement import ALL_KINDS, Accepted, Arrival, judge_arrival
 from ecu_node.trust.key_set import KeySet
 from ecu_node.trust.state import TrustState, audit_path, read_state, signed_parameters, write_slot
 from ecu_node.trust.statements import Statement, open_statement
@@ -70,7 +70,7 @@ def accept(
         state = opened(folder)
         digest = hashlib.sha256(content).hexdigest()
         try:
-            accepted = judge(Arrival(folder, state, content, where, now), database, kinds)
+            accepted = judge_arrival(Arrival(folder, state, content, where, now), database, kinds)
         except UnfitError as error:
             event = event_now(REFUSED, str(error), now=now, sequence=_number(content), sha256=digest)
             add_entry(audit_path(folder), event)
@@ -93,7 +93,7 @@ def _number(content: bytes) -> int | None:
 
 def examine(folder: Path, content: bytes, where: str, database: VehicleDatabase, now: datetime) -> Accepted:
     """What :func:`accept` would do; nothing is written. Parameters and errors are those of it."""
-    return judge(Arrival(folder, read_state(folder), content, where, now), database)
+    return judge_arrival(Arrival(folder, read_state(folder), content, where, now), database)
 
 
 def conclude(folder: Path, sequence: int, *, passed: bool, text: str, now: datetime) -> TrustState:

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ecu_node.errors import printable
-from ecu_node.failures import say_error
-from ecu_node.standard_output import write_output, write_text
+from ecu_node.program import say_error, write_output, write_text
 
 __all__ = ["add_trust_commands"]
 

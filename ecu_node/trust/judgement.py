@@ -10,10 +10,10 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
+from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UnfitError
-from ecu_node.parameter_fit import check_fit
-from ecu_node.status import Reason
+from ecu_node.parameters import check_fit
 from ecu_node.trust.key_set import KeySet
 from ecu_node.trust.largest_step import require_small_step
 from ecu_node.trust.state import Slot, SlotName, TrustState, slot_of
@@ -27,7 +27,7 @@ from ecu_node.trust.statements import (
 )
 from ecu_node.trust.validity import require_time
 
-__all__ = ["ALL_KINDS", "Accepted", "Arrival", "judge"]
+__all__ = ["ALL_KINDS", "Accepted", "Arrival", "judge_arrival"]
 
 ALL_KINDS: tuple[type[Statement], ...] = (SignedParameters, KeySet, Revocation)
 _REMEMBERED = 64
@@ -57,7 +57,9 @@ class Accepted:
     """Where the file is to be kept."""
 
 
-def judge(arrival: Arrival, database: VehicleDatabase, kinds: tuple[type[Statement], ...] = ALL_KINDS) -> Accepted:
+def judge_arrival(
+    arrival: Arrival, database: VehicleDatabase, kinds: tuple[type[Statement], ...] = ALL_KINDS
+) -> Accepted:
     """Decide on a signed file.
 
     Parameters

@@ -11,13 +11,13 @@ from typing import BinaryIO, NamedTuple
 
 from ecu_node.errors import UserError
 
-__all__ = ["Line", "lines", "lines_from_the_end"]
+__all__ = ["LogLine", "lines", "lines_from_the_end"]
 
 _BLOCK = 8192
 """No line that is written is longer. [byte]"""
 
 
-class Line(NamedTuple):
+class LogLine(NamedTuple):
     """One line, without its end."""
 
     text: bytes
@@ -26,7 +26,7 @@ class Line(NamedTuple):
     """SHA-256 of all of it."""
 
 
-def lines(path: Path) -> Iterator[Line]:
+def lines(path: Path) -> Iterator[LogLine]:
     """Lines of a file, the first one first.
 
     Parameters
@@ -36,7 +36,7 @@ def lines(path: Path) -> Iterator[Line]:
 
     Yields
     ------
-    Line
+    LogLine
         The last one also if its end is missing.
 
     Raises
@@ -52,13 +52,13 @@ def lines(path: Path) -> Iterator[Line]:
                 text, digest = part, hashlib.sha256()
             digest.update(part)
             if piece.endswith(b"\n"):
-                yield Line(text, digest.hexdigest())
+                yield LogLine(text, digest.hexdigest())
                 digest = None
         if digest is not None:
-            yield Line(text, digest.hexdigest())
+            yield LogLine(text, digest.hexdigest())
 
 
-def lines_from_the_end(path: Path) -> Iterator[Line]:
+def lines_from_the_end(path: Path) -> Iterator[LogLine]:
     """Lines of a file, the last one first; parameters, values and errors as for :func:`lines`."""
     with _opened(path) as file:
         size = file.seek(0, os.SEEK_END)
@@ -80,11 +80,11 @@ def _start(file: BinaryIO, end: int) -> int:
     return 0
 
 
-def _line(file: BinaryIO, start: int, end: int) -> Line:
+def _line(file: BinaryIO, start: int, end: int) -> LogLine:
     digest = hashlib.sha256()
     for place in range(start, end, _BLOCK):
         digest.update(_read(file, place, min(end, place + _BLOCK)))
-    return Line(_read(file, start, min(end, start + _BLOCK)), digest.hexdigest())
+    return LogLine(_read(file, start, min(end, start + _BLOCK)), digest.hexdigest())
 
 
 def _read(file: BinaryIO, start: int, end: int) -> bytes:

@@ -6,18 +6,17 @@ from datetime import datetime
 from functools import partial
 from pathlib import Path
 
-from ecu_node.corrector import Corrector
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.in_force import FileSignature, InForce, put_in_force, signature
+from ecu_node.core.corrector import Corrector
+from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UnfitError, UserError
-from ecu_node.guard import Mode
-from ecu_node.in_force import InForce, put_in_force
-from ecu_node.parameter_file import FileSignature, signature
-from ecu_node.parameter_fit import check_fit
-from ecu_node.status import Reason
+from ecu_node.parameters import check_fit
 from ecu_node.trust.activation import conclude
 from ecu_node.trust.state import Slot, SlotName, TrustState, read_state, signed_parameters, slot_path, state_path
 from ecu_node.trust.statements import SignedParameters
-from ecu_node.trust.trial import Trial, TrialResult, begin_trial
+from ecu_node.trust.trial import ParameterTrial, TrialResult, begin_trial
 from ecu_node.trust.validity import require_time
 
 __all__ = ["ParameterStore"]
@@ -68,7 +67,7 @@ class ParameterStore:
         self._vehicle = vehicle
         self._background = background
         self._due_s = self._retry_due_s = float("-inf")
-        self._trial: Trial | None = None
+        self._trial: ParameterTrial | None = None
         self._no_trial: Reason | None = None
         self._changing_until_s: float | None = None
         self._result: TrialResult | None = None

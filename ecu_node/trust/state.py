@@ -17,8 +17,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from ecu_node.core.status import Reason
 from ecu_node.errors import TrustError
-from ecu_node.status import Reason
 from ecu_node.trust.audit import AuditEntry
 from ecu_node.trust.canonical import MAX_BYTES, Expected, canonical_bytes, malformed, read_bytes, read_canonical
 from ecu_node.trust.key_set import KeySet, check_key_set

@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from ecu_node.core.status import Reason
 from ecu_node.errors import TrustError
 from ecu_node.parameters import VehicleParameters
-from ecu_node.status import Reason
 from ecu_node.trust.canonical import read_canonical
 from ecu_node.trust.envelope import Envelope, not_signed, read_envelope, require_known, signers, signers_among
 from ecu_node.trust.key_set import KEYS_TYPE, KeySet, check_key_set

@@ -17,14 +17,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from ecu_node.branch import LiveBranch
+from ecu_node.bus.in_force import InForce, sensor_fault
+from ecu_node.core.branch import LiveBranch
+from ecu_node.core.correction import NO_FAULT, SensorFault
+from ecu_node.core.junction import aligned_currents
 from ecu_node.database import VehicleDatabase
-from ecu_node.in_force import InForce, sensor_fault
-from ecu_node.junction_watch import aligned_currents
 from ecu_node.parameters import JunctionResidual, VehicleParameters
-from ecu_node.sensor_fault import NO_FAULT, SensorFault
 
-__all__ = ["Trial", "TrialResult", "TrialRules", "begin_trial"]
+__all__ = ["ParameterTrial", "TrialResult", "TrialRules", "begin_trial"]
 
 _LEAST_CURRENT_SHARE = 0.02
 """A trial counts while a branch carries this share of full scale. [1]"""
@@ -64,7 +64,7 @@ class TrialResult:
     text: str
 
 
-class Trial:
+class ParameterTrial:
     """One set on trial.
 
     Parameters
@@ -170,7 +170,9 @@ def _share(measured2: float, corrected2: float, step2: float) -> float:
     return min(1.0, (measured2 - corrected2) / step2)
 
 
-def begin_trial(parameters: VehicleParameters, database: VehicleDatabase, branches: Sequence[LiveBranch]) -> Trial:
+def begin_trial(
+    parameters: VehicleParameters, database: VehicleDatabase, branches: Sequence[LiveBranch]
+) -> ParameterTrial:
     """Put a set on trial.
 
     Parameters
@@ -184,12 +186,12 @@ def begin_trial(parameters: VehicleParameters, database: VehicleDatabase, branch
 
     Returns
     -------
-    Trial
+    ParameterTrial
         To be asked at each look at the junction.
     """
     layout = database.layout
     faults = {name: sensor_fault(InForce(parameters=parameters), name) for name in layout.branch_names}
-    return Trial(
+    return ParameterTrial(
         branches,
         {name: fault for name, fault in faults.items() if fault.applied},
         {name: branch.delay_s or 0.0 for name, branch in parameters.branches.items()},

@@ -18,7 +18,7 @@ from calibrator.cli import app, main
 from calibrator.experiments.command import RECORDED_EXPERIMENTS
 from calibrator.experiments.runner import EXPERIMENTS, Recorded
 from calibrator.processes.interrupts import TERMINATED, interrupted_message, terminated_message
-from ecu_node.interrupts import INTERRUPTED
+from ecu_node.program import INTERRUPTED
 
 ROOT = Path(__file__).parents[2]
 LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"

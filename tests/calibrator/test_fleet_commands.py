@@ -13,8 +13,7 @@ from calibrator.estimator.results import read_results
 from calibrator.fleet_truth import read_truth
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
-from ecu_node.parameter_fit import check_fit
-from ecu_node.parameters import read_parameters
+from ecu_node.parameters import check_fit, read_parameters
 from tests.calibrator.command_here import calibrator
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
@@ -199,6 +198,19 @@ def test_one_car_alone_gives_ratios_of_gains(fleet: Path, tmp_path: Path) -> Non
     assert run.returncode == 0
     assert "only ratios of gains are known: name a sensor that you trust" in run.stdout
     assert not pd.read_parquet(tmp_path / "x" / "results.parquet").applied.any()
+
+
+def test_only_vehicle_that_drove_since_is_one_of_its_fleet(fleet: Path, tmp_path: Path) -> None:
+    first = calibrator(*("calibrate", fleet / "logs", "--layout", LAYOUT, "--out", tmp_path / "first", "--workers", 1))
+    assert first.returncode == 0, first.stderr
+    new = sorted((fleet / "unseen").iterdir())[0]
+    shutil.copytree(new, tmp_path / "new" / new.name)
+    since = ("--since", tmp_path / "first", "--workers", 1)
+    run = calibrator("calibrate", tmp_path / "new", "--layout", LAYOUT, "--out", tmp_path / "second", *since)
+    assert run.returncode == 0, run.stderr
+    assert {row["vehicle"] for row in read_results(tmp_path / "second")} == {
+        row["vehicle"] for row in read_results(tmp_path / "first")
+    }
 
 
 def test_one_car_alone_is_no_fleet_of_the_published_method(fleet: Path, tmp_path: Path) -> None:

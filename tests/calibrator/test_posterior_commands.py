@@ -9,8 +9,7 @@ from calibrator.estimator.results import read_results, read_run
 from calibrator.fleet_truth import read_truth
 from ecu_node.database import read_database
 from ecu_node.layout import file_digest, read_layout
-from ecu_node.parameter_fit import check_fit
-from ecu_node.parameters import VehicleParameters, read_parameters
+from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
 from tests.calibrator.command_here import calibrator
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"

@@ -70,6 +70,15 @@ def test_before_the_program_is_installed_the_check_of_the_installation_document_
     assert "`Command ... is not executable`" in document
 
 
+def test_systemd_finds_nothing_wrong_with_its_additions(analyze: str, unit: Path) -> None:
+    folder = unit.with_name(f"{unit.name}.d")
+    folder.mkdir()
+    for path in DEPLOY.glob("*.conf"):
+        shutil.copy(path, folder)
+    result = run(analyze, "verify", "--man=no", "--recursive-errors=no", str(unit))
+    assert (result.returncode, [line for line in result.stderr.splitlines() if "ecu-node" in line]) == (0, [])
+
+
 def test_systemd_would_find_what_is_wrong_with_it(analyze: str, unit: Path) -> None:
     unit.write_text(unit.read_text().replace("WatchdogSec=5s", "WatchdogSec=often"))
     result = run(analyze, "verify", "--man=no", "--recursive-errors=no", str(unit))
@@ -108,6 +117,16 @@ def test_it_may_do_next_to_nothing(analyze: str, unit: Path) -> None:
 )
 def test_what_is_promised_is_there(key: str, values: list[str]) -> None:
     assert settings(UNIT)[key] == values
+
+
+def test_a_gateway_gets_what_the_rules_in_the_kernel_need_and_nothing_else() -> None:
+    assert settings(DEPLOY / "gateway.conf") == {
+        "Wants": ["modprobe@can_gw.service"],
+        "After": ["modprobe@can_gw.service"],
+        "AmbientCapabilities": ["CAP_NET_ADMIN"],
+        "CapabilityBoundingSet": ["CAP_NET_ADMIN"],
+        "RestrictAddressFamilies": ["AF_NETLINK"],
+    }
 
 
 def test_the_network_file_uses_only_what_networkd_knows() -> None:

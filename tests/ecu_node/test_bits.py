@@ -1,13 +1,17 @@
 """Signals in frames; cantools is the oracle."""
 
+from pathlib import Path
+
 import pytest
 from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ecu_node.bits import bit_place
+from ecu_node.core.signals import bit_place, placed_signal
+from ecu_node.database import read_database
 from ecu_node.errors import DatabaseError
+from ecu_node.layout import read_layout
 
 
 @st.composite
@@ -59,7 +63,6 @@ def test_a_frame_too_short_gives_none_and_is_left_alone(case: tuple[Message, Sig
     before = bytes(payload)
     assert place.extract(payload) is None
     assert not place.put(payload, 0)
-    assert place.in_word(len(payload)) is None
     assert payload == before
 
 
@@ -87,3 +90,36 @@ def test_a_code_beyond_the_width_is_refused_and_never_wraps() -> None:
 def test_signals_that_are_no_plain_integers_are_refused(signal: Signal, words: str) -> None:
     with pytest.raises(DatabaseError, match=words):
         bit_place(signal)
+
+
+CUT_NAME = "PackStatus_loggingAndVitals_Page"
+CUT_DBC = f"""BU_: A
+BO_ 1 Pack: 8 A
+ SG_ {CUT_NAME} M : 0|8@1+ (1,0) [0|1] "" A
+ SG_ Current m1 : 8|16@1- (0.1,0) [-1000|1000] "A" A
+BO_ 2 Motor: 8 A
+ SG_ Current : 0|16@1- (0.1,0) [-1000|1000] "A" A
+BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;
+BA_ "SystemSignalLongSymbol" SG_ 1 {CUT_NAME} "{CUT_NAME}Index";
+"""
+
+
+def test_name_of_a_multiplexer_cut_to_32_characters_means_the_whole_one(tmp_path: Path) -> None:
+    branches = "".join(
+        f'[[branch]]\nname = "{name}"\nsignal = "{name}.Current"\nsign = 1\n' for name in ("Pack", "Motor")
+    )
+    (tmp_path / "a.dbc").write_text(CUT_DBC)
+    (tmp_path / "a.toml").write_text(f'schema = 1\nname = "a"\ndbc = "a.dbc"\nfull_scale_a = 400\n{branches}')
+    message, signal = read_database(read_layout(tmp_path / "a.toml")).signal("Pack.Current")
+    assert signal.multiplexer_signal == f"{CUT_NAME}Index"
+    codes = [placed_signal(message, signal).code(bytes([page, 7, *6 * [0]])) for page in (0, 1, 2)]
+    assert codes == [None, 7, None]
+    decoded = message.decode(b"\1\7\0\0\0\0\0\0")
+    assert isinstance(decoded, dict)
+    assert decoded["Current"] == pytest.approx(0.7)
+
+
+def test_multiplexer_that_the_message_lacks_is_named() -> None:
+    signal = Signal("S", start=8, length=8, multiplexer_ids=[1], multiplexer_signal="Page")
+    with pytest.raises(DatabaseError, match="message M has no signal 'Page', the multiplexer of its signal S"):
+        placed_signal(Message(frame_id=1, name="M", length=8, signals=[signal]), signal)

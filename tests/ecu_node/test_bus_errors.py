@@ -5,13 +5,13 @@ import errno
 import can
 import pytest
 
-from ecu_node.bus_errors import error_text, is_of_frame, means_gone
+from ecu_node.bus.links import error_text, is_of_frame, means_gone
 
 
 @pytest.mark.parametrize(
     ("error", "text"),
     [
-        (OSError(errno.EAFNOSUPPORT, "Address family not supported"), "this kernel has no SocketCAN (try "),
+        (OSError(errno.EAFNOSUPPORT, "Address family not supported"), "this kernel has no SocketCAN (modules "),
         (OSError(errno.ENODEV, "No such device"), "no such interface (see 'ip link')"),
         (can.CanOperationError("Transmit buffer full\nmore of it"), "Transmit buffer full"),
         (can.CanError(), "CanError"),

@@ -2,10 +2,10 @@
 
 import pytest
 
-from ecu_node.buses import carries_fd, connect
-from ecu_node.counters import Counters
+from ecu_node.bus.links import carries_fd, connect
+from ecu_node.bus.steady_bus import SteadyBus
+from ecu_node.core.status import Counters
 from ecu_node.errors import BusError
-from ecu_node.steady_bus import SteadyBus
 
 
 @pytest.mark.parametrize(

@@ -136,7 +136,7 @@ def test_check_says_that_run_needs_fd(small: Callable[..., list[str]], capsys: p
 def test_run_does_not_claim_to_correct_what_it_cannot_publish(
     small: Callable[..., list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ecu_node.service.Requests.stop", lambda self: True)
+    monkeypatch.setattr("ecu_node.bus.service.Requests.stop", lambda self: True)
     handlers = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)]
     try:
         assert main(["run", "--unsigned", *small(), "--interface", "virtual", "--channel", "c0"]) == 0
@@ -195,7 +195,7 @@ def test_a_layout_without_own_signals_is_refused_with_both_ways_out_and_the_gate
     options = ["check", "--params", str(tmp_path / "v1.json"), "--layout", str(database.layout.path)]
     assert main(options) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert "docs/layout.md" in line
+    assert "page 'Layout'" in line
     assert line.endswith("--gateway CHANNEL")
     assert main([*options, "--gateway", "can1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["branches"]["battery"]["target"] == "Pair.Battery"

@@ -10,11 +10,17 @@ from cantools.database.conversion import BaseConversion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ecu_node.codes import Codes, impossible_values, not_available_code, read_codes, require_reach, writable_range
-from ecu_node.correction import LARGEST_ERROR, IntegerPlan, Line, Signals, correction_plan
-from ecu_node.correction import integer_plan as plan_of_line
+from ecu_node.core.correction import LARGEST_ERROR, IntegerPlan, Line, SensorFault, Signals, correction_plan
+from ecu_node.core.correction import integer_plan as plan_of_line
+from ecu_node.core.signals import (
+    Codes,
+    impossible_values,
+    not_available_code,
+    read_codes,
+    require_reach,
+    writable_range,
+)
 from ecu_node.errors import DatabaseError
-from ecu_node.sensor_fault import SensorFault
 from ecu_node.units import AMPERE
 
 HALF = Fraction(1, 2)

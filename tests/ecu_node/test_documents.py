@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ecu_node.cli import main
-from ecu_node.status import Reason, State
+from ecu_node.core.status import Reason, State
 
 ROOT = Path(__file__).parents[2]
 FEWEST_HAZARDS = 15

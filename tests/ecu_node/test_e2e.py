@@ -13,9 +13,8 @@ from e2e.p01 import (
 from e2e.p02 import e2e_p02_check
 from e2e.p05 import e2e_p05_check
 
+from ecu_node.core.e2e import Check, E2EState, Protection, Receiver, protection_of
 from ecu_node.database import VehicleDatabase
-from ecu_node.e2e import Check, Protection, Receiver
-from ecu_node.e2e_profiles import protection_of
 from ecu_node.errors import DatabaseError, LayoutError
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT
 
@@ -213,13 +212,53 @@ def test_gaps_and_jumps_count_on_past_the_last_code(kind: str, protect: Callable
         assert [check(frames[last]), check(frames[last + step])] == [Check.OK, found]
 
 
-def test_a_receiver_says_which_counter_it_expects(kind: str, protect: Callable[[str], Protection]) -> None:
+def damaged(frame: bytearray) -> bytearray:
+    return frame[:-1] + bytes([frame[-1] ^ 1])
+
+
+def test_message_is_valid_from_its_first_intact_frame(kind: str, protect: Callable[[str], Protection]) -> None:
     protection = protect(ENTRIES[kind])
+    receiver, frame, states = Receiver(protection), stream(protection, 1)[0], []
+    for payload in (damaged(frame), frame):
+        receiver.check(payload)
+        states.append(receiver.state)
+    assert states == [E2EState.INIT, E2EState.VALID]
+
+
+def test_more_corrupt_frames_than_allowed_make_a_message_invalid_until_enough_are_intact(
+    kind: str, protect: Callable[[str], Protection]
+) -> None:
+    windows = "valid = { window = 6, min_ok = 1, max_error = 2 }\ninvalid = { window = 4, min_ok = 3, max_error = 0 }"
+    protection = protect(f"{ENTRIES[kind]}\nmax_delta_counter = 4\n{windows}")
+    receiver, frames, states = Receiver(protection), stream(protection, 40), []
+    for number, frame in enumerate(frames[:20]):
+        receiver.check(damaged(frame) if number in {12, 13, 14} else frame)
+        states.append(receiver.state)
+    invalid = [number for number, state in enumerate(states) if state is E2EState.INVALID]
+    assert invalid == [14, 15, 16, 17], "the third error of six; four frames without one make it valid again"
+
+
+def test_repeated_frames_are_no_intact_ones(kind: str, protect: Callable[[str], Protection]) -> None:
+    protection = protect(ENTRIES[kind] + "\nvalid = { window = 5, min_ok = 1, max_error = 2 }")
     receiver = Receiver(protection)
-    assert receiver.expected == -1
-    for frame in stream(protection, protection.modulus):
+    frame = stream(protection, 1)[0]
+    states = [receiver.check(frame) and receiver.state for _ in range(6)]
+    assert states[1:] == [E2EState.VALID] * 4 + [E2EState.INVALID]
+
+
+def test_after_a_silence_a_single_frame_with_any_counter_is_not_enough(
+    kind: str, protect: Callable[[str], Protection]
+) -> None:
+    protection = protect(ENTRIES[kind])
+    receiver, frames = Receiver(protection), stream(protection, 40)
+    for frame in frames[:12]:
         receiver.check(frame)
-        assert receiver.expected == (counter(protection, frame) + 1) % protection.modulus
+    receiver.restart()
+    states = []
+    for frame in frames[5:8]:
+        assert receiver.check(frame) is Check.OK
+        states.append(receiver.state)
+    assert states == [E2EState.INVALID, E2EState.INVALID, E2EState.VALID]
 
 
 def test_a_corrupt_frame_leaves_the_counter_as_it_was(kind: str, protect: Callable[[str], Protection]) -> None:

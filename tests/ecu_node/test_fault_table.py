@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.corrector import Corrector
-from ecu_node.counters import Counters
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.in_force import InForce
+from ecu_node.bus.wiring import wire
+from ecu_node.core.corrector import Corrector
+from ecu_node.core.frames import FrameKey
+from ecu_node.core.status import Counters
 from ecu_node.database import VehicleDatabase
-from ecu_node.frames import FrameKey
-from ecu_node.guard import Mode
-from ecu_node.in_force import InForce
-from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import Frame, answers, parameters_for, passed_on, protected
 
 TABLE = Path(__file__).parents[2] / "docs" / "fault_table.md"

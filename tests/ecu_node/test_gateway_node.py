@@ -15,18 +15,16 @@ import pytest
 from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
-from ecu_node.buses import open_bus
-from ecu_node.corrector import Corrector
-from ecu_node.counters import Counters
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.in_force import InForce
+from ecu_node.bus.links import SocketCanLink, open_bus
+from ecu_node.bus.node import GatewayNode
+from ecu_node.bus.steady_bus import SteadyBus
+from ecu_node.bus.wiring import wire
+from ecu_node.core.corrector import Corrector
+from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
-from ecu_node.gateway_node import GatewayNode
-from ecu_node.guard import Mode
-from ecu_node.in_force import InForce
-from ecu_node.socketcan import SocketCanLink
-from ecu_node.status import Reason, State
-from ecu_node.steady_bus import SteadyBus
-from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import decoded, parameters_for, protected
 
 LONGEST_WAIT_S = 20.0
@@ -45,7 +43,9 @@ def ends(request: pytest.FixtureRequest) -> Iterator[Ends]:
 
 
 @contextmanager
-def gateway(database: VehicleDatabase, name: str, other: str | None = None) -> Iterator[tuple[Corrector, Future[None]]]:
+def gateway(
+    database: VehicleDatabase, name: str, other: str | None = None, *, routed: bool = False
+) -> Iterator[tuple[Corrector, Future[None]]]:
     """A gateway between the two buses, with a fault of the battery's sensor in force."""
     in_force = InForce(parameters=parameters_for(database, battery=(0.25, 5.0)))
     corrector = wire(database, in_force, time.monotonic(), mode=Mode.GATEWAY)
@@ -60,7 +60,8 @@ def gateway(database: VehicleDatabase, name: str, other: str | None = None) -> I
     stop = threading.Event()
     with ThreadPoolExecutor(1) as pool:
         ready = threading.Event()
-        running = pool.submit(GatewayNode(*buses, corrector, database, period_s=0.02).run, stop.is_set, ready.set)
+        node = GatewayNode(*buses, corrector, database, period_s=0.02, routed=routed)
+        running = pool.submit(node.run, stop.is_set, ready.set)
         while not ready.wait(0.01) and not running.done():
             pass
         try:
@@ -142,6 +143,23 @@ def test_frames_of_the_vehicle_reach_the_sensors_bus_unchanged_and_in_order(
             vehicle.send(message)
         found = received(sensors, len(sent))
     assert list(map(as_sent, found)) == list(map(as_sent, sent))
+
+
+def test_what_the_kernel_carries_is_not_passed_on_once_more(
+    database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest
+) -> None:
+    sensors, vehicle = ends
+    data = protected(database, "HV_Battery", 0, BatteryCurrent=100.0)
+    with gateway(database, request.node.name, routed=True):
+        received(vehicle, 1, status=True)
+        for bus in ends:
+            bus.send(can.Message(arbitration_id=0x200, is_extended_id=False, data=bytes(8)))
+            bus.send(can.Message(arbitration_id=0x200, is_extended_id=False, is_remote_frame=True))
+            bus.send(can.Message(arbitration_id=0x110, is_extended_id=False, is_remote_frame=True))
+        sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
+        to_vehicle, to_sensors = received(vehicle, 2), received(sensors, 1)
+    assert [(item.arbitration_id, item.is_remote_frame) for item in to_vehicle] == [(0x110, True), (0x110, False)]
+    assert [(item.arbitration_id, item.is_remote_frame) for item in to_sensors] == [(0x110, True)]
 
 
 class PairBus(SocketcanBus):
@@ -248,7 +266,7 @@ class BlockingBus(VirtualBus):
 def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
     database: VehicleDatabase, ends: Ends, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
-    monkeypatch.setattr("ecu_node.gateway_node._LONGEST_TURN_S", 0.2)
+    monkeypatch.setattr("ecu_node.bus.node._LONGEST_TURN_S", 0.2)
     name = request.node.name
     corrector = wire(database, InForce(parameters=None), time.monotonic(), mode=Mode.GATEWAY)
     near, stop, fed = BlockingBus(f"{name} a"), threading.Event(), queue.SimpleQueue[float]()
@@ -363,27 +381,37 @@ def test_the_status_goes_to_the_vehicle_alone(
 WORDS = "another node sends frames 0x(110|5F0), which only this one may send there; two nodes on one bus, or two buses"
 
 
-@pytest.mark.parametrize(("origin", "identifier"), [("vehicle", 0x110), ("sensors", 0x5F0)])
-def test_a_frame_that_only_it_may_send_ends_it(
+@pytest.mark.parametrize(("origin", "identifier"), [("vehicle", 0x110), ("vehicle", 0x5F0), ("sensors", 0x5F0)])
+def test_frames_that_only_it_may_send_are_dropped_and_counted_and_end_nothing(
     database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest, origin: str, identifier: int
 ) -> None:
     sensors, vehicle = ends
-    with gateway(database, request.node.name) as (_, running):
+    with gateway(database, request.node.name) as (corrector, running):
         received(vehicle, 1, status=True)
         sender = vehicle if origin == "vehicle" else sensors
-        sender.send(can.Message(arbitration_id=identifier, is_extended_id=False, data=bytes(8)))
-        with pytest.raises(BusError, match=WORDS):
-            running.result(LONGEST_WAIT_S)
-    assert sensors.recv(0.0) is None, "it was not passed on"
+        for counter in range(100):
+            sender.send(can.Message(arbitration_id=identifier, is_extended_id=False, data=[counter, *bytes(7)]))
+        for counter in range(10):
+            data = protected(database, "HV_Battery", counter, BatteryCurrent=100.0)
+            sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
+        found = received(vehicle, 10)
+        give_up = time.monotonic() + LONGEST_WAIT_S
+        while corrector.counters.foreign < 100 and time.monotonic() < give_up:
+            time.sleep(0.01)
+        assert corrector.counters.foreign == 100
+        assert not running.done()
+    assert {message.arbitration_id for message in found} == {0x110}
+    assert sensors.recv(0.0) is None, "none was passed on"
 
 
 def test_both_ends_on_one_bus_end_it(database: VehicleDatabase, ends: Ends, request: pytest.FixtureRequest) -> None:
     sensors, _ = ends
     name = request.node.name
     with gateway(database, name, f"{name} a") as (_, running):
-        data = protected(database, "HV_Battery", 0, BatteryCurrent=100.0)
-        for _ in range(3):
+        for counter in range(100):
+            data = protected(database, "HV_Battery", counter % 15, BatteryCurrent=float(counter))
             sensors.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
+            time.sleep(0.005)
         with pytest.raises(BusError, match=WORDS):
             running.result(LONGEST_WAIT_S)
 

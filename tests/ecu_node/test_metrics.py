@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
+from ecu_node.bus.in_force import InForce
+from ecu_node.bus.service import serve_metrics
+from ecu_node.bus.telemetry import Latency
+from ecu_node.bus.wiring import wire
 from ecu_node.cli import main
-from ecu_node.counters import Counters
+from ecu_node.core.frames import FrameKey
+from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase
-from ecu_node.frames import FrameKey
-from ecu_node.in_force import InForce
-from ecu_node.metrics import serve_metrics
-from ecu_node.status import Reason, State
-from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import LAYOUT, Frame, answers, parameters_for, protected
 
 
@@ -71,10 +71,20 @@ def test_the_sums_of_the_junction_are_told_while_they_are_known(database: Vehicl
     data = protected(database, "HV_Battery", 0, BatteryCurrent=80.0)
     answers(corrector, Frame(FrameKey(0x110, False), data), 0.0)
     corrector.look(0.0)
-    serve_metrics(corrector, free_port)
+    serve_metrics(corrector, Latency(), free_port)
     told = asked(free_port)
     assert told["ecu_node_sum_measured_amperes"] == pytest.approx(80.0)
     assert told["ecu_node_sum_corrected_amperes"] == pytest.approx(60.0)
+
+
+def test_latency_is_a_histogram(database: VehicleDatabase, free_port: int) -> None:
+    latency = Latency()
+    latency.counts[7], latency.counts[40] = 3, 1
+    serve_metrics(wire(database, InForce(parameters=None), 0.0), latency, free_port)
+    with urllib.request.urlopen(f"http://127.0.0.1:{free_port}/metrics", timeout=10) as answer:
+        text = answer.read().decode()
+    found = {float(le): float(count) for le, count in re.findall(r'latency_seconds_bucket\{le="(.+)"\} (.+)', text)}
+    assert found == {2.0**bits * 1e-6: 3.0 * (bits >= 7) for bits in range(21)} | {float("inf"): 4.0}
 
 
 def test_only_this_machine_is_answered(node: int) -> None:

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import pty
+import re
 import signal
 import socket
 import struct
@@ -21,12 +22,11 @@ import pytest
 from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
+from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.cli import main
-from ecu_node.counters import Counters
+from ecu_node.core.status import Counters
 from ecu_node.database import VehicleDatabase
-from ecu_node.monitor import listen
-from ecu_node.monitor_model import BusMonitor
-from ecu_node.steady_bus import SteadyBus
+from ecu_node.monitor import BusMonitor, listen_until
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, protected
 
 CHANNEL = "monitor"
@@ -170,18 +170,32 @@ def test_without_a_terminal_a_block_comes_per_second_until_a_signal(
     assert time.monotonic() - start_s < 10.0
     blocks = capsys.readouterr().out.strip().split("\n\n")
     assert len(blocks) == 2
-    assert all(block.startswith(f"virtual {CHANNEL}: no node on this bus\nbranch ") for block in blocks)
+    assert all(block.startswith(f"virtual {CHANNEL}: no node on this bus\n ") for block in blocks)
+    assert all(block.splitlines()[2].startswith("branch ") for block in blocks)
 
 
-def test_in_a_terminal_a_table_is_drawn_and_ctrl_c_ends_it_with_0() -> None:
+def test_with_standard_output_closed_it_listens_until_a_signal(monkeypatch: pytest.MonkeyPatch) -> None:
+    timer = threading.Timer(1.3, os.kill, (os.getpid(), signal.SIGTERM))
+    monkeypatch.setattr(sys, "stdout", None)
+    timer.start()
+    assert main(MONITOR) == 0
+    timer.join()
+
+
+def in_terminal(columns: int, lines: int) -> tuple[int, str]:
+    """Exit code of a monitor that was interrupted once it had drawn, and what the terminal got."""
     ours, theirs = pty.openpty()
-    command = [sys.executable, "-m", "ecu_node", *MONITOR]
+    size = {"COLUMNS": str(columns), "LINES": str(lines)}
     shown = b""
     with subprocess.Popen(
-        command, stdin=theirs, stdout=theirs, stderr=theirs, env={**os.environ, "TERM": "xterm", "COLUMNS": "120"}
+        [sys.executable, "-m", "ecu_node", *MONITOR],
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        env={**os.environ, "TERM": "xterm", **size},
     ) as process:
         os.close(theirs)
-        while b"motor_rear" not in shown:
+        while b"\x1b[J" not in shown:
             shown += os.read(ours, 65536)
         process.send_signal(signal.SIGINT)
         try:
@@ -189,27 +203,40 @@ def test_in_a_terminal_a_table_is_drawn_and_ctrl_c_ends_it_with_0() -> None:
                 shown += chunk
         except OSError:  # EIO: the terminal has no other end any more
             pass
-        assert process.wait(timeout=60) == 0
+        code = process.wait(timeout=60)
     os.close(ours)
-    text = shown.decode()
+    return code, shown.decode().replace("\r\n", "\n")
+
+
+def drawn(text: str) -> list[str]:
+    """Lines of the first picture, without styles."""
+    first = text.partition("\x1b[H")[2].partition("\x1b[J")[0]
+    return re.sub(r"\x1b\[[0-9;]*[mK]", "", first).splitlines()
+
+
+def test_in_a_terminal_a_table_is_drawn_and_ctrl_c_ends_it_with_0() -> None:
+    code, text = in_terminal(120, 24)
+    assert code == 0
     assert "\x1b[?1049h" in text  # on a screen of its own, which is given back
-    assert "\x1b[?1049l" in text
-    assert "not fitted?" in text.rpartition("\x1b[?1049l")[2]
+    assert "\x1b[2mmotor_rear" in text  # dim
+    before, _, after = text.rpartition("\x1b[?1049l")
+    assert drawn(before)[0] == f"virtual {CHANNEL}: no node on this bus"
+    assert after.splitlines() == drawn(before)  # what was seen last stays on the screen
 
 
-def test_without_rich_one_line_says_what_to_install() -> None:
-    ours, theirs = pty.openpty()
-    code = f"import sys; sys.modules['rich.live'] = None; from ecu_node.cli import main; sys.exit(main({MONITOR!r}))"
-    result = subprocess.run(
-        [sys.executable, "-c", code], stdout=theirs, stderr=subprocess.PIPE, text=True, timeout=60, check=False
-    )
-    os.close(theirs)
-    os.close(ours)
-    assert result.returncode == 1
-    assert result.stderr == (
-        "ecu-node: a live table needs rich; install it with pip install 'hv-current-correction[monitor]', "
-        "or give --once SECONDS\n"
-    )
+@pytest.mark.parametrize("columns", [34, 60, 80, 160])
+def test_a_terminal_of_any_width_shows_everything(columns: int) -> None:
+    lines = drawn(in_terminal(columns, 50)[1])
+    assert max(map(len, lines)) <= columns
+    words = " ".join(lines).split()
+    for branch in ("battery", "motor", "motor_rear"):
+        assert words[words.index(branch) + 1 :][:9] == [*7 * ["-"], "not", "fitted?"]
+
+
+def test_a_low_terminal_shows_the_first_lines_and_says_how_many_are_missing() -> None:
+    whole, low = drawn(in_terminal(80, 24)[1]), drawn(in_terminal(80, 7)[1])
+    assert len(whole) <= 23
+    assert low == [*whole[:5], f"{len(whole) - 5} more lines do not fit"]
 
 
 @pytest.mark.parametrize(
@@ -272,8 +299,8 @@ def test_of_many_frames_none_is_left_out(database: VehicleDatabase) -> None:
             other.send(can.Message(arbitration_id=0x110, is_extended_id=False, is_remote_frame=True))
         start_s = time.monotonic()
         monitor = BusMonitor(database, start_s)
-        listen(bus, monitor, start_s + 5.0, lambda: time.monotonic() > start_s + 1.0)
+        listen_until(bus, monitor, start_s + 5.0, lambda: time.monotonic() > start_s + 1.0)
         bus.close()
     battery = monitor.look(start_s + 1.0).branches[0]
     assert battery.rate_hz == pytest.approx(5000.0)
-    assert (battery.faults.corrupt, battery.faults.lost, battery.faults.repeated) == (0, 0, 0)
+    assert not any(battery.faults.values())

@@ -14,19 +14,16 @@ import pytest
 from can.interfaces.virtual import VirtualBus
 from e2e.p01 import e2e_p01_check
 
-from ecu_node.buses import open_bus, receive_filters
-from ecu_node.clocks import TimeOfDay
-from ecu_node.corrector import Corrector
-from ecu_node.counters import Counters
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.in_force import InForce
+from ecu_node.bus.links import open_bus, receive_filters
+from ecu_node.bus.node import GatewayNode, OverlayNode, TimeOfDay
+from ecu_node.bus.steady_bus import SteadyBus
+from ecu_node.bus.wiring import wire
+from ecu_node.core.corrector import Corrector
+from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
-from ecu_node.gateway_node import GatewayNode
-from ecu_node.guard import Mode
-from ecu_node.in_force import InForce
-from ecu_node.overlay_node import OverlayNode
-from ecu_node.status import Reason, State
-from ecu_node.steady_bus import SteadyBus
-from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import SMALL_DBC, decoded, parameters_for, protected
 
 LONGEST_WAIT_S = 10.0
@@ -244,6 +241,27 @@ def test_frames_that_the_bus_does_not_take_are_dropped_and_counted(
             time.sleep(0.01)
 
 
+def test_a_send_queue_that_stays_full_is_told_and_when_it_opens_again(
+    database: VehicleDatabase, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = list[str]()
+    full = FullBus(request.node.name)
+    bus = SteadyBus(lambda: full, Counters(), said.append)
+    frame = can.Message(arbitration_id=1)
+    now_s = time.monotonic()
+    for later_s in (0.0, 0.5, 1.5, 12.0):
+        monkeypatch.setattr(time, "monotonic", lambda later_s=later_s: now_s + later_s)
+        bus.send(frame)
+        assert bus.flush() == (0, 1)
+    assert len(said) == 1
+    assert "the send queue stays full" in said[0]
+    monkeypatch.setattr(full, "send", lambda *_: None)
+    bus.send(frame)
+    assert bus.flush() == (1, 0)
+    assert "takes frames again" in said[1]
+    bus.close()
+
+
 class DrivingBus(VirtualBus):
     """A bus on which three branches send in turn, one frame each 5 ms; reading may pause, then frames wait to be read.
 
@@ -335,7 +353,7 @@ class HeldUpClock:
 def test_a_process_that_is_held_up_between_two_clocks_does_not_take_that_for_a_clock_that_was_set(
     held_up: range, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ecu_node.clocks.time", HeldUpClock(held_up))
+    monkeypatch.setattr("ecu_node.bus.node.time", HeldUpClock(held_up))
     counters = Counters()
     time_of_day = TimeOfDay(counters)
     assert [time_of_day.ahead_s() for _ in range(20)] == pytest.approx([1.7e9] * 20, abs=0.05)
@@ -347,7 +365,7 @@ def test_a_frame_that_comes_after_the_clock_was_set_is_not_taken_for_an_old_one(
 ) -> None:
     bus = SetClockBus(request.node.name)
     bus.clock, bus.frames = SetClock(), []
-    monkeypatch.setattr("ecu_node.clocks.time", bus.clock)
+    monkeypatch.setattr("ecu_node.bus.node.time", bus.clock)
     with node_on(database, "", lambda: bus) as corrector:
         wait_until(lambda: corrector.state()[0] is State.STARTING)
         bus.frames = [protected(database, "HV_Battery", k) for k in range(8)]
@@ -491,11 +509,12 @@ class ClosedBus(VirtualBus):
 def test_the_kernel_is_asked_for_the_branches_only(
     database: VehicleDatabase, make_database: Callable[..., VehicleDatabase]
 ) -> None:
-    assert sorted(item["can_id"] for item in receive_filters(database)) == [
+    assert sorted(item["can_id"] for item in receive_filters(database, Mode.OVERLAY)) == [
         *(0x110, 0x120, 0x128, 0x130, 0x140),
         *(0x510, 0x520, 0x528, 0x530, 0x540, 0x5F0),
     ]
-    assert {(item["can_id"], item["can_mask"], item["extended"]) for item in receive_filters(make_database())} == {
+    filters = receive_filters(make_database(), Mode.OVERLAY)
+    assert {(item["can_id"], item["can_mask"], item["extended"]) for item in filters} == {
         (256, 0x7FF, False),
         (512, 0x1FFFFFFF, True),
         (258, 0x7FF, False),

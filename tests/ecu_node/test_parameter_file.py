@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.corrector import Corrector
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.in_force import ParameterFile
+from ecu_node.bus.wiring import wire
+from ecu_node.core.corrector import Corrector
+from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
-from ecu_node.guard import Mode
-from ecu_node.parameter_file import ParameterFile
 from ecu_node.parameters import write_parameters
-from ecu_node.status import Reason
-from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import SMALL_DBC, parameters_for
 
 

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import ecu_node
+from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError, UnfitError
-from ecu_node.parameter_fit import check_fit
 from ecu_node.parameters import (
     MAX_FILE_BYTES,
     BranchParameters,
@@ -26,11 +26,11 @@ from ecu_node.parameters import (
     HardwareFault,
     JunctionResidual,
     Verdict,
+    check_fit,
     parameter_schema,
     read_parameters,
     write_parameters,
 )
-from ecu_node.status import Reason
 from tests.ecu_node.vehicles import as_document, parameters_for
 
 SCHEMA_FILE = Path(ecu_node.__file__).parent / "parameters.schema.json"

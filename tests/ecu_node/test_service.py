@@ -10,15 +10,32 @@ from pathlib import Path
 
 import pytest
 
+from ecu_node.bus.guard import Mode, key_of
+from ecu_node.bus.in_force import ParameterFile
+from ecu_node.bus.run import _Tick
+from ecu_node.bus.service import Log, Requests, ServiceManager
+from ecu_node.bus.wiring import wire
 from ecu_node.database import VehicleDatabase
-from ecu_node.guard import Mode, key_of
-from ecu_node.parameter_file import ParameterFile
-from ecu_node.run import _Tick
-from ecu_node.service import Log, Requests, ServiceManager
-from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import Frame, answers, protected
 
 WATCHDOG_S = 4.0
+
+
+def test_a_log_that_nobody_reads_holds_nothing_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    reader, writer = os.pipe()
+    with os.fdopen(writer, "w") as full, os.fdopen(reader, "rb") as reading:
+        monkeypatch.setattr(sys, "stderr", full)
+        log = Log()
+        start_s = time.monotonic()
+        for number in range(5000):
+            log.say(f"line {number} {'x' * 50}")
+        assert time.monotonic() - start_s < 5.0
+        os.read(reader, 1 << 20)
+        log.say("after all")
+        last = os.read(reader, 1 << 20).decode()
+        assert not reading.closed
+    assert "ecu-node: after all (" in last
+    assert "lines before were lost: nobody read them)" in last
 
 
 class Manager:
@@ -89,7 +106,15 @@ def test_a_node_that_does_not_do_its_work_does_not_feed_the_watchdog(
     said = list[str]()
     file = ParameterFile(tmp_path / "none.json", database, None, mode=Mode.GATEWAY, say=said.append)
     corrector = wire(database, file.in_force, 0.0, mode=Mode.GATEWAY)
-    tick = _Tick(corrector=corrector, buses=[], file=file, requests=requests, manager=ServiceManager(), say=said.append)
+    tick = _Tick(
+        corrector=corrector,
+        buses=[],
+        file=file,
+        memory=None,
+        requests=requests,
+        manager=ServiceManager(),
+        say=said.append,
+    )
     found = []
     for works in (False, True):
         tick(1000.0, works)
@@ -103,7 +128,15 @@ def test_what_changes_is_said_in_the_log_and_to_the_manager(
     said = list[str]()
     file = ParameterFile(tmp_path / "none.json", database, None, mode=Mode.OVERLAY, say=said.append)
     corrector = wire(database, file.in_force, 0.0, mode=Mode.OVERLAY)
-    tick = _Tick(corrector=corrector, buses=[], file=file, requests=requests, manager=ServiceManager(), say=said.append)
+    tick = _Tick(
+        corrector=corrector,
+        buses=[],
+        file=file,
+        memory=None,
+        requests=requests,
+        manager=ServiceManager(),
+        say=said.append,
+    )
     found = []
     for look in range(20):
         if look < 10:
@@ -155,7 +188,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     """Sets the steady clock of the log. [s]"""
 
     def at(time_s: float) -> None:
-        monkeypatch.setattr("ecu_node.service.time.monotonic", lambda: time_s)
+        monkeypatch.setattr("ecu_node.bus.service.time.monotonic", lambda: time_s)
 
     return at
 

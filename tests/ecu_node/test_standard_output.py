@@ -9,7 +9,7 @@ import pytest
 
 from ecu_node import __version__
 from ecu_node.errors import UserError
-from ecu_node.standard_output import drop_output, write_output
+from ecu_node.program import drop_output, write_output
 from tests.ecu_node.vehicles import LAYOUT
 
 FULL = "import resource, runpy, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "

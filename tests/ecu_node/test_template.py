@@ -9,17 +9,16 @@ from pathlib import Path
 
 import pytest
 
+from ecu_node.bus.guard import key_of
+from ecu_node.bus.in_force import InForce
+from ecu_node.bus.wiring import wire
+from ecu_node.check import template_text
 from ecu_node.cli import main
+from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
-from ecu_node.guard import key_of
-from ecu_node.in_force import InForce
-from ecu_node.parameter_fit import check_fit
-from ecu_node.parameters import decode_parameters
-from ecu_node.status import Reason, State
-from ecu_node.template import template_text
+from ecu_node.parameters import check_fit, decode_parameters
 from ecu_node.trust.trial import begin_trial
-from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, answers
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node import user_files
+from ecu_node.core.status import Reason
 from ecu_node.database import MAX_DBC_BYTES, read_database
 from ecu_node.errors import DatabaseError, UnfitError
 from ecu_node.layout import MAX_LAYOUT_BYTES, read_layout
 from ecu_node.parameters import MAX_FILE_BYTES, read_parameters
-from ecu_node.status import Reason
 from ecu_node.user_files import UnsuitableFileError, read_user_file
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT
 
@@ -97,15 +96,15 @@ def test_a_pipe_that_takes_the_place_of_a_file_keeps_nobody_waiting(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As the owner of the folder can do it, between a look at the file and its opening."""
-    path, look = tmp_path / "p.json", user_files.require_user_file
+    path, opened = tmp_path / "p.json", os.open
     path.write_bytes(b"{}")
 
-    def look_and_swap(path: Path, *, largest_bytes: int) -> None:
-        look(path, largest_bytes=largest_bytes)
+    def swap_and_open(name: str, flags: int) -> int:
         path.unlink()
         os.mkfifo(path)
+        return opened(name, flags)
 
-    monkeypatch.setattr(user_files, "require_user_file", look_and_swap)
+    monkeypatch.setattr(os, "open", swap_and_open)
     with pytest.raises(UnsuitableFileError, match="it is a pipe"):
         read_user_file(path, largest_bytes=10)
 

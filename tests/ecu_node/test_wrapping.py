@@ -6,7 +6,7 @@ import pty
 
 import pytest
 
-from ecu_node.wrapping import fitted, wrapped
+from ecu_node.program import fitted, wrapped
 
 TEXT = (
     "notice: a text that is longer than the terminal is wide\n  /a/very/long/path/that/stays/whole: and more words\nend"

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple, cast
 import msgspec
 from e2e.p01 import e2e_p01_protect
 
-from ecu_node.corrector import Corrector
+from ecu_node.core.corrector import Corrector
+from ecu_node.core.frames import FrameKey
 from ecu_node.database import VehicleDatabase
-from ecu_node.frames import FrameKey
 from ecu_node.parameters import (
     BranchParameters,
     FileReference,

@@ -11,9 +11,9 @@ import pytest
 
 from release.clean_venv import CleanVenv
 from tests.package.conftest import VEHICLE, Installed
-from tests.package.processes import on_terminal, started, until
+from tests.package.processes import started, until
 
-EXTRAS = ("bench", "calibrator", "cluster", "demo", "docs", "metrics", "mf4", "monitor")
+EXTRAS = ("bench", "calibrator", "cluster", "demo", "docs", "metrics", "mf4")
 LAYOUT = ("--layout", "my_car.toml")
 
 
@@ -112,13 +112,6 @@ def test_mf4_logs_are_read(installed: Installed, car: Path, drive: Path, tmp_pat
             log(frame)
     told = calibrator(installed("mf4"), tmp_path, "kirchhoff", "drive.mf4", "--layout", car / "my_car.toml", "--json")
     assert json.loads(told)["branches"] == ["battery", "motor"]
-
-
-def test_monitor_draws_a_table(installed: Installed, car: Path) -> None:
-    options = (*LAYOUT, "--interface", "virtual", "--channel", "monitor")
-    code, shown = on_terminal(installed("monitor"), "ecu-node", "monitor", *options, folder=car, wanted=b"motor_rear")
-    assert code is None, shown
-    assert b"\x1b[?1049h" in shown  # a screen of its own
 
 
 def test_bench_compares_with_its_peers(installed: Installed, unpacked: Path) -> None:

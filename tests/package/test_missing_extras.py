@@ -9,7 +9,6 @@ import can
 import pytest
 
 from release.clean_venv import CleanVenv, new_venv
-from tests.package.processes import on_terminal
 
 LAYOUT = ("--layout", "my_car.toml")
 BUS = ("--interface", "virtual", "--channel", "c")
@@ -26,12 +25,6 @@ def piped(program: str, *arguments: object) -> Callable[[CleanVenv, Path], tuple
     return run
 
 
-def shown(venv: CleanVenv, folder: Path) -> tuple[int | None, str]:
-    """The monitor on a terminal, which breaks lines."""
-    code, text = on_terminal(venv, "ecu-node", "monitor", *LAYOUT, *BUS, folder=folder, wanted=b"motor_rear")
-    return code, " ".join(text.decode().split()) + "\n"
-
-
 def steps(taken_port: int) -> dict[str, tuple[Callable[[CleanVenv, Path], tuple[int | None, str]], str]]:
     """By extra, from the lightest on: what needs it, and what that says without it."""
     run = ("run", *PARAMETERS, *LAYOUT, *BUS, "--metrics-port", taken_port)  # ends with the extra, too
@@ -41,7 +34,6 @@ def steps(taken_port: int) -> dict[str, tuple[Callable[[CleanVenv, Path], tuple[
         "tcp://127.0.0.1:9",
     )  # what is missing is told before the fleet is read, which takes hours
     return {
-        "monitor": (shown, "ecu-node: a live table needs rich; install it with "),
         "metrics": (piped("ecu-node", *run), "ecu-node: --metrics-port needs prometheus-client; install it with "),
         "calibrator": (piped("calibrator", "--version"), "calibrator: typer is not installed; "),
         "demo": (

@@ -14,6 +14,7 @@ from calibrator.terminal.command_line import run_app
 from ecu_node import __version__
 from release.clean_venv import ROOT, CleanVenv
 from tests.package.conftest import VEHICLE, Installed
+from tests.package.processes import on_terminal
 
 PLAYER = Path(__file__).with_name("virtual_drive.py")
 LAYOUT = ("--layout", "my_car.toml")
@@ -67,6 +68,13 @@ def test_a_bus_is_watched(node: CleanVenv, car: Path) -> None:
     assert done.returncode == 1
     assert "no branch of my_car.toml was seen" in done.stderr
     assert json.loads(done.stdout)["node"] is None
+
+
+def test_the_monitor_draws_a_table(node: CleanVenv, car: Path) -> None:
+    options = (*LAYOUT, "--interface", "virtual", "--channel", "monitor")
+    code, shown = on_terminal(node, "ecu-node", "monitor", *options, folder=car, wanted=b"motor_rear")
+    assert code is None, shown
+    assert b"\x1b[?1049h" in shown  # a screen of its own
 
 
 def test_signed_parameters_are_taken_and_taken_back(

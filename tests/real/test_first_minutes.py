@@ -13,7 +13,7 @@ import pytest
 
 from calibrator.drives.store import iterate_drives
 from calibrator.files.layout_files import vehicle_database
-from calibrator.recordings.drive_log import write_drive_log
+from calibrator.recordings.canlog import write_drive_log
 from ecu_node.layout import read_layout
 from tests.calibrator.doctor.artificial_logs import examined
 from tests.real.delay_trips import import_trips
@@ -136,6 +136,27 @@ def test_an_inverted_sign_is_named(branch: str, tesla: Path, tmp_path: Path) -> 
     told, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz", inverted(branch))
     assert errors == [("sign", branch)]
     assert told.findings()[0].figures["rms_before_a"] > 20.0 * told.findings()[0].figures["rms_after_a"]
+
+
+def swapped(one: str, other: str) -> Callable[[str], str]:
+    """A layout in which two branches read each other's signal."""
+
+    def change(layout: str) -> str:
+        lines = {name: re.search(rf'"{name}", sign = .*?, (.*) }}', layout) for name in (one, other)}
+        first, second = (match[1] for match in lines.values() if match is not None)
+        return layout.replace(first, "@").replace(second, first).replace("@", second)
+
+    return change
+
+
+@pytest.mark.parametrize(("one", "other"), [("battery", "motor_rear"), ("motor_rear", "motor_front")])
+def test_exchanged_branches_are_named(one: str, other: str, tesla: Path, tmp_path: Path) -> None:
+    """The front motor hardly moves: the sum closes as well, so it is no error."""
+    told, errors = errors_of(tmp_path, tesla, tesla / "drive.log.gz", swapped(one, other))
+    (found,) = told.findings("exchanged")
+    assert (found.subject, found.severity) == (one, "warning")
+    assert f'exchange what [[branch]] "{one}" and "{other}" read' in found.remedy
+    assert errors == []
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,9 @@
-"""The recorded trips of a BMW i3."""
+"""The recorded trips of a BMW i3, as they are and with faults put into them."""
 
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,11 @@ import pytest
 
 from calibrator.drives.align import align, choose_inputs
 from calibrator.drives.store import iterate_drives
+from calibrator.experiments.methods import POSTERIOR
+from calibrator.experiments.outcome import judge
+from calibrator.experiments.recorded_fleet import RecordedFleet, read_fleet
+from calibrator.experiments.recorded_trial import RecordedCase, recorded_trial
+from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 
 ROOT = Path(__file__).parents[2]
@@ -52,3 +58,33 @@ def test_the_other_trips_give_valid_samples_whose_currents_sum_to_zero(
         currents_a = samples.currents_a[samples.valid]
         np.testing.assert_allclose(currents_a.sum(axis=1), 0.0, atol=1e-9)
         assert np.all(currents_a[:, 2] <= 0.0)
+
+
+@pytest.fixture(scope="module")
+def trips(imported: tuple[Path, dict[str, list[str]]]) -> RecordedFleet:
+    return read_fleet(imported[0], read_database(read_layout(LAYOUT)))
+
+
+@pytest.mark.parametrize("balanced", [True, False])
+def test_fleet_with_many_faults_is_not_left_alone(trips: RecordedFleet, balanced: bool) -> None:
+    """Three branches, S = 60: some vehicles of every fleet are corrected, and none is made worse."""
+    for seed in (400, 401):
+        trial = recorded_trial(trips, RecordedCase(branches=3, sparsity=60.0, balanced=balanced, world=""), seed)
+        found = judge(POSTERIOR.estimate(trial), trial)
+        assert found.corrected.any()
+        assert not (found.corrected & found.harmed).any()
+
+
+@pytest.mark.parametrize(("vehicles", "branches", "least"), [(6, 2, 0.5), (12, 2, 0.8), (6, 3, 0.5), (12, 3, 0.5)])
+def test_small_fleet_is_corrected(trips: RecordedFleet, vehicles: int, branches: int, least: float) -> None:
+    """Of S = 80: of four fleets so many of the faulty vehicles, and no vehicle is made worse."""
+    found = []
+    for seed in range(420, 424):
+        some = np.random.default_rng(seed).permutation(len(trips.trips))[:vehicles]
+        fleet = replace(trips, trips=tuple(trips.trips[place] for place in some))
+        trial = recorded_trial(fleet, RecordedCase(branches=branches, sparsity=80.0, balanced=True, world=""), seed)
+        found.append(judge(POSTERIOR.estimate(trial), trial))
+    faulty = np.concatenate([each.faulty for each in found])
+    corrected = np.concatenate([each.corrected for each in found])
+    assert corrected[faulty].mean() >= least
+    assert not (corrected & np.concatenate([each.harmed for each in found])).any()

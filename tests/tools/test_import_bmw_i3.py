@@ -11,12 +11,11 @@ from calibrator.drive import Array
 from calibrator.drives.drive_file import read_drive_file
 from calibrator.drives.store import list_drives
 from calibrator.errors import DriveError, LogError
-from calibrator.recordings.bmw_i3 import COLUMNS, ImportedTrip, trip_from_table
 from calibrator.recordings.readers import read_drive
-from calibrator.recordings.signal_range import signal_ranges
 from calibrator.recordings.tables import read_table
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
+from import_bmw_i3 import COLUMNS, ImportedTrip, signal_ranges, trip_from_table
 
 ROOT = Path(__file__).parents[2]
 LAYOUT = ROOT / "dbc" / "hv_powertrain.toml"
@@ -258,3 +257,8 @@ def test_short_help_is_given() -> None:
     done = run("-h")
     assert (done.returncode, done.stderr) == (0, "")
     assert "--logs" in done.stdout
+
+
+def test_ranges_of_a_layout_are_in_its_signs() -> None:
+    assert (RANGES["motor"].low, RANGES["motor"].high) == (-650.0, 650.0)
+    assert (RANGES["accelerator"].low, RANGES["accelerator"].high) == (0.0, 100.0)

@@ -8,9 +8,9 @@ import pytest
 from bench import trust_fuzz
 from bench.trust_fuzz import Vehicle, WrongAnswerError, fuzz
 from bench.trust_fuzz_mutations import MUTATIONS
+from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError
-from ecu_node.status import Reason
 from ecu_node.trust.judgement import Arrival
 
 
@@ -71,6 +71,6 @@ def test_a_crash_and_an_answer_of_two_lines_are_reported(
     def failing(arrival: Arrival, database: VehicleDatabase) -> None:
         raise error
 
-    monkeypatch.setattr(trust_fuzz, "judge", failing)
+    monkeypatch.setattr(trust_fuzz, "judge_arrival", failing)
     with pytest.raises(WrongAnswerError, match=words):
         vehicle.require_refused(b"{}", "here")

@@ -12,10 +12,10 @@ from pathlib import Path
 import can
 import pytest
 
+from ecu_node.bus.service import Requests
 from ecu_node.cli import main
+from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase
-from ecu_node.service import Requests
-from ecu_node.status import Quality, Reason, State
 from tests.ecu_node.vehicles import LAYOUT, decoded, protected
 from tests.trust.damage import a_folder, a_loop, a_pipe, cut, huge, with_text, without, zeros
 
@@ -41,7 +41,7 @@ def drive(bus: can.BusABC, database: VehicleDatabase, seen: Seen, done: threadin
     try:
         give_up = datetime.now(UTC) + timedelta(seconds=LONGEST_WAIT_S)
         for k in range(1_000_000):
-            motor = protected(database, "HV_Motor", k % 15, MotorCurrent=float(k % 50))
+            motor = protected(database, "HV_Motor", k % 15, MotorCurrent=93.3 + 0.1 * (k % 2))
             battery = protected(database, "HV_Battery", k % 15, BatteryCurrent=CURRENT_A)
             bus.send(can.Message(arbitration_id=0x120, is_extended_id=False, data=motor))
             bus.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=battery))

@@ -11,18 +11,18 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from ecu_node.corrector import Corrector
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.wiring import wire
+from ecu_node.core.corrector import Corrector
+from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import TrustError, UnfitError
-from ecu_node.guard import Mode
 from ecu_node.parameters import JunctionResidual, VehicleParameters
-from ecu_node.status import Reason
 from ecu_node.trust.activation import accept
 from ecu_node.trust.parameter_store import ParameterStore
 from ecu_node.trust.state import TrustState, audit_path, read_state
 from ecu_node.trust.storage import locked
-from ecu_node.trust.trial import Trial, TrialResult
-from ecu_node.wiring import wire
+from ecu_node.trust.trial import ParameterTrial, TrialResult
 from tests.trust.damage import a_folder, cut, without, zeros
 from tests.trust.signing import Signers
 
@@ -87,7 +87,7 @@ def test_a_state_that_is_mended_under_a_running_node_is_used(two_slots: Path, da
     assert (running.drift, running.corrector.reason) == (DRIFT, Reason.NONE)
 
 
-class _Ended(Trial):
+class _Ended(ParameterTrial):
     """A trial that has seen enough."""
 
     def look(self, now_s: float) -> TrialResult | None:
@@ -103,7 +103,7 @@ def ended(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Running:
     """A node whose trial of number 7, with a drift of 0.06, ends well as soon as it is looked at."""
-    monkeypatch.setattr("ecu_node.trust.trial.Trial", _Ended)
+    monkeypatch.setattr("ecu_node.trust.trial.ParameterTrial", _Ended)
     now = datetime.now(UTC)
     battery = replace(parameters.branches["battery"], drift=0.06)
     other = replace(parameters, branches={**parameters.branches, "battery": battery})

@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.wiring import wire
+from ecu_node.core.frames import FrameKey
+from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.frames import FrameKey
-from ecu_node.guard import Mode
 from ecu_node.layout import read_layout
 from ecu_node.parameters import JunctionResidual, VehicleParameters
-from ecu_node.status import Reason, State
 from ecu_node.trust.activation import accept
 from ecu_node.trust.parameter_store import ParameterStore
 from ecu_node.trust.state import read_state
-from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import Frame, answers, parameters_for, protected
 from tests.trust.signing import NOW, Signers
 

@@ -3,7 +3,7 @@
 import os
 import shutil
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol
@@ -21,7 +21,7 @@ from tests.vcan.small_drive import true_parameters
 class StartNode(Protocol):
     """Starts ``ecu-node run`` with a parameter file and further options."""
 
-    def __call__(self, params: Path, *options: str) -> AbstractContextManager[NodeProcess]: ...
+    def __call__(self, params: Path, *options: str, by: Sequence[str] = ()) -> AbstractContextManager[NodeProcess]: ...
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -68,10 +68,9 @@ def start_node(database: VehicleDatabase, tmp_path: Path) -> StartNode:
     """The node as a process of its own on vcan0; what it says is in node.err, of a second one in node2.err."""
     logs = (tmp_path / name for name in ("node.err", "node2.err"))
 
-    def start(params: Path, *options: str) -> AbstractContextManager[NodeProcess]:
-        return running_node(
-            next(logs), "--unsigned", "--params", str(params), "--layout", str(database.layout.path), *options
-        )
+    def start(params: Path, *options: str, by: Sequence[str] = ()) -> AbstractContextManager[NodeProcess]:
+        layout = str(database.layout.path)
+        return running_node(next(logs), "--unsigned", "--params", str(params), "--layout", layout, *options, by=by)
 
     return start
 

@@ -4,7 +4,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,9 +82,9 @@ class NodeProcess:
 
 
 @contextmanager
-def running_node(log: Path, *options: str) -> Iterator[NodeProcess]:
-    """The node on vcan0, from when it says that it runs."""
-    command = [*ECU_NODE, "run", "--interface", "socketcan", "--channel", CHANNEL, *options]
+def running_node(log: Path, *options: str, by: Sequence[str] = ()) -> Iterator[NodeProcess]:
+    """The node on vcan0, started by another program if one is given, from when it says that it runs."""
+    command = [*by, *ECU_NODE, "run", "--interface", "socketcan", "--channel", CHANNEL, *options]
     with log.open("wb") as file, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=file) as process:
         node = NodeProcess(process=process, log=log)
         try:

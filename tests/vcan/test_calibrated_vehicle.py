@@ -12,9 +12,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from ecu_node.core.status import Quality
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters, read_parameters
-from ecu_node.status import Quality
 from tests.vcan.calibrated_fleet import make_calibrated_fleet
 from tests.vcan.conftest import StartNode
 from tests.vcan.patient_layout import LAYOUT

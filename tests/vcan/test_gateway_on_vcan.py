@@ -41,6 +41,14 @@ def drive_of(frames: Iterable[LoggedFrame]) -> list[LoggedFrame]:
     return [item for item in frames if not is_noise(item) and item.identifier != STATUS]
 
 
+def by_carrier(frames: Iterable[LoggedFrame]) -> tuple[list[LoggedFrame], list[LoggedFrame]]:
+    """Frames of branches, which the node carries, and others, which the kernel does: each in their order."""
+    both: tuple[list[LoggedFrame], list[LoggedFrame]] = [], []
+    for item in frames:
+        both[item.identifier not in {"110", "120", "130"}].append(item)
+    return both
+
+
 def rewritten(database: VehicleDatabase, frames: Iterable[LoggedFrame]) -> list[LoggedFrame]:
     """What must arrive on the other side."""
     found = ((item.identifier, passed_on(database, item.identifier, bytes.fromhex(item.data))) for item in frames)
@@ -77,10 +85,10 @@ def test_a_gateway_changes_currents_and_crcs_and_nothing_else(
     assert len(noise(sent)) == 200
     assert any(item.data.startswith("#") for item in noise(sent)), "FD frames, too"
     assert noise(arrived) == noise(sent)
-    assert drive_of(arrived) == expected
+    assert by_carrier(drive_of(arrived)) == by_carrier(expected)
     assert expected != drive_of(sent)
     assert recording.frames == sent, "nothing comes back"
-    passed = len(expected) + 200
+    passed = len(by_carrier(expected)[0])
     counted = f"forwarded {passed}, held back {INSTANTS // 10}, corrupt {INSTANTS // 10}"
     assert node.messages.endswith(f"{counted}\n")
 
@@ -119,7 +127,7 @@ def test_in_shadow_mode_a_gateway_changes_nothing(
         intact = [item for item in sent if rewritten(database, [item])]
         wait_until(lambda: len(drive_of(other_recording.frames)) >= len(intact), "all frames on the other bus")
         assert node.stop() == 0
-    assert drive_of(other_recording.frames) == intact
+    assert by_carrier(drive_of(other_recording.frames)) == by_carrier(intact)
 
 
 def test_a_gateway_that_cannot_see_can_fd_says_so(

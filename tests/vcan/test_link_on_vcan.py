@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import can
 import pytest
 
-from ecu_node.buses import connect
-from ecu_node.socketcan import SocketCanLink
+from ecu_node.bus.links import SocketCanLink, connect
 from tests.ecu_node.test_socketcan import fields, random_frame
 from tests.vcan.processes import CHANNEL
 

@@ -8,8 +8,8 @@ from typing import Any, cast
 import pytest
 from e2e.p01 import e2e_p01_check
 
+from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase
-from ecu_node.status import Quality, Reason, State
 from tests.vcan.conftest import StartNode
 from tests.vcan.processes import Recording, frames_of, play, send
 from tests.vcan.small_drive import BRANCHES, VEHICLE, protected, write_drive

@@ -1,6 +1,7 @@
 """The node as its service runs it, without any privilege, and the monitor beside it on a real SocketCAN bus."""
 
 import json
+import os
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -120,3 +121,16 @@ def test_the_node_needs_no_capability(
         finally:
             process.terminate()
     assert process.returncode == 0
+
+
+def test_real_time_is_first_in_first_out_on_one_processor_with_locked_memory(params: Path, tmp_path: Path) -> None:
+    options = ("--unsigned", "--params", str(params), "--layout", str(LAYOUT), "--realtime")
+    with running_node(tmp_path / "node.err", *options) as node:
+        number = node.process.pid
+        status = Path(f"/proc/{number}/status").read_text()
+        locked_kb = int(status.partition("VmLck:")[2].split()[0])
+        scheduler, processors = os.sched_getscheduler(number), os.sched_getaffinity(number)
+        assert node.stop() == 0
+    assert "real time: SCHED_FIFO, memory lock, one processor" in node.messages
+    assert (scheduler, len(processors)) == (os.SCHED_FIFO, 1)
+    assert locked_kb > 1000

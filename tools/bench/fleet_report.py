@@ -23,8 +23,6 @@ from calibrator.estimator.results import (
 )
 from calibrator.estimator.rows import VehicleEvidence, evidence_names
 from calibrator.report.page import fleet_report
-from calibrator.summaries.filter_bank import plain_bank
-from calibrator.summaries.unity import UNITY_FILE, UnityWindow
 from ecu_node.parameters import (
     BranchParameters,
     Explanation,
@@ -40,13 +38,27 @@ __all__ = ["rows"]
 FLEET, QUICK_FLEET = 100_000, 2_000
 BRANCHES = ("battery", "motor", "auxiliary")
 FULL_SCALE_A = 400.0
-READ_OUT_A = {"battery": [60.0, 10.0, 1.0], "motor": [-50.0, -5.0, 0.0], "auxiliary": [-10.0, -5.0, -1.0]}
 FAULTY, UNDECIDED, SUSPECTED = 0.2, 0.1, 0.02
 """Share of the sensors with a fault, of the vehicles of which it cannot be told, and with a hardware fault. [1]"""
 OPENED = 5
 """How often the page is opened; the median counts."""
 PATIENCE_S = 120.0
 NOTHING = FileReference(name="none", sha256="0" * 64)
+RUN = RunRecord(
+    tool="bench",
+    method="posterior",
+    fleet="bench",
+    layout="bench",
+    branches=list(BRANCHES),
+    model_inputs=[],
+    settings={},
+    created="2026-01-01T00:00:00Z",
+    details={"evidence": evidence_names(BRANCHES)},
+    vehicles=1,
+    full_scale_a=FULL_SCALE_A,
+    left_out={},
+    notices=[],
+)
 
 
 def rows(*, quick: bool) -> list[Row]:
@@ -92,7 +104,6 @@ def make_result(folder: Path, vehicles: int) -> Path:
     write_parameter_files(folder, {0: part}, vehicles=10**9)  # in parts, as of every large fleet
     rows_file.unlink()
     part.unlink()
-    (folder / UNITY_FILE).write_bytes(window().encoded())
     write_run(folder, replace(RUN, vehicles=vehicles))
     return folder
 
@@ -162,34 +173,6 @@ def drawn_evidence(rng: np.random.Generator, item: VehicleParameters) -> Vehicle
         sd=[None if r in unread else float(sd[r]) for r in range(count)],
         explained=(value + sd * rng.normal(size=count)).tolist(),
     )
-
-
-def window() -> UnityWindow:
-    """A minute of two inputs."""
-    time_s = 0.1 * np.arange(600)
-    columns = np.column_stack([np.sin(0.2 * time_s), np.cos(0.5 * time_s)])
-    bank = plain_bank(("a", "b"), period_s=0.1)
-    return UnityWindow(vehicle="v", drive="d", time_s=time_s, columns=columns, voltage_v=360.0, bank=bank)
-
-
-RUN = RunRecord(
-    tool="bench",
-    method="posterior",
-    fleet="bench",
-    layout="bench",
-    branches=list(BRANCHES),
-    model_inputs=[],
-    settings={},
-    created="2026-01-01T00:00:00Z",
-    details={
-        "evidence": evidence_names(BRANCHES),
-        "reference": {"read_out": READ_OUT_A},
-    },
-    vehicles=1,
-    full_scale_a=FULL_SCALE_A,
-    left_out={},
-    notices=[],
-)
 
 
 def ready_times_s(page: Path) -> list[float]:

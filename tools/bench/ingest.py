@@ -113,7 +113,7 @@ def _message_by_message(path: Path, database: VehicleDatabase) -> dict[str, Chan
         names.setdefault(database.message(message).frame_id, []).append((name, signal))
     times: dict[int, list[float]] = {frame_id: [] for frame_id in names}
     values: dict[str, list[float]] = {name: [] for name in signals}
-    decode: Any = database.database.decode_message
+    decode: Any = database.databases[""].decode_message
     with can.LogReader(path) as reader:
         for frame in reader:
             wanted = names.get(frame.arbitration_id)

@@ -4,10 +4,9 @@ from collections.abc import Callable
 from typing import Any
 
 from bench.node_vehicle import FAULTS, BenchVehicle
-from ecu_node.e2e import Check, Protection, Receiver
-from ecu_node.e2e_profiles import protection_of
-from ecu_node.guard import Mode
-from ecu_node.status import Quality
+from ecu_node.bus.guard import Mode
+from ecu_node.core.e2e import Check, Protection, Receiver, protection_of
+from ecu_node.core.status import Quality
 
 __all__ = ["PlainJob", "plain_job"]
 

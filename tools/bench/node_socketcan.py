@@ -30,9 +30,9 @@ from bench.node_plain import plain_job
 from bench.node_process import command_line
 from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle
 from bench.row import Row
-from ecu_node.guard import Mode
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.links import SocketCanLink
 from ecu_node.parameters import write_parameters
-from ecu_node.socketcan import SocketCanLink
 
 __all__ = ["rows"]
 

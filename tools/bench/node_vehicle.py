@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.true_parameters import true_parameters
-from ecu_node.corrector import Corrector
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.in_force import InForce
+from ecu_node.bus.wiring import wire
+from ecu_node.core.corrector import Corrector
+from ecu_node.core.e2e import protection_of
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.e2e_profiles import protection_of
-from ecu_node.guard import Mode
-from ecu_node.in_force import InForce
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters, VehicleParameters
-from ecu_node.wiring import wire
 
 __all__ = ["FAULTS", "IDENTIFIER", "NUMBERS", "OUT_IDENTIFIER", "BenchVehicle", "make_vehicle"]
 

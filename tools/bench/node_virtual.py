@@ -21,12 +21,11 @@ import can
 from bench.node_plain import plain_job
 from bench.node_vehicle import IDENTIFIER, NUMBERS, OUT_IDENTIFIER, BenchVehicle, make_vehicle
 from bench.row import Row
-from ecu_node.buses import open_bus
-from ecu_node.counters import Counters
-from ecu_node.gateway_node import GatewayNode
-from ecu_node.guard import Mode
-from ecu_node.overlay_node import OverlayNode
-from ecu_node.steady_bus import SteadyBus
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.links import open_bus
+from ecu_node.bus.node import GatewayNode, OverlayNode
+from ecu_node.bus.steady_bus import SteadyBus
+from ecu_node.core.status import Counters
 
 __all__ = ["BUS_LOAD_HZ", "load_rows", "rows"]
 

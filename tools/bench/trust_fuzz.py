@@ -34,7 +34,7 @@ from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters
 from ecu_node.trust.activation import accept, conclude
 from ecu_node.trust.envelope import Envelope
-from ecu_node.trust.judgement import Arrival, judge
+from ecu_node.trust.judgement import Arrival, judge_arrival
 from ecu_node.trust.key_set import KeySet, PublicKey
 from ecu_node.trust.provision import provision
 from ecu_node.trust.statements import Revocation, SignedParameters, Statement
@@ -147,7 +147,7 @@ class Vehicle:
     def answer(self, file: bytes) -> tuple[bool, str]:
         """Whether a file would be accepted, and what is said of it."""
         try:
-            return True, judge(Arrival(self._folder, self._state, file, "f", _NOW), self._database).text
+            return True, judge_arrival(Arrival(self._folder, self._state, file, "f", _NOW), self._database).text
         except UserError as error:
             return False, str(error)
 

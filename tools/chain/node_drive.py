@@ -10,12 +10,12 @@ from calibrator.artificial.vehicle import Vehicle, vehicle_currents, vehicle_fra
 from calibrator.drive import Array
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.recordings.canlog import FrameSeries
-from ecu_node.branch_plans import branch_signals
-from ecu_node.codes import Codes
-from ecu_node.corrector import Corrector
+from ecu_node.bus.guard import Mode, key_of
+from ecu_node.bus.in_force import branch_signals
+from ecu_node.core.corrector import Corrector
+from ecu_node.core.frames import FrameKey
+from ecu_node.core.signals import Codes
 from ecu_node.database import VehicleDatabase
-from ecu_node.frames import FrameKey
-from ecu_node.guard import Mode, key_of
 from ecu_node.layout import split_signal
 
 __all__ = ["BranchErrors", "BranchTrace", "NodeDrive", "drive_through"]

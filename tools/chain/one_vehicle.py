@@ -10,17 +10,17 @@ from msgspec.structs import replace
 
 from chain.fleet import ChainFleet
 from chain.node_drive import BranchTrace, NodeDrive, drive_through
+from ecu_node.bus.guard import Mode
+from ecu_node.bus.in_force import InForce, sensor_fault
+from ecu_node.bus.wiring import wire
+from ecu_node.core.status import State
 from ecu_node.errors import UserError
-from ecu_node.guard import Mode
-from ecu_node.in_force import InForce, sensor_fault
 from ecu_node.parameters import BranchParameters, VehicleParameters
-from ecu_node.status import State
 from ecu_node.trust.activation import accept
 from ecu_node.trust.key_set import KeySet
 from ecu_node.trust.parameter_store import ParameterStore
 from ecu_node.trust.provision import provision
-from ecu_node.trust.trial import Trial, TrialResult, begin_trial
-from ecu_node.wiring import wire
+from ecu_node.trust.trial import ParameterTrial, TrialResult, begin_trial
 
 __all__ = ["SignedFile", "VehicleOutcome", "WrongSet", "drive_vehicle"]
 
@@ -174,7 +174,7 @@ def drive_vehicle(
 class _WrongTrial:
     """Trial of a set that is not in the vehicle's state."""
 
-    def __init__(self, trial: Trial) -> None:
+    def __init__(self, trial: ParameterTrial) -> None:
         self._trial = trial
         self._result: TrialResult | None = None
 

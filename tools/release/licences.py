@@ -20,7 +20,7 @@ __all__ = ["DOCUMENT", "EXTRAS", "Package", "document", "licence_of", "packages"
 
 DOCUMENT = ROOT / "docs" / "licences.md"
 PROJECT = "hv-current-correction"
-EXTRAS = ("", "monitor", "metrics", "calibrator", "cluster", "mf4", "demo", "docs", "bench", "dev")
+EXTRAS = ("", "metrics", "calibrator", "cluster", "mf4", "demo", "docs", "bench", "dev")
 """From the lightest on; a package is told with the first that needs it. "" is the node alone."""
 PERMISSIVE = {
     *("0BSD", "Apache-2.0", "BSD", "BSD-2-Clause", "BSD-3-Clause", "CC0-1.0", "ISC", "LLVM-exception", "MIT", "MIT-0"),

@@ -22,7 +22,7 @@ from release.clean_venv import ROOT, CleanVenv, new_venv, the_wheel
 
 __all__ = ["BILLS", "bill_of", "main"]
 
-BILLS = {"node": (), "all": ("calibrator", "cluster", "demo", "metrics", "mf4", "monitor")}
+BILLS = {"node": (), "all": ("calibrator", "cluster", "demo", "metrics", "mf4")}
 """Name of each bill, and the extras in it."""
 _NAME = "hv-current-correction"
 _VERSION = SchemaVersion.V1_6

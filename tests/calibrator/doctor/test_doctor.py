@@ -12,7 +12,7 @@ import pytest
 
 from calibrator.drive import Array, Channel, Drive
 from ecu_node.database import VehicleDatabase
-from ecu_node.wrapping import wrapped
+from ecu_node.program import wrapped
 from tests.calibrator.command_here import calibrator
 from tests.calibrator.doctor.artificial_logs import (
     channel,
@@ -157,7 +157,8 @@ def test_calibrate_takes_what_the_doctor_calls_ready(
     assert (done.returncode == 0) is bool(told), done.stderr
     if seconds == 3.0:
         waits = examined(layout, log).report["not_ready"]["calibrate --trusted"]
-        assert waits == "it needs 5 s with values of all branches, and there are 3 s"
+        assert waits.startswith("3.0 s in which all branches have usable samples; at least 5 s are needed")
+        assert waits in done.stdout + done.stderr
 
 
 def test_two_minutes_with_gaps_everywhere_are_said_to_have_gaps(
@@ -188,7 +189,8 @@ def test_inverted_sign_is_found_of_the_right_branch(branch: str, log: Path, tmp_
 
 def test_all_signs_inverted_are_told_by_the_voltage(log: Path, tmp_path: Path) -> None:
     layout = write_layout(tmp_path, inverted=("battery", "motor", "auxiliary", "dcdc", "motor_rear"))
-    assert examined(layout, log).errors == [("sign", "all branches")]
+    told = examined(layout, log)
+    assert [(item.subject, item.severity) for item in told.findings("sign")] == [("all branches", "warning")]
 
 
 @pytest.mark.parametrize(
@@ -418,3 +420,121 @@ def test_missing_log_and_missing_dbc_are_one_line(layout: Path) -> None:
     done = calibrator("doctor", "--layout", layout, "--log", "none.log")
     assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
     assert calibrator("doctor", "--layout", layout).returncode == 2
+
+
+# ---- doctor, kirchhoff and calibrate say the same
+
+
+def calibrated(folder: Path, log: Path, layout: Path, *arguments: object) -> tuple[int, str]:
+    done = calibrator("calibrate", log, "--layout", layout, "--out", folder / "result", *arguments)
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_car_at_rest_is_called_so_by_kirchhoff_and_taken_by_calibrate(
+    tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
+    log = at_rest(database, tmp_path, noise_a=0.3, offset_a=2.0)
+    (still,) = examined(layout, log).findings("stands still")
+    told = calibrator("kirchhoff", log, "--layout", layout).stdout
+    assert still.text in " ".join(told.split())
+    assert "gain error" not in told
+    assert calibrated(tmp_path, log, layout, "--trusted", "battery")[0] == 0
+
+
+@pytest.mark.parametrize("seconds", [3.0, 12.0, 40.0])
+def test_short_log_is_called_so_by_kirchhoff(
+    seconds: float, tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
+    log = write_log(tmp_path, cut(true_drive(), seconds), database)
+    told = examined(layout, log)
+    (short,) = told.findings("too short")
+    shown = calibrator("kirchhoff", log, "--layout", layout).stdout
+    assert short.text in " ".join(shown.split())
+    assert "stand still" not in shown
+    assert told.findings("stands still") == []
+    assert ("gain error" in shown) is (seconds == 40.0)
+
+
+def test_branch_that_the_log_lacks_keeps_the_others_ready(
+    tmp_path: Path, layout: Path, database: VehicleDatabase
+) -> None:
+    drive = true_drive()
+    rest = {name: item for name, item in drive.branches.items() if name != "dcdc"}
+    log = write_log(tmp_path, replace(drive, branches=rest), database)
+    told = examined(layout, log)
+    assert {"dcdc", "motor_rear"} == {item.subject for item in told.findings("not in log")} & set(
+        told.report["branches"]
+    )
+    assert "calibrate --trusted" in told.report["ready"]
+    assert calibrated(tmp_path, log, layout, "--trusted", "battery")[0] == 0
+
+
+def test_wrong_sign_is_refused_by_calibrate_with_the_same_branch(log: Path, tmp_path: Path) -> None:
+    layout = write_layout(tmp_path, inverted=("motor",))
+    assert examined(layout, log).errors == [("sign", "motor")]
+    code, said = calibrated(tmp_path, log, layout, "--trusted", "battery")
+    assert code == 1
+    assert "check sign and unit of branch" in said
+    assert "motor" in said
+
+
+def test_one_vehicle_without_a_trusted_branch_is_not_corrected(log: Path, layout: Path, tmp_path: Path) -> None:
+    said = calibrator("doctor", "--layout", layout, "--log", log).stdout.splitlines()
+    assert said[-1].startswith("5 vehicles or more: calibrator calibrate")
+    code, told = calibrated(tmp_path, log, layout)
+    assert code == 0
+    assert "only ratios of gains are known: name a sensor that you trust (--trusted battery)" in " ".join(told.split())
+
+
+def test_three_vehicles_are_not_corrected_as_the_doctor_wants_five(
+    log: Path, layout: Path, tmp_path: Path, database: VehicleDatabase
+) -> None:
+    for vehicle in range(3):
+        folder = tmp_path / "fleet" / f"V{vehicle}"
+        folder.mkdir(parents=True)
+        write_log(folder, true_drive(seed=vehicle), database)
+    code, told = calibrated(tmp_path, tmp_path / "fleet", layout)
+    assert code == 0
+    assert "nothing is corrected; at least 5 are needed" in " ".join(told.split())
+
+
+def exchange(layout: Path, one: str, other: str) -> None:
+    """Let two branches read the signal of the other."""
+    text = layout.read_text()
+    first, second = (re.search(rf'name = "{name}".*\nsignal = (".*")', text) for name in (one, other))
+    assert first is not None
+    assert second is not None
+    mark = text.replace(f"signal = {first[1]}", "signal = @").replace(f"signal = {second[1]}", f"signal = {first[1]}")
+    layout.write_text(mark.replace("signal = @", f"signal = {second[1]}"))
+
+
+def test_exchanged_branches_of_other_signs_are_an_error_that_calibrate_refuses(
+    log: Path, layout: Path, tmp_path: Path
+) -> None:
+    exchange(layout, "battery", "motor")
+    told = examined(layout, log)
+    assert told.errors == [("exchanged", "battery")]
+    (error,) = told.findings("exchanged")
+    assert "reads HV_Motor.MotorCurrent, and motor reads HV_Battery.BatteryCurrent" in error.text
+    assert error.figures["rms_before_a"] > 4.0 * error.figures["rms_after_a"]
+    assert 'exchange what [[branch]] "battery" and "motor" read' in error.remedy
+    code, said = calibrated(tmp_path, log, layout, "--trusted", "battery")
+    assert code == 1
+    assert "check sign and unit of branch" in said
+
+
+def test_exchanged_branches_of_one_sign_are_a_warning(log: Path, layout: Path) -> None:
+    exchange(layout, "auxiliary", "dcdc")
+    told = examined(layout, log)
+    assert told.errors == []
+    assert [(item.subject, item.severity) for item in told.findings("exchanged")] == [("auxiliary", "warning")]
+
+
+def test_error_of_a_table_without_the_branches_keeps_its_parts(tmp_path: Path) -> None:
+    """Names with a semicolon are no end of a sentence."""
+    (tmp_path / "table.csv").write_text("time,a; b,c\n0,1,2\n1,2,3\n2,3,4\n")
+    branches = "".join(f'[[branch]]\nname = "{name}"\nsignal = "I; {name}"\nsign = 1\n' for name in ("x", "y"))
+    (tmp_path / "table.toml").write_text(f'schema = 1\nname = "table"\nfull_scale_a = 150\n{branches}')
+    (error,) = examined(tmp_path / "table.toml", tmp_path / "table.csv").findings("no branch")
+    assert error.text.endswith("expected 'I; x', 'I; y'")
+    assert error.remedy.startswith("check that layout and log belong to the same vehicle")

@@ -165,7 +165,9 @@ def test_summaries_give_what_the_command_writes(
     capsys.readouterr()
     settings: dict[str, Any] = {"workers": 1, "hold_out": ["V003", "V004"], "harm_limit": 0.01, "readings": bench}
     found = FleetCalibrator(**settings).fit(Fleet.from_folder(store.url, LAYOUT))
-    assert contents(found.write(tmp_path / "python")) == contents(tmp_path / "command")
+    here, there = contents(found.write(tmp_path / "python")), contents(tmp_path / "command")
+    here["run.json"] = here["run.json"].replace(b'"data frame"', b'"readings.csv"')  # where the readings came from
+    assert here == there
     assert found.summary() in done.stdout
     assert found.notices_ == ["a notice"]
     assert capsys.readouterr() == ("", "")
@@ -436,6 +438,10 @@ def test_arguments_of_another_type_are_refused_in_one_line(
     assert "\n" not in str(caught.value)
 
 
+def bench_rows(vehicles: list[str], drift: float) -> pd.DataFrame:
+    return pd.DataFrame({"vehicle": vehicles, "branch": "battery", "drift": drift, "drift_sd": 0.01})
+
+
 def test_wrong_places_and_parameters_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FleetError, match="no such folder, store of drives or store of summaries"):
         Fleet.from_folder(tmp_path / "nothing", LAYOUT)
@@ -455,7 +461,15 @@ def test_wrong_places_and_parameters_are_refused(tmp_path: Path) -> None:
         ({"readings": [1]}, r"readings \[1\]: expected a DataFrame or the path of a CSV table"),
         (
             {"readings": pd.DataFrame(columns=["vehicle", "branch", "drift", "drift_sd"])},
-            "; leave readings out if there",
+            "^readings: no reading below the header; leave readings out if there",
+        ),
+        (
+            {"readings": pd.DataFrame({"vehicle": ["V1"], "drift": [0.1]})},
+            "^readings: columns vehicle, drift; expected",
+        ),
+        (
+            {"readings": bench_rows(["V1", "V2"], 0.1).assign(branch=["battery", "x"])},
+            "^readings: row 1: no branch 'x'",
         ),
         ({"trusted": 1}, "trusted 1: expected a list of names"),
         ({"trusted": [1]}, "fleet frames: no usable vehicle 1 to trust"),

@@ -1,6 +1,7 @@
 """Models of single vehicles from their drives, and ``calibrator identify`` as a user types it."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -117,6 +118,20 @@ def test_junction_residual_from_moments_is_that_of_the_samples() -> None:
     assert [found.measured_mean_a, found.corrected_mean_a] == pytest.approx(means)
     about = [float(np.sqrt(np.mean((values - 1.5) ** 2))) for values in sums[:2]]
     assert found.about_expected() == pytest.approx(about)
+
+
+def test_spread_of_corrected_sums_is_told_at_rest_and_per_ampere() -> None:
+    random = np.random.default_rng(2)
+    throughput_a = np.repeat(np.linspace(0.0, 300.0, 40), 500)
+    noise = random.normal(size=(2, len(throughput_a)))
+    battery_a = throughput_a + 1.5 + 0.8 * noise[0] + 0.03 * throughput_a * noise[1]
+    samples = np.stack([battery_a, -throughput_a, np.ones_like(battery_a)], axis=1).reshape(40, 500, 3)
+    moments = np.einsum("bsk,bsl->bkl", samples, samples)
+    found = junction_residual(moments, gain=np.ones((1, 2)), offset_a=np.zeros(2), expected_a=1.5)
+    assert found.corrected_sd_a is not None
+    assert found.corrected_sd_per_a is not None
+    assert 0.8 <= found.corrected_sd_a <= 2.0
+    assert found.corrected_sd_per_a == pytest.approx(math.hypot(0.03, 0.01), rel=0.1)
 
 
 @pytest.fixture(scope="module")

@@ -68,7 +68,28 @@ def test_ratios_alone_have_no_scale(motor_off: pd.DataFrame) -> None:
     assert not calibrator.parameters_.corrected.any()
     assert calibrator.parameters_.gain_error_sd.min() > 0.1
     assert "only ratios of gains are known" in calibrator.summary()
-    assert any("1.05" in notice for notice in calibrator.notices_)
+    assert any("0.95" in notice and "battery / motor" in notice for notice in calibrator.notices_)
+
+
+def test_gain_ratios_are_named_in_the_order_of_the_layout(motor_off: pd.DataFrame) -> None:
+    turned = Junction(branches=["heater", "motor", "battery"], full_scale_a=400.0)
+    (said,) = [each for each in JunctionCalibrator().fit(motor_off, turned).notices_ if "gain ratios" in each]
+    assert "(heater / motor)" in said
+    assert "1.05" in said.partition("(motor / battery)")[0]
+
+
+def test_unusable_vehicle_leaves_the_others_calibrated(motor_off: pd.DataFrame, tmp_path: Path) -> None:
+    for name, frame in {"good": motor_off, "short": motor_off.iloc[:20], "empty": motor_off.iloc[:0]}.items():
+        (tmp_path / "cars" / name).mkdir(parents=True)
+        frame.rename_axis("time_s").to_csv(tmp_path / "cars" / name / "drive.csv")
+    layout = write_layout(tmp_path, motor_off)
+    arguments = ["calibrate", tmp_path / "cars", "--layout", layout, "--trusted", "battery", "--out", tmp_path / "r"]
+    done = command(*arguments)
+    assert done.returncode == 0, done.stderr
+    assert [path.stem for path in (tmp_path / "r" / "params").iterdir()] == ["good"]
+    assert "short: " in done.stdout
+    assert "at least 5 s are needed" in done.stdout
+    assert "next: calibrator report" in done.stderr
 
 
 def test_offset_is_open_where_loads_are_not_known() -> None:
@@ -97,6 +118,67 @@ def test_offset_of_one_of_two_has_two_explanations() -> None:
     assert {*first.offset_a, *second.offset_a} == {"motor", "heater"}
     assert first.probability + second.probability > 0.9
     assert not calibrator.parameters_.corrected.any()
+    deciding = calibrator.vehicles_["vehicle"].parameters.deciding_evidence
+    assert "A is of motor or heater: a zero-current window" in deciding
+
+
+def test_gain_is_corrected_alone_where_it_is_open_whose_an_offset_is() -> None:
+    frame = recording(gain=(0.0, 0.1, 0.0), offset_a=(0.0, 0.0, 6.0))
+    rows = found(frame, trusted=["battery"], load=(0.0, 0.1)).loc["vehicle"]
+    assert rows.corrected.to_dict() == {"battery": False, "motor": True, "heater": False}
+    assert rows.gain_error["motor"] == pytest.approx(0.1, abs=0.01)
+    assert rows.offset_a["motor"] == 0.0
+    assert rows.offset_sd_a["motor"] > 2.0
+
+
+def test_car_at_rest_tells_an_offset_and_no_gain() -> None:
+    frame = 0.01 * recording(gain=(0.0, 0.1, 0.0))[["battery", "motor"]] + [0.0, 5.0]
+    junction = Junction(branches=["battery", "motor"], full_scale_a=400.0)
+    calibrator = JunctionCalibrator(trusted=["battery"], load=(0.0, 0.1)).fit(frame, junction)
+    rows = calibrator.parameters_.set_index("branch")
+    assert rows.offset_a["motor"] == pytest.approx(5.0, abs=0.5)
+    assert rows.gain_error_sd["motor"] > 0.1
+
+
+def test_right_sensors_are_said_to_be_right() -> None:
+    calibrator = JunctionCalibrator(trusted=["battery"], load=(0.0, 0.1)).fit(recording(), JUNCTION)
+    assert set(calibrator.parameters_.verdict) == {"no sensor fault"}
+
+
+def test_load_that_is_switched_without_a_sensor_is_found_and_nothing_is_corrected() -> None:
+    frame = recording(gain=(0.0, 0.1, 0.0))
+    frame["battery"] += 12.0 * (np.sin(frame.index / 3.0) > 0.3)
+    calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame, JUNCTION)
+    assert [each.cause for each in calibrator.vehicles_["vehicle"].parameters.findings] == ["switching"]
+    assert not calibrator.parameters_.corrected.any()
+
+
+def bent(frame: pd.DataFrame, rms_a: float) -> None:
+    """Bend the motor's sensor: what no straight line explains has this RMS."""
+    current_a = frame["motor"].to_numpy()
+    curve = np.polynomial.Polynomial.fit(current_a, current_a**3, 1)
+    bend = current_a**3 - curve(current_a)
+    frame["motor"] += rms_a * bend / bend.std()
+
+
+def switched(frame: pd.DataFrame, rms_a: float) -> None:
+    """Switch a load without a sensor, every 15 s at random."""
+    rng = np.random.default_rng(5)
+    load = np.repeat(rng.integers(0, 2, len(frame) // 150 + 1), 150)[: len(frame)].astype(float)
+    frame["battery"] += rms_a * load / load.std()
+
+
+@pytest.mark.parametrize(("spoil", "share"), [(bent, 0.002), (switched, 0.008)])
+def test_what_no_gain_and_offset_explain_is_found_from_the_size_that_the_documents_say(
+    spoil: Any, share: float
+) -> None:
+    """Of full scale, RMS; see docs/junction.md."""
+    for seed in range(300, 305):
+        frame = recording(seed, gain=(0.0, 0.1, 0.0))
+        spoil(frame, share * 400.0)
+        calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame, JUNCTION)
+        assert calibrator.vehicles_["vehicle"].parameters.findings
+        assert not calibrator.parameters_.corrected.any()
 
 
 def test_charge_balance_tells_an_offset() -> None:
@@ -130,6 +212,13 @@ def test_meters_of_one_car_are_one_system() -> None:
     assert rows.gain_error["station_2", "charger"] == pytest.approx(0.03, abs=0.012)
 
 
+def test_error_of_the_trusted_sensor_is_the_same_in_all_others_and_said() -> None:
+    wrong = JunctionCalibrator(trusted=["battery"]).fit(recording(gain=(0.05, 0.0, 0.0), seconds=1200.0), JUNCTION)
+    assert any("against battery: a gain error of its own of +5." in notice for notice in wrong.notices_)
+    right = JunctionCalibrator(trusted=["battery"]).fit(recording(gain=(0.0, 0.05, 0.0), seconds=1200.0), JUNCTION)
+    assert not any("against battery" in notice for notice in right.notices_)
+
+
 def test_contradicting_knowledge_corrects_nothing() -> None:
     calibrator = JunctionCalibrator(trusted=["battery", "motor"]).fit(recording(gain=(0.0, 0.05, 0.2)), JUNCTION)
     assert any("contradicts itself" in notice for notice in calibrator.notices_)
@@ -140,6 +229,32 @@ def test_trust_in_a_sensor_that_shows_an_offset_is_a_contradiction() -> None:
     readings = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "offset_a": [3.0], "offset_sd_a": [0.05]})
     calibrator = JunctionCalibrator(trusted=["battery"], readings=readings).fit(recording(), JUNCTION)
     assert any("the offset of battery is known as" in notice for notice in calibrator.notices_)
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (lambda motor: motor.clip(-50.0, 50.0), "clipped"),
+        (lambda motor: motor.where(motor.index < 120.0, 1.1 * motor), "step"),
+        (lambda motor: motor.where(motor > 0.0, 1.1 * motor), "sign"),
+        (lambda motor: motor * (1.0 + 0.0005 * motor.abs()), "saturating"),
+    ],
+)
+def test_sensor_that_is_not_linear_is_found_and_not_corrected(change: Any, cause: str) -> None:
+    frame = recording()
+    calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame.assign(motor=change(frame["motor"])), JUNCTION)
+    findings = calibrator.vehicles_["vehicle"].parameters.findings
+    assert [each.cause for each in findings] == [cause]
+    assert findings[0].branch is None
+    assert not calibrator.parameters_.corrected.any()
+    assert set(calibrator.parameters_.verdict) == {"cannot tell"}
+
+
+def test_linear_sensors_have_no_finding() -> None:
+    for seed in range(10):
+        frame = recording(seed, gain=(0.0, 0.1, -0.2), offset_a=(0.0, 3.0, 0.0))
+        calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame, JUNCTION)
+        assert not calibrator.vehicles_["vehicle"].parameters.findings
 
 
 def test_order_of_branches_makes_no_difference(motor_off: pd.DataFrame) -> None:
@@ -185,7 +300,8 @@ def test_standard_deviations_are_right() -> None:
         (lambda frame: frame.iloc[:20], {}, "at least 5 s are needed"),
         (lambda frame: frame, {"trusted": ["gearbox"]}, "trusted gearbox: no such branch"),
         (lambda frame: frame, {"meter": "gearbox"}, "meter gearbox: no such branch"),
-        (lambda frame: frame, {"load": (1.0,)}, "a value with its standard deviation"),
+        (lambda frame: frame, {"load": (1.0,)}, "a value from 0 with its standard deviation"),
+        (lambda frame: frame, {"load": (-3.0, 0.1)}, "a value from 0 with its standard deviation"),
         (lambda frame: frame, {"charge_ah": {"battery": 3.0}}, "a value with its standard deviation"),
         (lambda frame: frame.iloc[::50].iloc[:7], {}, "tell too little: at least"),
         (lambda frame: {"a": frame, "b": frame * 1.001}, {"charge_ah": {"battery": (1.0, 0.1)}}, "of one vehicle"),
@@ -208,9 +324,14 @@ def table(tmp_path_factory: pytest.TempPathFactory, motor_off: pd.DataFrame) -> 
     """A car in a folder of its own: a table, and the layout of its columns."""
     folder = tmp_path_factory.mktemp("car")
     motor_off.rename_axis("time_s").to_csv(folder / "drive.csv")
-    branches = "".join(f'[[branch]]\nname = "{name}"\nsignal = "{name}"\nsign = 1\n' for name in motor_off)
-    (folder / "layout.toml").write_text(f'schema = 1\nname = "car"\nfull_scale_a = 400.0\n{branches}')
+    write_layout(folder, motor_off)
     return folder
+
+
+def write_layout(folder: Path, frame: pd.DataFrame) -> Path:
+    branches = "".join(f'[[branch]]\nname = "{name}"\nsignal = "{name}"\nsign = 1\n' for name in frame)
+    (folder / "layout.toml").write_text(f'schema = 1\nname = "car"\nfull_scale_a = 400.0\n{branches}')
+    return folder / "layout.toml"
 
 
 def test_command_writes_what_python_finds(table: Path, tmp_path: Path, motor_off: pd.DataFrame) -> None:
@@ -226,6 +347,7 @@ def test_command_writes_what_python_finds(table: Path, tmp_path: Path, motor_off
     ("options", "match"),
     [
         (["--load", "much"], "expected a number and its standard deviation"),
+        (["--load=-3:0.1"], "expected what flows out of the junction"),
         (["--charge", "battery"], "expected a branch with its charge"),
         (["--charge", "battery=3"], "give its standard deviation"),
         (["--trusted", "battery", "--expected-faults", "0.2"], "--expected-faults is for a fleet"),

@@ -9,13 +9,13 @@ from msgspec.structs import replace
 
 from bench.c99_driver import COMPILER, CompiledExport, Frame, compile_export
 from calibrator.export.checked import Checked, read_checked
-from ecu_node.corrector import Corrector
+from ecu_node.bus.guard import Mode, key_of
+from ecu_node.bus.in_force import InForce
+from ecu_node.bus.wiring import wire
+from ecu_node.core.corrector import Corrector
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.guard import Mode, key_of
-from ecu_node.in_force import InForce
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters, VehicleParameters, write_parameters
-from ecu_node.wiring import wire
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
 
 needs_compiler = pytest.mark.skipif(shutil.which(COMPILER) is None, reason=f"no {COMPILER} to compile the export with")
@@ -57,7 +57,7 @@ def gateway(database: VehicleDatabase, parameters: VehicleParameters) -> Correct
 
 def by_the_node(database: VehicleDatabase, corrector: Corrector, frames: Iterable[Frame]) -> list[bytes]:
     """What the node passes on of frames that all come at one time."""
-    keys = {message.name: key_of(message) for message in database.database.messages}
+    keys = {message.name: key_of(message) for message in database.databases[""].messages}
     found = []
     for name, payload in frames:
         source = corrector.sources.get(keys[name])

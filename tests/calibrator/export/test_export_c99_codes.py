@@ -12,7 +12,7 @@ from bench.c99_driver import COMPILER, FLAGS, NO_CODE
 from calibrator.errors import ExportError
 from calibrator.export.c99 import HEADER, SOURCE, c99_files
 from calibrator.export.c_model import CBranch
-from ecu_node.codes import Codes
+from ecu_node.core.signals import Codes
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError, ParameterError
 from tests.calibrator.export.exports import (

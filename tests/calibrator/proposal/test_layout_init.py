@@ -307,7 +307,7 @@ def test_motor_that_does_not_follow_the_battery_is_none(tmp_path: Path) -> None:
     log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 15.0 * math.sin(5.3 * t)})
     run = calibrator("layout", "init", dbc, "--log", log)
     assert run.returncode == 1
-    assert "does not follow the battery's current" in run.stderr
+    assert "of the greatest of them: a branch is missing or wrong" in run.stderr
 
 
 def test_sum_that_does_not_close_makes_no_layout(tmp_path: Path) -> None:
@@ -467,6 +467,15 @@ def test_current_that_closes_the_sum_is_a_branch_whatever_its_name(tmp_path: Pat
     assert set(sources(found(late))) == {"battery", "motor"}
 
 
+def test_current_in_another_unit_than_its_header_says_is_named(tmp_path: Path) -> None:
+    rows = [f"{0.1 * k:.1f},{battery_a(0.1 * k):.3f},{1000.0 * motor_a(0.1 * k):.3f}" for k in range(900)]
+    (tmp_path / "x.csv").write_text("\n".join(["time,Ibat,Imot", *rows]))
+    run = calibrator("layout", "init", tmp_path / "x.csv", "--out", tmp_path / "x.toml", "--yes")
+    assert run.returncode == 1
+    assert "in mA?" in run.stderr
+    assert not (tmp_path / "x.toml").exists()
+
+
 def test_table_is_a_recording_for_a_database(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
     rows = ["time,PackStatus.PackCurrent [mA],PackVoltage,DcPower,ClimaStatus.HeaterCurrent"]
@@ -554,6 +563,18 @@ def test_json_has_every_candidate(tmp_path: Path) -> None:
     assert json.loads(run.stdout)["problem"].startswith("no pack current found")
 
 
+def test_tool_makes_the_table_of_a_folder(tmp_path: Path) -> None:
+    database_file(tmp_path, PACK, INVERTER, name="one.dbc")
+    database_file(tmp_path, PACK, INVERTER, name="other.dbc")
+    database_file(tmp_path, INVERTER, name="inverter.dbc")
+    (tmp_path / "broken.dbc").write_text("BO_ 1")
+    (tmp_path / "right").write_text("database,battery\none,PackStatus.PackCurrent\nother,PackStatus.Nix\n")
+    tool = [DBC.parent / "tools" / "tried_databases.py", tmp_path, "--right", tmp_path / "right"]
+    run = subprocess.run([sys.executable, *map(str, tool)], capture_output=True, text=True, check=True)
+    assert "| one | right | `PackStatus.PackCurrent` | motor `InverterStatus.DcPower` |" in run.stdout.splitlines()
+    assert run.stdout.endswith("\nnone 1, refused 1, right 1, wrong 1\n")
+
+
 # ---- the dialogue
 
 
@@ -597,24 +618,51 @@ class Screen:
 DOWN = "\x1b[B"
 
 
-def test_dialogue_takes_leaves_and_turns(tmp_path: Path) -> None:
+def test_dialogue_takes_and_leaves(tmp_path: Path) -> None:
     dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
     screen = Screen(dbc, "--log", log_file(dbc, DRIVING), "--out", tmp_path / "car.toml")
     lines = screen.until("q quit")
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 80
-    assert any("The sum of these 3 closes" in line for line in lines)
-    screen.press(f"{DOWN}s")
-    assert any(re.search(r"motor +\+1 DcPower", line) for line in screen.until("DOES NOT CLOSE"))
-    screen.press("s")
-    screen.until("3 closes")
-    screen.press(f"{DOWN} ")
-    assert any("[ ]" in line and "HeaterCurrent" in line for line in screen.until("these 2"))
+    assert any("[x]" in line and "HeaterCurrent" in line for line in lines)
+    screen.press(f"{DOWN}{DOWN} ")
+    assert any("[ ]" in line and "HeaterCurrent" in line for line in screen.until("q quit"))
     screen.press("\r")
     code, text = screen.ended()
     assert code == 0
     assert "branches battery, motor;" in text
     assert {b.name: b.sign for b in read_layout(tmp_path / "car.toml").branch} == {"battery": 1, "motor": -1}
+
+
+def test_candidate_that_is_left_stands_beside_the_one_that_is_taken(tmp_path: Path) -> None:
+    pack = PACK.replace(
+        " SG_ PackVoltage", ' SG_ PackCurrentRaw : 32|16@1- (0.1,0) [-1000|1000] "A" INV\n SG_ PackVoltage'
+    )
+    screen = Screen(database_file(tmp_path, pack, INVERTER), "--out", tmp_path / "car.toml")
+    lines = screen.until("q quit")
+    down = next(k for k, line in enumerate(lines) if "PackCurrentRaw" in line) - next(
+        k for k, line in enumerate(lines) if line.startswith(">")
+    )
+    screen.press(DOWN * down + " ")
+    screen.until("PackCurrentRaw: A")
+    screen.press("\r")
+    assert screen.ended()[0] == 0
+    text = (tmp_path / "car.toml").read_text()
+    assert sources(read_layout(tmp_path / "car.toml"))["battery"] == "PackStatus.PackCurrentRaw"
+    assert '# or: "PackStatus.PackCurrent" (A)' in text
+
+
+def test_dialogue_writes_what_does_not_close_only_when_asked_again(tmp_path: Path) -> None:
+    dbc = database_file(tmp_path, PACK, INVERTER, HEATER)
+    log = log_file(dbc, {**DRIVING, "DcPower": lambda t: 0.2e-3 * motor_a(t) * volts(t)})
+    screen = Screen(dbc, "--log", log, "--out", tmp_path / "car.toml")
+    screen.until("q quit")
+    screen.press("\r")
+    screen.until("enter again writes it, but the sum of battery, motor")
+    assert not (tmp_path / "car.toml").exists()
+    screen.press("\r")
+    assert screen.ended()[0] == 0
+    assert (tmp_path / "car.toml").exists()
 
 
 def test_dialogue_wants_two_branches_and_quits(tmp_path: Path) -> None:

@@ -160,6 +160,12 @@ def test_an_impossible_time_stamp_is_counted_as_damaged() -> None:
     assert (frames.key.tolist(), frames.damaged) == ([0x10], 1)
 
 
+def test_impossible_date_of_the_start_is_none() -> None:
+    content = bytearray(of_objects(an_object(CLASSIC, classic(0x10, b"x"), time=7)))
+    content[40:56] = struct.pack("<8H", 9000, 1, 0, 1, 0, 0, 0, 0)
+    assert read_blf(io.BytesIO(content), "x.blf").time_ns.tolist() == [7]
+
+
 def test_error_objects_that_python_can_passes_over_are_counted() -> None:
     content = of_objects(an_object(2, bytes(8)), an_object(104, bytes(60)), an_object(ERROR, bytes(32)))
     assert read_blf(io.BytesIO(content), "x.blf").error_frames == 3
@@ -168,7 +174,7 @@ def test_error_objects_that_python_can_passes_over_are_counted() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (of_objects(an_object(CLASSIC, b"1234")), "an object too short for its frame"),
+        (of_objects(an_object(CLASSIC, b"1234")), "an object of 36 bytes, which is impossible for its type"),
         (of_objects(an_object(CLASSIC, classic(1, b"x")), b"no object at all"), "something that is no object"),
         (of_objects(an_object(CLASSIC, classic(1, b"x")))[:-2], "the file ends before"),
         (of_objects(an_object(CLASSIC, classic(1, b"x"))[:-4]), "the last object is cut"),

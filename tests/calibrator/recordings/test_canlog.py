@@ -76,7 +76,7 @@ def big_endian_database() -> VehicleDatabase:
     layout = read_layout(Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml")
     database = cantools.database.load_string(BIG_ENDIAN_DBC)
     assert isinstance(database, cantools.database.can.Database)
-    return VehicleDatabase(layout=layout, database=database, digest="0" * 64)
+    return VehicleDatabase(layout=layout, databases={"": database}, digest="0" * 64)
 
 
 @pytest.mark.parametrize("suffix", [".log", ".log.gz"])

@@ -1,5 +1,5 @@
 from collections.abc import Sequence
-from math import isfinite, nan
+from math import inf, isfinite, nan
 from typing import Any, Literal
 
 import cantools
@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from calibrator.recordings.decode import decode_signal, means_not_available, raw_values
-from calibrator.recordings.e2e_profile import p01_is_sound
+from calibrator.recordings.decode import decode_signal, means_not_available, p01_is_sound, raw_values, signal_range
 from ecu_node.errors import DatabaseError
 
 MULTIPLEXED = """VERSION ""
@@ -251,6 +250,34 @@ def test_a_value_outside_the_range_of_the_dbc_is_not_good(limits: tuple[float, f
     message, signal = one_signal(0, 8, scale=0.1, limits=limits)
     decoded = decode_signal(message, signal, *payloads([b"\0", b"\x0a", b"\x0b"], 8))
     assert decoded.good.tolist() == good
+
+
+def ranged_signal(minimum: float | None, maximum: float | None) -> Signal:
+    return one_signal(0, 16, scale=0.02, limits=(minimum, maximum))[1]
+
+
+@pytest.mark.parametrize(
+    ("minimum", "maximum", "low", "high"),
+    [
+        (-5.0, 7.0, -5.0, 7.0),
+        (None, 7.0, -inf, 7.0),
+        (0, 0, -inf, inf),
+        (None, None, -inf, inf),
+    ],
+)
+def test_range_is_what_the_dbc_says(minimum: float | None, maximum: float | None, low: float, high: float) -> None:
+    limits = signal_range(ranged_signal(minimum, maximum))
+    assert (limits.low, limits.high) == (low, high)
+
+
+def test_a_negative_factor_turns_the_range_round() -> None:
+    limits = signal_range(ranged_signal(-5.0, 7.0), -2.0)
+    assert (limits.low, limits.high) == (-14.0, 10.0)
+
+
+def test_limits_hold_with_rounding_and_nothing_beyond_does() -> None:
+    value = np.array([-5.0, 7.0 + 1e-9, 7.02, -5.02, np.nan, np.inf])
+    assert signal_range(ranged_signal(-5.0, 7.0)).holds(value).tolist() == [True, True, False, False, False, False]
 
 
 def test_the_limit_itself_is_good_in_spite_of_rounding() -> None:

@@ -294,16 +294,19 @@ def arxml(frames_: dict[str, tuple[int, str]]) -> str:
     return f"{head}{schema}{where}<AR-PACKAGES>{''.join(packages)}</AR-PACKAGES></AUTOSAR>"
 
 
-@pytest.mark.parametrize("suffix", [".kcd", ".sym", ".arxml"])
-def test_databases_of_other_formats_are_read(tmp_path: Path, layout: Path, suffix: str) -> None:
+def write_database(path: Path) -> Path:
     database = cantools.database.load_string(DBC, "dbc")
-    path = tmp_path / f"car{suffix}"
-    if suffix == ".arxml":
+    if path.suffix == ".arxml":
         path.write_text(arxml({"Pack": (0x100, "STANDARD"), "Motor": (0x200, "EXTENDED")}))
     else:
         assert isinstance(database, cantools.database.Database)
         cantools.database.dump_file(database, path)
-    layout.write_text(LAYOUT.replace("car.dbc", path.name))
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".kcd", ".sym", ".arxml"])
+def test_databases_of_other_formats_are_read(tmp_path: Path, layout: Path, suffix: str) -> None:
+    layout.write_text(LAYOUT.replace("car.dbc", write_database(tmp_path / f"car{suffix}").name))
     write_with_python_can(tmp_path / "x.blf")
     require_currents(before(tmp_path / "x.blf", layout))
 
@@ -418,6 +421,12 @@ def require_one_line(done: subprocess.CompletedProcess[str], words: str) -> None
     assert len(done.stderr.splitlines()) == 1, done.stderr
 
 
+def nameless_archive(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.log", "")
+    path.write_bytes(path.read_bytes().replace(b"a.log", b"\0.log"))
+
+
 @pytest.mark.parametrize(
     ("name", "write", "words"),
     [
@@ -425,6 +434,7 @@ def require_one_line(done: subprocess.CompletedProcess[str], words: str) -> None
         ("x.csv", with_head(GVRET.replace("LEN", "L"), "{us},{id8},true,Rx,0,8,{cells}"), "without the column 'LEN'"),
         ("x.csv", with_head(GVRET, "{us},{id8},true,Rx,0,8,ZZ"), "line 2 is damaged, and 80 of 80 are"),
         ("x.zip", lambda path: path.write_bytes(b"PK nothing"), "x.zip: not a readable archive: File is not a zip"),
+        ("x.zip", nameless_archive, "x.zip: no logs in it; expected .log, .asc"),
         ("x.zip", lambda path: zipfile.ZipFile(path, "w").close(), "x.zip: no logs in it; expected .log, .asc"),
         ("x.log", lines("{n} {id} {data}"), "line 1 is damaged"),
         ("x.xlsx", lines("{n}"), "x.xlsx: not a known log format; expected .log, .asc"),
@@ -435,6 +445,66 @@ def test_mistake_with_a_log_is_one_line(
 ) -> None:
     write(tmp_path / name)
     require_one_line(calibrator("kirchhoff", tmp_path / name, "--layout", layout), words)
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda _: b"",
+    "cut at its end": lambda whole: whole[: len(whole) // 2 + 7],
+    "damaged in its middle": lambda whole: whole[: len(whole) // 2] + b"\0xx\xffx.xx" + whole[len(whole) // 2 + 30 :],
+    "random": lambda whole: bytes(k * k % 251 for k in range(len(whole))),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("program", [name for name in LOGS if name != "folder"])
+def test_damaged_log_is_one_line_or_counted(tmp_path: Path, layout: Path, program: str, damage: str) -> None:
+    name, write = LOGS[program]
+    log = tmp_path / name
+    write(log)
+    log.write_bytes(DAMAGES[damage](log.read_bytes()))
+    done = calibrator("kirchhoff", log, "--layout", layout, "--json")
+    if done.returncode:
+        require_one_line(done, name)
+        return
+    said = json.loads(done.stdout)
+    assert damage in {"cut at its end", "damaged in its middle"}
+    assert said["before"]["sum"]["mean_a"] == pytest.approx(2.2, abs=0.05)
+    if damage == "damaged in its middle":
+        assert any("damaged lines or frames left out" in notice for notice in said["notices"])
+
+
+@pytest.mark.parametrize(
+    ("program", "old", "new"),
+    [
+        ("candump -ta", b"[8]  14 00 A0 0F 00 00 00 00\n", b"[8]  14 00 A0\n"),
+        ("candump -tA", b"2023-11-14 22:13:20.100", b"2023-11-4 22:13:20.100"),
+        ("candump -td", b"(000.04", b"(0.0.04"),
+        ("SavvyCAN", b",\n265", b",265"),
+        ("SavvyCAN", b"00000100,false", b'"0000100,false'),
+        ("SavvyCAN", b"00000100,false", b"90000000000100,false"),
+        ("PEAK TRC 1.3", b"00000200", b"9000000200"),
+    ],
+)
+def test_damaged_line_is_left_out_and_counted(
+    tmp_path: Path, layout: Path, program: str, old: bytes, new: bytes
+) -> None:
+    name, write = LOGS[program]
+    write(tmp_path / name)
+    above, found, below = (tmp_path / name).read_bytes().rpartition(old)
+    assert found
+    (tmp_path / name).write_bytes(above + new + below)
+    notices = before(tmp_path / name, layout)["notices"]
+    assert "1 damaged lines or frames left out" in notices
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut at its end", "random"])
+@pytest.mark.parametrize("suffix", [".dbc", ".kcd", ".sym", ".arxml"])
+def test_damaged_database_is_one_line(tmp_path: Path, layout: Path, suffix: str, damage: str) -> None:
+    path = write_database(tmp_path / f"car{suffix}")
+    path.write_bytes(DAMAGES[damage](path.read_bytes()))
+    layout.write_text(LAYOUT.replace("car.dbc", path.name))
+    write_with_python_can(tmp_path / "x.blf")
+    require_one_line(calibrator("kirchhoff", tmp_path / "x.blf", "--layout", layout), path.name)
 
 
 @pytest.mark.parametrize(

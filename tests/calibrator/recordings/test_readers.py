@@ -6,8 +6,7 @@ import pytest
 
 from calibrator.drive import Array, Channel, Drive
 from calibrator.errors import LogError
-from calibrator.recordings.canlog import encode_message, write_candump
-from calibrator.recordings.drive_log import write_drive_log
+from calibrator.recordings.canlog import encode_message, write_candump, write_drive_log
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.readers import drive_from_frames, read_drive, read_recording
 from ecu_node.database import VehicleDatabase, read_database
@@ -178,7 +177,7 @@ def test_absent_branches_and_inputs_are_reported(tmp_path: Path, database: Vehic
     write_drive_log(tmp_path / "d.log", drive, database)
     recording = read_recording(tmp_path / "d.log", database, vehicle="v", name="d")
     assert set(recording.drive.branches) == {"battery"}
-    assert "no frames of motor, auxiliary, dcdc, motor_rear, torque" in recording.report.notices()[0]
+    assert "no frames of motor, auxiliary, dcdc, motor_rear, torque" in str(recording.report.notices()[0])
 
 
 def test_an_input_that_is_never_available_is_left_out_and_reported(tmp_path: Path, database: VehicleDatabase) -> None:
@@ -186,7 +185,7 @@ def test_an_input_that_is_never_available_is_left_out_and_reported(tmp_path: Pat
     write_drive_log(tmp_path / "d.log", drive, database)
     recording = read_recording(tmp_path / "d.log", database, vehicle="v", name="d")
     assert "voltage" not in recording.drive.inputs
-    assert "voltage: 2 of 2 frames not usable" in recording.report.notices()
+    assert "voltage: 2 of 2 frames not usable" in map(str, recording.report.notices())
 
 
 def test_a_frame_with_a_wrong_crc_is_labelled(tmp_path: Path, database: VehicleDatabase) -> None:
@@ -216,7 +215,7 @@ def test_another_message_on_another_bus_does_no_harm(tmp_path: Path, power_datab
 def test_disorder_and_clock_steps_are_reported(tmp_path: Path, power_database: VehicleDatabase) -> None:
     lines = [(t, "00000003#0100") for t in (0.0, 0.2, 0.1, 5000.0)]
     report = read_recording(log_of(tmp_path / "x.log", lines), power_database, vehicle="v", name="d").report
-    assert report.notices()[-2:] == [
+    assert [*map(str, report.notices()[-2:])] == [
         "1 frames out of order, sorted",
         "the clock was set 1 times, each step became a gap of 60 s",
     ]

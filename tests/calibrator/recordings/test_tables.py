@@ -312,6 +312,15 @@ def test_damaged_table_is_one_line(tmp_path: Path, suffix: str) -> None:
     assert len(done.stderr.splitlines()) == 1, done.stderr
 
 
+def test_damaged_description_in_a_feather_is_one_line(tmp_path: Path) -> None:
+    frame().to_feather(tmp_path / "x.feather")
+    whole = (tmp_path / "x.feather").read_bytes()
+    (tmp_path / "x.feather").write_bytes(whole.replace(b'{"index_columns"', b'\0"index_columns"'))
+    done = calibrator("kirchhoff", tmp_path / "x.feather", "--branches", BRANCHES)
+    assert done.returncode == 1
+    assert "x.feather: not a readable table: " in done.stderr
+
+
 def test_folder_of_tables_is_refused_where_one_is_needed(tmp_path: Path) -> None:
     for name in ("x.csv", "y.csv"):
         csv(frame())(tmp_path / name)

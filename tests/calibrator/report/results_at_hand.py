@@ -3,13 +3,10 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 from msgspec.structs import replace
 
 from calibrator.estimator.results import RunRecord, encode_chunk, join_rows, write_parameter_files, write_run
 from calibrator.estimator.rows import VehicleEvidence, evidence_names
-from calibrator.summaries.filter_bank import plain_bank
-from calibrator.summaries.unity import UNITY_FILE, UnityWindow
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import (
     BranchParameters,
@@ -22,16 +19,7 @@ from tests.ecu_node.vehicles import parameters_for
 
 BRANCHES = ("battery", "motor")
 FULL_SCALE_A = 400.0
-READ_OUT_A = {"battery": [50.0, 10.0, 1.0], "motor": [-50.0, -10.0, -1.0]}
 EVIL = "<script>document.title='run'</script>"
-WINDOW = UnityWindow(
-    vehicle="V1",
-    drive="d1",
-    time_s=0.1 * np.arange(600),
-    columns=np.column_stack([np.sin(0.02 * np.arange(600)), np.cos(0.05 * np.arange(600))]),
-    voltage_v=350.0,
-    bank=plain_bank(("driving_current", "heater_current"), period_s=0.1),
-)
 
 
 def sensor(
@@ -149,7 +137,6 @@ def write_result(
     left_out: Mapping[str, str] | None = None,
     moved: Mapping[tuple[str, str], str] | None = None,
     method: str = "posterior",
-    window: UnityWindow | None = WINDOW,
     evidence: bool = True,
     created: str = "2026-01-01T00:00:00+00:00",
 ) -> Path:
@@ -164,8 +151,6 @@ def write_result(
     write_parameter_files(folder, {0: parameters}, vehicles=len(vehicles))
     rows.unlink()
     parameters.unlink()
-    if window is not None:
-        (folder / UNITY_FILE).write_bytes(window.encoded())
     run = run_of(len(vehicles), left_out or {}, method=method, evidence=evidence)
     write_run(folder, replace(run, created=created))
     return folder
@@ -176,7 +161,6 @@ def run_of(vehicles: int, left_out: Mapping[str, str], *, method: str, evidence:
     reference = {
         "agreeing_share": {"battery": 0.8, "motor": 0.75},
         "unmeasured_a": 0.3,
-        "read_out": READ_OUT_A,
     }
     spread = {"model_spread": {"battery": 0.004, "motor": 0.005}}
     own = {"reference": reference, "hyperparameters": spread, "evidence": evidence_names(BRANCHES)}

@@ -36,20 +36,19 @@ def test_the_page_of_a_vehicle_is_named_after_it(
     assert "Look at the hardware of V3" in (tmp_path / "V3.html").read_text()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--vehicle", "V1", "--limit", "300"], "--limit: belongs to the page of the fleet"),
-        (["--limit", "-3"], "expected a number from 0.1 to 10000"),
-    ],
-)
-def test_options_that_do_not_belong_together_are_refused(
-    result: Path, tmp_path: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
+def test_a_limit_that_no_battery_has_is_refused(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "page.html"
-    assert run_command(["report", str(result), "--out", str(out), *options]) == 2
-    assert message in " ".join(capsys.readouterr().err.split())
+    assert run_command(["report", str(result), "--out", str(out), "--limit", "-3"]) == 2
+    assert "expected a number from 0.1 to 10000" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_the_page_of_a_vehicle_has_its_margin(result: Path, tmp_path: Path) -> None:
+    out = tmp_path / "page.html"
+    assert run_command(["report", str(result), "--vehicle", "V1", "--limit", "300", "--out", str(out)]) == 0
+    assert "<b>34.0 A</b> given back" in out.read_text()
 
 
 def test_a_pipe_is_not_replaced_by_a_page(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """The numbers of the report are those of results.parquet, counted here in another way."""
 
+import hashlib
 from pathlib import Path
 
 import duckdb
@@ -9,7 +10,7 @@ from msgspec.structs import replace
 
 from calibrator.errors import FleetError
 from calibrator.report.fleet_table import FleetTable, read_details, read_fleet_table
-from calibrator.report.overview import WorkshopRow, next_steps, overview_of, workshop_list
+from calibrator.report.overview import WorkshopRow, overview_of, steps_to_take, workshop_list
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import Finding
 from tests.calibrator.report.results_at_hand import EVIL, sensor, six_vehicles, vehicle, write_result
@@ -27,7 +28,7 @@ def workshop(table: FleetTable) -> list[WorkshopRow]:
 
 def steps(result: Path) -> list[str]:
     table = read_fleet_table(result)
-    return next_steps(table, workshop(table))
+    return steps_to_take(table, workshop(table))
 
 
 def test_counts_are_those_of_the_result(result: Path) -> None:
@@ -101,25 +102,42 @@ def test_workshop_list_has_hardware_then_sensors_then_what_many_share(
 def test_steps_say_what_to_do_and_to_whom(result: Path) -> None:
     install, window, hardware, check, left_out = steps(result)
     assert install.startswith("Install the parameters of V1, V10 on their nodes")
-    assert window == "A zero-current window (contactors open) would decide about V4."
+    assert window == "V4: a zero-current window (contactors open) would decide."
     assert hardware == "Look at the hardware of V3: their currents differ from the fleet's."
     assert check == "Check the sensors of V5 (motor): see the workshop list."
     assert left_out == f"Find out why log of {EVIL} could not be used; most often: cannot be read: {EVIL}."
 
 
-def test_steps_join_vehicles_that_need_the_same(tmp_path: Path, database: VehicleDatabase) -> None:
-    needs = {
-        "V1": "a zero-current window (contactors open) would decide: the motor sensor then shows -7 A or +0 A",
-        "V2": "a zero-current window (contactors open) would decide: the motor sensor then shows +3 A or +0 A",
-        "V3": "only ratios of gains are known: name a sensor that you trust",
-        "V4": "a check of the motor sensor would decide: its gain is off by 3 % or 4 %",
-    }
-    items = [vehicle(database, name, sensor(), sensor(), decides=need) for name, need in needs.items()]
-    assert steps(write_result(tmp_path / "r", items)) == [
-        "A zero-current window (contactors open) would decide about V1, V2.",
-        "V3: only ratios of gains are known: name a sensor that you trust.",
-        "A check of the motor sensor would decide about V4: its gain is off by 3 % or 4 %.",
+def test_steps_join_vehicles_with_the_same_question(tmp_path: Path, database: VehicleDatabase) -> None:
+    held = sensor(0.0, 8.0, held_back="harm limit")
+    window = "a zero-current window (contactors open) would decide: the motor sensor then shows +{} A or +0 A"
+    needs = {"V1": window.format(7), "V2": window.format(3), "V3": window.format(7)}
+    items = [vehicle(database, name, held, sensor(), decides=need) for name, need in needs.items()]
+    assert steps(write_result(tmp_path / "few", items)) == [
+        f"V1, V3: {needs['V1']}.",
+        f"V2: {needs['V2']}.",
     ]
+    items += [vehicle(database, f"W{n}", held, sensor(), decides=window.format(n)) for n in (4, 5)]
+    assert steps(write_result(tmp_path / "many", items)) == [
+        "V1, V3, V2, W4, W5, not corrected because the correction might do harm: what would decide stands with each. "
+        f"Of V1: {needs['V1']}."
+    ]
+
+
+def test_undecided_vehicle_is_never_without_a_step(tmp_path: Path, database: VehicleDatabase) -> None:
+    item = vehicle(database, "V1", sensor(), sensor(), verdict="cannot tell")
+    assert steps(write_result(tmp_path / "r", [item])) == [
+        "V1: more recordings, a reading at zero current or a bench check would decide."
+    ]
+
+
+def test_parameters_of_a_table_are_for_tables(result: Path) -> None:
+    text = (result / "run.json").read_text()
+    no_dbc = f'"dbc_sha256": "{hashlib.sha256(b"").hexdigest()}"'
+    (result / "run.json").write_text(text.replace('"dbc_sha256": ""', no_dbc))
+    (first, *_) = steps(result)
+    assert first.startswith("Correct the tables of V1, V10: 'calibrator kirchhoff TABLE --layout LAYOUT --parameters")
+    assert "A node needs a layout with the signals of a DBC." in first
 
 
 def test_faultless_fleet_has_nothing_to_do(tmp_path: Path, database: VehicleDatabase) -> None:

@@ -1,78 +1,96 @@
+"""The battery's protection margin, through the report; the limit is full scale, 400 A."""
+
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from calibrator.report.protection import SIGMAS, Margins, margins, protection_of
+from calibrator.report.overview import SIGMAS, BatteryMargin
+from calibrator.report.page import fleet_report
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import BranchParameters
+from tests.calibrator.report.results_at_hand import sensor, vehicle, write_result
+from tests.calibrator.report.test_report_pages import visible
 
-ONES = np.ones(4)
-DRIFT, OFFSET_A = np.array([0.1, -0.1, 0.0, 0.02]), np.array([4.0, 4.0, 0.0, -1.0])
-
-
-def of(applied: list[bool], *, sd: float = 0.0, limit_a: float = 400.0, scale: float = 1.0) -> Margins:
-    return margins(scale * DRIFT, scale * OFFSET_A, sd * ONES, 100.0 * sd * ONES, np.array(applied), limit_a=limit_a)
-
-
-def test_a_vehicle_needs_what_its_sensor_is_off_by_at_the_limit() -> None:
-    found = of([False] * 4)
-    np.testing.assert_allclose(found.before_a, [44.0, 44.0, 0.0, 9.0])
-    np.testing.assert_array_equal(found.after_a, found.before_a)
-    np.testing.assert_array_equal(found.own_gain_a, 0.0)
+DOUBT_A = SIGMAS * np.hypot(400.0 * 0.001, 0.1)
+"""Of a sensor that is known to 0.1 % and 0.1 A. [A]"""
 
 
-def test_a_corrected_sensor_needs_its_uncertainty_alone() -> None:
-    found = of([True] * 4, sd=0.001)
-    expected = SIGMAS * np.hypot(0.4, 0.1)
-    np.testing.assert_allclose(found.after_a, expected)
-    np.testing.assert_allclose(found.before_a, [44.0, 44.0, 0.0, 9.0])
+@pytest.fixture
+def margin(tmp_path: Path, database: VehicleDatabase) -> "Margin":
+    return Margin(tmp_path, database)
 
 
-def test_doubt_gives_nothing_back() -> None:
-    found = of([False] * 4, sd=0.01)
-    doubt_a = SIGMAS * np.hypot(4.0, 1.0)
-    np.testing.assert_allclose(found.after_a, [44.0, 44.0, doubt_a, 9.0 + doubt_a])
-    assert found.common_before_a - found.common_after_a == 0.0
+class Margin:
+    """The margin of a fleet with these battery sensors."""
+
+    def __init__(self, folder: Path, database: VehicleDatabase) -> None:
+        self.folder, self.database, self.text = folder, database, ""
+
+    def __call__(self, *batteries: BranchParameters, **options: float) -> BatteryMargin | None:
+        number = len(list(self.folder.iterdir()))
+        items = [vehicle(self.database, f"V{j}", battery, sensor()) for j, battery in enumerate(batteries, start=1)]
+        text, report = fleet_report(write_result(self.folder / str(number), items), **options)  # type: ignore[arg-type]
+        self.text = visible(text)
+        return report.protection
+
+    def known(self, *batteries: BranchParameters, **options: float) -> BatteryMargin:
+        found = self(*batteries, **options)
+        assert found is not None
+        return found
 
 
-def test_no_vehicle_needs_more_than_what_is_set_for_the_worst() -> None:
-    np.testing.assert_allclose(of([True, False, True, False], sd=0.5).after_a, 44.0)
+def test_sensor_needs_its_error_at_the_limit_and_corrected_its_doubt_alone(margin: Margin) -> None:
+    found = margin.known(sensor(0.1, -4.0, apply=True), sensor(0.02, 1.0, apply=True))
+    assert found.common_before_a == pytest.approx(44.0 + DOUBT_A)
+    assert found.common_after_a == pytest.approx(DOUBT_A)
+    assert found.common_gain_a == pytest.approx(44.0)
+    assert found.own_gain_a == pytest.approx((44.0 + 9.0) / 2.0)
+    assert (found.vehicles, found.corrected, found.largest) == (2, 2, [])
+    half = margin.known(sensor(0.1, -4.0, apply=True), sensor(), limit_a=200.0)
+    assert half.common_gain_a == pytest.approx(24.0)
 
 
-def test_one_margin_for_all_falls_no_lower_than_the_worst_that_is_not_corrected() -> None:
-    found = of([True, True, True, False])
-    assert found.common_before_a == pytest.approx(44.0)
-    assert found.common_after_a == pytest.approx(9.0)
+def test_doubt_of_a_trusted_sensor_counts(margin: Margin) -> None:
+    """A gain that is trusted to 0.2 % is wrong by up to 0.8 A and more."""
+    found = margin.known(sensor(sd=0.002))
+    assert found.common_before_a == found.common_after_a == pytest.approx(2.0 * DOUBT_A)
+    assert f"{2.0 * DOUBT_A:.1f} A margin as measured" in margin.text
 
 
-def test_without_correction_nothing_is_given_back() -> None:
-    none_applied = np.zeros(4, bool)
-    found = protection_of(of([False] * 4, sd=0.01), none_applied, branch="battery", voltage_v=350.0)
-    assert (found.common_gain_a, found.common_gain_kw, found.corrected) == (0.0, 0.0, 0)
-    assert (found.own_gain_a, found.own_gain_kw) == (None, None)
-    np.testing.assert_array_equal(of([False] * 4, sd=0.01).own_gain_a, 0.0)
+def test_doubt_gives_nothing_back(margin: Margin) -> None:
+    found = margin.known(sensor(0.1, 4.0, sd=0.02), sensor(0.01, 1.0, sd=0.02, apply=True))
+    assert found.common_gain_a == 0.0
+    assert found.own_gain_a == pytest.approx(5.0)
 
 
-def test_with_a_margin_per_vehicle_a_correction_gives_back_what_it_takes_away() -> None:
-    applied = [True, False, False, True]
-    found = of(applied, sd=0.001)
-    doubt_a = SIGMAS * np.hypot(0.4, 0.1)
-    np.testing.assert_allclose(found.own_gain_a, [44.0 - doubt_a, 0.0, 0.0, 9.0])
-    told = protection_of(found, np.array(applied), branch="battery", voltage_v=350.0)
-    assert told.own_gain_a == pytest.approx((44.0 - doubt_a + 9.0) / 2.0)
-    assert told.corrected == 2
+def test_one_margin_for_all_falls_no_lower_than_the_worst_that_is_not_corrected(margin: Margin) -> None:
+    found = margin.known(sensor(0.1, 4.0, apply=True), sensor(0.02, -1.0), sensor())
+    assert found.common_after_a == pytest.approx(9.0 + DOUBT_A)
+    assert [name for name, _ in found.largest] == ["V2"]
+    assert f"Not corrected, these keep it large: V2 ({9.0 + DOUBT_A:.1f} A)." in margin.text
 
 
-def test_gains_are_told_in_kilowatts_where_the_voltage_is_known() -> None:
-    every = np.ones(4, bool)
-    found = protection_of(of([True] * 4), every, branch="battery", voltage_v=350.0)
-    assert found.common_gain_kw == pytest.approx(44.0 * 0.35)
-    assert found.own_gain_kw == pytest.approx(26.5 * 0.35)
-    assert protection_of(of([True] * 4), every, branch="battery", voltage_v=None).own_gain_kw is None
+def test_sensor_that_is_not_known_is_not_counted_and_that_is_said(margin: Margin) -> None:
+    lost = sensor(0.3, 50.0, sd=0.2)
+    found = margin.known(lost, sensor(0.1, 4.0), sensor())
+    assert (found.vehicles, found.not_known) == (2, 1)
+    assert found.common_before_a == pytest.approx(44.0 + DOUBT_A)
+    assert "1 of which the sensor is not known are not counted" in margin.text
+    assert margin(lost, lost) is None
+    assert "How wrong the battery sensor can be is not known, so no margin follows." in margin.text
 
 
-def test_twice_the_faults_take_twice_the_margin() -> None:
-    np.testing.assert_allclose(of([False] * 4, scale=2.0).before_a, 2.0 * of([False] * 4).before_a)
+def test_gains_are_told_in_kilowatts_where_the_voltage_is_known(margin: Margin) -> None:
+    margin.known(sensor(0.1, 4.0, apply=True), sensor(), voltage_v=350.0)
+    assert "44.0 A = 15.4 kW given back with one margin for all" in margin.text
+    margin.known(sensor(0.1, 4.0, apply=True), sensor())
+    assert "With --voltage the same is given in kW." in margin.text
+    none = margin.known(sensor(0.1, 4.0), sensor(), voltage_v=350.0)
+    assert (none.common_gain_a, none.own_gain_a) == (0.0, None)
 
 
-def test_of_a_large_fleet_one_in_a_thousand_may_need_more() -> None:
-    needed_a, nothing = np.concatenate([np.full(9995, 5.0), np.full(5, 500.0)]), np.zeros(10_000)
-    found = margins(nothing, needed_a, nothing, nothing, np.zeros(10_000, bool), limit_a=400.0)
-    assert found.common_before_a == pytest.approx(5.0)
+def test_of_a_large_fleet_one_in_a_thousand_may_need_more(margin: Margin) -> None:
+    usual = [sensor(0.0, 5.0)] * 2998
+    assert margin.known(*usual, sensor(0.0, 300.0)).common_before_a == pytest.approx(5.0 + DOUBT_A)
+    assert margin.known(*usual[:500], sensor(0.0, 300.0)).common_before_a == pytest.approx(300.0 + DOUBT_A)

@@ -8,28 +8,10 @@ import sys
 
 import pytest
 
-from calibrator.terminal.progress import numbered_passes, progress_bar, rate_text, shown
+from calibrator.terminal.progress import numbered_passes, progress_bar, shown
 
 
-@pytest.mark.parametrize(
-    ("per_s", "text"),
-    [
-        (12345.6, "12346/s"),
-        (12.34, "12/s"),
-        (1.26, "1.3/s"),
-        (0.5, "30/min"),
-        (0.1, "6.0/min"),
-        (0.01, "36/h"),
-        (0.0001, "0.4/h"),
-    ],
-)
-def test_rates_have_few_digits_and_a_fitting_time(per_s: float, text: str) -> None:
-    assert rate_text(per_s) == text
-
-
-def test_a_log_gets_lines_with_rate_and_time_left(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_log_gets_lines_with_time_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     clock = iter([0.0, 5.0, 11.0, 12.0, 40.0, 41.0])
     monkeypatch.setattr("calibrator.terminal.progress.time.monotonic", lambda: next(clock))
     with progress_bar("read drives", 8, "vehicles") as done:
@@ -38,8 +20,8 @@ def test_a_log_gets_lines_with_rate_and_time_left(
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.splitlines() == [
-        "read drives: 2 of 8 vehicles, 11/min, 11 s, 33 s left",
-        "read drives: 8 of 8 vehicles, 12/min, 40 s, 0 s left",
+        "read drives: 2 of 8 vehicles, 11 s, 33 s left",
+        "read drives: 8 of 8 vehicles, 40 s, 0 s left",
     ]
 
 
@@ -57,14 +39,14 @@ def test_passes_are_numbered_and_a_later_command_is_not(
     assert starts == ["1/2 learn the fleet", "2/2 calibrate: 2 of 2 vehicles", "import: 1 of 1 logs"]
 
 
-def test_what_was_done_before_is_no_part_of_the_rate(
+def test_what_was_done_before_does_not_shorten_the_time_left(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock = iter([0.0, 10.0])
     monkeypatch.setattr("calibrator.terminal.progress.time.monotonic", lambda: next(clock))
     with progress_bar("calibrate", 1000, "vehicles", begun=900) as done:
         done(950)
-    assert capsys.readouterr().err == "calibrate: 950 of 1000 vehicles, 5.0/s, 10 s, 10 s left\n"
+    assert capsys.readouterr().err == "calibrate: 950 of 1000 vehicles, 10 s, 10 s left\n"
 
 
 IN_TERMINAL = """

@@ -1,6 +1,7 @@
 """What command lines made with typer share."""
 
 import os
+import re
 import signal
 from typing import Annotated
 
@@ -8,11 +9,13 @@ import pytest
 import typer
 from joblib import delayed
 
+from calibrator.cli import ORDER
+from calibrator.cli import app as calibrator_app
 from calibrator.errors import ContradictionError, FleetError
 from calibrator.processes.computing import in_processes
 from calibrator.processes.reading import read_in_processes
 from calibrator.terminal.command_line import command_app, run_app, run_tool
-from ecu_node.standard_output import write_output
+from ecu_node.program import write_output
 
 app = command_app(no_args_is_help=True)
 NUMBER = Annotated[int, typer.Option("--number", min=1, help="A number.")]
@@ -80,6 +83,30 @@ def test_help_is_not_cut_and_tells_exit_codes(capsys: pytest.CaptureFixture[str]
     assert "second paragraph" not in words
     for text in ("70 internal error", "--debug shows the traceback of an error"):
         assert text in words
+
+
+COMMANDS = [[], ["layout"], ["layout", "init"], ["keys"], ["keys", "new"], ["keys", "set"]]
+COMMANDS += [[name] for names in ORDER.values() for name in names if [name] not in COMMANDS]
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_help_has_an_example_and_words_that_people_use(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run_app(calibrator_app, "calibrator", [*command, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 80
+    assert f"Example:\n    {' '.join(['calibrator', *command])} " in text
+    assert re.search(r"list\[|<[a-zA-Z]+>|[{}]|e\+[0-9]", text) is None
+
+
+def test_help_says_what_may_be_repeated_and_no_bound_that_nobody_reaches(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(calibrator_app, "calibrator", ["sign", "--help"]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert "calibrator sign [OPTIONS] PARAMS... " in words
+    assert "$CALIBRATOR_KEY_PASSPHRASE. May be repeated." in words
+    assert "(default: time in seconds, UTC), 1 or more." in words
 
 
 def test_nothing_but_the_name_shows_help(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,1 @@
+"""The node's buses, clocks, files and surroundings around :mod:`ecu_node.core`."""

@@ -1,0 +1,158 @@
+"""Fault memory: why the node fell back, kept in the state folder as a control unit keeps its trouble codes.
+
+One entry per reason and branches: when first and last, how often, and the currents of the last time. What is active
+holds also after a restart, until the bus has slept (a branch that was silent or stuck), another parameter set is in
+force, or ``ecu-node clear``.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+
+from ecu_node.core.corrector import Corrector
+from ecu_node.core.status import Reason
+from ecu_node.errors import UserError
+from ecu_node.user_files import UnsuitableFileError, read_user_file, write_atomically
+
+__all__ = ["Fault", "FaultMemory", "clear_faults", "faults_text", "read_faults"]
+
+_NAME = "faults.json"
+_MOST_FAULTS, _LARGEST_BYTES = 64, 1_000_000
+_LOOK_EVERY_S = 1.0
+"""Between looks whether somebody cleared the memory. [s]"""
+
+
+class Fault(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
+    """One entry."""
+
+    reason: str
+    """As the status message names it."""
+    branches: list[str]
+    """Which explain it best."""
+    parameter_set: int
+    """In force the last time, modulo 256."""
+    first: str
+    last: str
+    """ISO 8601, UTC."""
+    count: int = 1
+    measured_a: dict[str, float] = {}
+    corrected_a: dict[str, float] = {}
+    """Currents of the last time, positive into the junction. [A]"""
+    active: bool = True
+    """Whether it still keeps the node from correcting."""
+
+
+def read_faults(folder: Path) -> list[Fault]:
+    """Entries of a state folder, the last one first; UserError if they cannot be read."""
+    path = folder / _NAME
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such state folder; name the one of 'ecu-node run --state'")
+    try:
+        return msgspec.json.decode(read_user_file(path, largest_bytes=_LARGEST_BYTES), type=list[Fault])
+    except FileNotFoundError:
+        return []
+    except (OSError, UnsuitableFileError, msgspec.DecodeError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise UserError(f"{path}: cannot read the fault memory: {why}; 'ecu-node clear' begins a new one") from None
+
+
+def clear_faults(folder: Path) -> None:
+    """Forget all entries; a node that runs corrects again within a second."""
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such state folder; name the one of 'ecu-node run --state'")
+    (folder / _NAME).unlink(missing_ok=True)
+
+
+def faults_text(faults: list[Fault]) -> str:
+    """Entries for people."""
+    lines = []
+    for fault in faults:
+        which = f" ({' or '.join(fault.branches)})" if fault.branches else ""
+        lines.append(
+            f"{fault.reason}{which}, {'active' if fault.active else 'over'}: {fault.count} times, first {fault.first}, "
+            f"last {fault.last}, parameter set {fault.parameter_set}"
+        )
+        lines += [
+            f"  {name}: measured {value:+.1f} A, corrected {fault.corrected_a.get(name, value):+.1f} A"
+            for name, value in fault.measured_a.items()
+        ]
+    return "\n".join(lines) or "no faults"
+
+
+class FaultMemory:
+    """Keeps the faults of a running node.
+
+    Parameters
+    ----------
+    corrector : Corrector
+        Parameters are in force in it; what is active of the same set is latched again.
+    folder : Path
+        State folder.
+    say : callable
+        Takes one line for the log.
+    background : Executor
+        Writes: a slow disk must not hold up the bus.
+    """
+
+    def __init__(self, corrector: Corrector, folder: Path, say: Callable[[str], None], background: Executor) -> None:
+        self._corrector, self._folder, self._say, self._background = corrector, folder, say, background
+        self._due_s = float("-inf")
+        self._failed = False
+        self._writing: Future[None] | None = None
+        try:
+            self._faults = read_faults(folder)
+        except UserError as error:
+            say(str(error))
+            self._faults = []
+        for fault in self._faults:
+            if fault.active and fault.parameter_set == corrector.parameter_set and not corrector.latched:
+                corrector.latch(Reason[fault.reason], fault.branches)
+        self._before = corrector.latched, corrector.latched_branches
+
+    def look(self, now_s: float) -> None:
+        """Keep what has changed since the last time."""
+        corrector = self._corrector
+        if now_s >= self._due_s and corrector.latched:
+            self._due_s = now_s + _LOOK_EVERY_S
+            if self._faults and self._is_written() and not (self._folder / _NAME).exists():
+                self._faults = []
+                corrector.release()
+        found = corrector.latched, corrector.latched_branches
+        if found == self._before:
+            return
+        self._before = found
+        for fault in self._faults:
+            fault.active = False
+        if corrector.latched:
+            self._add(Reason(corrector.latched).name, list(corrector.latched_branches))
+        content = msgspec.json.format(msgspec.json.encode(self._faults), indent=2) + b"\n"
+        self._writing = self._background.submit(self._write, content)
+
+    def _is_written(self) -> bool:
+        return not self._failed and (self._writing is None or self._writing.done())
+
+    def _add(self, reason: str, branches: list[str]) -> None:
+        corrector, now = self._corrector, datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        before = next((item for item in self._faults if (item.reason, item.branches) == (reason, branches)), None)
+        fault = Fault(
+            reason=reason,
+            branches=branches,
+            parameter_set=corrector.parameter_set,
+            first=before.first if before is not None else now,
+            last=now,
+            count=before.count + 1 if before is not None else 1,
+            measured_a={name: round(pair[0], 3) for name, pair in corrector.watch.currents_a.items()},
+            corrected_a={name: round(pair[1], 3) for name, pair in corrector.watch.currents_a.items()},
+        )
+        self._faults = [fault, *(item for item in self._faults if item is not before)][:_MOST_FAULTS]
+
+    def _write(self, content: bytes) -> None:
+        try:
+            write_atomically(self._folder / _NAME, content)
+            self._failed = False
+        except OSError as error:
+            self._failed = True
+            self._say(f"{self._folder / _NAME}: cannot keep the fault: {error.strerror}; see that its disk has room")

@@ -1,0 +1,236 @@
+"""What a service needs of its surroundings: signals, the service manager, a log that does not flood, and metrics."""
+
+import ctypes
+import os
+import resource
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import asdict
+from itertools import accumulate
+from types import FrameType
+
+from ecu_node.bus.telemetry import Latency
+from ecu_node.core.corrector import Corrector
+from ecu_node.errors import UserError, printable
+
+__all__ = ["Log", "Requests", "ServiceManager", "be_real_time", "serve_metrics"]
+
+
+_WHILE_S, _SAME_LINE_TIMES = 10.0, 3
+"""The same line is written so many times in so long [s]: enough to see it come and go, and no flood."""
+_REMEMBERED_LINES = 100
+_LONGEST_LINE = 900
+"""Characters of a line, such that it fits into PIPE_BUF in UTF-8 with what is written around it."""
+_LONGEST_NOTIFY_S = 0.1
+"""A service manager that does not read must not hold up the bus. [s]"""
+
+
+class Requests:
+    """Signals that came: SIGTERM and SIGINT ask to stop, SIGHUP to read the parameters again."""
+
+    def __init__(self) -> None:
+        self._stop = self._reload = False
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._on_stop)
+        signal.signal(signal.SIGHUP, self._on_reload)
+
+    def stop(self) -> bool:
+        """Whether the node is to stop."""
+        return self._stop
+
+    def take_reload(self) -> bool:
+        """Whether the parameters are to be read again; asked once per signal."""
+        asked, self._reload = self._reload, False
+        return asked
+
+    def _on_stop(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        self._stop = True
+
+    def _on_reload(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        self._reload = True
+
+
+class Log:
+    """Lines on standard error; the same line a few times in a while, and then with how often it came in between.
+
+    A reader that does not read must not hold up the bus: lines that standard error does not take at once are lost, and
+    the next one that it takes says how many.
+    """
+
+    def __init__(self) -> None:
+        self._lost = 0
+        self._said: dict[str, tuple[float, int]] = {}
+
+    def say(self, text: str) -> None:
+        """Write a line."""
+        now_s = time.monotonic()
+        since_s, times = self._said.get(text, (now_s, 0))
+        is_over = now_s - since_s >= _WHILE_S
+        if times >= _SAME_LINE_TIMES and not is_over:
+            self._said[text] = since_s, times + 1
+            return
+        if len(self._said) >= _REMEMBERED_LINES:
+            self._said.clear()
+        held_back = times - _SAME_LINE_TIMES if is_over else 0
+        self._said[text] = (now_s, 1) if is_over else (since_s, times + 1)
+        again = f" (and {held_back} times before)" if held_back > 0 else ""
+        if not _takes_a_line():
+            self._lost += 1
+            return
+        if self._lost:
+            again, self._lost = f"{again} ({self._lost} lines before were lost: nobody read them)", 0
+        with suppress(OSError):  # a log that is gone, as when the journal is started anew, must not end the node
+            print(f"ecu-node: {printable(text)[:_LONGEST_LINE]}{again}", file=sys.stderr, flush=True)
+
+
+def _takes_a_line() -> bool:
+    """Whether standard error takes a line without waiting; a pipe that says so has room for PIPE_BUF bytes."""
+    try:
+        number = sys.stderr.fileno()
+    except (AttributeError, OSError, ValueError):  # closed, or no file at all
+        return True
+    waiting = select.poll()
+    waiting.register(number, select.POLLOUT)
+    return bool(waiting.poll(0))
+
+
+class ServiceManager:
+    """systemd, if it started the node: told that the node is ready, alive, and what it does; see sd_notify(3)."""
+
+    def __init__(self) -> None:
+        self._address = os.environ.get("NOTIFY_SOCKET")
+        period_us = os.environ.get("WATCHDOG_USEC", "")
+        is_for_us = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())  # see sd_watchdog_enabled(3)
+        self._period_s = int(period_us) / 2e6 if period_us.isdecimal() and is_for_us else None
+        self._due_s = 0.0
+
+    def ready(self, text: str) -> None:
+        """The node is at work."""
+        self._notify(f"READY=1\nSTATUS={text}")
+
+    def alive(self, now_s: float) -> None:
+        """The node has just done its work; told at half the time that the watchdog allows."""
+        if self._period_s is not None and now_s >= self._due_s:
+            self._due_s = now_s + self._period_s
+            self._notify("WATCHDOG=1")
+
+    def status(self, text: str) -> None:
+        """What the node does now."""
+        self._notify(f"STATUS={text}")
+
+    def stopping(self) -> None:
+        """The node ends."""
+        self._notify("STOPPING=1")
+
+    def _notify(self, text: str) -> None:
+        if not self._address:
+            return
+        address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+                notify.settimeout(_LONGEST_NOTIFY_S)
+                notify.sendto(text.encode(), address)
+        except OSError:
+            pass  # a service manager that is gone must not end the node
+
+
+_LATENCY_BITS = 21
+"""Buckets up to 2^20 us = 1 s."""
+_FIFO_PRIORITY = 50
+"""That of the kernel's interrupt threads, which bring the frames; see sched(7)."""
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+"""Of mlockall(2): memory that there is and that there will be, each page once it was used."""
+
+
+def be_real_time() -> str:
+    """Run before all that is no real-time process, on one processor, with memory that stays in RAM.
+
+    To be called before there are other threads: these inherit it.
+
+    Returns
+    -------
+    str
+        One line for the log, with what was not allowed.
+    """
+    steps: dict[str, Callable[[], None]] = {
+        "SCHED_FIFO": lambda: os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY)),
+        "memory lock": _lock_memory,
+        "one processor": lambda: os.sched_setaffinity(0, {max(os.sched_getaffinity(0))}),
+    }
+    refused = []
+    for name, step in steps.items():
+        try:
+            step()
+        except (OSError, ValueError) as error:  # ValueError: of setrlimit
+            refused.append(f"{name} ({error})")
+    return f"real time, but not allowed: {', '.join(refused)}" if refused else f"real time: {', '.join(steps)}"
+
+
+def _lock_memory() -> None:
+    # Without this limit lifted, memory that is asked for later could not be had.
+    resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    if ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+
+def serve_metrics(corrector: Corrector, latency: Latency, port: int) -> None:
+    """Answer Prometheus in a thread of its own, on this machine's address only.
+
+    Parameters
+    ----------
+    corrector : Corrector
+        Whose counters and state are told.
+    latency : Latency
+        Of its answers.
+    port : int
+        TCP port.
+
+    Raises
+    ------
+    UserError
+        If prometheus-client is not installed, or the port cannot be had.
+    """
+    try:
+        from prometheus_client import CollectorRegistry, start_http_server  # noqa: PLC0415
+        from prometheus_client.core import (  # noqa: PLC0415
+            CounterMetricFamily,
+            GaugeMetricFamily,
+            HistogramMetricFamily,
+            Metric,
+        )
+    except ImportError:
+        raise UserError(
+            "--metrics-port needs prometheus-client; install it with pip install 'hv-current-correction[metrics]'"
+        ) from None
+
+    class Collector:
+        def collect(self) -> Iterator[Metric]:
+            for name, value in asdict(corrector.counters).items():
+                yield CounterMetricFamily(f"ecu_node_{name}", f"{name.replace('_', ' ')} since the start", value=value)
+            state, reason = corrector.told
+            yield GaugeMetricFamily("ecu_node_state", "state, as in the status message", value=int(state))
+            yield GaugeMetricFamily("ecu_node_reason", "reason, as in the status message", value=int(reason))
+            yield GaugeMetricFamily("ecu_node_parameter_set", "number in force", value=corrector.parameter_set)
+            counted = list(accumulate(latency.counts))
+            buckets = [(str(1e-6 * 2**bits), counted[bits]) for bits in range(_LATENCY_BITS)]
+            yield HistogramMetricFamily(
+                "ecu_node_latency_seconds",
+                "from when a frame came until its answer was sent",
+                buckets=[*buckets, ("+Inf", counted[-1])],
+            )
+            sums = corrector.watch.sums
+            if sums is not None:
+                yield GaugeMetricFamily("ecu_node_sum_measured_amperes", "Kirchhoff sum", value=sums.measured_a)
+                yield GaugeMetricFamily("ecu_node_sum_corrected_amperes", "Kirchhoff sum", value=sums.corrected_a)
+
+    registry = CollectorRegistry()
+    registry.register(Collector())
+    try:
+        start_http_server(port, addr="127.0.0.1", registry=registry)
+    except (OSError, OverflowError) as error:
+        raise UserError(f"port {port}: cannot answer there: {error}; give another --metrics-port") from None

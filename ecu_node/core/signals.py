@@ -1,0 +1,475 @@
+"""A signal of the DBC: its raw integer in a frame, and what its codes are worth.
+
+The bytes that a signal touches are one integer of its own byte order; the signal is ``length`` bits of it, ``shift``
+bits above the least significant one. No other bit is ever touched. A multiplexed signal is in a frame only if the
+multiplexers above it have one of its codes. value = scale * code + offset, with scale and offset as the decimals that
+stand in the DBC, held exactly. A code is a value if it lies in the DBC's [minimum|maximum] and has no name in the DBC's
+value table: a named code of a current ("SNA", "Error") is a message, not a number of amperes.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Literal, NamedTuple
+
+from cantools.database.can import Message, Signal
+
+from ecu_node.errors import DatabaseError
+from ecu_node.units import unit_factor
+
+__all__ = [
+    "BitPlace",
+    "Codes",
+    "Order",
+    "PlacedSignal",
+    "as_written",
+    "bit_place",
+    "impossible_values",
+    "not_available_code",
+    "placed_signal",
+    "read_codes",
+    "require_reach",
+    "writable_range",
+]
+
+
+_BITS_PER_BYTE = 8
+_LONGEST = 64
+"""No CAN signal of integers is longer. [bit]"""
+
+
+Order = Literal["little", "big"]
+"""Byte order."""
+
+
+class WordField(NamedTuple):
+    """A signal in a whole payload of one length, read as one integer of the signal's byte order.
+
+    ``raw = ((word >> shift & ones) ^ sign) - sign``.
+    """
+
+    shift: int
+    ones: int
+    sign: int
+    """The sign bit of a two's complement; 0 if the signal has none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BitPlace:
+    """Where the raw integer of one signal stands.
+
+    Attributes
+    ----------
+    first, end : int
+        The signal touches the bytes ``first`` to ``end - 1`` of the payload.
+    order : "little" or "big"
+        Byte order.
+    shift : int
+        Bits below the signal in the integer made of these bytes.
+    length : int
+        Width of the signal, 1 to 64. [bit]
+    signed : bool
+        Whether the raw integer is a two's complement.
+    """
+
+    first: int
+    end: int
+    order: Order
+    shift: int
+    length: int
+    signed: bool
+
+    @property
+    def lowest(self) -> int:
+        """Least raw integer that the width can hold."""
+        return -(1 << (self.length - 1)) if self.signed else 0
+
+    @property
+    def highest(self) -> int:
+        """Greatest raw integer that the width can hold."""
+        return (1 << (self.length - self.signed)) - 1
+
+    @property
+    def mask(self) -> int:
+        """The signal's bits in the payload read as one little-endian integer."""
+        field = ((1 << self.length) - 1) << self.shift
+        placed = bytes(self.first) + field.to_bytes(self.end - self.first, self.order)
+        return int.from_bytes(placed, "little")
+
+    def in_word(self, payload_bytes: int) -> WordField:
+        """The signal in payloads of some length, which must hold it. [byte]"""
+        ones = (1 << self.length) - 1
+        below = self.first if self.order == "little" else payload_bytes - self.end
+        shift = self.shift + _BITS_PER_BYTE * below
+        sign = 1 << (self.length - 1) if self.signed else 0
+        return WordField(shift, ones, sign)
+
+    def extract(self, payload: bytes | bytearray) -> int | None:
+        """Read the raw integer.
+
+        Parameters
+        ----------
+        payload : bytes
+            Data of a frame, 0 to 64 bytes.
+
+        Returns
+        -------
+        int or None
+            The raw integer; None if the frame is too short to hold the signal.
+        """
+        if len(payload) < self.end:
+            return None
+        field = int.from_bytes(payload[self.first : self.end], self.order) >> self.shift
+        raw = field & ((1 << self.length) - 1)
+        return raw - (1 << self.length) if raw > self.highest else raw
+
+    def put(self, payload: bytearray, raw: int) -> bool:
+        """Write the raw integer in place; all other bits stay as they are.
+
+        Parameters
+        ----------
+        payload : bytearray
+            Data of a frame, changed in place.
+        raw : int
+            Between :attr:`lowest` and :attr:`highest`.
+
+        Returns
+        -------
+        bool
+            False if the frame is too short to hold the signal; it is then unchanged.
+
+        Raises
+        ------
+        ValueError
+            If the raw integer does not fit the width: the caller saturates, nothing wraps.
+        """
+        if not self.lowest <= raw <= self.highest:
+            raise ValueError(f"raw code {raw} does not fit into {self.length} bits")
+        if len(payload) < self.end:
+            return False
+        ones = (1 << self.length) - 1
+        field = int.from_bytes(payload[self.first : self.end], self.order)
+        field = field & ~(ones << self.shift) | (raw & ones) << self.shift
+        payload[self.first : self.end] = field.to_bytes(self.end - self.first, self.order)
+        return True
+
+
+def bit_place(signal: Signal) -> BitPlace:
+    """Find the place of a signal of the DBC.
+
+    Parameters
+    ----------
+    signal : Signal
+        An integer signal; where it is multiplexed, see :func:`placed_signal`.
+
+    Returns
+    -------
+    BitPlace
+        Its place.
+
+    Raises
+    ------
+    DatabaseError
+        If the signal is a floating-point number or wider than 64 bits.
+    """
+    if signal.is_float:
+        raise DatabaseError(f"signal {signal.name} is a floating-point number; the node corrects integer signals only")
+    if not 1 <= signal.length <= _LONGEST:
+        raise DatabaseError(f"signal {signal.name} has {signal.length} bits; 1 to {_LONGEST} are expected")
+    if signal.byte_order == "little_endian":
+        low, high = signal.start, signal.start + signal.length - 1
+        shift = low % _BITS_PER_BYTE
+    else:  # the start bit is the most significant one, numbered from the top of its byte here
+        low = signal.start - signal.start % _BITS_PER_BYTE + (_BITS_PER_BYTE - 1 - signal.start % _BITS_PER_BYTE)
+        high = low + signal.length - 1
+        shift = _BITS_PER_BYTE - 1 - high % _BITS_PER_BYTE
+    return BitPlace(
+        first=low // _BITS_PER_BYTE,
+        end=high // _BITS_PER_BYTE + 1,
+        order="little" if signal.byte_order == "little_endian" else "big",
+        shift=shift,
+        length=signal.length,
+        signed=signal.is_signed,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Multiplexer:
+    """A signal that tells which others a frame has.
+
+    Attributes
+    ----------
+    place : BitPlace
+        Of the multiplexer.
+    codes : frozenset of int
+        Its raw codes with which the other signal is in the frame.
+    """
+
+    place: BitPlace
+    codes: frozenset[int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedSignal:
+    """A signal, and the multiplexers that decide whether it is in a frame."""
+
+    place: BitPlace
+    above: tuple[Multiplexer, ...] = ()
+
+    @property
+    def end(self) -> int:
+        """Bytes that a payload must have for the signal and its multiplexers to be in it."""
+        return max(self.place.end, *(item.place.end for item in self.above), 0)
+
+    def code(self, payload: bytes | bytearray) -> int | None:
+        """Raw code of the signal in a payload; None if it is not there."""
+        if all(item.place.extract(payload) in item.codes for item in self.above):
+            return self.place.extract(payload)
+        return None
+
+
+def placed_signal(message: Message, signal: Signal) -> PlacedSignal:
+    """Find out where a signal of the DBC stands, and in which frames.
+
+    Parameters
+    ----------
+    message : Message
+        The signal's message.
+    signal : Signal
+        Any of its signals.
+
+    Returns
+    -------
+    PlacedSignal
+        All multiplexers of it must have one of their codes, the nearest one first; none for a signal of every frame.
+
+    Raises
+    ------
+    DatabaseError
+        As :func:`bit_place`, for the signal or one of its multiplexers; if the message lacks one of these.
+    """
+    found = []
+    inner = signal
+    while inner.multiplexer_ids is not None and inner.multiplexer_signal is not None:
+        above = next((item for item in message.signals if item.name == inner.multiplexer_signal), None)
+        if above is None:
+            raise DatabaseError(
+                f"message {message.name} has no signal {inner.multiplexer_signal!r}, the multiplexer of its signal "
+                f"{inner.name}; correct the DBC"
+            )
+        found.append(Multiplexer(place=bit_place(above), codes=frozenset(inner.multiplexer_ids)))
+        inner = above
+    return PlacedSignal(place=bit_place(signal), above=tuple(found))
+
+
+_NOT_AVAILABLE_NAMES = ("sna", "notavailable", "signalnotavailable", "na", "invalid", "error")
+"""Names of the code for "no value", letters only, the best one first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Codes:
+    """Raw codes of one signal and their worth.
+
+    Attributes
+    ----------
+    name : str
+        The signal.
+    place : BitPlace
+        Where it stands in the frame.
+    scale, offset : Fraction
+        value = scale * code + offset. [A, V or W]
+    lowest, highest : int
+        Ends of the codes that the width and the DBC's range allow.
+    named : mapping of int to str
+        Codes with a name; they are no values.
+    """
+
+    name: str
+    place: BitPlace
+    scale: Fraction
+    offset: Fraction
+    lowest: int
+    highest: int
+    named: Mapping[int, str]
+
+    def is_value(self, code: int) -> bool:
+        """Whether a code stands for a number, rather than for a name or outside the DBC's range."""
+        return self.lowest <= code <= self.highest and code not in self.named
+
+    def worth(self, code: int) -> Fraction:
+        """Value of a code, whether it has a name or not."""
+        return self.scale * code + self.offset
+
+    def nearest(self, value: Fraction) -> int:
+        """Code nearest to a value, halves up, inside the width and the DBC's range."""
+        code = math.floor((value - self.offset) / self.scale + Fraction(1, 2))
+        return min(max(code, self.lowest), self.highest)
+
+
+def as_written(number: float) -> Fraction:
+    """Exact value of the shortest decimal that reads as this float: 1/50 for 0.02, as it stands in a DBC or JSON."""
+    return Fraction(repr(number))
+
+
+def read_codes(signal: Signal, units: Mapping[str, float], where: str) -> Codes:
+    """Collect what the DBC says of a signal's codes.
+
+    Parameters
+    ----------
+    signal : Signal
+        An integer signal of the DBC.
+    units : mapping of str to float
+        One of the tables of :mod:`ecu_node.units`; values come out in its base unit.
+    where : str
+        What the signal is for, for messages of errors.
+
+    Returns
+    -------
+    Codes
+        Codes and their worth.
+
+    Raises
+    ------
+    DatabaseError
+        If the unit is wrong, the scale is zero, or the signal cannot be read bit by bit.
+    """
+    place = bit_place(signal)
+    if signal.scale == 0:
+        raise DatabaseError(f"{where}: signal {signal.name} has scale 0 in the DBC; a number other than 0 is expected")
+    lowest, highest = place.lowest, place.highest
+    if signal.minimum is not None and signal.maximum is not None and signal.minimum < signal.maximum:
+        scale, offset = as_written(signal.scale), as_written(signal.offset)
+        ends = sorted((as_written(limit) - offset) / scale for limit in (signal.minimum, signal.maximum))
+        lowest, highest = max(lowest, math.ceil(ends[0])), min(highest, math.floor(ends[1]))
+    if lowest > highest:
+        raise DatabaseError(f"{where}: no code of signal {signal.name} lies in its range in the DBC")
+    factor = as_written(unit_factor(signal, units, where))
+    return Codes(
+        name=signal.name,
+        place=place,
+        scale=as_written(signal.scale) * factor,
+        offset=as_written(signal.offset) * factor,
+        lowest=lowest,
+        highest=highest,
+        named={int(code): str(name) for code, name in (signal.choices or {}).items()},
+    )
+
+
+def writable_range(codes: Codes, where: str) -> tuple[int, int]:
+    """Ends of the unbroken run of values around 0, into which results are clamped so that no named code is hit.
+
+    Parameters
+    ----------
+    codes : Codes
+        Of the signal to write.
+    where : str
+        What the signal is for, for the message of the error.
+
+    Returns
+    -------
+    lowest, highest : int
+        Every code between them is a value.
+
+    Raises
+    ------
+    DatabaseError
+        If 0 itself has a name: no run is around it.
+    """
+    zero = codes.nearest(Fraction(0))
+    if zero in codes.named:
+        raise DatabaseError(
+            f"{where}: the code of 0 of signal {codes.name} is named {codes.named[zero]!r} in the DBC; "
+            f"names are for codes that are no values"
+        )
+    lowest = max([codes.lowest, *(code + 1 for code in codes.named if code < zero)])
+    highest = min([codes.highest, *(code - 1 for code in codes.named if code > zero)])
+    return lowest, highest
+
+
+_NEARLY = Fraction(98, 100)
+"""A range that reaches this share of what it could is whole, but for codes beside those with names. [1]"""
+
+
+def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
+    """Refuse a signal to write if a name amid its values keeps results of full scale out.
+
+    Parameters
+    ----------
+    codes : Codes
+        Of the signal to write.
+    largest : Fraction
+        Largest magnitude that must be written, as far as the signal reaches at all. [unit of the codes]
+    where : str
+        What the signal is for, for the message of the error.
+
+    Raises
+    ------
+    DatabaseError
+        If results would be clamped to less, though the signal has values beyond.
+    """
+    ends = writable_range(codes, where)
+    for end, extreme, inwards in zip(ends, (codes.lowest, codes.highest), (1, -1), strict=True):
+        outermost = extreme
+        while outermost in codes.named:  # names at the ends of the range keep no value out
+            outermost += inwards
+        if abs(codes.worth(end)) >= min(largest, _NEARLY * abs(codes.worth(outermost))):
+            continue
+        named = end - inwards
+        raise DatabaseError(
+            f"{where}: code {named} of signal {codes.name} means {codes.named[named]!r}, so that no result beyond "
+            f"{float(codes.worth(end)):g} could be written, and full scale is {float(largest):g}; names are for codes "
+            f"that are no values"
+        )
+
+
+def impossible_values(signal: Signal, values: Sequence[float]) -> list[float]:
+    """Those of some values that a signal of the DBC can never have; none of a floating-point number's.
+
+    Parameters
+    ----------
+    signal : Signal
+        A signal of the DBC.
+    values : sequence of float
+        In the unit of the DBC.
+    """
+    if signal.is_float or signal.scale == 0:
+        return []
+    place, scale, offset = bit_place(signal), as_written(signal.scale), as_written(signal.offset)
+    codes = [(as_written(float(value)) - offset) / scale for value in values]
+    return [
+        value
+        for value, code in zip(values, codes, strict=True)
+        if code.denominator != 1 or not place.lowest <= code <= place.highest
+    ]
+
+
+def not_available_code(codes: Codes, where: str) -> int:
+    """Code by which a signal says that it has no value.
+
+    Parameters
+    ----------
+    codes : Codes
+        Of the signal to write.
+    where : str
+        What the signal is for, for the message of the error.
+
+    Returns
+    -------
+    int
+        The code named SNA, "not available" or alike.
+
+    Raises
+    ------
+    DatabaseError
+        If no code has such a name, or it does not fit the signal's width.
+    """
+    letters = {
+        "".join(filter(str.isalpha, name)).casefold(): code
+        for code, name in codes.named.items()
+        if codes.place.lowest <= code <= codes.place.highest
+    }
+    for name in _NOT_AVAILABLE_NAMES:
+        if name in letters:
+            return letters[name]
+    raise DatabaseError(f"{where}: signal {codes.name} needs a code named SNA in the DBC (VAL_) that says 'no value'")

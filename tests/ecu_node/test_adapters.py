@@ -1,0 +1,378 @@
+"""How an adapter is opened: its speed, python-can's configuration, a dry run, and a node that only listens.
+
+An slcan adapter is a pseudo-terminal whose other end speaks the protocol; networks are those of python-can.
+"""
+
+import json
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import can
+import cantools
+import pytest
+from can.typechecking import BitTimingFdDict
+
+from ecu_node.bus.adapters import bus_config
+from ecu_node.bus.links import connect
+from ecu_node.cli import main
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import BusError
+from ecu_node.parameters import write_parameters
+from tests.ecu_node.vehicles import SMALL_DBC, parameters_for
+
+_FD_VALUES = (80_000_000, 2, 63, 16, 16, 2, 15, 4, 4)
+FD_TIMING = dict(zip(BitTimingFdDict.__annotations__, _FD_VALUES, strict=True))
+"""500 kbit/s and 2 Mbit/s, both sampled at 80 %."""
+CLASSIC_TIMING = {"f_clock": 8_000_000, "brp": 2, "tseg1": 13, "tseg2": 2, "sjw": 1, "nof_samples": 1}
+"""250 kbit/s, sampled at 87.5 %."""
+DATABASE = cantools.database.can.Database()
+DATABASE.add_dbc_string(SMALL_DBC)
+PAIR, ANSWER = DATABASE.get_message_by_name("Pair"), DATABASE.get_message_by_name("PairOut")
+BATTERY_A, CORRECTED_A = 111.0, 100.0
+"""Of a battery with a gain error of +0.1 and an offset of 1 A. [A]"""
+
+
+@pytest.fixture(autouse=True)
+def _no_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the configuration of who runs the tests; HOME holds can.conf."""
+    for name in ("CAN_CONFIG", "CAN_BITRATE", "CAN_INTERFACE", "CAN_CHANNEL"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+
+
+@pytest.fixture
+def node(make_database: Callable[..., VehicleDatabase], tmp_path: Path) -> list[str]:
+    """Options of a node for the small vehicle."""
+    database = make_database()
+    write_parameters(parameters_for(database, battery=(0.1, 1.0)), tmp_path / "v1.json")
+    layout = ["--layout", str(database.layout.path)]
+    return ["run", "--unsigned", "--params", str(tmp_path / "v1.json"), *layout, "--vehicle", "v1"]
+
+
+# ---- the speed of a bus
+
+
+@pytest.mark.parametrize("interface", ["pcan", "kvaser", "vector", "slcan", "gs_usb", "ixxat", "cantact"])
+def test_adapter_without_bit_rate_is_refused(interface: str) -> None:
+    with pytest.raises(
+        BusError, match=rf"^{interface} 1: no bitrate: .* give ecu-node --bitrate BIT_PER_S, or bitrate"
+    ):
+        connect(interface, "1")
+
+
+@pytest.mark.parametrize("interface", ["kvaser", "vector", "ixxat"])
+def test_data_bit_rate_is_needed_for_can_fd(interface: str) -> None:
+    with pytest.raises(BusError, match=r"no data_bitrate: .* --data-bitrate BIT_PER_S"):
+        bus_config(interface, "1", fd=True, bitrates={"bitrate": 500_000})
+    config = bus_config(interface, "1", fd=True, bitrates={"bitrate": 500_000, "data_bitrate": 2_000_000})
+    assert (config["fd"], config["bitrate"], config["data_bitrate"]) == (True, 500_000, 2_000_000)
+
+
+@pytest.mark.parametrize("interface", ["pcan", "slcan", "nixnet"])
+def test_can_fd_needs_a_bit_timing_where_the_driver_drops_the_data_bit_rate(interface: str) -> None:
+    with pytest.raises(BusError, match=r"CAN FD needs its bit timing: f_clock, .* in section \[1\] of can.conf"):
+        bus_config(interface, "1", fd=True, bitrates={"bitrate": 500_000, "data_bitrate": 2_000_000})
+
+
+@pytest.mark.parametrize("interface", ["socketcan", "virtual", "udp_multicast", "serial"])
+def test_bit_rate_that_cannot_be_set_is_refused(interface: str) -> None:
+    with pytest.raises(BusError, match=rf"^{interface} c0: the bit rate of {interface} is not set from here"):
+        connect(interface, "c0", bitrates={"bitrate": 250_000})
+
+
+def test_socketcan_says_how_its_bit_rate_is_set() -> None:
+    with pytest.raises(BusError, match="ip link set can0 type can bitrate"):
+        bus_config("socketcan", "can0", bitrates={"bitrate": 250_000})
+
+
+@pytest.mark.parametrize(
+    ("config", "fd", "words"),
+    [
+        ({"bitrate": "250k"}, False, "bitrate = 250k: a number of bit/s is expected"),
+        ({"bitrate": -1}, False, "bitrate = -1: a number of bit/s is expected"),
+        ({"bitrate": 83_300}, False, "bitrate = 83300: pcan has 1000000, .*; or give the bit timing"),
+        ({"f_clock": 8_000_000, "bitrate": 250_000}, False, "incomplete, .* classic CAN .* brp, tseg1"),
+        (FD_TIMING, False, "not one of classic CAN"),
+        (CLASSIC_TIMING, True, "not one of CAN FD, which has f_clock, nom_brp"),
+        ({**CLASSIC_TIMING, "bitrate": 500_000}, False, r"bitrate = 500000 contradicts the bit timing \(BR: 250_000"),
+        ({**FD_TIMING, "data_bitrate": 4_000_000}, True, "data_bitrate = 4000000 contradicts"),
+    ],
+)
+def test_speed_that_would_be_another_one_is_refused(
+    config: dict[str, object], fd: bool, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAN_CONFIG", json.dumps(config))
+    with pytest.raises(BusError, match=f"^pcan PCAN_USBBUS1: .*{words}"):
+        bus_config("pcan", "PCAN_USBBUS1", fd=fd)
+
+
+def test_bit_timing_that_the_driver_drops_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAN_CONFIG", json.dumps(CLASSIC_TIMING))
+    with pytest.raises(BusError, match=r"^gs_usb 0: python-can cannot set a bit timing there"):
+        bus_config("gs_usb", "0", bitrates={"bitrate": 250_000})
+
+
+@pytest.mark.parametrize("text", ["bitrate = 250000\n", "[default\n"])
+def test_configuration_that_cannot_be_read_is_named(text: str, tmp_path: Path) -> None:
+    (tmp_path / "can.conf").write_text(text)
+    with pytest.raises(BusError, match=r"^pcan c0: cannot open the bus: File contains no section headers.*can\.conf"):
+        bus_config("pcan", "c0")
+
+
+# ---- python-can's configuration
+
+
+def test_each_channel_has_its_section_and_the_command_line_goes_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "can.conf").write_text("[default]\nbitrate = 125000\n[1]\nbitrate = 250000\nserial = 1234\n")
+    assert bus_config("vector", "1") == {"interface": "vector", "channel": 1, "bitrate": 250_000, "serial": 1234}
+    assert bus_config("vector", "2")["bitrate"] == 125_000
+    assert bus_config("vector", "1", bitrates={"bitrate": 500_000, "data_bitrate": None})["bitrate"] == 500_000
+    monkeypatch.setenv("CAN_BITRATE", "100000")
+    assert bus_config("vector", "1")["bitrate"] == 100_000
+
+
+@pytest.mark.parametrize(("timing", "fd"), [(FD_TIMING, True), (CLASSIC_TIMING, False)])
+def test_bit_timing_of_can_conf_reaches_the_driver(timing: dict[str, int], fd: bool, tmp_path: Path) -> None:
+    lines = [f"{name} = {value}" for name, value in timing.items()]
+    (tmp_path / "can.conf").write_text("\n".join(["[PCAN_USBBUS1]", *lines]))
+    found = bus_config("pcan", "PCAN_USBBUS1", fd=fd)["timing"]
+    assert isinstance(found, can.BitTimingFd if fd else can.BitTiming)
+    assert dict(found) == timing
+
+
+# ---- a dry run
+
+
+def test_dry_run_prints_what_would_be_opened_and_opens_nothing(
+    node: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    adapter = ["--interface", "pcan", "--channel", "PCAN_USBBUS1"]  # its library is not here: opening it would fail
+    assert main([*node, *adapter, "--bitrate", "250000", "--dry-run"]) == 0
+    captured = capsys.readouterr()
+    assert captured.out.splitlines() == [
+        "would open pcan PCAN_USBBUS1: bitrate 250000",
+        "  reads Pair (0x100), Heater (0x200), Net (0x102)",
+        "  sends PairOut (0x200)",
+    ]
+    assert captured.err == ""
+    assert main([*node, *adapter, "--dry-run"]) == 1
+    assert "no bitrate" in capsys.readouterr().err
+
+
+def test_dry_run_of_a_gateway_shows_both_buses(
+    node: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    timing = "\n".join(f"{name} = {value}" for name, value in FD_TIMING.items())
+    (tmp_path / "can.conf").write_text(f"[0]\nbitrate = 500000\ndata_bitrate = 2000000\n[1]\n{timing}\n")
+    assert main([*node, "--interface", "kvaser", "--channel", "0", "--gateway", "1", "--fd", "--dry-run"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "would open kvaser 0: fd True, bitrate 500000, data_bitrate 2000000" in lines
+    assert any(
+        re.match(r"would open kvaser 1: fd True, timing NBR: 500_000 bit/s, NSP: 80.00%,", line) for line in lines
+    )
+    assert "  sends Pair (0x100), Heater (0x200), corrected; nothing; " not in lines
+    assert lines[1] == "  reads all frames; corrects Pair (0x100), Heater (0x200)"
+
+
+# ---- listening only
+
+
+@pytest.mark.parametrize(
+    ("interface", "settings"),
+    [
+        ("pcan", {"state": can.BusState.PASSIVE}),
+        ("kvaser", {"driver_mode": False}),
+        ("vector", {"listen_only": True}),
+        ("slcan", {"listen_only": True}),
+        ("gs_usb", {}),
+    ],
+)
+def test_listen_only_settings_of_each_driver(interface: str, settings: dict[str, object]) -> None:
+    both = [bus_config(interface, "1", listen_only=only, bitrates={"bitrate": 250_000}) for only in (False, True)]
+    assert both[1] == {**both[0], **settings}
+
+
+@pytest.mark.parametrize(
+    ("interface", "words"),
+    [
+        ("slcan", "nothing is sent, and no frame acknowledged"),
+        ("gs_usb", "the adapter acknowledges frames, as python-can has no listen-only mode of gs_usb"),
+        ("socketcan", r"acknowledges frames, unless .*'ip link set c0 type can listen-only on'"),
+        ("virtual", "nothing is sent$"),
+    ],
+)
+def test_listen_only_says_whether_the_adapter_acknowledges(
+    interface: str, words: str, node: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    rate = ["--bitrate", "250000"] if interface in {"slcan", "gs_usb"} else []
+    assert main([*node, "--interface", interface, "--channel", "c0", *rate, "--listen-only", "--dry-run"]) == 0
+    *_, sends, last = capsys.readouterr().out.splitlines()
+    assert sends == "  sends nothing"
+    assert re.search(words, last)
+
+
+def test_gateway_that_only_listens_is_refused(node: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*node, "--channel", "c0", "--gateway", "c1", "--listen-only"]) == 2
+    assert "--listen-only sends nothing, and a gateway must pass frames on" in capsys.readouterr().err
+
+
+@contextmanager
+def running(*options: str) -> Iterator[list[str]]:
+    """A node in a process of its own, at work; the lines of its log, all of them after the block."""
+    command = [sys.executable, "-m", "ecu_node", *options]
+    environment = {**os.environ, "CAN_CONFIG": os.environ.get("CAN_CONFIG", '{"sleep_after_open": 0}')}
+    log: list[str] = []
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process:
+        assert process.stderr is not None
+        try:
+            for line in process.stderr:
+                log.append(line)
+                if "running on" in line:
+                    break
+            yield log
+        finally:
+            process.send_signal(signal.SIGTERM)
+            log += process.stderr.readlines()
+            assert process.wait(timeout=30) == 0, log
+
+
+class SlcanAdapter:
+    """The adapter's end of a serial line: takes commands and frames, and says OK, as LAWICEL's protocol has it."""
+
+    def __init__(self) -> None:
+        self._here, self._there = pty.openpty()
+        tty.setraw(self._there)
+        self.path = os.ttyname(self._there)
+        self.lines: list[bytes] = []
+        """All that came, each without its carriage return."""
+        self._reading = threading.Thread(target=self._read, daemon=True)
+        self._reading.start()
+
+    def _read(self) -> None:
+        rest = b""
+        while not rest.endswith(b"END"):
+            *lines, rest = (rest + os.read(self._here, 4096)).split(b"\r")
+            self.lines += lines
+            os.write(self._here, b"\r" * len(lines))
+
+    def put(self, frame: bytes) -> None:
+        """Say that a frame came over the bus."""
+        os.write(self._here, frame + b"\r")
+
+    def close(self) -> None:
+        """Unplug it."""
+        os.write(self._there, b"END")
+        self._reading.join()
+        os.close(self._here)
+        os.close(self._there)
+
+
+@pytest.fixture
+def adapter() -> Iterator[SlcanAdapter]:
+    pytest.importorskip("serial", reason="python-can's slcan needs pyserial")
+    adapter = SlcanAdapter()
+    yield adapter
+    adapter.close()
+
+
+MEASURED = PAIR.encode({"Battery": BATTERY_A, "Motor": -50.0})
+FRAME = b"t1008" + MEASURED.hex().upper().encode()
+
+
+def fed(adapter: SlcanAdapter, enough: Callable[[], bool]) -> None:
+    """Send frames of the sensors every 20 ms, until it is enough, or 5 s."""
+    for _ in range(250):
+        adapter.put(FRAME)
+        time.sleep(0.02)
+        if enough():
+            return
+
+
+def test_slcan_is_opened_at_its_bit_rate_and_answers_corrected(node: list[str], adapter: SlcanAdapter) -> None:
+    bus = ("--interface", "slcan", "--channel", adapter.path, "--bitrate", "250000")
+    with running(*node, *bus) as log:
+        fed(adapter, lambda: any(line.startswith(b"t200") for line in adapter.lines))
+    assert any("running on slcan" in line for line in log)
+    assert adapter.lines[:5] == [b"C", b"S5", b"", b"O", b"O"]  # python-can opens it twice
+    assert adapter.lines[-1] == b"C"
+    answers = adapter.lines[5:-1]
+    assert answers
+    for line in answers:
+        assert line[:5] == b"t2008"
+        values = ANSWER.decode_simple(bytes.fromhex(line[5:].decode()))
+        assert values["Battery"] == pytest.approx(CORRECTED_A, abs=0.05 + 1e-9)
+        assert values["Motor"] == pytest.approx(-50.0)
+
+
+@pytest.mark.parametrize("rate", [("125000", b"S4"), ("1000000", b"S8")])
+def test_slcan_of_can_conf(node: list[str], adapter: SlcanAdapter, tmp_path: Path, rate: tuple[str, bytes]) -> None:
+    (tmp_path / "can.conf").write_text(f"[{adapter.path}]\nbitrate = {rate[0]}\n")
+    with running(*node, "--interface", "slcan", "--channel", adapter.path):
+        pass
+    assert adapter.lines == [b"C", rate[1], b"", b"O", b"O", b"C"]
+
+
+def test_slcan_with_a_bit_timing(node: list[str], adapter: SlcanAdapter, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAN_CONFIG", json.dumps({**CLASSIC_TIMING, "sleep_after_open": 0}))
+    with running(*node, "--interface", "slcan", "--channel", adapter.path):
+        pass
+    assert adapter.lines == [b"C", b"s011C", b"O", b"O", b"C"]
+
+
+def test_slcan_that_only_listens_computes_and_never_sends(node: list[str], adapter: SlcanAdapter) -> None:
+    bus = ("--interface", "slcan", "--channel", adapter.path, "--bitrate", "250000")
+    with running(*node, *bus, "--listen-only") as log:
+        rounds = iter(range(25))
+        fed(adapter, lambda: next(rounds, None) is None)
+    assert adapter.lines == [b"C", b"S5", b"", b"L", b"L", b"C"]
+    assert any("listen-only: nothing is sent, and no frame acknowledged" in line for line in log)
+    (counted,) = re.findall(r"ended: frames in (\d+), answers (\d+)", "".join(log))
+    assert counted[0] == counted[1]
+    assert int(counted[0]) > 20
+
+
+def test_monitor_on_slcan_that_only_listens(
+    node: list[str], adapter: SlcanAdapter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAN_CONFIG", '{"sleep_after_open": 0}')
+    bus = ("--interface", "slcan", "--channel", adapter.path, "--bitrate", "250000", "--listen-only")
+    layout = node[node.index("--layout") + 1]
+    command = [sys.executable, "-m", "ecu_node", "monitor", "--layout", layout, *bus, "--once", "1", "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        fed(adapter, lambda: process.poll() is not None)
+        output, _ = process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert adapter.lines == [b"C", b"S5", b"", b"L", b"L", b"C"]
+    assert str(BATTERY_A) in output
+
+
+GROUP = "239.74.163.7"
+
+
+def test_node_that_only_listens_stands_beside_the_one_that_sends(node: list[str]) -> None:
+    try:
+        peer = can.Bus(GROUP, "udp_multicast", ignore_config=True, can_filters=[{"can_id": 0x200, "can_mask": 0x7FF}])
+    except (can.CanError, OSError) as error:
+        pytest.skip(str(error))
+    bus = ("--interface", "udp_multicast", "--channel", GROUP)
+    with peer, running(*node, *bus, "--shadow") as sends, running(*node, *bus, "--listen-only") as listens:
+        answers = []
+        for _ in range(50):
+            peer.send(can.Message(arbitration_id=0x100, data=MEASURED, is_extended_id=False))
+            answers.append(peer.recv(5.0))
+        assert peer.recv(0.2) is None
+    assert {message.arbitration_id for message in answers if message is not None} == {0x200}
+    assert "frames in 50, answers 50" in sends[-1]
+    assert "frames in 50, answers 50" in listens[-1]

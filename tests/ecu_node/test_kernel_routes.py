@@ -1,0 +1,36 @@
+"""Which identifiers a gateway's rules cover; that the kernel follows them is tested in tests/vcan."""
+
+import random
+
+import pytest
+
+from ecu_node.bus.kernel_routes import complement, kernel_routes
+from ecu_node.database import VehicleDatabase
+
+
+@pytest.mark.parametrize("taken", [(), (0,), (0x7FF,), (0x110, 0x120, 0x130, 0x5F0), (0x110, 0x111), tuple(range(300))])
+def test_all_other_identifiers_are_covered_once(taken: tuple[int, ...]) -> None:
+    pairs = list(complement(taken, 11))
+    covered = [sum(identifier & mask == prefix for prefix, mask in pairs) for identifier in range(2048)]
+    assert covered == [int(identifier not in taken) for identifier in range(2048)]
+
+
+def test_all_other_identifiers_of_29_bits_are_covered_once() -> None:
+    chance = random.Random(1)
+    taken = [chance.randrange(1 << 29) for _ in range(8)]
+    near = [identifier ^ 1 << bit for identifier in taken for bit in range(29)]
+    pairs = list(complement(taken, 29))
+    for identifier in (*taken, *near, 0, (1 << 29) - 1, *(chance.randrange(1 << 29) for _ in range(20_000))):
+        covered = sum(identifier & mask == prefix for prefix, mask in pairs)
+        assert covered == int(identifier not in taken), hex(identifier)
+
+
+def test_few_rules_are_needed() -> None:
+    assert len(list(complement((0x110, 0x120, 0x130, 0x5F0), 11))) == 27
+    assert list(complement((), 29)) == [(0, 0)]
+
+
+def test_an_interface_that_is_not_there_is_told_by_opening_the_bus_alone(database: VehicleDatabase) -> None:
+    said: list[str] = []
+    assert kernel_routes(("lo", "no_such_bus"), database, fd=False, say=said.append) is None
+    assert said == []

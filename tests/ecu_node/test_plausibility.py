@@ -1,0 +1,173 @@
+"""A sensor that breaks after the calibration: the node no longer says that its values are corrected."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ecu_node.bus.run import StateChanges
+from ecu_node.core.status import Quality, Reason, State
+from tests.ecu_node.junctions import NAMES, Junction, driving, three_branches
+
+
+@pytest.fixture
+def junction(tmp_path: Path) -> Junction:
+    return Junction(three_branches(tmp_path))
+
+
+def test_a_right_set_stays_in_force(junction: Junction) -> None:
+    junction.run(60.0, driving)
+    assert junction.corrector.state() == (State.CORRECTING, Reason.NONE)
+    assert set(junction.qualities.values()) == {Quality.CORRECTED}
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("jump_a", [50.0, -50.0, 200.0])
+def test_a_jump_of_a_sensor_ends_the_correction_within_100_ms(junction: Junction, name: str, jump_a: float) -> None:
+    junction.run(15.0, driving)
+    junction.wrong = {name: lambda shown_a: shown_a + jump_a}
+    junction.run(10.0, driving)
+    assert junction.fell_back_s is not None
+    assert junction.fell_back_s - 15.0 <= 0.1
+    assert junction.corrector.state() == (State.PASSING_THROUGH, Reason.SUM_IMPLAUSIBLE)
+    assert junction.corrector.latched_branches == (name,)
+    assert junction.corrected_after == 0
+    assert junction.qualities[name] == Quality.IMPLAUSIBLE
+    assert {junction.qualities[other] for other in NAMES if other != name} == {Quality.PASSED_THROUGH}
+
+
+@pytest.mark.parametrize(("name", "gain"), [("battery", 1.2), ("motor", 1.2), ("battery", 0.8), ("battery", 3.0)])
+def test_a_gain_that_changes_ends_the_correction_within_5_s(junction: Junction, name: str, gain: float) -> None:
+    junction.run(15.0, driving)
+    junction.wrong = {name: lambda shown_a: gain * shown_a}
+    junction.run(10.0, driving)
+    assert junction.fell_back_s is not None
+    assert junction.fell_back_s - 15.0 <= 5.0
+    assert junction.corrector.latched is Reason.SUM_IMPLAUSIBLE
+    assert junction.corrector.latched_branches[0] == name
+    assert junction.corrected_after == 0
+
+
+def test_a_gain_error_that_grows_slowly_is_told(junction: Junction) -> None:
+    junction.run(15.0, driving)
+    junction.wrong = {"battery": lambda shown_a: shown_a * (1.0 + 0.01 * (junction.now_s - 15.0))}
+    junction.run(30.0, driving)
+    assert junction.corrector.latched is Reason.SUM_IMPLAUSIBLE
+    assert junction.corrector.latched_branches[0] == "battery"
+
+
+def test_an_offset_that_creeps_is_told_of_all_branches_that_may_have_it(junction: Junction) -> None:
+    def parked(_: float) -> dict[str, float]:
+        return {"battery": 6.0, "motor": 0.0, "heater": 6.0}
+
+    junction.run(15.0, parked)
+    junction.wrong = {"motor": lambda shown_a: shown_a + 1.0 * (junction.now_s - 15.0)}
+    junction.run(15.0, parked)
+    assert junction.corrector.latched is Reason.SUM_IMPLAUSIBLE
+    assert "motor" in junction.corrector.latched_branches
+
+
+@pytest.mark.parametrize("forged_a", [50.0, -120.0])
+def test_forged_frames_before_each_real_one_end_the_correction(junction: Junction, forged_a: float) -> None:
+    junction.run(15.0, driving)
+    junction.forged = {"battery": forged_a}
+    junction.run(5.0, driving)
+    assert junction.fell_back_s is not None
+    assert junction.fell_back_s - 15.0 <= 0.1
+    assert junction.corrector.latched_branches == ("battery",)
+    assert junction.corrected_after == 0
+
+
+def test_a_steady_load_beside_a_broken_battery_is_not_named(junction: Junction) -> None:
+    def steady_heater(time_s: float) -> dict[str, float]:
+        return driving(time_s) | {"battery": driving(time_s)["motor"] + 10.0, "heater": 10.0}
+
+    junction.noise_a = 0.0
+    junction.run(15.0, steady_heater)
+    junction.wrong = {"battery": lambda shown_a: 1.5 * shown_a}
+    junction.run(20.0, steady_heater)
+    assert junction.corrector.latched is Reason.SUM_IMPLAUSIBLE
+    assert junction.corrector.latched_branches[0] == "battery"
+
+
+def test_a_sensor_that_stays_where_it_is_while_the_others_move_is_stuck(junction: Junction) -> None:
+    def accelerating(time_s: float) -> dict[str, float]:
+        motor_a = 40.0 + max(time_s - 15.0, 0.0) * 10.0
+        return {"battery": motor_a + 10.0, "motor": motor_a, "heater": 10.0}
+
+    junction.run(15.0, accelerating)
+    junction.wrong = {"battery": lambda _: 54.5}
+    junction.run(10.0, accelerating)
+    assert junction.corrector.latched is Reason.BRANCH_STUCK
+    assert junction.corrector.latched_branches == ("battery",)
+
+
+def test_without_what_the_calibrator_saw_gross_faults_show_all_the_same(tmp_path: Path) -> None:
+    junction = Junction(three_branches(tmp_path), sd_a=None, sd_per_a=None)
+    junction.run(60.0, driving)
+    assert junction.corrector.latched_branches == ()
+    junction.wrong = {"battery": lambda shown_a: 3.0 * shown_a}
+    junction.run(5.0, driving)
+    assert junction.corrector.latched is Reason.SUM_IMPLAUSIBLE
+
+
+def test_what_the_calibrator_saw_is_no_fault(tmp_path: Path) -> None:
+    junction = Junction(three_branches(tmp_path), sd_a=None, sd_per_a=None, corrected_a=60.0)
+    junction.wrong = {"heater": lambda shown_a: shown_a + 60.0}
+    junction.run(8.0, driving)
+    assert junction.corrector.latched_branches == ()
+
+
+def test_narrow_signals_say_invalid_and_worse(tmp_path: Path) -> None:
+    junction = Junction(three_branches(tmp_path, quality_bits=2, reason_bits=4))
+    junction.run(5.0, driving)
+    junction.wrong = {"battery": lambda shown_a: shown_a + 100.0}
+    junction.run(1.0, driving)
+    assert junction.qualities["battery"] == Quality.INVALID
+    status = junction.corrector.status()
+    assert status is not None
+    assert status[1][1] == Reason.CORRECTION_WORSE
+
+
+def test_steps_of_loads_are_no_fault(junction: Junction) -> None:
+    """Frames come one after the other, and the motor's sensor is 20 ms late: a moment long one branch moves alone."""
+
+    def steps(time_s: float) -> dict[str, float]:
+        heater_a = 60.0 if time_s % 3.0 < 1.5 else 0.0
+        late_s = time_s - 0.02
+        motor_a, late_a = (200.0 if at_s % 4.0 < 1.0 else -80.0 for at_s in (time_s, late_s))
+        return {"battery": motor_a + heater_a, "motor": late_a, "heater": heater_a}
+
+    junction.run(60.0, steps)
+    assert junction.corrector.state() == (State.CORRECTING, Reason.NONE)
+
+
+def test_the_log_names_the_sensor(junction: Junction, tmp_path: Path) -> None:
+    changes: Callable[[], str | None] = StateChanges(junction.corrector).news
+    junction.run(5.0, driving)
+    changes()
+    junction.wrong = {"battery": lambda shown_a: shown_a - 100.0}
+    junction.run(1.0, driving)
+    text = changes()
+    assert text is not None
+    assert "the sensor of battery is wrong" in text
+
+
+@pytest.mark.parametrize(("bits", "told"), [(8, Reason.FOREIGN_FRAMES), (4, Reason.NONE)])
+def test_foreign_frames_are_in_the_status_until_10_s_after_the_last(tmp_path: Path, bits: int, told: Reason) -> None:
+    junction = Junction(three_branches(tmp_path, reason_bits=bits))
+    corrector = junction.corrector
+
+    def in_status() -> int:
+        status = corrector.status()
+        assert status is not None
+        return status[1][1]
+
+    junction.run(5.0, driving)
+    corrector.counters.foreign += 1
+    junction.run(5.0, driving)
+    corrector.counters.foreign += 1
+    junction.run(9.8, driving)
+    assert (corrector.told, in_status()) == ((State.CORRECTING, Reason.FOREIGN_FRAMES), told)
+    junction.run(0.4, driving)
+    assert (corrector.told, in_status()) == ((State.CORRECTING, Reason.NONE), Reason.NONE)

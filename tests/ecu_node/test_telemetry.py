@@ -1,0 +1,311 @@
+"""Telemetry, latency, garbage and real time: nothing of it holds up the bus."""
+
+import json
+import os
+import re
+import resource
+import runpy
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from ecu_node.bus import service
+from ecu_node.bus.in_force import InForce
+from ecu_node.bus.node import GatewayNode, OverlayNode
+from ecu_node.bus.steady_bus import SteadyBus
+from ecu_node.bus.telemetry import Latency, Telemetry
+from ecu_node.bus.wiring import wire
+from ecu_node.cli import main
+from ecu_node.core.frames import FrameKey
+from ecu_node.core.status import Counters
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import LayoutError
+from tests.ecu_node.test_node import FullBus, at_work, wait_until
+from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, answers, parameters_for, protected
+
+ROOT = Path(__file__).parents[2]
+VSS = "Vehicle.Powertrain.TractionBattery.CurrentCurrent"
+NAMED = SMALL_LAYOUT.replace('name = "battery", ', f'name = "battery", vss = "{VSS}", ')
+FRAMES = 100_000
+
+
+class Outlet:
+    """Telemetry of a small vehicle of which battery frames came."""
+
+    def __init__(self, database: VehicleDatabase, target: Path | tuple[str, int]) -> None:
+        fit = InForce(parameters=parameters_for(database, battery=(0.25, 5.0)))
+        self.corrector = wire(database, fit, time.monotonic())
+        self.bus = SteadyBus(lambda: can.Bus("telemetry", "virtual"), self.corrector.counters)
+        self.said: list[str] = []
+        self.telemetry = Telemetry(
+            target, self.corrector, layout=database.layout, latency=Latency(), buses=[self.bus], say=self.said.append
+        )
+
+    def second(self) -> None:
+        """A frame of the pair, of 80 A from battery to motor, and what is done once per second."""
+        self.now_s = getattr(self, "now_s", time.monotonic()) + 1.0
+        data = bytes((*(800).to_bytes(2, "big"), *(-1600).to_bytes(2, "big", signed=True), 0, 0, 0, 0))
+        answers(self.corrector, Frame(FrameKey(256, False), data), self.now_s)
+        self.corrector.look(self.now_s)
+        self.telemetry.look(self.now_s)
+
+
+@pytest.fixture
+def make_outlet(make_database: Callable[..., VehicleDatabase]) -> Iterator[Callable[..., Outlet]]:
+    made: list[Outlet] = []
+
+    def make(target: Path | tuple[str, int]) -> Outlet:
+        made.append(Outlet(make_database(NAMED), target))
+        return made[-1]
+
+    yield make
+    for outlet in made:
+        outlet.bus.close()
+
+
+def lost(outlet: Outlet, count: int) -> bool:
+    return outlet.corrector.counters.telemetry_lost >= count
+
+
+def lines_of(path: Path, count: int) -> list[dict[str, Any]]:
+    wait_until(lambda: path.exists() and path.read_text().count("\n") >= count)
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_line_has_currents_by_vss_name_sums_state_and_counters(make_outlet: Any, tmp_path: Path) -> None:
+    outlet = make_outlet(tmp_path / "node.jsonl")
+    outlet.second()
+    (line,) = lines_of(tmp_path / "node.jsonl", 1)
+    assert line["branches"] == {
+        VSS: {"measured_a": 80.0, "corrected_a": 60.0, "quality": "CORRECTED"},
+        "motor": {"measured_a": -80.0, "corrected_a": -80.0, "quality": "PASSED_THROUGH"},
+        "heater": {"measured_a": None, "corrected_a": None, "quality": "NOT_AVAILABLE"},
+    }
+    assert (line["sum_measured_a"], line["sum_corrected_a"]) == (0.0, -20.0)
+    assert (line["state"], line["reason"], line["parameter_set"]) == ("CORRECTING", "NONE", 300 % 256)
+    assert line["counters"].keys() == vars(Counters()).keys()
+    assert line["counters"]["frames_in"] == 1
+    assert list(line["buses"].values()) == ["open"]
+    assert abs((datetime.now(UTC) - datetime.fromisoformat(line["time"])).total_seconds()) < 60.0
+
+
+def test_measured_value_is_told_where_it_is_published(make_outlet: Any, tmp_path: Path) -> None:
+    outlet = make_outlet(tmp_path / "node.jsonl")
+    outlet.corrector.latch(outlet.corrector.latched.SUM_IMPLAUSIBLE, ["battery"])
+    outlet.second()
+    (line,) = lines_of(tmp_path / "node.jsonl", 1)
+    assert line["branches"][VSS] == {"measured_a": 80.0, "corrected_a": 80.0, "quality": "IMPLAUSIBLE"}
+    assert line["sum_corrected_a"] == -20.0  # as the status has it
+
+
+def test_one_line_per_second_whatever_the_looks(make_outlet: Any, tmp_path: Path) -> None:
+    outlet = make_outlet(tmp_path / "node.jsonl")
+    start_s = time.monotonic()
+    for k in range(500):
+        outlet.telemetry.look(start_s + 0.02 * k)
+        time.sleep(0.001)
+    assert len(lines_of(tmp_path / "node.jsonl", 10)) == 10
+
+
+def test_lines_come_by_udp(make_outlet: Any) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(10.0)
+        make_outlet(receiver.getsockname()).second()
+        assert json.loads(receiver.recv(65536))["branches"][VSS]["corrected_a"] == 60.0
+
+
+def test_full_disk_loses_lines_counts_them_and_says_so_once(make_outlet: Any, tmp_path: Path) -> None:
+    path = tmp_path / "link"
+    path.symlink_to("/dev/full")
+    outlet = make_outlet(path)
+    for count in (1, 2, 3):
+        outlet.second()
+        wait_until(partial(lost, outlet, count))
+    assert outlet.said == ["--telemetry: No space left on device; lines are lost until that has changed"]
+    path.unlink()
+    outlet.second()
+    lines_of(path, 1)
+    wait_until(lambda: len(outlet.said) == 2)
+    assert outlet.said[1] == "--telemetry: lines are written again"
+
+
+def test_half_a_line_is_taken_back(make_outlet: Any, tmp_path: Path) -> None:
+    """Where the disk takes only a part: a limit of the file's size is like one, and needs a process of its own."""
+    code = (
+        "import resource, signal, sys; from pathlib import Path; from ecu_node.bus.telemetry import _append; "
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (150, 150)); "
+        "path = Path(sys.argv[1]); _append(path, b'a' * 99 + b'\\n'); _append(path, b'b' * 99 + b'\\n')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "f")], capture_output=True, text=True, check=False, cwd=ROOT
+    )
+    assert "No space left on device" in done.stderr
+    assert (tmp_path / "f").read_bytes() == b"a" * 99 + b"\n"
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe without reader", "host without address"])
+def test_target_that_takes_nothing_never_blocks(kind: str, make_outlet: Any, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    target = {"folder": tmp_path, "pipe without reader": tmp_path / "pipe"}.get(kind, ("no-such-host.invalid", 5000))
+    outlet = make_outlet(target)
+    start_s = time.monotonic()
+    for _ in range(5):
+        outlet.second()
+    assert time.monotonic() - start_s < 1.0
+    wait_until(partial(lost, outlet, 3))
+
+
+def test_line_that_finds_the_writer_busy_is_lost(make_outlet: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def look_up(*_: object, **__: object) -> None:
+        """As where no name server answers."""
+        answered.wait(10.0)
+        raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
+
+    answered = threading.Event()
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    outlet = make_outlet(("somewhere", 5000))
+    for _ in range(5):
+        outlet.second()
+    assert outlet.corrector.counters.telemetry_lost in {3, 4}  # one is being sent, one waits
+    answered.set()
+
+
+@pytest.mark.parametrize("text", ["mqtt://host:1", "udp://host", "udp://:5000", "udp://host:x", "udp://host:99999", ""])
+def test_wrong_target_is_wrong_use(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["run", "--unsigned", "--params", "p", "--layout", "l", "--channel", "c", f"--telemetry={text}"])
+    assert caught.value.code == 2
+    assert "is expected, found" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["CurrentCurrent", "Vehicle", "vehicle.Current", "Vehicle.a b", "Vehicle..A"])
+def test_wrong_vss_name_is_refused(name: str, make_database: Callable[..., VehicleDatabase]) -> None:
+    with pytest.raises(LayoutError, match=r"branch battery: vss '.*': expected a name of the Vehicle Signal Spec"):
+        make_database(NAMED.replace(VSS, name))
+
+
+def test_vss_name_of_two_branches_is_refused(make_database: Callable[..., VehicleDatabase]) -> None:
+    twice = NAMED.replace('name = "motor"', f'name = "motor", vss = "{VSS}"')
+    with pytest.raises(LayoutError, match=f"vss '{VSS}' stands at two branches; each needs a name of its own"):
+        make_database(twice)
+
+
+def test_example_takes_the_currents_out_of_a_line(make_outlet: Any, tmp_path: Path) -> None:
+    make_outlet(tmp_path / "node.jsonl").second()
+    lines_of(tmp_path / "node.jsonl", 1)
+    currents = runpy.run_path(str(ROOT / "examples" / "telemetry_to_mqtt.py"))["currents"]
+    assert currents((tmp_path / "node.jsonl").read_text()) == {VSS: -60.0, "motor": -80.0}
+
+
+def test_latency_is_counted_by_bits_of_microseconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    latency = Latency()
+    monkeypatch.setattr(time, "monotonic", lambda: 100.0)
+    for later_s, frames in ((3.0, 1), (0.1, 1), (100e-6, 998)):
+        for k in range(frames):
+            latency.came(100.0 - later_s + 1e-8 * k)  # the first one has waited longest
+        latency.sent(0)
+    assert (latency.counts[7], latency.counts[17], latency.counts[22], sum(latency.counts)) == (998, 1, 1, 1000)
+    assert latency.at_most_s(0.5) == pytest.approx(128e-6)
+    assert latency.at_most_s(0.999) == pytest.approx(0.131072)
+    assert latency.at_most_s(1.0) == latency.largest_s == 3.0
+    latency.came(0.0)
+    latency.sent(1)  # an answer that the bus did not take is none
+    latency.sent(0)
+    assert sum(latency.counts) == 1000
+
+
+def test_latency_before_any_frame_is_0() -> None:
+    assert Latency().at_most_s(0.999) == 0.0
+
+
+@pytest.mark.parametrize("kind", ["overlay", "gateway"])
+def test_every_answer_is_in_the_histogram(kind: str, database: VehicleDatabase, request: pytest.FixtureRequest) -> None:
+    def opened(which: str) -> SteadyBus:
+        return SteadyBus(lambda: can.Bus(f"{request.node.name}{which}", "virtual"), Counters())
+
+    corrector, latency = wire(database, InForce(parameters=parameters_for(database)), 0.0), Latency()
+    near, far = opened("near"), opened("far")
+    node: OverlayNode | GatewayNode = OverlayNode(near, corrector, database, period_s=0.1, latency=latency)
+    if kind == "gateway":
+        node = GatewayNode(near, far, corrector, database, period_s=0.1, latency=latency)
+    with can.Bus(f"{request.node.name}near", "virtual") as peer, at_work(node):
+        for k in range(50):
+            data = protected(database, "HV_Battery", k % 15)
+            peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
+            peer.send(can.Message(arbitration_id=0x7, is_extended_id=False, data=data))
+        wait_until(lambda: sum(latency.counts) >= 50)
+    assert sum(latency.counts) == 50
+    assert 0.0 < latency.at_most_s(0.5) <= latency.largest_s < 1.0
+    near.close()
+    far.close()
+
+
+def test_full_send_queue_is_a_state_until_it_opens(
+    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    full = FullBus(request.node.name)
+    bus = SteadyBus(lambda: full, Counters())
+    now_s, states = time.monotonic(), []
+    for later_s in (0.0, 0.9, 1.1):
+        monkeypatch.setattr(time, "monotonic", lambda later_s=later_s: now_s + later_s)
+        bus.send(can.Message(arbitration_id=1))
+        bus.flush()
+        states.append(bus.state)
+    monkeypatch.setattr(full, "send", lambda *_: None)
+    bus.send(can.Message(arbitration_id=1))
+    bus.flush()
+    states.append(bus.state)
+    bus.close()
+    assert [*states, bus.state] == ["open", "open", "full", "open", "gone"]
+
+
+def test_nothing_leaks_and_no_garbage_is_collected_in_100000_frames(tmp_path: Path) -> None:
+    """The whole node; frames and answers go through a virtual bus in its process."""
+    done = subprocess.run(
+        [sys.executable, str(Path(__file__).parent / "many_frames.py"), str(LAYOUT), str(tmp_path), str(FRAMES)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert done.returncode == 0, done.stderr
+    seen = json.loads(done.stdout)
+    assert seen["frozen"] > 10_000
+    assert seen["answers"] >= FRAMES
+    assert abs(seen["grown_objects"]) < 500
+    assert seen["collections"] == 0
+    assert "ecu-node: real time" in done.stderr
+    lines = [json.loads(line) for line in (tmp_path / "telemetry.jsonl").read_text().splitlines()]
+    assert 0 < lines[1]["latency_us"]["p50"] <= lines[-1]["latency_us"]["p99.9"] <= lines[-1]["latency_us"]["max"]
+    assert lines[0]["counters"]["frames_in"] < lines[-1]["counters"]["frames_in"] <= FRAMES + 5_000
+
+
+def test_memory_that_cannot_be_locked_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resource, "setrlimit", lambda *_: None)
+    monkeypatch.setattr(service, "_MCL_CURRENT", 64)  # no flag of mlockall
+    with pytest.raises(OSError, match="Invalid argument"):
+        service._lock_memory()
+
+
+def test_real_time_says_what_was_not_allowed_and_goes_on() -> None:
+    code = (
+        "import os; from ecu_node.bus.service import be_real_time; "
+        "os.geteuid() or os.setuid(65534); print(be_real_time()); print(len(os.sched_getaffinity(0)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    line, processors = done.stdout.splitlines()
+    assert re.fullmatch(r"real time, but not allowed: SCHED_FIFO \(.*\), memory lock \(.*\)", line)
+    assert processors == "1"

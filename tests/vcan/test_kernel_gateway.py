@@ -1,0 +1,344 @@
+"""A gateway of which the kernel carries all but its own frames: killed, deceived, with joined buses."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from statistics import median
+
+import pytest
+
+from ecu_node.bus.kernel_routes import KernelRoutes
+from ecu_node.core.status import Reason, State
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import BusError
+from tests.vcan.conftest import StartNode
+from tests.vcan.processes import (
+    CHANNEL,
+    ECU_NODE,
+    LONGEST_WAIT_S,
+    OTHER_CHANNEL,
+    Recording,
+    bring_up,
+    generate,
+    ip_link,
+    playing,
+    run_tool,
+    running_recording,
+    send,
+    wait_until,
+)
+from tests.vcan.small_drive import write_drive
+from tests.vcan.test_faults_on_vcan import AUXILIARY, BATTERY, GATEWAY, STATUS, state_of
+
+NOISE, BACK = 0x345, 0x346
+"""Identifiers of others, sent towards the vehicle and towards the sensors."""
+RULES = 2 * (34 + 1)
+"""Both ways, all standard identifiers but those of the five branches and the status, and all extended ones."""
+FOREIGN = "FFFFFFFFFFFFFFFF"
+"""What another node sends under the battery's identifier."""
+
+
+@pytest.fixture(autouse=True)
+def no_rules() -> Iterator[None]:
+    """Begin and end without rules in the kernel, so that what one test leaves does no harm to others."""
+    subprocess.run(["cangw", "-F"], check=True)
+    yield
+    subprocess.run(["cangw", "-F"], check=True)
+
+
+def rules() -> list[tuple[str, ...]]:
+    """Source, identifier and mask of the kernel's rules; ``cangw -L`` fails where there are as many as of a gateway."""
+    lines = [line.split() for line in Path("/proc/net/can/rcvlist_fil").read_text().splitlines()]
+    return sorted(tuple(words[:3]) for words in lines if words[-1:] == ["gw"])
+
+
+@pytest.fixture
+def drive(database: VehicleDatabase, tmp_path: Path) -> Path:
+    path = tmp_path / "drive.log"
+    write_drive(path, database, 150)
+    return path
+
+
+@contextmanager
+def noise(count: int) -> Iterator[None]:
+    """Frames of others on both buses meanwhile, numbered, every 8 ms; at the end all have been sent."""
+    ways = ((CHANNEL, NOISE), (OTHER_CHANNEL, BACK))
+    commands = [
+        ["cangen", channel, "-I", f"{identifier:X}", "-D", "i", "-L", "8", "-n", str(count), "-g", "8"]
+        for channel, identifier in ways
+    ]
+    running = [subprocess.Popen(command) for command in commands]
+    try:
+        yield
+        assert [process.wait(LONGEST_WAIT_S) for process in running] == [0, 0]
+    finally:
+        for process in running:
+            process.kill()
+
+
+def delays_s(identifier: int, sent: Recording, arrived: Recording) -> list[float]:
+    """How long frames of one identifier took from one bus to the other, by the kernel's time stamps. [s]"""
+    stamps = [
+        [float(line.split()[0][1:-1]) for line in side.log.read_text().splitlines() if f" {identifier:X}#" in line]
+        for side in (sent, arrived)
+    ]
+    return [after - before for before, after in zip(*stamps, strict=True)]
+
+
+def wait_for_state(recording: Recording, state: State, reason: Reason) -> None:
+    wait_until(lambda: state_of(recording.data_of(STATUS)[-1]) == (state, reason), f"the state {state.name}")
+
+
+def test_other_frames_go_on_while_the_gateway_is_killed_and_started_again(
+    params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
+) -> None:
+    with start_node(params, *GATEWAY) as node:
+        other_recording.wait_for(STATUS, 1)
+        at_work = rules()
+        with noise(400):
+            other_recording.wait_for(NOISE, 100)
+            node.stop(signal.SIGKILL)
+            while_killed = len(other_recording.data_of(NOISE))
+            other_recording.wait_for(NOISE, while_killed + 150)
+            with start_node(params, *GATEWAY) as again:
+                assert rules() == at_work, "those that were left are used again, not doubled"
+        wait_until(lambda: len(recording.frames) >= 800, "all frames towards the sensors")
+        wait_until(lambda: len(other_recording.data_of(NOISE)) >= 400, "all frames towards the vehicle")
+        for identifier in (NOISE, BACK):
+            numbers = [int.from_bytes(data, "little") for data in recording.data_of(identifier)]
+            assert numbers == list(range(400)), "none lost, none twice"
+            assert other_recording.data_of(identifier) == recording.data_of(identifier)
+        delays = delays_s(NOISE, recording, other_recording)
+        alive_s, killed_s = median(delays[:100]), median(delays[while_killed : while_killed + 150])
+        print(f"median delay {1e6 * alive_s:.0f} us while the node is at work, {1e6 * killed_s:.0f} us while killed")
+        assert killed_s < 2e-3, "by the kernel alone"
+    assert len(at_work) == len(set(at_work)) == RULES
+    assert again.process.returncode is not None
+
+
+def test_the_rules_go_with_the_gateway_both_ways(
+    params: Path, start_node: StartNode, other_recording: Recording
+) -> None:
+    with start_node(params, *GATEWAY, "--fd") as node:
+        other_recording.wait_for(STATUS, 1)
+        assert len(rules()) == 2 * RULES, "both ways, classic and FD"
+        node.stop(signal.SIGKILL)
+    with start_node(params, *GATEWAY) as node:
+        assert len(rules()) == RULES, "those of another kind are replaced"
+        assert node.stop() == 0
+    assert rules() == []
+    send(f"{NOISE:X}#01")
+    send(f"{BACK:X}#01", OTHER_CHANNEL)
+    other_recording.wait_for(BACK, 1)
+    assert other_recording.data_of(NOISE) == []
+
+
+def test_rules_that_vanish_are_set_again(params: Path, start_node: StartNode) -> None:
+    mine = ("-s", CHANNEL, "-d", OTHER_CHANNEL, "-f", "345:7FF", "-X")
+    with start_node(params, *GATEWAY) as node:
+        before = rules()
+        run_tool("cangw", "-F")
+        run_tool("cangw", "-A", *mine)
+        node.wait_for(f"vcan0 and vcan1: {RULES} rules of the kernel were not as they must be; they are now")
+        assert len(rules()) == len(before) + 1, "a rule that somebody else has set stays"
+        ip_link("del", OTHER_CHANNEL)
+        node.wait_for("the kernel carries no frames: ")
+        assert rules() == [], "neither way is open"
+        ip_link("add", OTHER_CHANNEL, "type", "vcan")
+        bring_up(OTHER_CHANNEL)
+        wait_until(lambda: rules() == before, "the rules to be there again")
+        assert node.stop() == 0
+
+
+WITHOUT_RIGHTS = ("setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin")
+
+
+def test_without_rights_the_node_carries_all_frames_and_says_so(
+    params: Path, start_node: StartNode, recording: Recording, other_recording: Recording
+) -> None:
+    with start_node(params, *GATEWAY, by=WITHOUT_RIGHTS) as node:
+        other_recording.wait_for(STATUS, 1)
+        with noise(50):
+            pass
+        assert rules() == []
+        assert len(other_recording.wait_for(NOISE, 50)) == len(recording.wait_for(BACK, 50)) == 50
+        assert node.stop() == 0
+    assert (
+        "vcan0 and vcan1: the kernel carries no frames (CAP_NET_ADMIN is needed), so this program carries them all, "
+        "and they stop when it does"
+    ) in node.messages
+
+
+def test_without_the_module_the_node_carries_all_frames_and_says_so(
+    params: Path, start_node: StartNode, other_recording: Recording
+) -> None:
+    run_tool("rmmod", "can-gw")
+    try:
+        with start_node(params, *GATEWAY) as node:
+            other_recording.wait_for(STATUS, 1)
+            send(f"{NOISE:X}#01")
+            other_recording.wait_for(NOISE, 1)
+            assert node.stop() == 0
+    finally:
+        module = f"/usr/lib/uml/modules/{os.uname().release}/kernel/net/can/can-gw.ko"
+        run_tool(*(("insmod", module) if Path(module).exists() else ("modprobe", "can-gw")))
+    assert "the kernel carries no frames (its module can-gw is needed)" in node.messages
+
+
+def test_rules_that_nobody_here_may_change_are_told(
+    params: Path, start_node: StartNode, other_recording: Recording
+) -> None:
+    with start_node(params, *GATEWAY) as node:
+        other_recording.wait_for(STATUS, 1)
+        node.stop(signal.SIGKILL)
+    words = "an earlier gateway left rules in the kernel, which only CAP_NET_ADMIN may change"
+    with pytest.raises(AssertionError, match=words), start_node(params, *GATEWAY, by=WITHOUT_RIGHTS):
+        pass  # it never says that it runs
+    assert len(rules()) == RULES, "others are still carried"
+
+
+def test_a_rule_that_the_kernel_refuses_leaves_none() -> None:
+    with KernelRoutes((CHANNEL, "lo"), {(BATTERY, False)}, fd=False, say=print) as routes:
+        with pytest.raises(BusError, match=r"vcan0 and lo: the kernel refuses a rule of can-gw: .*No such device"):
+            routes.set()
+        assert rules() == []
+
+
+def test_a_fault_of_the_program_leaves_the_rules_as_a_kill_does() -> None:
+    routes = KernelRoutes((CHANNEL, OTHER_CHANNEL), {(BATTERY, False)}, fd=False, say=print)
+    with suppress(ZeroDivisionError), routes:
+        routes.set()
+        raise ZeroDivisionError
+    assert len(rules()) == 2 * (11 + 1)
+
+
+@pytest.mark.parametrize("gap_ms", [300, 1], ids=["each 300 ms", "1000 per s"])
+def test_foreign_frames_of_a_branch_hold_nothing_up_and_the_status_says_so(
+    params: Path, drive: Path, start_node: StartNode, recording: Recording, other_recording: Recording, gap_ms: int
+) -> None:
+    command = ["cangen", OTHER_CHANNEL, "-I", f"{BATTERY:X}", "-D", FOREIGN, "-L", "8", "-g", str(gap_ms)]
+    with start_node(params, *GATEWAY) as node:
+        other_recording.wait_for(STATUS, 1)
+        with subprocess.Popen(command) as foreigner:
+            with playing(drive) as player:
+                wait_for_state(other_recording, State.CORRECTING, Reason.FOREIGN_FRAMES)
+                assert player.wait(LONGEST_WAIT_S) == 0
+            foreigner.terminate()
+        sent = len(recording.wait_for(BATTERY, 150))
+        other_recording.wait_for(AUXILIARY, 150)
+        print(f"{len(other_recording.data_of(BATTERY)) - sent} foreign frames among {sent}")
+        assert node.stop() == 0
+    foreign = bytes.fromhex(FOREIGN)
+    assert foreign not in recording.data_of(BATTERY), "none reaches the sensors' bus"
+    passed = [data for data in other_recording.data_of(BATTERY) if data != foreign]
+    assert [data[1] & 15 for data in passed] == [k % 15 for k in range(150)], "each frame of the branch arrives"
+    assert passed != recording.data_of(BATTERY), "corrected"
+    assert "vcan1': another node sends frames 0x110, which only this one may send there; they are dropped" in (
+        node.messages
+    )
+
+
+def test_foreign_frames_are_told_until_10_s_after_the_last(
+    database: VehicleDatabase, params: Path, tmp_path: Path, start_node: StartNode, other_recording: Recording
+) -> None:
+    endless = tmp_path / "long.log"
+    write_drive(endless, database, 45)
+    with start_node(params, *GATEWAY) as node, playing(endless, endlessly=True):
+        wait_until(lambda: bool(other_recording.data_of(STATUS)), "the first status")
+        wait_for_state(other_recording, State.CORRECTING, Reason.NONE)
+        send(f"{BATTERY:X}#{FOREIGN}", OTHER_CHANNEL)
+        wait_for_state(other_recording, State.CORRECTING, Reason.FOREIGN_FRAMES)
+        told_s = time.monotonic()
+        wait_for_state(other_recording, State.CORRECTING, Reason.NONE)
+        assert time.monotonic() - told_s == pytest.approx(10.0, abs=2.0)
+        assert node.stop() == 0
+
+
+def test_a_gateway_whose_log_nobody_reads_goes_on_both_ways_and_ends(
+    database: VehicleDatabase, params: Path, drive: Path, recording: Recording, other_recording: Recording
+) -> None:
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    try:
+        while True:
+            os.write(write, bytes(1 << 12))
+    except BlockingIOError:
+        os.set_blocking(write, True)
+    command = [*ECU_NODE, "run", "--channel", CHANNEL, "--unsigned", "--params", str(params), *GATEWAY]
+    with subprocess.Popen([*command, "--layout", str(database.layout.path)], stderr=write) as process:
+        try:
+            other_recording.wait_for(STATUS, 1)
+            with noise(100), playing(drive) as player:
+                generate(OTHER_CHANNEL, 20, "-I", f"{BATTERY:X}")  # each is worth a line
+                assert player.wait(LONGEST_WAIT_S) == 0
+            other_recording.wait_for(AUXILIARY, 150)
+            other_recording.wait_for(NOISE, 100)
+            recording.wait_for(BACK, 100)
+            process.terminate()
+            assert process.wait(1.0 if sys.gettrace() is None else LONGEST_WAIT_S) == 0
+        finally:
+            process.kill()
+            os.close(write)
+            os.close(read)
+    assert rules() == []
+
+
+@contextmanager
+def joined() -> Iterator[None]:
+    """Both buses as one, as by a cable: each frame of one is sent anew on the other."""
+    ends = [socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) for _ in range(2)]
+    ended = threading.Event()
+
+    def carry(source: socket.socket, target: socket.socket) -> None:
+        while not ended.is_set():
+            with suppress(OSError):  # nothing came, or a full queue
+                target.send(source.recv(16))
+
+    for end, channel in zip(ends, (CHANNEL, OTHER_CHANNEL), strict=True):
+        end.bind((channel,))
+        end.settimeout(0.1)
+    threads = [threading.Thread(target=carry, args=pair) for pair in (ends, ends[::-1])]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        for thread in threads:
+            thread.join()
+        for end in ends:
+            end.close()
+
+
+@pytest.mark.parametrize("killed", [False, True], ids=["at work", "killed before"])
+def test_buses_that_are_joined_end_the_gateway_and_its_rules_so_that_no_storm_stays(
+    params: Path, drive: Path, tmp_path: Path, start_node: StartNode, other_recording: Recording, killed: bool
+) -> None:
+    words = "which only this one may send there; two nodes on one bus, or two buses that are joined? Stop one"
+    with start_node(params, *GATEWAY) as node:
+        other_recording.wait_for(STATUS, 1)
+        if killed:
+            node.stop(signal.SIGKILL)
+        with joined(), playing(drive, endlessly=True):
+            joined_s = time.monotonic()
+            if killed:
+                with pytest.raises(AssertionError, match=re.escape(words)), start_node(params, *GATEWAY):
+                    pass  # it hears the branches where only it may send them, and removes what the first one left
+            else:
+                assert node.wait_for_end() == 1
+                assert words in node.messages
+            print(f"ended {time.monotonic() - joined_s:.2f} s after the buses were joined")
+            assert rules() == []
+    with joined(), running_recording(tmp_path / "after.log", OTHER_CHANNEL) as after:
+        send(f"{NOISE:X}#01")
+        after.wait_for(NOISE, 1)
+        time.sleep(0.5)
+        assert len(after.data_of(NOISE)) == 1, "nothing goes round"
