@@ -156,7 +156,7 @@ def _branch(branch: LiveBranch, now_s: float) -> dict[str, Any]:
     is_old = branch.is_old(now_s)
     currents_a = None if is_old else branch.currents_at(branch.time_s)
     if currents_a is None:
-        quality = Quality.NOT_AVAILABLE if is_old else branch.why_no_value()
+        _, quality = branch.published(now_s)
         return {"measured_a": None, "corrected_a": None, "quality": quality.name}
     published_a = currents_a[branch.quality is Quality.CORRECTED]
     return {

@@ -5,7 +5,7 @@ The structure depends on layout and DBC alone; the parameters are then put in fo
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from ecu_node.bus.guard import Mode, check_output, is_fd, key_of, received
 from ecu_node.bus.in_force import (
@@ -82,7 +82,6 @@ def wire(
     corrector = Corrector(
         sources=_sources(database, parts, targets, counters),
         branches=list(parts.branches.values()),
-        auxiliaries=parts.auxiliaries,
         status_fields=_status_fields(database),
         watch=JunctionWatch(
             list(parts.branches.values()),
@@ -105,23 +104,21 @@ class _Parts:
 
     branches: dict[str, LiveBranch]
     signals: list[tuple[SignalName, Auxiliary | LiveBranch]]
-    auxiliaries: list[Auxiliary] = field(default_factory=list)
     whole: tuple[Auxiliary, frozenset[int]] | None = None
     """The input that tells whether all currents are measured, and its codes with which they are."""
 
-    def is_whole(self) -> bool:
+    def is_whole(self, now_s: float) -> bool:
         """Whether all currents of the junction are measured now."""
-        return self.whole is None or self.whole[0].code in self.whole[1]
+        return self.whole is None or self.whole[0].code_at(now_s) in self.whole[1]
 
 
 def _parts(database: VehicleDatabase) -> _Parts:
-    """Make all of them; auxiliary signals stand in the order in which those of one frame are taken."""
+    """Make all of them."""
     layout = database.layout
     parts = _Parts(branches={}, signals=[])
 
     def auxiliary(name: SignalName, codes: Codes, timeout_s: float) -> Auxiliary:
         item = Auxiliary(codes, timeout_s)
-        parts.auxiliaries.append(item)
         parts.signals.append((name, item))
         return item
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault
 from ecu_node.core.signals import Codes, PlacedSignal
-from ecu_node.core.status import Quality
+from ecu_node.core.status import Counters, Quality
 
 __all__ = ["REMEMBERED_FRAMES", "Auxiliary", "Frames", "LiveBranch", "Movement", "Past"]
 
@@ -57,34 +57,24 @@ class Auxiliary:
     """
 
     def __init__(self, codes: Codes, timeout_s: float) -> None:
-        self.code: int | None = None
-        """Last code that is a value."""
-        self._codes = codes
-        self._timeout_s = timeout_s
-        self._time_s = 0.0
+        self._codes, self._timeout_s = codes, timeout_s
         self._past = Past()
 
     def follow(self, signal: PlacedSignal, frames: Frames) -> None:
-        """Look for the signal in these frames, when its past is asked for."""
+        """Look for the signal in these frames, when it is asked for."""
         self._past = Past(signal, frames)
 
-    def take(self, code: int, now_s: float) -> None:
-        """Take the code of a new frame."""
-        self._time_s = now_s
-        self.code = code if self._codes.is_value(code) else None
-
-    def expire(self, now_s: float) -> None:
-        """Forget a value that is too old."""
-        if self.code is not None and now_s - self._time_s > self._timeout_s:
-            self.code = None
-
-    def value_at(self, time_s: float) -> float | None:
-        """Value in the last frame up to a time [V]; None if there is none, it is no value, or too old."""
+    def code_at(self, time_s: float) -> int | None:
+        """Code in the last frame up to a time [s]; None if there is none, it is no value, or too old."""
         for seen_s, code in self._past.newest_first():
             if seen_s <= time_s:
-                is_known = time_s - seen_s <= self._timeout_s and self._codes.is_value(code)
-                return float(self._codes.scale) * code + float(self._codes.offset) if is_known else None
+                return code if time_s - seen_s <= self._timeout_s and self._codes.is_value(code) else None
         return None
+
+    def value_at(self, time_s: float) -> float | None:
+        """The same as a value. [V]"""
+        code = self.code_at(time_s)
+        return None if code is None else float(self._codes.scale) * code + float(self._codes.offset)
 
 
 _LEAST_VOLTAGE_V = 10.0
@@ -139,13 +129,10 @@ class LiveBranch:
         self.voltage = voltage
         self.fault = NO_FAULT
         self.delay_s = 0.0
-        self.out: int | None = None
-        """The code to write; None where there is no value."""
         self.quality = Quality.PASSED_THROUGH
-        """Of values; where there is none see :meth:`why_no_value`."""
-        self.is_spoilt = False
-        """Whether the last frame must not be used: until the next one there is no value."""
+        """Of values."""
         self._past = Past()
+        self._spoilt_s = float("-inf")
         self._is_named = False
         self._time_s = self._awake_s = self._waited_s = float("-inf")
         self._scale, self._offset = float(sign * codes.scale), float(sign * codes.offset)
@@ -190,10 +177,6 @@ class LiveBranch:
         corrects = active and self.fault.applied
         self.plan = self._correcting if corrects else self._passing
         self.quality = Quality.CORRECTED if corrects else Quality.IMPLAUSIBLE if doubted else Quality.PASSED_THROUGH
-        latest = None if self.is_spoilt else self.latest()
-        if latest is not None:  # what is published of the last code shall have the quality that stands beside it
-            voltage_code = self.voltage.code if self.voltage is not None and self.plan.needs_voltage else 0
-            self.out = self.plan.apply(latest[1], voltage_code) if voltage_code is not None else None
         for react in self.when_changed:
             react()
 
@@ -201,9 +184,9 @@ class LiveBranch:
         """Look for the signal in these frames, when its past is asked for."""
         self._past = Past(signal, frames)
 
-    def spoil(self) -> None:
+    def spoil(self, now_s: float) -> None:
         """A frame came that must not be used: until the next one there is no value."""
-        self.out, self.is_spoilt = None, True
+        self._spoilt_s = now_s
 
     @property
     def time_s(self) -> float:
@@ -247,20 +230,52 @@ class LiveBranch:
         """Wait for frames from now on: the bus has woken up."""
         self._awake_s = self._waited_s = now_s
 
-    @property
-    def lacks_input(self) -> bool:
+    def lacks_input(self, now_s: float) -> bool:
         """Whether a branch with a fault to correct is not corrected now: something that this needs is missing."""
-        no_voltage = self.voltage is not None and self.plan.needs_voltage and self.voltage.code is None
-        return self.quality is not Quality.CORRECTED or no_voltage or (self.seen and self.latest() is None)
+        no_value = self.seen and self.latest() is None
+        return self.quality is not Quality.CORRECTED or no_value or self._voltage_code(now_s) is None
 
-    def why_no_value(self) -> Quality:
-        """Why :attr:`out` is None: never seen, named "no value", a voltage missing; else its code was impossible."""
+    def _voltage_code(self, time_s: float) -> int | None:
+        """Code of the voltage that the plan needs at a time; 0 where it needs none."""
+        return self.voltage.code_at(time_s) if self.voltage is not None and self.plan.needs_voltage else 0
+
+    def ordinary_codes(self) -> tuple[int, int]:
+        """Least and greatest code of a range in which each is a value with a result that only the code decides.
+
+        Returns
+        -------
+        first, last : int
+            The first one is greater where there is no such range. Results beyond the ends of the signal are none.
+        """
+        plan, (first, last) = self.plan, (self.codes.lowest, self.codes.highest)
+        while first in self.codes.named:
+            first += 1
+        while last in self.codes.named:
+            last -= 1
+        if plan.needs_voltage or plan.gain <= 0 or any(first <= code <= last for code in self.codes.named):
+            return 1, 0
+        least, beyond = plan.lowest << plan.shift, (plan.highest + 1) << plan.shift
+        bias = plan.bias + (1 << (plan.shift - 1))
+        return max(first, -((bias - least) // plan.gain)), min(last, (beyond - 1 - bias) // plan.gain)
+
+    def convert(self, code: int, time_s: float, counters: Counters) -> tuple[int | None, Quality]:
+        """What is written of a code that came at a time: None where it is no value; saturation is counted."""
+        if not self.codes.is_value(code):
+            return None, Quality.NOT_AVAILABLE if code in self.codes.named else Quality.INVALID
+        voltage_code = self._voltage_code(time_s)
+        if voltage_code is None:
+            return None, Quality.NOT_AVAILABLE
+        counters.saturated += self.plan.saturates(code, voltage_code)
+        return self.plan.apply(code, voltage_code), self.quality
+
+    def published(self, now_s: float) -> tuple[int | None, Quality]:
+        """What is written of it where no frame of it just came."""
         found = next(self._past.newest_first(), None)
-        if found is None:
-            return Quality.NOT_AVAILABLE
-        _, code = found
-        known = not self.is_spoilt and (code in self.codes.named or self.codes.is_value(code))
-        return Quality.NOT_AVAILABLE if known else Quality.INVALID
+        if found is None or now_s - found[0] > self.timeout_s:
+            return None, Quality.NOT_AVAILABLE
+        if found[0] <= self._spoilt_s:
+            return None, Quality.INVALID
+        return self.convert(found[1], found[0], Counters())
 
     def currents_at(self, time_s: float) -> tuple[float, float] | None:
         """Measured current and what the parameters make of it, whether or not they are in force.

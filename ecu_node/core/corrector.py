@@ -9,7 +9,7 @@ given a valid CRC. Times are those of one steady clock. [s]
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from ecu_node.core.branch import Auxiliary, LiveBranch
+from ecu_node.core.branch import LiveBranch
 from ecu_node.core.e2e import Protection
 from ecu_node.core.frames import FrameKey, Source
 from ecu_node.core.junction import NOTHING_EXPECTED, ExpectedSum, JunctionWatch
@@ -55,8 +55,6 @@ class Corrector:
         What is received; no other frame is looked at.
     branches : sequence of LiveBranch
         All branches of the layout.
-    auxiliaries : sequence of Auxiliary
-        Voltages, and the state that the watch depends on.
     status_fields : StatusFields or None
         Status message, if the layout has one.
     watch : JunctionWatch
@@ -74,7 +72,6 @@ class Corrector:
         *,
         sources: Mapping[FrameKey, Source],
         branches: Sequence[LiveBranch],
-        auxiliaries: Sequence[Auxiliary],
         status_fields: StatusFields | None,
         watch: JunctionWatch,
         counters: Counters,
@@ -94,7 +91,7 @@ class Corrector:
         self.parameter_set = 0
         self.sources: dict[tuple[int, bool], Source] = dict(sources.items())
         """Who takes which frames, by identifier and whether it has 29 bits; no other frame is looked at."""
-        self._auxiliaries = auxiliaries
+        self._looked_s = float("-inf")
         self._status_fields = status_fields
         self._silent, self._silent_since_s = True, float("inf")
         self._was_awake = False
@@ -132,8 +129,7 @@ class Corrector:
         self.told = self.state()
 
     def _look(self, now_s: float) -> None:
-        for auxiliary in self._auxiliaries:
-            auxiliary.expire(now_s)
+        self._looked_s = now_s
         self._see_whether_asleep(now_s)
         self.watch.look(now_s)
         if self.reason is not Reason.NONE or self.latched is not Reason.NONE or self._silent:
@@ -161,7 +157,7 @@ class Corrector:
         if any(branch.is_fitted and not branch.seen for branch in self.branches):
             return State.STARTING, Reason.NONE
         is_invalid = any(source.is_invalid for source in self.sources.values())
-        if is_invalid or any(branch.lacks_input for branch in applied):
+        if is_invalid or any(branch.lacks_input(self._looked_s) for branch in applied):
             return State.PARTLY_CORRECTING, Reason.E2E_INVALID if is_invalid else Reason.INPUT_MISSING
         return State.CORRECTING, self._beside
 

@@ -1,8 +1,9 @@
 """Incoming messages and what the node makes of them, frame by frame.
 
-A payload is read as one integer per byte order, in which each signal is a shift and a mask. What does not change from
-frame to frame is looked up once: the places of signals per length of payload, the conversion of a branch whenever its
-parameters change.
+A payload is read as one integer per byte order, in which each signal is a shift and a mask. An answer is the target's
+last message with the branches of the frame written anew; a gateway's frame is the frame itself with its branches
+written anew: one way for both. What does not change from frame to frame is looked up once per length of payload, and
+again whenever a branch is corrected otherwise.
 """
 
 from collections import deque
@@ -12,45 +13,17 @@ from typing import NamedTuple
 
 from ecu_node.core.branch import REMEMBERED_FRAMES, Auxiliary, Frames, LiveBranch
 from ecu_node.core.e2e import Check, E2EState, Protection, Receiver
-from ecu_node.core.signals import BitPlace, Multiplexer, Order, PlacedSignal
+from ecu_node.core.signals import BitPlace, Order, PlacedSignal
 from ecu_node.core.status import Counters, Quality
 
 __all__ = ["FrameKey", "Reader", "Source", "Target", "TargetField"]
 
 
 _OK, _LAST_USABLE, _CORRUPT = Check.OK, Check.LOST, Check.CORRUPT  # looking up members of an enumeration is slow
-_INVALID = E2EState.INVALID
+_INVALID, _from_bytes = E2EState.INVALID, int.from_bytes
+_BITS_PER_BYTE = 8
 _LEAST_SILENCE_S = 1.0
 """After a silence of this long, or of a branch's timeout, a message's counter begins anew. [s]"""
-
-
-class _Extra(NamedTuple):
-    """What few branches have."""
-
-    above: tuple[Multiplexer, ...]
-    named: frozenset[int]
-    """Codes amid the values that have a name."""
-    voltage: Auxiliary | None
-    voltage_gain: int
-
-    def is_in(self, payload: bytearray) -> bool:
-        """Whether the multiplexers say that the branch is in this frame."""
-        return all(item.place.extract(payload) in item.codes for item in self.above)
-
-    def term(self, code: int, bias: int) -> int | None:
-        """The plan's bias, with the voltage's part; None if the code or the voltage is no value."""
-        if code in self.named:
-            return None
-        if self.voltage is None:
-            return bias
-        return None if self.voltage.code is None else bias + self.voltage.code * self.voltage_gain
-
-
-_SourceCell = tuple[LiveBranch, int, int, int, int, int, int, int, int, int, int, _Extra | None]
-"""A branch; its shift, ones and sign (:class:`~ecu_node.core.signals.WordField`); its least and highest value; gain,
-bias, shift, lowest and highest result (:class:`~ecu_node.core.correction.IntegerPlan`); and what few branches have."""
-_TargetCell = tuple[LiveBranch, int, int, int, tuple[int, ...]]
-"""A branch, its shift and ones, its code for "no value", and the bits of each quality in the payload."""
 
 
 class FrameKey(NamedTuple):
@@ -78,6 +51,75 @@ class TargetField:
     quality: BitPlace | None
 
 
+class _Written:
+    """One branch in outgoing payloads of one length, each read as one integer of the branch's byte order."""
+
+    def __init__(self, field: TargetField, length: int) -> None:
+        self.branch, self.order, self._not_available = field.branch, field.place.order, field.not_available
+        self.word = field.place.in_word(length)
+        payloads = [bytearray(length) for _ in Quality]
+        for quality, payload in zip(Quality, payloads, strict=True):
+            if field.quality is not None:
+                field.quality.put(payload, min(quality, field.quality.highest))
+        self.quality_bits = [int.from_bytes(payload, self.order) for payload in payloads]
+        self.mask = self.word.ones << self.word.shift
+        if field.quality is not None:
+            self.mask |= int.from_bytes(field.quality.mask.to_bytes(length, "little"), self.order)
+
+    def write(self, word: int, out: int | None, quality: Quality) -> int:
+        """The payload with a code, or "no value", and its quality."""
+        code = self._not_available if out is None else out
+        shift, ones, _ = self.word
+        return word & ~self.mask | (code & ones) << shift | self.quality_bits[quality]
+
+    def write_known(self, word: int, now_s: float) -> int:
+        """The payload with what is known of the branch now."""
+        return self.write(word, *self.branch.published(now_s))
+
+
+class _Unusual(NamedTuple):
+    """What is done with a branch where the result is no ordinary one."""
+
+    branch: LiveBranch
+    signal: PlacedSignal
+    written: _Written | None
+    """None where the branch is rewritten in its own place."""
+    counters: Counters
+
+    def write(self, word: int, payload: bytearray, now_s: float) -> int:
+        """The outgoing payload with what becomes of the branch in a frame."""
+        code = self.signal.code(payload)
+        if self.written is not None:
+            if code is None:
+                return self.written.write_known(word, now_s)
+            return self.written.write(word, *self.branch.convert(code, now_s, self.counters))
+        if code is None:
+            return word
+        out, _ = self.branch.convert(code, now_s, self.counters)
+        shift, ones, _ = self.signal.place.in_word(len(payload))
+        return word & ~(ones << shift) | ((code if out is None else out) & ones) << shift
+
+
+_Cell = tuple[int, int, int, int, int, int, int, int, _Unusual]
+"""One branch of a frame, in unsigned numbers: the sign bits of two's complements are turned over. Shift and ones; least
+and greatest number with an ordinary result; gain, bias and shift from number to result; the result's shift in the
+outgoing payload; and what is done with other numbers."""
+
+
+class _Pass(NamedTuple):
+    """Branches that are read in one byte order and written in one."""
+
+    order: Order
+    to: Order
+    signs: int
+    """Sign bits in the frame."""
+    keep: int
+    """Bits of the outgoing payload that stay."""
+    good: int
+    """Qualities, where all results are ordinary, and the sign bits, which these turn over."""
+    cells: list[_Cell]
+
+
 class Target:
     """One corrected message that the node sends in its own name.
 
@@ -101,62 +143,29 @@ class Target:
         self.key, self.fd = key, fd
         self.data = bytearray(length)
         """The message as it was made last; a new one each time."""
-        self.branches = [field.branch for field in fields]
         if protection is not None:
             protection.before_first(self.data)
-        self._length, self._advance = length, None if protection is None else protection.advance
-        self._counter_byte, self._counter_bits = (
-            (0, 0)
-            if protection is None
-            else (protection.counter_byte, protection.counter_ones << protection.counter_shift)
-        )
-        self._words = [(order, _placed(fields, order, length)) for order in {field.place.order for field in fields}]
-
-    def make(self, now_s: float, *, is_fresh: bool = False) -> None:
-        """Make the message anew; unless all branches were just taken from a frame, one may be stale: no value."""
-        payload = b""
-        for order, cells in self._words:
-            word = int.from_bytes(payload, order) if payload else 0
-            for branch, shift, ones, not_available, quality_bits in cells:
-                out, quality = branch.out, branch.quality
-                if out is None:
-                    out, quality = not_available, branch.why_no_value()
-                elif not is_fresh and branch.is_old(now_s):
-                    out, quality = not_available, Quality.NOT_AVAILABLE
-                word |= (out & ones) << shift | quality_bits[quality]
-            payload = word.to_bytes(self._length, order)
-        made = bytearray(payload)
-        if self._advance is not None:
-            made[self._counter_byte] |= self.data[self._counter_byte] & self._counter_bits
-            self._advance(made)
-        self.data = made
+        self.advance = protection.advance if protection is not None else None
+        self.written = {field.branch: _Written(field, length) for field in fields}
 
 
-def _placed(fields: Sequence[TargetField], order: Order, length: int) -> list[_TargetCell]:
-    """Where the branches of one byte order stand in payloads of some length [byte], and the bits of each quality."""
-    cells = []
-    for field in fields:
-        if field.place.order == order:
-            payloads = [bytearray(length) for _ in Quality]
-            for quality, payload in zip(Quality, payloads, strict=True):
-                if field.quality is not None:
-                    field.quality.put(payload, min(quality, field.quality.highest))
-            bits = tuple(int.from_bytes(payload, order) for payload in payloads)
-            place = field.place.in_word(length)
-            cells.append((field.branch, place.shift, place.ones, field.not_available, bits))
-    return cells
+class _Way(NamedTuple):
+    """How a target answers payloads of one length."""
+
+    target: Target
+    passes: list[_Pass]
+    others: list[_Written]
+    """Branches that are not in these payloads."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Places:
-    """The branches in payloads of one length."""
+class _Ways:
+    """What is done with payloads of one length."""
 
-    words: list[tuple[Order, list[_SourceCell]]]
-    """Per byte order its branches."""
     missing: list[LiveBranch]
     """Branches that such a payload is too short for."""
-    targets: list[tuple[Target, bool]]
-    """Messages that answer it, and whether all their branches are in each such payload."""
+    in_place: list[_Pass]
+    targets: list[_Way]
 
 
 class Source:
@@ -193,17 +202,17 @@ class Source:
         self._receiver = Receiver(protection) if protection is not None else None
         self._seal = protection.seal if protection is not None else None
         self._targets = tuple(targets)
-        self._auxiliaries = [(part, signal) for part, signal in readers if isinstance(part, Auxiliary)]
         self._branches = [(part, signal) for part, signal in readers if isinstance(part, LiveBranch)]
         self._counters, self._pass_on_invalid = counters, pass_on_invalid
         self._history: Frames = deque(maxlen=REMEMBERED_FRAMES)
         self._silence_s = max([_LEAST_SILENCE_S, *(branch.timeout_s for branch, _ in self._branches)])
-        self._places: dict[int, _Places] = {}
+        self._silent_from_s = float("inf")
+        self._ways: dict[int, _Ways] = {}
         self.timeout_s = max((branch.timeout_s for branch, _ in self._branches), default=float("inf"))
         for reader in readers:
             reader.part.follow(reader.signal, self._history)
         for branch, _ in self._branches:
-            branch.when_changed.append(self._places.clear)
+            branch.when_changed.append(self._ways.clear)
 
     @property
     def is_invalid(self) -> bool:
@@ -225,15 +234,24 @@ class Source:
         sequence of Target
             To be sent.
         """
-        places = self._places.get(len(payload)) or self._find(len(payload))
-        if self._convert(payload, now_s, places) > _LAST_USABLE:
-            if not self._pass_on_invalid:
-                return ()
+        ways = self._ways.get(len(payload)) or self._find(len(payload))
+        is_usable = self._take(payload, now_s, ways) <= _LAST_USABLE
+        if not (is_usable or self._pass_on_invalid):
+            return ()
+        answers = ways.targets
+        if not is_usable or (self._receiver is not None and self._receiver.state is _INVALID):
             for branch, _ in self._branches:
-                branch.spoil()
-        for target, is_fresh in places.targets:
-            target.make(now_s, is_fresh=is_fresh)
-        self._counters.answers += len(self._targets)
+                branch.spoil(now_s)
+            answers = [_Way(target, [], list(target.written.values())) for target in self._targets]
+        for target, passes, others in answers:
+            made = self._rewritten(payload, target.data, passes, now_s)
+            for written in others:
+                word = written.write_known(int.from_bytes(made, written.order), now_s)
+                made = bytearray(word.to_bytes(len(made), written.order))
+            if target.advance is not None:
+                target.advance(made)
+            target.data = made
+        self._counters.answers += len(answers)
         return self._targets
 
     def forward(self, payload: bytearray, now_s: float) -> bytearray | None:
@@ -249,46 +267,30 @@ class Source:
         Returns
         -------
         bytearray or None
-            To be sent on, protected with the counter that the frame came with; None if it is held back.
+            To be sent on, protected with the counter that the frame came with; None if it is held back. A receiver of
+            it judges for itself whether so many frames fail their check that it cannot rely on the message.
         """
-        places = self._places.get(len(payload)) or self._find(len(payload))
-        rewritten = bytearray(payload)
-        check = self._convert(payload, now_s, places, rewritten)
+        ways = self._ways.get(len(payload)) or self._find(len(payload))
+        check = self._take(payload, now_s, ways)
         if check > _LAST_USABLE and self._branches and not self._pass_on_invalid:
             self._counters.held_back += 1
             return None
-        if check is _CORRUPT or rewritten == payload:
+        if check is _CORRUPT:
+            return payload
+        made = self._rewritten(payload, payload, ways.in_place, now_s)
+        if made == payload:
             return payload
         self._counters.rewritten += 1
         if self._seal is not None:
-            self._seal(rewritten)
-        return rewritten
+            self._seal(made)
+        return made
 
-    def _convert(  # noqa: PLR0912 (in one piece, as each call costs a tenth of it)
-        self, payload: bytearray, now_s: float, places: _Places, rewritten: bytearray | None = None
-    ) -> Check:
-        """Check a frame and convert its branches: the only way of a frame through the node.
-
-        Parameters
-        ----------
-        payload : bytearray
-            Of the frame.
-        now_s : float
-            When it came. [s]
-        places : _Places
-            Where the branches stand in it.
-        rewritten : bytearray or None
-            A copy of the payload, in which results are written in the place of the codes that are values.
-
-        Returns
-        -------
-        Check
-            What is not usable leaves the branches as they were.
-        """
-        counters, history, check = self._counters, self._history, _OK
+    def _take(self, payload: bytearray, now_s: float, ways: _Ways) -> Check:
+        """Check a frame, and remember it if it is usable."""
+        counters, check = self._counters, _OK
         counters.frames_in += 1
         if self._receiver is not None:
-            if history and now_s - history[-1][0] > self._silence_s:
+            if now_s > self._silent_from_s:
                 self._receiver.restart()
             check = self._receiver.check(payload)
             if check is not _OK:
@@ -296,70 +298,77 @@ class Source:
                 counters.repeated += check is Check.REPEATED
                 counters.jumped += check is Check.JUMPED
                 counters.gaps += check is Check.LOST
-        is_usable = check <= _LAST_USABLE
-        if is_usable:
-            history.append((now_s, payload))
-            for auxiliary, signal in self._auxiliaries:  # before the branches, which may need a voltage
-                code = signal.code(payload)
-                if code is not None:
-                    auxiliary.take(code, now_s)
-            for branch in places.missing:
-                branch.spoil()
-                counters.short += 1
-            if rewritten is None and self.is_invalid:  # a receiver of a gateway's frames judges for itself
-                for branch, _ in self._branches:
-                    branch.spoil()
-                return check
-        elif rewritten is None or check is _CORRUPT or not self._pass_on_invalid:
-            return check
-        for order, cells in places.words:
-            word = int.from_bytes(payload if rewritten is None else rewritten, order)
-            for branch, shift, ones, sign, first, last, gain, bias, down, low, high, extra in cells:
-                code = ((word >> shift & ones) ^ sign) - sign
-                out: int | None = None
-                term: int | None = bias
-                if extra is not None:
-                    if not extra.is_in(payload):
-                        continue
-                    term = extra.term(code, bias)
-                if term is not None and first <= code <= last:
-                    out = (code * gain + term) >> down
-                    if not low <= out <= high:
-                        out = low if out < low else high
-                        counters.saturated += 1
-                if rewritten is None:
-                    branch.out, branch.is_spoilt = out, False
-                elif out is not None:
-                    word ^= ((code ^ out) & ones) << shift
-            if rewritten is not None:
-                rewritten[:] = word.to_bytes(len(rewritten), order)
+                if check > _LAST_USABLE:
+                    return check
+            self._silent_from_s = now_s + self._silence_s
+        self._history.append((now_s, payload))
+        for branch in ways.missing:
+            branch.spoil(now_s)
+            counters.short += 1
         return check
 
-    def _find(self, length: int) -> _Places:
-        """Find the branches in payloads of some length, with what is done to each. [byte]"""
+    def _rewritten(self, payload: bytearray, made: bytearray, passes: Sequence[_Pass], now_s: float) -> bytearray:
+        """The outgoing payload with the branches of a frame; never the same object, but where there are none."""
+        for order, to, signs, keep, good, cells in passes:
+            word = _from_bytes(payload, order)
+            new = (word if made is payload else _from_bytes(made, to)) & keep | good
+            word ^= signs
+            for shift, ones, first, last, gain, bias, down, place, unusual in cells:
+                number = word >> shift & ones
+                if first <= number <= last:
+                    new ^= (number * gain + bias) >> down << place
+                else:
+                    new = unusual.write(new, payload, now_s)
+            made = bytearray(new.to_bytes(len(made), to))
+        return made
+
+    def _find(self, length: int) -> _Ways:
+        """Find out what is done with payloads of some length. [byte]"""
         present = [(branch, signal) for branch, signal in self._branches if signal.end <= length]
-        words = [
-            (order, [_cell(*item, length) for item in present if item[1].place.order == order])
-            for order in {signal.place.order for _, signal in present}
-        ]
-        always = {branch for branch, signal in present if not signal.above}
-        found = self._places[length] = _Places(
-            words=words,
+        answers = []
+        for target in self._targets:
+            inside = [(*item, target.written[item[0]]) for item in present if item[0] in target.written]
+            others = [target.written[branch] for branch in target.written.keys() - {item[0] for item in inside}]
+            answers.append(_Way(target, self._passes(inside, length, len(target.data)), others))
+        found = self._ways[length] = _Ways(
             missing=[branch for branch, signal in self._branches if signal.end > length],
-            targets=[(target, always.issuperset(target.branches)) for target in self._targets],
+            in_place=self._passes([(*item, None) for item in present], length, length),
+            targets=answers,
         )
         return found
 
-
-def _cell(branch: LiveBranch, signal: PlacedSignal, length: int) -> _SourceCell:
-    plan, codes = branch.plan, branch.codes
-    first, last = codes.lowest, codes.highest
-    while first in codes.named:
-        first += 1
-    while last in codes.named:
-        last -= 1
-    named = frozenset(code for code in codes.named if first <= code <= last)
-    voltage = branch.voltage if plan.needs_voltage else None
-    extra = _Extra(signal.above, named, voltage, plan.voltage_gain) if signal.above or named or voltage else None
-    word, half = signal.place.in_word(length), 1 << (plan.shift - 1)
-    return branch, *word, first, last, plan.gain, plan.bias + half, plan.shift, plan.lowest, plan.highest, extra
+    def _passes(
+        self, branches: Sequence[tuple[LiveBranch, PlacedSignal, _Written | None]], length: int, made_length: int
+    ) -> list[_Pass]:
+        """What is done with these branches, per pair of byte orders."""
+        passes: dict[tuple[Order, Order], _Pass] = {}
+        for branch, signal, written in branches:
+            source, plan = signal.place.in_word(length), branch.plan
+            to, place = (signal.place.order, source) if written is None else (written.order, written.word)
+            first, last = (1, 0) if signal.above else branch.ordinary_codes()
+            is_ordinary = first <= last  # else no number lies between them
+            cell = (
+                source.shift,
+                source.ones,
+                first + source.sign,
+                last + source.sign,
+                plan.gain,
+                plan.bias + (1 << (plan.shift - 1)) - source.sign * plan.gain + (place.sign << plan.shift),
+                plan.shift,
+                place.shift,
+                _Unusual(branch, signal, written, self._counters),
+            )
+            found = passes.get((signal.place.order, to)) or _Pass(
+                signal.place.order, to, 0, (1 << _BITS_PER_BYTE * made_length) - 1, 0, []
+            )
+            found.cells.append(cell)
+            if is_ordinary:
+                found = found._replace(
+                    signs=found.signs | source.sign << source.shift,
+                    keep=found.keep & ~(place.ones << place.shift if written is None else written.mask),
+                    good=found.good
+                    | place.sign << place.shift
+                    | (0 if written is None else written.quality_bits[branch.quality]),
+                )
+            passes[found.order, found.to] = found
+        return list(passes.values())

@@ -312,7 +312,7 @@ class JunctionWatch:
         window_s: float,
         margin_a: float,
         full_scale_a: float,
-        is_whole: Callable[[], bool] = lambda: True,
+        is_whole: Callable[[float], bool] = lambda _: True,
     ) -> None:
         self._branches, self.is_whole = branches, is_whole
         self._window_s, self._margin_a = window_s, margin_a
@@ -365,7 +365,7 @@ class JunctionWatch:
             measured_a=sum(pair[0] for pair in currents.values()),
             corrected_a=sum(pair[1] for pair in currents.values()),
         )
-        if not self.is_whole():
+        if not self.is_whole(now_s):
             self._past.clear()
             self._plausibility.forget()
         elif instant_s > self._instant_s:

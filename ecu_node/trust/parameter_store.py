@@ -198,7 +198,7 @@ class ParameterStore:
             self._conclude(number, self._result, now_s)
         elif self._trial is None:
             self._begin(corrector, now_s)
-        elif corrector.watch.is_whole():
+        elif corrector.watch.is_whole(now_s):
             self._result = self._trial.look(now_s)
 
     def _conclude(self, number: int, result: TrialResult, now_s: float) -> None:

@@ -109,7 +109,7 @@ def ended(
     other = replace(parameters, branches={**parameters.branches, "battery": battery})
     accept(two_slots, signers.parameters(other, 7, not_before=now - DAY), "f", database, now)
     running = Running(two_slots, database)
-    monkeypatch.setattr(running.corrector.watch, "is_whole", lambda: True)
+    monkeypatch.setattr(running.corrector.watch, "is_whole", lambda _: True)
     return running
 
 
@@ -213,7 +213,7 @@ def test_a_slow_disk_does_not_hold_the_node_up_at_the_end_of_a_trial(
     monkeypatch.setattr("ecu_node.trust.storage.os.fsync", slow_fsync)
     with ThreadPoolExecutor(1) as background:
         running = Running(two_slots, database, background=background)
-        monkeypatch.setattr(running.corrector.watch, "is_whole", lambda: True)
+        monkeypatch.setattr(running.corrector.watch, "is_whole", lambda _: True)
         for now_s in range(0, 10, 2):
             running.store.look(running.corrector, float(now_s))
         assert writing.wait(20.0)

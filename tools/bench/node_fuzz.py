@@ -211,7 +211,7 @@ def _passed(
         script.begun = True
 
     corrector = wire(database, InForce(parameters=parameters), time.monotonic(), mode=mode)
-    corrector.watch.is_whole = lambda: False  # random currents do not sum to zero
+    corrector.watch.is_whole = lambda _: False  # random currents do not sum to zero
     near, far = SteadyBus(lambda: script, Counters()), SteadyBus(lambda: silent, Counters())
     node = (
         OverlayNode(near, corrector, database, period_s=_FOREVER_S, on_tick=begin)
