@@ -2,8 +2,8 @@
 
     PYTHONPATH=tools tools/with_vcan python -m bench.node_socketcan --frames 20000
 
-Compared are ``ecu-node run --gateway``, a python-can loop that only receives and sends, the plain version with Notifier
-and cantools, and the kernel's own gateway (cangw), which changes nothing. One raw socket sends, another one receives
+Compared are ``ecu-node run --gateway``, a program in C that does the same, a python-can loop that only receives and
+sends, the plain version with Notifier and cantools, and the kernel's own gateway (cangw), which changes nothing. One raw socket sends, another one receives
 and compares each frame, both many frames at a time, so that what is measured is what is between them. Where this runs
 on user-mode-linux a system call costs ten times more than on a bare machine, and all share one processor: the ratios
 count there, not the rates.
@@ -26,6 +26,7 @@ from statistics import median, quantiles
 
 import can
 
+from bench.node_c import compile_gateway
 from bench.node_plain import plain_job
 from bench.node_process import command_line
 from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle
@@ -69,10 +70,12 @@ def rows(frames: int) -> list[Row]:
         plain = [bytes(found) for found in map(plain_job(vehicle, Mode.GATEWAY), vehicle.frames) if found is not None]
         node = command_line(vehicle, "--interface", "socketcan", "--channel", IN, "--gateway", OUT)
         python = [sys.executable, "-m"]
+        in_c = [str(compile_gateway(vehicle, Path(folder))), IN, OUT]
         ways: dict[str, Callable[[], dict[str, float]]] = {
             "cangw": lambda: _kernel(vehicle, same, frames),
             "bare loop": lambda: _process([*python, "bench.node_peer", "bare", IN, OUT], vehicle, same, frames),
             "plain": lambda: _process([*python, "bench.node_peer", "plain", IN, OUT], vehicle, plain, frames),
+            "C": lambda: _process(in_c, vehicle, vehicle.corrected(Mode.GATEWAY), frames),
             "ecu-node": lambda: _process(
                 [*python, "ecu_node", *node], vehicle, vehicle.corrected(Mode.GATEWAY), frames
             ),
@@ -91,7 +94,7 @@ def _rows(name: str, figures: dict[str, float], node: dict[str, float]) -> Itera
     for what, value in figures.items():
         label, _, unit = what.rpartition(", ")
         peer = ratio = None
-        if name != "ecu-node" and label in {"rate", "CPU per 10^6 frames"}:
+        if name != "ecu-node" and label != "memory" and what in node:
             ours = node[what]
             peer = f"as the peer of ecu-node, {ours:.3g} {unit}"
             ratio = value / ours if label == "rate" else ours / value
@@ -192,6 +195,7 @@ class _Line:
             "rate, frames/s": 1.0 / per_frame_s,
             "latency, median, us": 1e6 * median(latencies_s),
             "latency, 99 %, us": 1e6 * quantiles(latencies_s, n=100, method="inclusive")[98],
+            "latency, 99.9 %, us": 1e6 * quantiles(latencies_s, n=1000, method="inclusive")[998],
         }
 
     def _require(self, number: int) -> None:
