@@ -21,6 +21,7 @@ from ecu_node.user_files import UnsuitableFileError, read_user_file, text_digest
 __all__ = [
     "MAX_LAYOUT_BYTES",
     "PROFILES",
+    "AutosarProfile",
     "Branch",
     "Bus",
     "Contactor",
@@ -35,7 +36,11 @@ __all__ = [
     "Name",
     "ProfileP01",
     "ProfileP02",
+    "ProfileP04",
     "ProfileP05",
+    "ProfileP06",
+    "ProfileP07",
+    "ProfileP11",
     "SignalName",
     "StatusMessage",
     "UnmeasuredLoad",
@@ -61,6 +66,7 @@ def split_signal(name: SignalName) -> tuple[str, str]:
 
 
 _DataId = Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)]
+_LongDataId = Annotated[int, msgspec.Meta(ge=0, le=0xFFFFFFFF)]
 _Offset = Annotated[int, msgspec.Meta(ge=0, le=60)]
 
 
@@ -87,15 +93,18 @@ class _Protected(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """Largest step of the counter between two frames that is used: one more than the frames that may be lost."""
 
 
-class ProfileP01(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P01"):
-    """AUTOSAR E2E profile 1: CRC-8 and a counter of 4 bits."""
-
+class _WithHeader(_Protected, frozen=True, kw_only=True):
     data_id: dict[str, _DataId] = {}
     """Data identifier per message; the message's own identifier where not given."""
-    data_id_mode: Literal["both", "alternating", "low", "nibble"] = "both"
-    """Which bytes of the data identifier the CRC covers: profile 1A, 1B, the low one only, 1C."""
     offset: _Offset = 0
     """First byte of the header."""
+
+
+class ProfileP01(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P01"):
+    """AUTOSAR E2E profile 1: CRC-8 and a counter of 4 bits."""
+
+    data_id_mode: Literal["both", "alternating", "low", "nibble"] = "both"
+    """Which bytes of the data identifier the CRC covers: profile 1A, 1B, the low one only, 1C."""
 
 
 class ProfileP02(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P02"):
@@ -107,13 +116,33 @@ class ProfileP02(_Protected, frozen=True, kw_only=True, tag_field="profile", tag
     """Data identifiers per message."""
 
 
-class ProfileP05(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="P05"):
+class ProfileP04(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P04"):
+    """AUTOSAR E2E profile 4: length, a counter of 16 bits, the data identifier and CRC-32."""
+
+    data_id: dict[str, _LongDataId] = {}
+    """Data identifier per message; the message's own identifier where not given."""
+
+
+class ProfileP05(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P05"):
     """AUTOSAR E2E profile 5: CRC-16 and a counter of 8 bits."""
 
-    data_id: dict[str, _DataId] = {}
+
+class ProfileP06(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P06"):
+    """AUTOSAR E2E profile 6: CRC-16, length and a counter of 8 bits."""
+
+
+class ProfileP07(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P07"):
+    """AUTOSAR E2E profile 7: CRC-64, length, a counter of 32 bits and the data identifier."""
+
+    data_id: dict[str, _LongDataId] = {}
     """Data identifier per message; the message's own identifier where not given."""
-    offset: _Offset = 0
-    """First byte of the header."""
+
+
+class ProfileP11(_WithHeader, frozen=True, kw_only=True, tag_field="profile", tag="P11"):
+    """AUTOSAR E2E profile 11: CRC-8 and a counter of 4 bits, as profile 1 on the bus."""
+
+    data_id_mode: Literal["both", "nibble"] = "both"
+    """Which bits of the data identifier the CRC covers: both bytes (11A), or 12 bits, of which 4 are sent (11C)."""
 
 
 class CounterCrc8(_Protected, frozen=True, kw_only=True, tag_field="profile", tag="counter CRC8"):
@@ -133,10 +162,11 @@ class CounterCrc8(_Protected, frozen=True, kw_only=True, tag_field="profile", ta
     """Whether they come before or after the payload."""
 
 
-EndToEnd = ProfileP01 | ProfileP02 | ProfileP05 | CounterCrc8
+AutosarProfile = ProfileP01 | ProfileP02 | ProfileP04 | ProfileP05 | ProfileP06 | ProfileP07 | ProfileP11
+EndToEnd = AutosarProfile | CounterCrc8
 """How some messages are protected."""
 
-PROFILES = ("P01", "P02", "P05", "counter CRC8")
+PROFILES = ("P01", "P02", "P04", "P05", "P06", "P07", "P11", "counter CRC8")
 """Values of ``profile``."""
 
 

@@ -168,12 +168,10 @@ def _bit_positions(signal: Signal) -> list[int]:
 def _protect(data: NDArray[np.uint8], protection: Protection) -> None:
     """Fill counter and CRC in place; the counter of the first frame is 0."""
     payload = bytearray(data.shape[1])
-    protection.before_first(payload)
-    last = payload[protection.counter_byte] >> protection.counter_shift & protection.counter_ones
-    hole, shift = 0xFF & ~(protection.counter_ones << protection.counter_shift), protection.counter_shift
+    last = protection.modulus - 1
     for row in data:
         payload[:] = row.tobytes()
-        payload[protection.counter_byte] = payload[protection.counter_byte] & hole | last << shift
+        protection.counter.put(payload, last)
         protection.advance(payload)
         last = (last + 1) % protection.modulus
         row[:] = np.frombuffer(payload, np.uint8)

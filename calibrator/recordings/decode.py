@@ -370,6 +370,5 @@ def message_is_sound(
     for index, (row, size) in enumerate(zip(data, length.tolist(), strict=True)):
         if size >= protection.least_bytes:
             payload = bytearray(row[:size].tobytes())
-            counter = payload[protection.counter_byte] >> protection.counter_shift & protection.counter_ones
-            sound[index] = counter < protection.modulus and protection.is_sound(payload)
+            sound[index] = protection.counter_of(payload) < protection.modulus and protection.is_sound(payload)
     return sound

@@ -1,30 +1,33 @@
 """End-to-end protection: frames that come in are checked before anything is read from them, outgoing ones get a CRC.
 
-So a frame that came in corrupt can never go out with a valid CRC. AUTOSAR profiles P01, P02 and P05, computed by
-autosar-e2e, and a counter with a CRC-8 (fastcrc), as control units often have.
+So a frame that came in corrupt can never go out with a valid CRC. AUTOSAR profiles P01, P02, P04, P05, P06, P07 and
+P11, computed by autosar-e2e, and a counter with a CRC-8 (fastcrc), as control units often have.
 """
 
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import NamedTuple, TypeVar
 
 from cantools.database.can import Message
-from e2e.p01 import (
-    E2E_P01_DATAID_ALT,
-    E2E_P01_DATAID_BOTH,
-    E2E_P01_DATAID_LOW,
-    E2E_P01_DATAID_NIBBLE,
-    e2e_p01_check,
-    e2e_p01_protect,
-)
-from e2e.p02 import e2e_p02_check, e2e_p02_protect
-from e2e.p05 import e2e_p05_check, e2e_p05_protect
+from e2e import p01, p02, p04, p05, p06, p07, p11
 
-from ecu_node.core.signals import bit_place
+from ecu_node.core.signals import BitPlace, bit_place
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
-from ecu_node.layout import CounterCrc8, E2EWindow, EndToEnd, ProfileP01, ProfileP02, ProfileP05
+from ecu_node.layout import (
+    AutosarProfile,
+    CounterCrc8,
+    E2EWindow,
+    ProfileP01,
+    ProfileP02,
+    ProfileP04,
+    ProfileP05,
+    ProfileP06,
+    ProfileP07,
+    ProfileP11,
+)
 
 __all__ = ["Check", "E2EState", "Protection", "Receiver", "protection_of"]
 
@@ -52,6 +55,7 @@ class E2EState(IntEnum):
     INVALID = 2
 
 
+_T = TypeVar("_T")
 _OK = Check.OK  # looking up members of an enumeration is slow
 
 
@@ -65,7 +69,7 @@ class Protection:
     Attributes
     ----------
     header_mask : int
-        Bits of CRC and counter in the frame read as one little-endian integer.
+        Bits of CRC, counter and all else that the profile writes, in the frame read as one little-endian integer.
     least_bytes : int
         Bytes that a frame must have.
     modulus : int
@@ -74,12 +78,12 @@ class Protection:
         Largest step of the counter from one frame to the next that is used.
     is_sound : callable
         Whether the CRC of a payload is right; the counter is not looked at.
-    counter_byte, counter_shift, counter_ones : int
-        The counter of a payload is ``payload[counter_byte] >> counter_shift & counter_ones``.
+    counter : BitPlace
+        Where the counter stands: within one byte, or in whole bytes, the most significant one first.
     seal : callable
-        Writes the CRC into a payload; its counter stays.
+        Writes CRC, length and data identifier, as the profile has them, into a payload; its counter stays.
     advance : callable
-        Lets the counter of a payload count on, and writes the CRC.
+        The same after the counter of the payload has counted on.
     """
 
     header_mask: int
@@ -87,17 +91,20 @@ class Protection:
     modulus: int
     max_step: int
     is_sound: Callable[[bytearray], bool]
-    counter_byte: int
-    counter_shift: int = 0
-    counter_ones: int
+    counter: BitPlace
     seal: Callable[[bytearray], None]
     advance: Callable[[bytearray], None]
     windows: tuple[E2EWindow, E2EWindow, E2EWindow] = (_NEVER_INVALID, _NEVER_INVALID, _NEVER_INVALID)
     """By :class:`E2EState`: what makes a message in it VALID."""
 
+    def counter_of(self, payload: bytes | bytearray) -> int:
+        """Read the counter of a payload of at least ``least_bytes``."""
+        place = self.counter
+        return int.from_bytes(payload[place.first : place.end]) >> place.shift & place.highest
+
     def before_first(self, payload: bytearray) -> None:
         """Prepare an empty payload so that its counter is 0 after it has first advanced."""
-        payload[self.counter_byte] |= (self.modulus - 1) << self.counter_shift
+        self.counter.put(payload, self.modulus - 1)
 
 
 class Receiver:
@@ -126,11 +133,9 @@ class Receiver:
             protection.least_bytes,
             protection.modulus,
         )
-        self._byte, self._shift, self._ones = (
-            protection.counter_byte,
-            protection.counter_shift,
-            protection.counter_ones,
-        )
+        place = protection.counter
+        self._byte, self._shift, self._ones = place.first, place.shift, place.highest
+        self._counter_of = protection.counter_of if place.end - place.first > 1 else None  # in one byte: read at once
 
     def check(self, payload: bytearray) -> Check:
         """Check one frame and remember its counter.
@@ -147,7 +152,10 @@ class Receiver:
             first intact frame is OK with any counter.
         """
         if self._is_steady and len(payload) >= self._least_bytes:
-            counter = payload[self._byte] >> self._shift & self._ones
+            if self._counter_of is None:
+                counter = payload[self._byte] >> self._shift & self._ones
+            else:
+                counter = self._counter_of(payload)
             if counter == self._expected and self._is_sound(payload):
                 self._expected = counter + 1 if counter + 1 < self._modulus else 0
                 return _OK
@@ -165,7 +173,7 @@ class Receiver:
     def _checked(self, payload: bytearray) -> Check:
         if len(payload) < self._least_bytes or not self._is_sound(payload):
             return Check.CORRUPT
-        counter, modulus = payload[self._byte] >> self._shift & self._ones, self._modulus
+        counter, modulus = self._protection.counter_of(payload), self._modulus
         if counter >= modulus:
             return Check.CORRUPT
         before, self._expected = self._expected, (counter + 1) % modulus
@@ -191,15 +199,34 @@ class Receiver:
         self._is_steady = whole and self.state is E2EState.VALID and max(self._past) <= Check.LOST
 
 
-_DATA_ID_MODES = {
-    "both": E2E_P01_DATAID_BOTH,
-    "alternating": E2E_P01_DATAID_ALT,
-    "low": E2E_P01_DATAID_LOW,
-    "nibble": E2E_P01_DATAID_NIBBLE,
+class _Profile(NamedTuple):
+    """A profile of AUTOSAR, by autosar-e2e, and its header, counted from the offset."""
+
+    check: Callable[..., bool]
+    protect: Callable[..., None]
+    header_bits: int
+    counter_byte: int
+    """The most significant one."""
+    counter_bits: int
+    modulus: int
+
+
+_PROFILES = {
+    ProfileP01: _Profile(p01.e2e_p01_check, p01.e2e_p01_protect, 12, 1, 4, 15),
+    ProfileP02: _Profile(p02.e2e_p02_check, p02.e2e_p02_protect, 12, 1, 4, 16),
+    ProfileP04: _Profile(p04.e2e_p04_check, p04.e2e_p04_protect, 96, 2, 16, 1 << 16),
+    ProfileP05: _Profile(p05.e2e_p05_check, p05.e2e_p05_protect, 24, 2, 8, 1 << 8),
+    ProfileP06: _Profile(p06.e2e_p06_check, p06.e2e_p06_protect, 40, 4, 8, 1 << 8),
+    ProfileP07: _Profile(p07.e2e_p07_check, p07.e2e_p07_protect, 160, 12, 32, 1 << 32),
+    ProfileP11: _Profile(p11.e2e_p11_check, p11.e2e_p11_protect, 12, 1, 4, 15),
 }
-"""``data_id_mode`` of a layout, as autosar-e2e has it."""
-_NIBBLE = 0x0F
-"""Bits of a counter of P01 or P02 in its byte."""
+_DATA_ID_MODES = {
+    "both": p01.E2E_P01_DATAID_BOTH,
+    "alternating": p01.E2E_P01_DATAID_ALT,
+    "low": p01.E2E_P01_DATAID_LOW,
+    "nibble": p01.E2E_P01_DATAID_NIBBLE,
+}
+"""``data_id_mode`` of a layout, as autosar-e2e has it; P11 has two of them, with the same numbers."""
 _LONGEST_CLASSIC, _FD_LENGTHS = 8, (12, 16, 20, 24, 32, 48, 64)
 """Bytes of payloads."""
 
@@ -234,7 +261,7 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
             f"{where} has {message.length} bytes in the DBC; CAN FD pads it, so that its CRC cannot be checked; "
             f"expected {', '.join(map(str, _FD_LENGTHS))}"
         )
-    protection = _by_profile(entry, message, where)
+    protection = _counter_crc8(entry, message, where) if isinstance(entry, CounterCrc8) else _autosar(entry, message)
     if entry.max_delta_counter >= protection.modulus:
         raise LayoutError(
             f"{where}: max_delta_counter is {entry.max_delta_counter}, but the counter has {protection.modulus} codes "
@@ -247,91 +274,52 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
     return replace(protection, windows=(entry.init, entry.valid, entry.invalid))
 
 
-def _by_profile(entry: EndToEnd, message: Message, where: str) -> Protection:
-    match entry:
-        case ProfileP01():
-            return _p01(entry, _data_id(entry.data_id, message))
-        case ProfileP02():
-            return _p02(entry, bytes(entry.data_id_list[message.name]))
-        case ProfileP05():
-            return _p05(entry, _data_id(entry.data_id, message))
-        case _:
-            return _counter_crc8(entry, message, where)
+def _data_id(given: dict[str, int], message: Message, highest: int = 0xFFFF) -> int:
+    return given.get(message.name, message.frame_id & highest)
 
 
-def _data_id(given: dict[str, int], message: Message) -> int:
-    return given.get(message.name, message.frame_id & 0xFFFF)
-
-
-def _p01(entry: ProfileP01, data_id: int) -> Protection:
-    """CRC-8 SAE J1850 in a byte, a counter from 0 to 14 in the low nibble of the next one."""
-    offset, mode = entry.offset, _DATA_ID_MODES[entry.data_id_mode]
-    place, modulus = offset + 1, 15
-
-    if (mode, offset) == (E2E_P01_DATAID_BOTH, 0):  # without keyword arguments, which cost time in every frame
-
-        def is_sound(payload: bytearray) -> bool:
-            return e2e_p01_check(payload, data_id)
-
-        def advance(payload: bytearray) -> None:
-            e2e_p01_protect(payload, data_id)
-
-        def seal(payload: bytearray) -> None:
-            payload[place] += -1 if payload[place] & _NIBBLE else modulus - 1  # it counts on to what it was
-            e2e_p01_protect(payload, data_id)
+def _autosar(entry: AutosarProfile, message: Message) -> Protection:
+    """Protection by a profile of AUTOSAR."""
+    check, protect, header_bits, counter_byte, counter_bits, modulus = _PROFILES[type(entry)]
+    identity: int | bytes
+    if isinstance(entry, ProfileP02):
+        identity, offset = bytes(entry.data_id_list[message.name]), 0
     else:
+        highest = 0xFFFFFFFF if isinstance(entry, ProfileP04 | ProfileP07) else 0xFFFF
+        identity, offset = _data_id(entry.data_id, message, highest), entry.offset
+    options = {"offset": offset}
+    if isinstance(entry, ProfileP01 | ProfileP11):
+        options["data_id_mode"] = _DATA_ID_MODES[entry.data_id_mode]
+        if entry.data_id_mode == "nibble":  # it is sent above the counter
+            header_bits += 4
+    options = {key: value for key, value in options.items() if value}
+    first = offset + counter_byte
+    last, ones = first + (counter_bits - 1) // 8, (1 << min(counter_bits, 8)) - 1
 
-        def is_sound(payload: bytearray) -> bool:
-            return e2e_p01_check(payload, data_id, data_id_mode=mode, offset=offset)
-
-        def advance(payload: bytearray) -> None:
-            e2e_p01_protect(payload, data_id, data_id_mode=mode, offset=offset)
-
-        def seal(payload: bytearray) -> None:
-            e2e_p01_protect(payload, data_id, data_id_mode=mode, offset=offset, increment_counter=False)
+    def seal(payload: bytearray) -> None:
+        if payload[last] & ones and not options:
+            payload[last] -= 1  # then it counts on to what it was: no keyword argument, half the time
+            protect(payload, identity)
+        else:
+            protect(payload, identity, increment_counter=False, **options)
 
     return Protection(
-        header_mask=(0xFFFF if entry.data_id_mode == "nibble" else 0xFFF) << 8 * offset,
-        least_bytes=offset + 2,
+        header_mask=(1 << header_bits) - 1 << 8 * offset,
+        least_bytes=offset + (header_bits + 7) // 8,
         modulus=modulus,
         max_step=entry.max_delta_counter,
-        is_sound=is_sound,
-        counter_byte=place,
-        counter_ones=_NIBBLE,
+        is_sound=_bound(check, identity, options),
+        counter=BitPlace(first=first, end=last + 1, order="big", shift=0, length=counter_bits, signed=False),
         seal=seal,
-        advance=advance,
+        advance=_bound(protect, identity, options),
     )
 
 
-def _p02(entry: ProfileP02, data_id_list: bytes) -> Protection:
-    """CRC-8 0x2F in byte 0, a counter from 0 to 15 in the low nibble of byte 1 that selects the data identifier."""
-    return Protection(
-        header_mask=0xFFF,
-        least_bytes=2,
-        modulus=16,
-        max_step=entry.max_delta_counter,
-        is_sound=lambda payload: e2e_p02_check(payload, data_id_list, length=0),
-        counter_byte=1,
-        counter_ones=_NIBBLE,
-        seal=lambda payload: e2e_p02_protect(payload, data_id_list, increment_counter=False),
-        advance=lambda payload: e2e_p02_protect(payload, data_id_list),
-    )
-
-
-def _p05(entry: ProfileP05, data_id: int) -> Protection:
-    """CRC-16 CCITT in two bytes, low one first, and a counter from 0 to 255 in the next one."""
-    offset = entry.offset
-    return Protection(
-        header_mask=0xFFFFFF << 8 * offset,
-        least_bytes=offset + 3,
-        modulus=256,
-        max_step=entry.max_delta_counter,
-        is_sound=lambda payload: e2e_p05_check(payload, data_id, offset=offset),
-        counter_byte=offset + 2,
-        counter_ones=0xFF,
-        seal=lambda payload: e2e_p05_protect(payload, data_id, offset=offset, increment_counter=False),
-        advance=lambda payload: e2e_p05_protect(payload, data_id, offset=offset),
-    )
+def _bound(function: Callable[..., _T], identity: int | bytes, options: dict[str, int]) -> Callable[[bytearray], _T]:
+    """A function of autosar-e2e for one message; keyword arguments would double the time of every frame."""
+    if not options:
+        return lambda payload: function(payload, identity)
+    return lambda payload: function(payload, identity, **options)
 
 
 def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> Protection:
@@ -377,9 +365,7 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> Protectio
         modulus=modulus,
         max_step=entry.max_delta_counter,
         is_sound=lambda payload: payload[byte] == crc(payload),
-        counter_byte=counter_byte,
-        counter_shift=shift,
-        counter_ones=ones,
+        counter=counter_place,
         seal=seal,
         advance=advance,
     )

@@ -2,16 +2,9 @@
 
 from collections.abc import Callable
 
+import fastcrc
 import pytest
-from e2e.p01 import (
-    E2E_P01_DATAID_ALT,
-    E2E_P01_DATAID_BOTH,
-    E2E_P01_DATAID_LOW,
-    E2E_P01_DATAID_NIBBLE,
-    e2e_p01_check,
-)
-from e2e.p02 import e2e_p02_check
-from e2e.p05 import e2e_p05_check
+from e2e import p01, p02, p04, p05, p06, p07, p11
 
 from ecu_node.core.e2e import Check, E2EState, Protection, Receiver, protection_of
 from ecu_node.database import VehicleDatabase
@@ -19,7 +12,10 @@ from ecu_node.errors import DatabaseError, LayoutError
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT
 
 MakeDatabase = Callable[..., VehicleDatabase]
-ROOM = 'BO_ 700 Room: 16 Node\n SG_ Count : 36|4@1+ (1,0) [0|15] "" Node\n SG_ Sum : 56|8@1+ (1,0) [0|255] "" Node\n'
+SIZE = 24
+ROOM = (
+    f'BO_ 700 Room: {SIZE} Node\n SG_ Count : 36|4@1+ (1,0) [0|15] "" Node\n SG_ Sum : 56|8@1+ (1,0) [0|255] "" Node\n'
+)
 LIST = list(range(100, 116))
 ENTRIES = {
     "P01": 'profile = "P01"\nmessages = ["Room"]\ndata_id = { Room = 0x1234 }',
@@ -28,13 +24,21 @@ ENTRIES = {
     "P01 further on": 'profile = "P01"\nmessages = ["Room"]\noffset = 1',
     "P01 nibble": 'profile = "P01"\nmessages = ["Room"]\ndata_id_mode = "nibble"\noffset = 3',
     "P02": f'profile = "P02"\nmessages = ["Room"]\ndata_id_list = {{ Room = {LIST} }}',
+    "P04": 'profile = "P04"\nmessages = ["Room"]\ndata_id = { Room = 0x0A0B0C0D }',
+    "P04 further on": 'profile = "P04"\nmessages = ["Room"]\noffset = 5',
     "P05": 'profile = "P05"\nmessages = ["Room"]\noffset = 2',
+    "P06": 'profile = "P06"\nmessages = ["Room"]\ndata_id = { Room = 0x1234 }',
+    "P06 further on": 'profile = "P06"\nmessages = ["Room"]\noffset = 3',
+    "P07": 'profile = "P07"\nmessages = ["Room"]\ndata_id = { Room = 0x0A0B0C0D }',
+    "P07 further on": 'profile = "P07"\nmessages = ["Room"]\noffset = 3',
+    "P11": 'profile = "P11"\nmessages = ["Room"]\ndata_id = { Room = 0x123 }',
+    "P11 nibble": 'profile = "P11"\nmessages = ["Room"]\ndata_id_mode = "nibble"\noffset = 4',
     "OEM": 'profile = "counter CRC8"\nmessages = ["Room"]\ncounter = "Count"\ncrc = "Sum"\ndata_id_bytes = 2',
     "OEM after": 'profile = "counter CRC8"\nmessages = ["Room"]\ncounter = "Count"\ncrc = "Sum"\ncounter_modulus = 15\n'
     'algorithm = "autosar"\ndata_id_bytes = 1\ndata_id_at = "after"',
 }
 OEM = ENTRIES["OEM"]
-MODULUS = {"P02": 16, "P05": 256, "OEM": 16}
+MODULUS = {"P02": 16, "P04": 1 << 16, "P05": 256, "P06": 256, "P07": 1 << 32, "OEM": 16}
 HEADERS = {
     "P01": "ff0f",
     "P01 alternating": "ff0f",
@@ -42,11 +46,19 @@ HEADERS = {
     "P01 further on": "00ff0f",
     "P01 nibble": "000000ffff",
     "P02": "ff0f",
+    "P04": "ff" * 12,
+    "P04 further on": "00" * 5 + "ff" * 12,
     "P05": "0000ffffff",
+    "P06": "ff" * 5,
+    "P06 further on": "00" * 3 + "ff" * 5,
+    "P07": "ff" * 20,
+    "P07 further on": "00" * 3 + "ff" * 20,
+    "P11": "ff0f",
+    "P11 nibble": "00000000ffff",
     "OEM": "00000000f00000ff",
     "OEM after": "00000000f00000ff",
 }
-"""The bits that belong to CRC and counter, in the payload."""
+"""The bits that the profile writes, in the payload."""
 
 
 @pytest.fixture(params=list(ENTRIES))
@@ -65,10 +77,10 @@ def protect(make_database: MakeDatabase) -> Callable[[str], Protection]:
     return make
 
 
-def stream(protection: Protection, count: int, size: int = 16) -> list[bytearray]:
+def stream(protection: Protection, count: int, size: int = SIZE, *, first: int = 0) -> list[bytearray]:
+    """Frames in order, the first one with this counter."""
     payload = bytearray(b"\xa5" * size)
-    payload[protection.counter_byte] &= ~(protection.counter_ones << protection.counter_shift) & 0xFF
-    protection.before_first(payload)
+    protection.counter.put(payload, (first - 1) % protection.modulus)
     frames = []
     for _ in range(count):
         protection.advance(payload)
@@ -76,17 +88,14 @@ def stream(protection: Protection, count: int, size: int = 16) -> list[bytearray
     return frames
 
 
-def counter(protection: Protection, frame: bytearray) -> int:
-    return frame[protection.counter_byte] >> protection.counter_shift & protection.counter_ones
-
-
 def test_the_counter_starts_at_0_runs_through_and_every_frame_in_order_is_ok(
     kind: str, protect: Callable[[str], Protection]
 ) -> None:
     protection = protect(ENTRIES[kind])
     frames = stream(protection, 300)
-    modulus = MODULUS.get(kind, 15)
-    assert [counter(protection, frame) for frame in frames] == [k % modulus for k in range(300)]
+    modulus = MODULUS.get(kind.partition(" ")[0] if kind != "OEM after" else kind, 15)
+    assert protection.modulus == modulus
+    assert [protection.counter_of(frame) for frame in frames] == [k % modulus for k in range(300)]
     check = Receiver(protection).check
     assert {check(frame) for frame in frames} == {Check.OK}
 
@@ -94,7 +103,7 @@ def test_the_counter_starts_at_0_runs_through_and_every_frame_in_order_is_ok(
 def test_only_the_header_is_written(kind: str, protect: Callable[[str], Protection]) -> None:
     protection = protect(ENTRIES[kind])
     for frame in stream(protection, 20):
-        changed = int.from_bytes(frame, "little") ^ int.from_bytes(b"\xa5" * 16, "little")
+        changed = int.from_bytes(frame, "little") ^ int.from_bytes(b"\xa5" * SIZE, "little")
         assert changed & ~protection.header_mask == 0
 
 
@@ -105,19 +114,19 @@ def test_the_header_is_crc_and_counter_and_no_bit_more(kind: str, protect: Calla
 def test_sealing_keeps_the_counter(kind: str, protect: Callable[[str], Protection]) -> None:
     protection = protect(ENTRIES[kind])
     for frame in stream(protection, 20):
-        before = counter(protection, frame)
+        before = protection.counter_of(frame)
         frame[-1] ^= 0xFF
         assert not protection.is_sound(frame)
         protection.seal(frame)
         assert protection.is_sound(frame)
-        assert counter(protection, frame) == before
+        assert protection.counter_of(frame) == before
 
 
 def test_any_flipped_bit_is_noticed(kind: str, protect: Callable[[str], Protection]) -> None:
     protection = protect(ENTRIES[kind])
     (frame,) = stream(protection, 1)
-    for bit in range(8 * 16):
-        damaged = bytearray((int.from_bytes(frame, "little") ^ 1 << bit).to_bytes(16, "little"))
+    for bit in range(8 * SIZE):
+        damaged = bytearray((int.from_bytes(frame, "little") ^ 1 << bit).to_bytes(SIZE, "little"))
         assert Receiver(protection).check(damaged) is Check.CORRUPT
 
 
@@ -125,16 +134,84 @@ def test_the_libraries_find_the_frames_sound(protect: Callable[[str], Protection
     def frames(kind: str) -> list[bytearray]:
         return stream(protect(ENTRIES[kind]), 40)
 
-    assert all(e2e_p01_check(frame, 0x1234) for frame in frames("P01"))
+    assert all(p01.e2e_p01_check(frame, 0x1234) for frame in frames("P01"))
     for kind, mode, offset in (
-        ("P01 alternating", E2E_P01_DATAID_ALT, 0),
-        ("P01 low", E2E_P01_DATAID_LOW, 0),
-        ("P01 further on", E2E_P01_DATAID_BOTH, 1),
-        ("P01 nibble", E2E_P01_DATAID_NIBBLE, 3),
+        ("P01 alternating", p01.E2E_P01_DATAID_ALT, 0),
+        ("P01 low", p01.E2E_P01_DATAID_LOW, 0),
+        ("P01 further on", p01.E2E_P01_DATAID_BOTH, 1),
+        ("P01 nibble", p01.E2E_P01_DATAID_NIBBLE, 3),
     ):
-        assert all(e2e_p01_check(frame, 700, data_id_mode=mode, offset=offset) for frame in frames(kind))
-    assert all(e2e_p02_check(frame, bytes(LIST), length=0) for frame in frames("P02"))
-    assert all(e2e_p05_check(frame, 700, offset=2) for frame in frames("P05"))
+        assert all(p01.e2e_p01_check(frame, 700, data_id_mode=mode, offset=offset) for frame in frames(kind))
+    assert all(p02.e2e_p02_check(frame, bytes(LIST), length=0) for frame in frames("P02"))
+    assert all(p04.e2e_p04_check(frame, 0x0A0B0C0D) for frame in frames("P04"))
+    assert all(p05.e2e_p05_check(frame, 700, offset=2) for frame in frames("P05"))
+    assert all(p06.e2e_p06_check(frame, 700, length=SIZE, offset=3) for frame in frames("P06 further on"))
+    assert all(p07.e2e_p07_check(frame, 700, offset=3) for frame in frames("P07 further on"))
+    mode = p11.E2E_P11_DATAID_NIBBLE
+    assert all(p11.e2e_p11_check(frame, 700, data_id_mode=mode, offset=4) for frame in frames("P11 nibble"))
+
+
+@pytest.mark.parametrize(
+    ("entry", "expected"),
+    [
+        (ENTRIES["P04"], "001000000a0b0c0d862b055600000000"),
+        (ENTRIES["P05"].replace("offset = 2", "data_id = { Room = 0x1234 }"), "1cca000000000000"),
+        (ENTRIES["P06"], "b155000800000000"),
+        (ENTRIES["P07"], "1fb2e737fcedbcd900000018000000000a0b0c0d00000000"),
+        (ENTRIES["P11"], "cc00000000000000"),
+        (ENTRIES["P11"] + '\ndata_id_mode = "nibble"', "2a10000000000000"),
+    ],
+)
+def test_first_frame_is_that_of_the_examples_of_autosar(
+    protect: Callable[[str], Protection], entry: str, expected: str
+) -> None:
+    payload = bytearray(len(bytes.fromhex(expected)))
+    protection = protect(entry)
+    protection.before_first(payload)
+    protection.advance(payload)
+    assert payload.hex() == expected
+
+
+def test_wrong_length_or_data_identifier_is_corrupt_though_the_crc_is_right(
+    protect: Callable[[str], Protection],
+) -> None:
+    def is_intact(kind: str, changed: int, crc: Callable[[bytearray], bytes], crc_at: int) -> bool:
+        (frame,) = stream(protect(ENTRIES[kind]), 1)
+        frame[changed] ^= 0x10
+        made = crc(frame)
+        frame[crc_at : crc_at + len(made)] = made
+        return protect(ENTRIES[kind]).is_sound(frame)
+
+    def crc32(frame: bytearray) -> bytes:
+        return fastcrc.crc32.autosar(bytes(frame[:8] + frame[12:])).to_bytes(4)
+
+    def crc16(frame: bytearray) -> bytes:
+        return fastcrc.crc16.ibm_3740(bytes(frame[2:]) + b"\x12\x34").to_bytes(2)
+
+    def crc64(frame: bytearray) -> bytes:
+        return fastcrc.crc64.xz(bytes(frame[8:])).to_bytes(8)
+
+    def crc8_nibble(frame: bytearray) -> bytes:
+        return fastcrc.crc8.gsm_a(bytes([700 & 0xFF, 0]) + bytes(frame[:4] + frame[5:])).to_bytes(1)
+
+    length, counter, identity, content = 1, 3, 7, 20
+    assert [is_intact("P04", byte, crc32, 8) for byte in (length, identity, counter, content)] == [False] * 2 + [
+        True
+    ] * 2
+    assert [is_intact("P06", byte, crc16, 0) for byte in (3, 4, content)] == [False, True, True]
+    assert [is_intact("P07", byte, crc64, 0) for byte in (11, 19, 15, content)] == [False] * 2 + [True] * 2
+    assert [is_intact("P11 nibble", byte, crc8_nibble, 4) for byte in (5, content)] == [False, True]
+
+
+@pytest.mark.parametrize("profile", ["P04", "P07"])
+def test_data_identifier_of_29_bits_is_the_identifier_of_the_message(make_database: MakeDatabase, profile: str) -> None:
+    dbc = SMALL_DBC.replace("BO_ 2147484160 Heater: 4", f"BO_ {0x80000000 | 0x12345678} Heater: 32")
+    layout = f'{SMALL_LAYOUT}\n[e2e]\nprofile = "{profile}"\nmessages = ["Heater"]\noffset = 3\n'
+    database = make_database(layout, dbc)
+    protection = protection_of(database, database.message("Heater"))
+    assert protection is not None
+    (frame,) = stream(protection, 1)
+    assert bytes.fromhex("12345678") in frame
 
 
 def crc8(data: bytes, polynomial: int) -> int:
@@ -182,7 +259,7 @@ def test_a_code_beyond_those_of_the_counter_is_corrupt_though_its_crc_is_right(
 ) -> None:
     protection = protect(ENTRIES["OEM after"])
     (frame,) = stream(protection, 1)
-    frame[protection.counter_byte] |= 15 << protection.counter_shift
+    protection.counter.put(frame, 15)
     protection.seal(frame)
     assert protection.is_sound(frame)
     assert Receiver(protection).check(frame) is Check.CORRUPT
@@ -206,10 +283,22 @@ def test_repeated_frames_gaps_and_jumps(kind: str, protect: Callable[[str], Prot
 def test_gaps_and_jumps_count_on_past_the_last_code(kind: str, protect: Callable[[str], Protection], last: int) -> None:
     protection = protect(ENTRIES[kind] + "\nmax_delta_counter = 3")
     last += protection.modulus
-    frames = stream(protection, last + 9)
+    frames = stream(protection, 9, first=last)
     for step, found in ((0, Check.REPEATED), (1, Check.OK), (3, Check.LOST), (4, Check.JUMPED), (8, Check.JUMPED)):
         check = Receiver(protection).check
-        assert [check(frames[last]), check(frames[last + step])] == [Check.OK, found]
+        assert [check(frames[0]), check(frames[step])] == [Check.OK, found]
+
+
+@pytest.mark.parametrize(
+    ("kind", "counter"), [("P04", 0x0100), ("P04", 0x0101), ("P07", 0x0101), ("P07", 0x010001), ("P07", 0x01000000)]
+)
+def test_every_byte_of_a_long_counter_is_compared_with_the_next_one(
+    protect: Callable[[str], Protection], kind: str, counter: int
+) -> None:
+    protection = protect(ENTRIES[kind])
+    check = Receiver(protection).check
+    assert {check(frame) for frame in stream(protection, 13, first=-12)} == {Check.OK}, "the next counter is 1"
+    assert check(*stream(protection, 1, first=counter)) is Check.JUMPED
 
 
 def damaged(frame: bytearray) -> bytearray:
@@ -279,6 +368,12 @@ def test_a_corrupt_frame_leaves_the_counter_as_it_was(kind: str, protect: Callab
             ENTRIES["P01"].replace("Room", "Net") + "\noffset = 1",
             "message Net has 2 bytes, too few for the header of 3",
         ),
+        (
+            ENTRIES["P04"].replace("Room", "Net"),
+            r"^.*: \[e2e\]: message Net has 2 bytes, too few for the header of 12 bytes$",
+        ),
+        (ENTRIES["P06"] + "\noffset = 20", "message Room has 24 bytes, too few for the header of 25 bytes$"),
+        (ENTRIES["P07"] + "\noffset = 5", "message Room has 24 bytes, too few for the header of 25 bytes$"),
         (OEM.replace('"Count"', '"Alive"'), r"message Room has no signal 'Alive'; it has Count, Sum"),
         (OEM.replace('crc = "Sum"', 'crc = "Count"'), "signal Count must be one whole byte"),
         (OEM + "\ncounter_modulus = 17", "signal Count cannot count from 0 to 16"),
@@ -292,7 +387,10 @@ def test_a_corrupt_frame_leaves_the_counter_as_it_was(kind: str, protect: Callab
         (OEM.replace("data_id_bytes = 2", "data_id = { Room = 5 }"), "data_id 5 does not fit into data_id_bytes = 0"),
         (ENTRIES["P02"].replace("Room = [", "Net = ["), "Net is not in 'messages'"),
         ('profile = "P02"\nmessages = ["Room"]\ndata_id_list = {}', "data_id_list: Room has none"),
-        ('profile = "P99"\nmessages = ["Room"]', "one of P01, P02, P05, counter CRC8 is expected, found 'P99'"),
+        (
+            'profile = "P99"\nmessages = ["Room"]',
+            "one of P01, P02, P04, P05, P06, P07, P11, counter CRC8 is expected, found 'P99'",
+        ),
     ],
 )
 def test_protection_that_cannot_be_is_one_line(make_database: MakeDatabase, entry: str, words: str) -> None:
@@ -323,7 +421,7 @@ def test_signals_that_can_be_no_counter_or_crc_are_refused(
 
 
 def test_a_message_that_can_fd_pads_cannot_be_protected(make_database: MakeDatabase) -> None:
-    dbc = SMALL_DBC.replace("VAL_", ROOM.replace("Room: 16", "Room: 10") + "VAL_", 1)
+    dbc = SMALL_DBC.replace("VAL_", ROOM.replace("Room: 24", "Room: 10") + "VAL_", 1)
     database = make_database(f"{SMALL_LAYOUT}\n[e2e]\n{ENTRIES['P01']}\n", dbc)
     words = "message Room has 10 bytes in the DBC; CAN FD pads it, .* expected 12, 16, 20, 24, 32, 48, 64$"
     with pytest.raises(LayoutError, match=words):
@@ -331,7 +429,7 @@ def test_a_message_that_can_fd_pads_cannot_be_protected(make_database: MakeDatab
 
 
 def test_a_whole_classic_frame_can_be_protected(make_database: MakeDatabase) -> None:
-    dbc = SMALL_DBC.replace("VAL_", ROOM.replace("Room: 16", "Room: 8") + "VAL_", 1)
+    dbc = SMALL_DBC.replace("VAL_", ROOM.replace("Room: 24", "Room: 8") + "VAL_", 1)
     database = make_database(f"{SMALL_LAYOUT}\n[e2e]\n{ENTRIES['P01']}\n", dbc)
     assert protection_of(database, database.message("Room")) is not None
 
@@ -351,8 +449,14 @@ def test_messages_may_be_protected_in_different_ways(make_database: MakeDatabase
 
 
 WRONG = [
-    ('profile = "P99"\nmessages = ["Room"]', ", profile: one of P01, P02, P05, counter CRC8 is expected, found 'P99'"),
-    ('messages = ["Room"]', ", profile: one of P01, P02, P05, counter CRC8 is expected, it is missing"),
+    (
+        'profile = "P99"\nmessages = ["Room"]',
+        ", profile: one of P01, P02, P04, P05, P06, P07, P11, counter CRC8 is expected, found 'P99'",
+    ),
+    (
+        'messages = ["Room"]',
+        ", profile: one of P01, P02, P04, P05, P06, P07, P11, counter CRC8 is expected, it is missing",
+    ),
     ('profile = "P01"', ": 'messages' is missing"),
     ('profile = "P01"\nmessages = []', ", messages: a list of at least 1 entry is expected, found a list of 0"),
     ('profile = "P01"\nmessages = ["Room", "Room"]', ", messages: Room is named twice"),
@@ -368,6 +472,9 @@ WRONG = [
         'profile = "P05"\nmessages = ["Room"]\ncrc = "C"',
         ": unknown key 'crc'; allowed are profile, messages",
     ),
+    ('profile = "P06"\nmessages = ["Room"]\ndata_id = { Room = 65536 }', ", data_id, Room: "),
+    ('profile = "P07"\nmessages = ["Room"]\ndata_id = { Room = 4294967296 }', ", data_id, Room: "),
+    ('profile = "P11"\nmessages = ["Room"]\ndata_id_mode = "low"', ", data_id_mode: "),
     ('profile = "counter CRC8"\nmessages = ["Room"]\ncounter = "C"', ": 'crc' is missing"),
     ('profile = "P01"\nmessages = ["Room"]\nmax_delta_counter = 15', ": message Room: max_delta_counter is 15"),
     (OEM.replace('"Count"', '"Sum"'), ": message Room: signals Sum and Sum overlap"),

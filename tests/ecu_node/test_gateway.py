@@ -234,10 +234,16 @@ def test_a_gateway_sends_nothing_in_its_own_name_but_the_status(database: Vehicl
     assert [key.identifier for key in transmitted(database, Mode.GATEWAY)] == [0x5F0]
 
 
-def test_a_branch_that_overlaps_the_header_is_refused(make_database: MakeDatabase) -> None:
-    layout = SMALL_LAYOUT + '\n[e2e]\nprofile = "P01"\nmessages = ["Pair"]\n'
-    with pytest.raises(LayoutError, match=r"branch battery: Pair\.Battery is written twice, or overlaps"):
-        gateway_for(make_database(layout))
+@pytest.mark.parametrize(
+    ("profile", "offset", "branch"),
+    [("P01", 0, "battery"), ("P04", 0, "battery"), ("P06", 1, "battery"), ("P07", 3, "motor"), ("P11", 2, "motor")],
+)
+def test_a_branch_that_overlaps_the_header_is_refused(
+    make_database: MakeDatabase, profile: str, offset: int, branch: str
+) -> None:
+    layout = f'{SMALL_LAYOUT}\n[e2e]\nprofile = "{profile}"\nmessages = ["Pair"]\noffset = {offset}\n'
+    with pytest.raises(LayoutError, match=rf"branch {branch}: Pair\.{branch.title()} is written twice, or overlaps"):
+        gateway_for(make_database(layout, SMALL_DBC.replace("Pair: 8", "Pair: 24")))
 
 
 def test_a_name_amid_the_values_of_a_branch_is_refused_where_it_is_written_back(make_database: MakeDatabase) -> None:

@@ -1,6 +1,6 @@
-"""A gateway in C that does what the node does with the bench's frames: check, correct, seal; between two SocketCAN buses.
+"""A gateway in C that does with the bench's frames what the node does: check, correct, seal.
 
-The arithmetic is the exported one of ``calibrator export --format c99``; CRC and counter of E2E profile 1 are beside it.
+The arithmetic is that of ``calibrator export --format c99``; CRC and counter of E2E profile 1 are beside it.
 """
 
 import shutil

@@ -138,6 +138,8 @@ class _Sender:
             protection.protect(payload, self._counter)
             if rng.random() < 0.04:
                 payload[rng.randrange(size)] ^= 1 << rng.randrange(8)
+                if rng.random() < 0.5:  # only length, data identifier or counter may tell
+                    protection.write_crc(payload)
         fd = size > 8 or rng.random() < 0.2
         key = message.key
         return FuzzFrame(*key, bytes(payload), fd=fd, bitrate_switch=fd and rng.random() < 0.5, dlc=size)

@@ -243,6 +243,9 @@ class Oracle:
             self._take_voltage(source, codes)
         if found == "usable" or (self._gateway and self._passes_invalid and found == "out of order"):
             self._take_branches(source, codes, len(frame.data))
+            if not self._gateway and source.state.is_invalid:
+                for branch in self._own(source):
+                    branch.spoil()
             return self._rewritten(source, codes, frame, sent) if self._gateway else self._answered(source, sent)
         if self._gateway:
             expected = [frame] if self._passes_invalid or not self._own(source) else []

@@ -31,11 +31,6 @@ _FULL_SCALE_A = 1e-9
 _OFFSET_LIMIT_A = 160.0
 _FOREVER_S = 1e6
 
-_ALWAYS_VALID = "\n".join(
-    f"{state} = {{ window = 1, min_ok = 0, max_error = 1 }}" for state in ("init", "valid", "invalid")
-)
-"""Each frame counts by itself: what a message as a whole is worth has tests of its own."""
-
 
 @dataclass(kw_only=True)
 class FuzzSignal:
@@ -279,9 +274,7 @@ class FuzzVehicle:
                 if quality is not None:
                     lines.append(f'quality = "{message.name}.{quality.name}"')
         lines += [
-            f'[[e2e]]\nmessages = ["{message.name}"]\n{message.protection.toml}\n{_ALWAYS_VALID}'.replace(
-                "%", message.name
-            )
+            f'[[e2e]]\nmessages = ["{message.name}"]\n{message.protection.toml}'.replace("%", message.name)
             for message in (*self.sources, *self.targets)
             if message.protection is not None
         ]
