@@ -3,10 +3,10 @@
     PYTHONPATH=tools tools/with_vcan python -m bench.node_socketcan --frames 20000
 
 Compared are ``ecu-node run --gateway``, a program in C that does the same, a python-can loop that only receives and
-sends, the plain version with Notifier and cantools, and the kernel's own gateway (cangw), which changes nothing. One raw
-socket sends, another one receives and compares each frame, both many frames at a time, so that what is measured is what
-is between them. Where this runs on user-mode-linux a system call costs ten times more than on a bare machine, and all
-share one processor: the ratios count there, not the rates.
+sends, the plain version with Notifier and cantools, and the kernel's own gateway (cangw), which changes nothing. One
+raw socket sends, another one receives and compares each frame, both many frames at a time, so that what is measured is
+what is between them. Where this runs on user-mode-linux a system call costs ten times more than on a bare machine, and
+all share one processor: the ratios count there, not the rates.
 """
 
 import argparse
