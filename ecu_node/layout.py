@@ -163,6 +163,7 @@ class CounterCrc8(_Protected, frozen=True, kw_only=True, tag_field="profile", ta
 
 
 AutosarProfile = ProfileP01 | ProfileP02 | ProfileP04 | ProfileP05 | ProfileP06 | ProfileP07 | ProfileP11
+"""A profile of AUTOSAR for some messages."""
 EndToEnd = AutosarProfile | CounterCrc8
 """How some messages are protected."""
 

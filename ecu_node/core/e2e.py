@@ -135,7 +135,7 @@ class Receiver:
         )
         place = protection.counter
         self._byte, self._shift, self._ones = place.first, place.shift, place.highest
-        self._counter_of = protection.counter_of if place.end - place.first > 1 else None  # in one byte: read at once
+        self._whole_bytes = slice(place.first, place.end) if place.end - place.first > 1 else None
 
     def check(self, payload: bytearray) -> Check:
         """Check one frame and remember its counter.
@@ -152,10 +152,10 @@ class Receiver:
             first intact frame is OK with any counter.
         """
         if self._is_steady and len(payload) >= self._least_bytes:
-            if self._counter_of is None:
+            if self._whole_bytes is None:
                 counter = payload[self._byte] >> self._shift & self._ones
             else:
-                counter = self._counter_of(payload)
+                counter = int.from_bytes(payload[self._whole_bytes])
             if counter == self._expected and self._is_sound(payload):
                 self._expected = counter + 1 if counter + 1 < self._modulus else 0
                 return _OK

@@ -3,15 +3,18 @@ from pathlib import Path
 
 import can
 import cantools
+import msgspec
 import numpy as np
 import pytest
 from e2e.p01 import e2e_p01_check
+from e2e.p07 import e2e_p07_check
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibrator.recordings.canlog import encode_message, write_candump
+from calibrator.recordings.decode import message_is_sound
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.layout import read_layout
+from ecu_node.layout import EndToEnd, ProfileP07, read_layout
 
 BIG_ENDIAN_DBC = """VERSION ""
 NS_ :
@@ -46,6 +49,20 @@ def test_protected_frames_pass_the_check_of_the_library(database: VehicleDatabas
     assert not any(e2e_p01_check(bytearray(row.tobytes()), 273, length=8) for row in series.data)
 
 
+def test_frames_with_a_counter_of_several_bytes_are_written_and_read() -> None:
+    dbc = BIG_ENDIAN_DBC.replace("M: 8", "M: 32")
+    database = big_endian_database(dbc, e2e=ProfileP07(messages=["M"], offset=8))
+    count = 300
+    series = encode_message(database, "M", np.arange(float(count)), {"B": np.arange(float(count))})
+    assert all(e2e_p07_check(row.tobytes(), 100, offset=8) for row in series.data)
+    assert [int.from_bytes(row[20:24].tobytes()) for row in series.data] == list(range(count))
+    length = np.full(count, 32, np.uint8)
+    length[1], length[2] = 27, 31
+    series.data[3, 0] ^= 1
+    sound = message_is_sound(database, database.message("M"), series.data, length)
+    assert np.flatnonzero(~sound).tolist() == [1, 2, 3]
+
+
 def test_missing_values_become_the_code_for_not_available(database: VehicleDatabase) -> None:
     series = encode_message(database, "HV_Motor", np.zeros(1), {"MotorCurrent": np.array([np.nan])})
     decoded = database.message("HV_Motor").decode_simple(series.data[0].tobytes())
@@ -72,9 +89,9 @@ def test_both_byte_orders_agree_with_cantools(a: int, b: int, c: int) -> None:
     assert series.data[0].tobytes() == expected
 
 
-def big_endian_database() -> VehicleDatabase:
-    layout = read_layout(Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml")
-    database = cantools.database.load_string(BIG_ENDIAN_DBC)
+def big_endian_database(dbc: str = BIG_ENDIAN_DBC, **keys: EndToEnd) -> VehicleDatabase:
+    layout = msgspec.structs.replace(read_layout(Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"), **keys)
+    database = cantools.database.load_string(dbc)
     assert isinstance(database, cantools.database.can.Database)
     return VehicleDatabase(layout=layout, databases={"": database}, digest="0" * 64)
 
