@@ -9,7 +9,7 @@ import numpy as np
 
 from calibrator.errors import FleetError
 from calibrator.faults import Faults
-from ecu_node.user_files import write_atomically
+from ecu_node.documents import write_atomically
 
 __all__ = ["TRUTH_FILE", "FleetTruth", "VehicleTruth", "faults_of", "read_truth", "with_fleet_id", "write_truth"]
 

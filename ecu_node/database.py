@@ -10,11 +10,10 @@ import cantools
 from cantools.database.can import Database, Message, Signal
 from cantools.database.conversion import BaseConversion
 
-from ecu_node.core.signals import impossible_values
+from ecu_node.core.signals import AMPERE, VOLT, WATT, impossible_values, unit_factor
+from ecu_node.documents import read_user_file, text_digest
 from ecu_node.errors import DatabaseError, LayoutError
-from ecu_node.layout import Layout, read_layout, split_signal
-from ecu_node.units import AMPERE, VOLT, WATT, unit_factor
-from ecu_node.user_files import UnsuitableFileError, read_user_file, text_digest
+from ecu_node.layout import Layout, joint_digest, read_layout, split_signal
 
 __all__ = ["MAX_DBC_BYTES", "VehicleDatabase", "look_everything_up", "node_database", "read_database"]
 
@@ -38,31 +37,33 @@ class VehicleDatabase:
 
     def channel_of(self, name: str) -> str | None:
         """Channel that a message ``Message`` or ``bus:Message`` comes on; None where the layout names no buses."""
-        bus = self._found(name, "")[0]
+        bus = self._found(name)[0]
         return next((item.channel for item in self.layout.bus if item.name == bus), None)
 
-    def _found(self, name: str, place: str) -> tuple[str, Message]:
+    def _found(self, name: str, place: str = "") -> tuple[str, Message]:
         """Bus and message of this name."""
-        wanted, _, bare = name.rpartition(":")
-        found = []
-        for bus in [wanted] if wanted in self.databases else self.databases:
-            with suppress(KeyError):
-                found.append((bus, self.databases[bus].get_message_by_name(bare)))
-        if len(found) == 1:
-            return found[0]
-        where = f" in {place}" if place else ""
-        if found:
-            raise DatabaseError(
-                f"{self.layout.path}: message {bare!r}{where} is in the DBCs of the buses "
-                f"{' and '.join(bus for bus, _ in found)}; write '{found[0][0]}:{bare}'"
-            )
-        paths = self.layout.dbc_paths
+        layout, paths = self.layout, self.layout.dbc_paths
         if not paths:
+            raise DatabaseError(f"{layout.path}: no 'dbc', so that it fits tables only; give the DBC of the frames")
+        bus, is_of_bus, bare = name.rpartition(":")
+        if is_of_bus and bus not in paths:
+            known = ", ".join(filter(None, paths)) or "none"
+            raise LayoutError(f"{layout.path}: {name}: no [[bus]] is named {bus!r}; known are {known}")
+        where = f" in {place}" if place else ""
+        found = []
+        for one in [bus] if is_of_bus else paths:
+            with suppress(KeyError):
+                found.append((one, self.databases[one].get_message_by_name(bare)))
+        if not found:
+            searched = paths[bus] if is_of_bus else ", ".join(map(str, paths.values()))
+            raise DatabaseError(f"{searched}: no message {bare!r}, which {layout.path} names{where}")
+        if len(found) > 1:
+            buses = [one for one, _ in found]
             raise DatabaseError(
-                f"{self.layout.path}: no 'dbc', so that it fits tables only; give the DBC of the frames"
+                f"{layout.path}: message {bare!r}{where} is in the DBCs of the buses "
+                f"{' and '.join(buses)}; write '{buses[0]}:{bare}'"
             )
-        path = paths.get(wanted) or ", ".join(map(str, paths.values()))
-        raise DatabaseError(f"{path}: no message {bare!r}, which {self.layout.path} names{where}")
+        return found[0]
 
     def signal(self, name: str) -> tuple[Message, Signal]:
         """Return message and signal of ``Message.Signal``, or raise :class:`DatabaseError`.
@@ -74,14 +75,18 @@ class VehicleDatabase:
             column = Signal(name, 0, 64, conversion=BaseConversion.factory(is_float=True), unit=unit)
             return Message(0, name, 8, [column]), column
         message_name, signal_name = split_signal(name)
-        message = self.message(message_name)
-        signals = {signal.name: signal for signal in message.signals}
-        if signal_name not in signals:
-            raise DatabaseError(
-                f"{self.layout.dbc_path}: message {message_name} has no signal {signal_name!r}, which "
-                f"{self.layout.path} names; it has {', '.join(signals)}"
+        if not signal_name:
+            raise LayoutError(
+                f"{self.layout.path}: 'Message.Signal' as in the DBC is expected, found \"{name}\"; see the page "
+                f"'Layout' of the documentation"
             )
-        return message, signals[signal_name]
+        message = self.message(message_name)
+        with suppress(KeyError):
+            return message, message.get_signal_by_name(signal_name)
+        raise DatabaseError(
+            f"{self.layout.dbc_path}: message {message_name} has no signal {signal_name!r}, which "
+            f"{self.layout.path} names; it has {', '.join(signal.name for signal in message.signals)}"
+        )
 
     def current_step_a(self, branch: str) -> float:
         """Step of the signal of a branch [A]; 0 where its current is computed of several, or any number."""
@@ -110,14 +115,13 @@ def read_database(layout: Layout) -> VehicleDatabase:
     DatabaseError
         If the file cannot be read or parsed, or lacks messages or a signal that the layout names.
     LayoutError
-        If the layout names a value of an input that its signal can never have.
+        If the layout names a value of an input that its signal can never have, or what is no ``Message.Signal``.
     """
     loaded = {bus: _load(layout, file) for bus, file in layout.dbc_files.items()}
-    digests = [digest for _, digest in loaded.values()]
     vehicle = VehicleDatabase(
         layout=layout,
         databases={bus: database for bus, (database, _) in loaded.items()},
-        digest=digests[0] if len(digests) == 1 else text_digest("".join(digests).encode()),
+        digest=joint_digest([digest for _, digest in loaded.values()]),
     )
     if loaded:
         for branch in layout.branch:
@@ -166,16 +170,10 @@ def _load(layout: Layout, file: str) -> tuple[Database, str]:
     path = layout.path.parent / file
     try:
         content = read_user_file(path, largest_bytes=MAX_DBC_BYTES)
-        if not content.strip():
-            raise DatabaseError(f"{path}: the DBC is empty, it has no message; copy it again")
-        database = _parsed(path, content)
-        if read_user_file(path, largest_bytes=MAX_DBC_BYTES) != content:
-            raise DatabaseError(f"{path}: the DBC was changed while it was read; try again")
-    except (OSError, UnsuitableFileError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise DatabaseError(
-            f'{path}: cannot read the DBC: {why}; it is named by the line dbc = "{file}" of {layout.path}'
-        ) from None
+        database = _parsed(content, path.suffix.lower()) if content.strip() else Database()
+    except OSError as error:
+        line = f'it is named by the line dbc = "{file}" of {layout.path}'
+        raise DatabaseError(f"{path}: cannot read the DBC: {error.strerror}; {line}") from None
     except (cantools.Error, ValueError, KeyError, TypeError) as error:
         first_line = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise DatabaseError(f"{path}: not a CAN database: {first_line}") from None
@@ -205,36 +203,37 @@ def _complete_multiplexers(message: Message) -> None:
         message.refresh(strict=False)
 
 
-def _parsed(path: Path, content: bytes) -> cantools.database.Database | object:
+_ENCODINGS = {"dbc": "cp1252", "sym": "cp1252", "arxml": "utf-8", "kcd": "utf-8", "cdd": "utf-8"}
+"""Formats by suffix and their encodings, as cantools has them."""
+_EXTENDED = 1 << 31
+_OF_MESSAGE = re.compile(r'(\s*(?:BO_|VAL_|BO_TX_BU_|CM_ (?:BO_|SG_)|SIG_VALTYPE_|BA_ "\w+" (?:BO_|SG_)) )(\d+)')
+
+
+def _parsed(content: bytes, suffix: str) -> object:
     """What cantools makes of a file; two slips that many public DBCs have are put right.
 
     Identifiers of 29 bits that are not marked as extended, and names for values of signals that are not there.
     """
+    kind = suffix.removeprefix(".")
+    text = content.decode(_ENCODINGS.get(kind, "utf-8"), errors="replace")
     try:
-        return cantools.database.load_file(path, strict=False)
+        return cantools.database.load_string(text, kind if kind in _ENCODINGS else None, strict=False)
     except (cantools.Error, ValueError) as error:
-        if path.suffix.lower() != ".dbc" or not re.search("more than 11 bits|unused VAL_", str(error)):
+        if kind != "dbc" or not re.search("more than 11 bits|unused VAL_", str(error)):
             raise
-    signals: dict[str, set[str]] = {}
+    signals: set[tuple[str, str]] = set()
     lines, message = [], ""
-    for line in content.decode("cp1252").splitlines():
+    for line in text.splitlines():
         if found := _OF_MESSAGE.match(line):
             number = int(found[2])
-            message = str(number | _EXTENDED if _STANDARD_BITS < number < _EXTENDED else number)
+            message = str(number | _EXTENDED if 0x7FF < number < _EXTENDED else number)
             line = f"{found[1]}{message}{line[found.end() :]}"  # noqa: PLW2901
         if found := re.match(r"\s*SG_ (\w+)", line):
-            signals.setdefault(message, set()).add(found[1])
+            signals.add((message, found[1]))
         lines.append(line)
-    known = [
-        line
-        for line in lines
-        if not (found := re.match(r"VAL_ (\d+) (\w+)", line)) or found[2] in signals.get(found[1], ())
-    ]
+    names = [(line, re.match(r"VAL_ (\d+) (\w+)", line)) for line in lines]
+    known = [line for line, name in names if name is None or name.groups() in signals]
     return cantools.database.load_string("\n".join(known) + "\n", "dbc", strict=False)
-
-
-_OF_MESSAGE = re.compile(r'(\s*(?:BO_|VAL_|BO_TX_BU_|CM_ (?:BO_|SG_)|SIG_VALTYPE_|BA_ "\w+" (?:BO_|SG_)) )(\d+)')
-_STANDARD_BITS, _EXTENDED = 0x7FF, 1 << 31
 
 
 def look_everything_up(vehicle: VehicleDatabase) -> None:
@@ -252,30 +251,20 @@ def look_everything_up(vehicle: VehicleDatabase) -> None:
                 unit_factor(vehicle.signal(name)[1], unit, where)
         if branch.quality is not None:
             vehicle.signal(branch.quality)
-    for item in layout.input:
-        vehicle.signal(item.signal)
-    _check_values(vehicle)
-    if layout.status is not None:
-        for field in ("state", "reason", "parameter_set", "alive_counter", "sum_measured", "sum_corrected"):
-            signal = getattr(layout.status, field)
-            if signal is not None:
-                vehicle.signal(f"{layout.status.message}.{signal}")
-    for place, entry in layout.protections:
-        for name in entry.messages:
-            vehicle.message(name, place)
-
-
-def _check_values(vehicle: VehicleDatabase) -> None:
-    """Refuse values of inputs that their signals can never have: what waits for them would wait for ever."""
-    layout = vehicle.layout
-    wanted = [("[watch] valid", layout.watch.input, layout.watch.valid)]
+    waited = [("[watch] valid", layout.watch.input, layout.watch.valid)]
     if layout.contactor is not None:
-        wanted.append(("[contactor] open", layout.contactor.input, layout.contactor.open))
-    for key, name, values in wanted:
-        for item in layout.input:
-            _, signal = vehicle.signal(item.signal)
-            if item.name == name and (never := impossible_values(signal, values)):
+        waited.append(("[contactor] open", layout.contactor.input, layout.contactor.open))
+    for item in layout.input:
+        _, signal = vehicle.signal(item.signal)
+        for key, name, values in waited:
+            if name == item.name and (never := impossible_values(signal, values)):  # one would wait for ever
                 raise LayoutError(
                     f"{layout.path}: {key}: {', '.join(f'{value:g}' for value in never)} is no value of {item.signal}, "
                     f"which has {signal.length} bits, scale {signal.scale:g} and offset {signal.offset:g}"
                 )
+    if layout.status is not None:
+        for name in layout.status.signals.values():
+            vehicle.signal(name)
+    for place, entry in layout.protections:
+        for name in entry.messages:
+            vehicle.message(name, place)

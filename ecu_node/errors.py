@@ -3,19 +3,7 @@
 The command line turns every :class:`UserError` into that line and an exit code; nothing else is caught.
 """
 
-from ecu_node.core.status import Reason
-
-__all__ = [
-    "BusError",
-    "DatabaseError",
-    "LayoutError",
-    "ParameterError",
-    "TrustError",
-    "UnfitError",
-    "UserError",
-    "printable",
-    "shown_name",
-]
+__all__ = ["BusError", "DatabaseError", "LayoutError", "ParameterError", "UserError", "printable", "shown_name"]
 
 _LONGEST_NAME = 64
 """Characters of a name that are shown."""
@@ -35,22 +23,6 @@ class DatabaseError(UserError):
 
 class ParameterError(UserError):
     """The parameter file cannot be used (malformed, another vehicle, another DBC, implausible)."""
-
-
-class UnfitError(ParameterError):
-    """Parameters that must not be applied here, with the reason as the node publishes it."""
-
-    def __init__(self, reason: Reason, text: str) -> None:
-        super().__init__(text)
-        self.reason = reason
-
-    def __reduce__(self) -> tuple[type["UnfitError"], tuple[Reason, str]]:
-        """Let it travel between processes."""
-        return type(self), (self.reason, str(self))
-
-
-class TrustError(UnfitError):
-    """Parameters that nobody may vouch for: signature, time, order, or form."""
 
 
 class BusError(UserError):

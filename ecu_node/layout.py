@@ -4,36 +4,25 @@ It names the branches of the junction with their sign, the inputs, where correct
 protected, timeouts and limits. All later steps use the names given here; the DBC's own names appear nowhere else.
 """
 
-import re
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal
 
 import msgspec
 
-from ecu_node.errors import LayoutError
-from ecu_node.fields import field_error, toml_place
-from ecu_node.formula import formula_names, parse_formula
-from ecu_node.units import AMPERE, WATT, usual_unit
-from ecu_node.user_files import UnsuitableFileError, read_user_file, text_digest
+from ecu_node.documents import field_error, read_user_file, text_digest
+from ecu_node.errors import LayoutError, printable
 
 __all__ = [
     "MAX_LAYOUT_BYTES",
-    "PROFILES",
     "AutosarProfile",
     "Branch",
-    "Bus",
-    "Contactor",
     "CounterCrc8",
-    "Derived",
     "E2EWindow",
     "EndToEnd",
     "Input",
     "Layout",
-    "LayoutKeys",
-    "Limits",
-    "Name",
     "ProfileP01",
     "ProfileP02",
     "ProfileP04",
@@ -44,18 +33,23 @@ __all__ = [
     "SignalName",
     "StatusMessage",
     "UnmeasuredLoad",
-    "Watch",
-    "check_layout",
     "file_digest",
+    "joint_digest",
     "layout_of",
     "read_layout",
     "split_signal",
 ]
 
 
-Name = Annotated[str, msgspec.Meta(pattern=r"^[_A-Za-z][_A-Za-z0-9]*\Z")]
+Name = Annotated[str, msgspec.Meta(pattern=r"^[_A-Za-z][_A-Za-z0-9]*\Z", description="a name of letters, digits and _")]
 """A name without blanks."""
-SignalName = Annotated[str, msgspec.Meta(pattern=r"^[^\s\x00-\x1f]([^\x00-\x1f]*[^\s\x00-\x1f])?\Z")]
+SignalName = Annotated[
+    str,
+    msgspec.Meta(
+        pattern=r"^[^\s\x00-\x1f]([^\x00-\x1f]*[^\s\x00-\x1f])?\Z",
+        description="'Message.Signal' as in the DBC, or a column without blanks at its ends,",
+    ),
+]
 """``Message.Signal``, as both are called in the DBC, or ``bus:Message.Signal``; without a DBC a column of a table."""
 
 
@@ -167,14 +161,18 @@ AutosarProfile = ProfileP01 | ProfileP02 | ProfileP04 | ProfileP05 | ProfileP06 
 EndToEnd = AutosarProfile | CounterCrc8
 """How some messages are protected."""
 
-PROFILES = ("P01", "P02", "P04", "P05", "P06", "P07", "P11", "counter CRC8")
-"""Values of ``profile``."""
-
 
 MAX_LAYOUT_BYTES = 1_000_000
 """A layout has some kilobytes; a larger file is not one."""
 
 _Positive = Annotated[float, msgspec.Meta(gt=0.0, le=1e6)]
+_VssName = Annotated[
+    str,
+    msgspec.Meta(
+        pattern=r"^Vehicle(\.[A-Z][A-Za-z0-9]*)+\Z",
+        description="a name of the Vehicle Signal Specification, such as Vehicle.Powertrain.TractionBattery.Power,",
+    ),
+]
 
 
 class Bus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -197,7 +195,8 @@ class Branch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     power: SignalName | None = None
     voltage: SignalName | None = None
     formula: str | None = None
-    """Of inputs and derived inputs, and without a DBC of columns; its value is the current. [A]"""
+    """Of inputs and derived inputs, and without a DBC of columns; its value is the current [A]. The calibrator reads
+    formulas; the node needs none."""
     unit: str | None = None
     """Of the current or power, where DBC or header do not say it or are wrong."""
     uncertainty: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
@@ -208,7 +207,7 @@ class Branch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """In ground truth made from recordings, this branch is minus the sum of the others, (19) of the paper."""
     corrected: SignalName | None = None
     quality: SignalName | None = None
-    vss: str | None = None
+    vss: _VssName | None = None
     """Its name in the COVESA Vehicle Signal Specification, used in telemetry."""
     no_value: list[int] = []
     """Raw codes of the signal that are no values, beyond those that the DBC names."""
@@ -278,6 +277,13 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Counts the status messages; for those without a counter by [e2e]."""
     sum_measured: Name | None = None
     sum_corrected: Name | None = None
+
+    @property
+    def signals(self) -> dict[str, SignalName]:
+        """Those that it has, as ``Message.Signal``, by the keys from ``state`` on."""
+        keys = ("state", "reason", "parameter_set", "alive_counter", "sum_measured", "sum_corrected")
+        names = {key: getattr(self, key) for key in keys}
+        return {key: f"{self.message}.{name}" for key, name in names.items() if name is not None}
 
 
 class Watch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -359,18 +365,17 @@ class LayoutKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     @property
     def offset_limit_a(self) -> float:
         """Largest magnitude of an offset that the node accepts. [A]"""
-        return self.limits.offset_a if self.limits.offset_a is not None else 0.4 * self.full_scale_a
+        return self.limits.offset_a or 0.4 * self.full_scale_a
 
     @property
     def step_offset_a(self) -> float:
         """Largest difference of an offset from the one that is in force. [A]"""
-        given = self.activation.step_offset_a
-        return given if given is not None else 0.2 * self.full_scale_a
+        return self.activation.step_offset_a or 0.2 * self.full_scale_a
 
     @property
     def watch_margin_a(self) -> float:
         """By how much the corrected sum must be worse than the measured one. [A]"""
-        return self.watch.margin_a if self.watch.margin_a is not None else 0.0025 * self.full_scale_a
+        return self.watch.margin_a or 0.0025 * self.full_scale_a
 
     @property
     def protections(self) -> list[tuple[str, EndToEnd]]:
@@ -408,9 +413,8 @@ class Layout(LayoutKeys, frozen=True, kw_only=True):
 
     @property
     def dbc_digest(self) -> str:
-        """SHA-256 of the DBC file, of several of their digests one after the other, without one of nothing."""
-        digests = [file_digest(path) for path in self.dbc_paths.values()]
-        return digests[0] if len(digests) == 1 else text_digest("".join(digests).encode())
+        """Digest of the DBC files, see :func:`joint_digest`."""
+        return joint_digest([file_digest(path) for path in self.dbc_paths.values()])
 
     def find_branch(self, name: str) -> Branch:
         """Return the branch of this name; LayoutError lists the known ones if there is none."""
@@ -438,20 +442,17 @@ def read_layout(path: Path) -> Layout:
     LayoutError
         If the file cannot be read, is not TOML, or a field is missing, unknown or contradictory.
     """
+    see = "see the page 'Layout' of the documentation"
     try:
         content = read_user_file(path, largest_bytes=MAX_LAYOUT_BYTES)
         document = tomllib.loads(content.decode())
-    except (OSError, UnsuitableFileError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise LayoutError(f"{path}: cannot read the layout: {why}; name the layout (TOML) of this vehicle") from None
+    except OSError as error:
+        advice = "name the layout (TOML) of this vehicle"
+        raise LayoutError(f"{path}: cannot read the layout: {error.strerror}; {advice}") from None
     except UnicodeDecodeError:
-        raise LayoutError(
-            f"{path}: not a layout: the file is not UTF-8 text; see the page 'Layout' of the documentation"
-        ) from None
+        raise LayoutError(f"{path}: not a layout: the file is not UTF-8 text; {see}") from None
     except (ValueError, RecursionError) as error:  # not only TOMLDecodeError: numbers and nesting have limits, too
-        raise LayoutError(
-            f"{path}: not TOML: {error}; a layout is expected, see the page 'Layout' of the documentation"
-        ) from None
+        raise LayoutError(f"{path}: not TOML: {error}; a layout is expected, {see}") from None
     return layout_of(document, path, text_digest(content))
 
 
@@ -477,16 +478,27 @@ def layout_of(document: dict[str, Any], path: Path, digest: str | None = None) -
     LayoutError
         If a field is missing, unknown or contradictory.
     """
-    _require_profiles(document, path)
     try:
         keys = msgspec.convert(document, LayoutKeys)
     except msgspec.ValidationError as error:
-        why = field_error(error, document, LayoutKeys, toml_place)
-        raise LayoutError(f"{path}: {why}; see the page 'Layout' of the documentation") from None
-    check_layout(keys, path)
+        steps, what = field_error(error, document, LayoutKeys)
+        where = f"{path}: {printable(_toml_place(document, steps))}" if steps else f"{path}"
+        raise LayoutError(f"{where}: {what}; see the page 'Layout' of the documentation") from None
+    for contradiction in _contradictions(keys):
+        raise LayoutError(f"{path}: {contradiction}")
     return Layout(
         **msgspec.structs.asdict(keys), path=path, digest=digest or text_digest(msgspec.json.encode(document))
     )
+
+
+def _toml_place(document: dict[str, Any], steps: list[str]) -> str:
+    """Table and key as they stand in the file: ``[[branch]] 'heater', timeout_s``."""
+    first, *others = steps
+    if isinstance(document[first], dict):
+        first = f"[{first}]"
+    elif isinstance(document[first], list) and others:
+        first = f"[[{first}]] {others.pop(0)}"
+    return ", ".join([first, *others])
 
 
 def file_digest(path: Path) -> str:
@@ -494,178 +506,92 @@ def file_digest(path: Path) -> str:
     return text_digest(path.read_bytes())
 
 
-def _require_profiles(document: dict[str, Any], path: Path) -> None:
-    """Refuse an unknown profile: what else an entry may say depends on it."""
-    found = document.get("e2e", [])
-    places = [("e2e", number) for number in range(len(found))] if isinstance(found, list) else [("e2e",)]
-    for steps, entry in zip(places, found if isinstance(found, list) else [found], strict=True):
-        if isinstance(entry, dict) and entry.get("profile") not in PROFILES:
-            what = f"found {entry['profile']!r}" if "profile" in entry else "it is missing"
-            raise LayoutError(
-                f"{path}: {toml_place(document, steps)}, profile: one of {', '.join(PROFILES)} is expected, {what}; "
-                f"see the page 'Layout' of the documentation"
-            )
+def joint_digest(digests: Sequence[str]) -> str:
+    """One digest for several files, or for none: that of their digests one after the other; of one file its own."""
+    return digests[0] if len(digests) == 1 else text_digest("".join(digests).encode())
 
 
-def check_layout(layout: "LayoutKeys", path: Path) -> None:
-    """Check a layout as a whole.
-
-    Parameters
-    ----------
-    layout : LayoutKeys
-        Each of its keys is right by itself.
-    path : Path
-        Where it was read from.
-
-    Raises
-    ------
-    LayoutError
-        If two keys contradict each other, or one names what the layout does not have.
-    """
-
-    def refuse(text: str) -> NoReturn:
-        raise LayoutError(f"{path}: {text}")
-
-    names = [*layout.branch_names, *(item.name for item in layout.input), *(item.name for item in layout.derived)]
-    twice = _repeated(names)
-    if twice:
-        refuse(f"{', '.join(twice)} is named twice; branches, inputs and derived inputs need different names")
+def _contradictions(layout: LayoutKeys) -> Iterator[str]:
+    """Keys that are right by themselves, but contradict each other or name what the layout does not have."""
+    inputs = [item.name for item in layout.input]
+    if twice := _repeated([*layout.branch_names, *inputs, *(item.name for item in layout.derived)]):
+        yield f"{twice} is named twice; branches, inputs and derived inputs need different names"
     for branch in layout.branch:
-        _check_branch(branch, refuse)
+        yield from (f"branch {branch.name}: {text}" for text in _contradictions_of_branch(branch))
     if sum(branch.balance for branch in layout.branch) > 1:
-        refuse("more than one branch has 'balance = true'; at most one can take what the others leave")
-    _check_buses(layout, refuse)
-    _check_signals(layout, refuse)
-    _check_inputs(layout, refuse)
-    _check_protection(layout, refuse)
+        yield "more than one branch has 'balance = true'; at most one can take what the others leave"
+    if name := _repeated([branch.source for branch in layout.branch]):
+        sharing = " and ".join(branch.name for branch in layout.branch if branch.source == name)
+        yield f"branches {sharing}: both read {name}; each branch needs a signal of its own"
+    if name := _repeated([branch.vss for branch in layout.branch if branch.vss is not None]):
+        yield f"vss {name!r} stands at two branches; each needs a name of its own"
+    yield from _contradictions_of_outputs(layout)
+    yield from _contradictions_of_buses(layout)
+    yield from _contradictions_of_protection(layout)
+    if (layout.watch.input is None) != (not layout.watch.valid):
+        yield "[watch]: give both 'input' and 'valid', or neither"
+    known = [*inputs, *(item.name for item in layout.derived)]
+    for key, names, allowed in (
+        ("[contactor] input", [layout.contactor.input] if layout.contactor is not None else [], inputs),
+        ("temperature", [layout.temperature], inputs),
+        ("[watch] input", [layout.watch.input], inputs),
+        ("model_inputs", layout.model_inputs, known),
+        ("fleet_inputs", layout.fleet_inputs, known),
+    ):
+        if unknown := [repr(name) for name in names if name is not None and name not in allowed]:
+            yield f"{key}: {', '.join(unknown)} is no [[input]]; declare the signal as one, or leave the name out"
 
 
-def _check_protection(layout: "LayoutKeys", refuse: Callable[[str], NoReturn]) -> None:
+def _repeated(names: Sequence[str]) -> str:
+    """The first name that stands there twice; empty if there is none."""
+    return next((name for name in names if names.count(name) > 1), "")
+
+
+def _contradictions_of_branch(branch: Branch) -> Iterator[str]:
+    ways = (branch.signal, branch.power, branch.formula)
+    if sum(way is not None for way in ways) != 1 or (branch.power is None) != (branch.voltage is None):
+        yield "give either 'signal' (a current), 'power' and 'voltage', or 'formula'"
+    if branch.formula is not None and (branch.corrected is not None or branch.unit is not None):
+        yield "'formula' gives A and is not written; leave out 'corrected' and 'unit'"
+    if branch.formula is None and branch.uncertainty:
+        yield "'uncertainty' is that of a 'formula'; a sensor's is what is estimated"
+    if branch.quality is not None:
+        if branch.corrected is None:
+            yield "'quality' without 'corrected'"
+        elif split_signal(branch.quality)[0] != split_signal(branch.corrected)[0]:
+            yield "'quality' and 'corrected' must be signals of one message"
+
+
+def _contradictions_of_outputs(layout: LayoutKeys) -> Iterator[str]:
+    outputs = [name for branch in layout.branch for name in (branch.corrected, branch.quality) if name is not None]
+    if name := _repeated(outputs):
+        yield f"{name} is written twice; each 'corrected' and 'quality' needs a signal of its own"
+    read = {name for branch in layout.branch for name in (branch.signal, branch.power, branch.voltage)}
+    read |= {item.signal for item in layout.input}
+    if both := [name for name in outputs if name in read]:
+        yield f"{both[0]} is both read and written; give the output a signal of its own"
+
+
+def _contradictions_of_buses(layout: LayoutKeys) -> Iterator[str]:
+    if layout.dbc is not None and layout.bus:
+        yield "give either 'dbc', or [[bus]] with a 'dbc' each"
+    for what in ("name", "channel"):
+        if twice := _repeated([getattr(bus, what) for bus in layout.bus]):
+            yield f"[[bus]] {what}: {twice} stands there twice; each bus needs one of its own"
+
+
+def _contradictions_of_protection(layout: LayoutKeys) -> Iterator[str]:
     places: dict[str, str] = {}
     for place, entry in layout.protections:
         for name in entry.messages:
             if name in places:
                 how = "is named twice" if places[name] == place else f"stands in {places[name]} too"
-                refuse(f"{place}, messages: {name} {how}; a message has one protection")
+                yield f"{place}, messages: {name} {how}; a message has one protection"
             places[name] = place
-        given = entry.data_id_list if isinstance(entry, ProfileP02) else entry.data_id
-        key = "data_id_list" if isinstance(entry, ProfileP02) else "data_id"
-        if unknown := [name for name in given if name not in entry.messages]:
-            refuse(f"{place}, {key}: {', '.join(unknown)} is not in 'messages'; add it there, or leave its {key} out")
-        if isinstance(entry, ProfileP02) and (missing := [name for name in entry.messages if name not in given]):
-            refuse(f"{place}, {key}: {', '.join(missing)} has none; profile P02 needs 16 numbers per message")
-
-
-def _check_buses(layout: "LayoutKeys", refuse: Callable[[str], NoReturn]) -> None:
-    """Refuse names of signals that the databases of the layout, or their absence, do not allow."""
-    if layout.dbc is not None and layout.bus:
-        refuse("give either 'dbc', or [[bus]] with a 'dbc' each")
-    for what in ("name", "channel"):
-        if twice := _repeated([getattr(bus, what) for bus in layout.bus]):
-            refuse(f"[[bus]] {what}: {', '.join(twice)} stands there twice; each bus needs one of its own")
-    if not layout.dbc_files:
-        outputs = [f"branch {item.name}: 'corrected'" for item in layout.branch if item.corrected is not None]
-        outputs += ["[e2e]"] if layout.protections else []
-        outputs += ["[status]"] if layout.status is not None else []
-        if outputs:
-            refuse(f"{outputs[0]} names messages, but the layout has no 'dbc'; give it, or leave this out")
-        return
-    known = {bus.name for bus in layout.bus}
-    items: list[Branch | Input] = [*layout.branch, *layout.input]
-    for item in items:
-        for key in ("signal", "power", "voltage", "corrected", "quality"):
-            name = getattr(item, key, None)
-            if name is None:
-                continue
-            bus, has_bus, bare = name.rpartition(":")
-            place = f"[[{'branch' if item in layout.branch else 'input'}]] {item.name!r}, {key}"
-            if re.fullmatch(r"[^.\s]+\.[^.\s]+", bare) is None:
-                refuse(
-                    f"{place}: 'Message.Signal' as in the DBC is expected, found \"{name}\"; see the page "
-                    "'Layout' of the documentation"
-                )
-            if has_bus and bus not in known:
-                refuse(f"{place}: no [[bus]] is named {bus!r}; known are {', '.join(sorted(known)) or 'none'}")
-
-
-def _repeated(names: Sequence[str]) -> list[str]:
-    return sorted({name for name in names if names.count(name) > 1})
-
-
-def _check_signals(layout: "LayoutKeys", refuse: Callable[[str], NoReturn]) -> None:
-    """Refuse one signal for two branches, for two outputs, or for both reading and writing."""
-    for name in _repeated([branch.source for branch in layout.branch]):
-        sharing = " and ".join(branch.name for branch in layout.branch if branch.source == name)
-        refuse(f"branches {sharing}: both read {name}; each branch needs a signal of its own")
-    for name in _repeated([branch.vss for branch in layout.branch if branch.vss is not None]):
-        refuse(f"vss {name!r} stands at two branches; each needs a name of its own")
-    outputs = [name for branch in layout.branch for name in (branch.corrected, branch.quality) if name is not None]
-    for name in _repeated(outputs):
-        writing = " and ".join(branch.name for branch in layout.branch if name in (branch.corrected, branch.quality))
-        refuse(f"branch {writing}: {name} is written twice; each 'corrected' and 'quality' needs a signal of its own")
-    read = {name for branch in layout.branch for name in (branch.signal, branch.power, branch.voltage)}
-    read |= {item.signal for item in layout.input}
-    for branch in layout.branch:
-        for output in (branch.corrected, branch.quality):
-            if output is not None and output in read:
-                refuse(f"branch {branch.name}: {output} is both read and written; give the output a signal of its own")
-
-
-def _check_inputs(layout: "LayoutKeys", refuse: Callable[[str], NoReturn]) -> None:
-    known = {item.name for item in layout.input}
-    for item in layout.derived:
-        if unknown := _unknown_names(item.formula, known, f"derived input {item.name}", refuse):
-            refuse(f"derived input {item.name}: {', '.join(unknown)} is no input or derived input declared above it")
-        known.add(item.name)
-    for branch in layout.branch:
-        if branch.formula is None:
-            continue
-        unknown = _unknown_names(branch.formula, known, f"branch {branch.name}", refuse)
-        if unknown and layout.dbc_files:
-            refuse(
-                f"branch {branch.name}: {', '.join(unknown)} is no [[input]] or [[derived]]; declare the signal as one"
-            )
-    if layout.contactor is not None and layout.contactor.input not in {item.name for item in layout.input}:
-        refuse(f"[contactor] input: {layout.contactor.input!r} is no [[input]]; declare the signal as one")
-    if layout.temperature is not None and layout.temperature not in {item.name for item in layout.input}:
-        refuse(f"temperature: {layout.temperature!r} is no [[input]]; declare the signal as one, or leave the key out")
-    watch = layout.watch
-    if watch.input is not None and watch.input not in {item.name for item in layout.input}:
-        refuse(f"[watch] input: {watch.input!r} is no [[input]]; declare the signal as one")
-    if (watch.input is None) != (not watch.valid):
-        refuse("[watch]: give both 'input' and 'valid', or neither")
-    for key, names in (("model_inputs", layout.model_inputs), ("fleet_inputs", layout.fleet_inputs)):
-        unknown = [name for name in names if name not in known]
-        if unknown:
-            refuse(f"{key}: {', '.join(unknown)} is no [[input]] or [[derived]]")
-
-
-def _unknown_names(formula: str, known: set[str], where: str, refuse: Callable[[str], NoReturn]) -> list[str]:
-    """Names in a formula that are not known."""
-    try:
-        names = formula_names(parse_formula(formula))
-    except LayoutError as error:
-        refuse(f"{where}: {error}")
-    return [name for name in names if name not in known]
-
-
-def _check_branch(branch: "Branch", refuse: Callable[[str], NoReturn]) -> None:
-    ways = (branch.signal, branch.power, branch.formula)
-    if sum(way is not None for way in ways) != 1 or (branch.power is None) != (branch.voltage is None):
-        refuse(f"branch {branch.name}: give either 'signal' (a current), 'power' and 'voltage', or 'formula'")
-    if branch.formula is not None and (branch.corrected is not None or branch.unit is not None):
-        refuse(f"branch {branch.name}: 'formula' gives A and is not written; leave out 'corrected' and 'unit'")
-    if branch.formula is None and branch.uncertainty:
-        refuse(f"branch {branch.name}: 'uncertainty' is that of a 'formula'; a sensor's is what is estimated")
-    known = {*AMPERE} if branch.signal is not None else {*WATT}
-    if branch.unit is not None and usual_unit(branch.unit) not in known:
-        refuse(f"branch {branch.name}: unit {branch.unit!r} is unknown; expected {', '.join(sorted(known))}")
-    if branch.vss is not None and re.fullmatch(r"Vehicle(\.[A-Z][A-Za-z0-9]*)+", branch.vss) is None:
-        refuse(
-            f"branch {branch.name}: vss {branch.vss!r}: expected a name of the Vehicle Signal Specification, such as "
-            "'Vehicle.Powertrain.TractionBattery.CurrentCurrent'"
+        given, key = (
+            (entry.data_id_list, "data_id_list") if isinstance(entry, ProfileP02) else (entry.data_id, "data_id")
         )
-    if branch.quality is not None and branch.corrected is None:
-        refuse(f"branch {branch.name}: 'quality' without 'corrected'")
-    if branch.quality and branch.corrected and split_signal(branch.quality)[0] != split_signal(branch.corrected)[0]:
-        refuse(f"branch {branch.name}: 'quality' and 'corrected' must be signals of one message")
+        if unknown := [name for name in given if name not in entry.messages]:
+            yield f"{place}, {key}: {', '.join(unknown)} is not in 'messages'; add it there, or leave its {key} out"
+        if isinstance(entry, ProfileP02) and (missing := [name for name in entry.messages if name not in given]):
+            yield f"{place}, {key}: {', '.join(missing)} has none; profile P02 needs 16 numbers per message"

@@ -34,12 +34,11 @@ from ecu_node.core.branch import REMEMBERED_FRAMES, Auxiliary, Frames, LiveBranc
 from ecu_node.core.e2e import Check, Receiver, protection_of
 from ecu_node.core.frames import FrameKey
 from ecu_node.core.junction import simultaneous_currents
-from ecu_node.core.signals import Codes, PlacedSignal, bit_place, placed_signal, read_codes
+from ecu_node.core.signals import AMPERE, Codes, PlacedSignal, bit_place, placed_signal, read_codes
 from ecu_node.core.status import Counters, Quality, Reason, State
 from ecu_node.database import VehicleDatabase, node_database
 from ecu_node.layout import Branch, SignalName, StatusMessage
 from ecu_node.program import say_error, wrapped, write_output, write_text
-from ecu_node.units import AMPERE
 
 __all__ = [
     "BranchView",

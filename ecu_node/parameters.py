@@ -6,17 +6,24 @@ made from them, which stands in ``ecu_node/parameters.schema.json``. Currents ar
 """
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+from msgspec import Meta, Struct
 
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Reason, UnfitError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import ParameterError, UnfitError, printable, shown_name
-from ecu_node.fields import field_error, json_error, quoted_place, repeated_key
-from ecu_node.layout import Layout
-from ecu_node.user_files import UnsuitableFileError, read_user_file, write_atomically
+from ecu_node.documents import (
+    UnsuitableFileError,
+    field_error,
+    json_error,
+    read_user_file,
+    repeated_key,
+    write_atomically,
+)
+from ecu_node.errors import ParameterError, printable, shown_name
 
 __all__ = [
     "BranchParameters",
@@ -42,177 +49,127 @@ __all__ = [
 MAX_FILE_BYTES = 1_000_000
 """A parameter file has some kilobytes; a larger one is not one."""
 
-_LARGEST_NUMBER = (1 << 53) - 1
-"""Beyond it readers of JSON differ."""
-_SIGNED = "this file is signed"
-_SIGNED_ADVICE = "use 'ecu-node activate' and --state, or name the file that was signed"
-
 Verdict = Literal["no sensor fault", "corrected", "cannot tell", "not enough data"]
 """What was found of the sensors of one vehicle."""
-
-_NO_MODELS = "sensors that are not linear are not corrected any more"
 
 HeldBack = Literal["beyond the limits", "does not fit", "reference in doubt", "moved too little", "harm limit"]
 """Why a branch in which a fault was found is passed through; "does not fit": no gain error and offset explain it."""
 
-_Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$", description="SHA-256, line ends counted as LF")]
-_Text64 = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
-_Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
-_NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
-_MeanSum = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # no vehicle has such currents, and squares are still finite
-_RmsSum = Annotated[float, msgspec.Meta(ge=0.0, le=1e6)]
+_Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", description="SHA-256: 64 digits 0-9 and a-f")]
+_Text64 = Annotated[str, Meta(min_length=1, max_length=64)]
+_Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+_NotNegative = Annotated[float, Meta(ge=0.0)]
+_MeanSum = Annotated[float, Meta(ge=-1e6, le=1e6)]  # no vehicle has such currents, and squares are still finite
+_RmsSum = Annotated[float, Meta(ge=0.0, le=1e6)]
+_Number = Annotated[int, Meta(ge=1, le=(1 << 53) - 1)]  # beyond it readers of JSON differ
 
 
-class BranchParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class BranchParameters(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Sensor fault of one branch: measured = (1 + drift) * true + offset, (13) of the paper."""
 
-    drift: Annotated[float, msgspec.Meta(gt=-1.0, lt=1.0, description="relative gain error of the sensor [1]")]
-    offset_a: Annotated[float, msgspec.Meta(description="offset of the sensor, positive into the junction [A]")]
-    drift_sd: Annotated[_NotNegative | None, msgspec.Meta(description="standard deviation of the drift [1]")] = None
-    offset_sd_a: Annotated[_NotNegative | None, msgspec.Meta(description="standard deviation of the offset [A]")] = None
-    apply: Annotated[bool, msgspec.Meta(description="false: the node passes this branch through")]
-    held_back: Annotated[
-        HeldBack | None, msgspec.Meta(description="why a fault that was found is not applied; null: none, or it is")
-    ] = None
-    sensor_model: Annotated[
-        msgspec.UnsetType | None,
-        msgspec.Meta(description="always null; only files of version 1.0 have it"),
-    ] = msgspec.UNSET
-    delay_s: Annotated[
-        float | None, msgspec.Meta(description="how much later than the largest branch it is seen [s]; null: unknown")
-    ] = None
-    delay_sd_s: Annotated[_NotNegative | None, msgspec.Meta(description="standard deviation of the delay [s]")] = None
-    fault_probability: Annotated[
-        _Share | None, msgspec.Meta(description="probability that this sensor is faulty; null if the method gives none")
-    ] = None
-    harm_probability: Annotated[
-        _Share | None, msgspec.Meta(description="probability that correcting with these values makes it worse")
-    ] = None
-    identifiable: Annotated[
-        bool, msgspec.Meta(description="false: the branch moved too little for its gain to be told")
-    ] = True
+    drift: Annotated[float, Meta(gt=-1.0, lt=1.0, description="relative gain error of the sensor [1]")]
+    offset_a: Annotated[float, Meta(description="offset of the sensor, positive into the junction [A]")]
+    drift_sd: Annotated[_NotNegative | None, Meta(description="standard deviation of the drift [1]")] = None
+    offset_sd_a: Annotated[_NotNegative | None, Meta(description="standard deviation of the offset [A]")] = None
+    apply: Annotated[bool, Meta(description="false: the node passes this branch through")]
+    held_back: Annotated[HeldBack | None, Meta(description="why a fault that was found is not applied")] = None
+    sensor_model: Annotated[msgspec.UnsetType | None, Meta(description="always null; of version 1.0")] = msgspec.UNSET
+    delay_s: Annotated[float | None, Meta(description="how much later than the largest branch it is seen [s]")] = None
+    delay_sd_s: Annotated[_NotNegative | None, Meta(description="standard deviation of the delay [s]")] = None
+    fault_probability: Annotated[_Share | None, Meta(description="probability that this sensor is faulty")] = None
+    harm_probability: Annotated[_Share | None, Meta(description="probability that these values make it worse")] = None
+    identifiable: Annotated[bool, Meta(description="false: the branch moved too little for its gain to be told")] = True
 
 
-class HardwareFault(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class HardwareFault(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Whether the vehicle itself differs from its fleet, (11) of the paper. Never corrected, only reported."""
 
     suspected: bool
-    drift: Annotated[float, msgspec.Meta(description="common relative change of all currents [1]")] = 0.0
-    offset_a: Annotated[
-        dict[str, float], msgspec.Meta(description="change of each branch current; the sum is 0 [A]")
-    ] = {}
-    probability: Annotated[_Share | None, msgspec.Meta(description="null if the method gives none")] = None
+    drift: Annotated[float, Meta(description="common relative change of all currents [1]")] = 0.0
+    offset_a: Annotated[dict[str, float], Meta(description="change of each branch current; the sum is 0 [A]")] = {}
+    probability: Annotated[_Share | None, Meta(description="null if the method gives none")] = None
 
 
-class Explanation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Explanation(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One way to explain a vehicle's recordings; several are given where the calibrator cannot tell."""
 
     probability: _Share
-    drift: Annotated[dict[str, float], msgspec.Meta(description="of the sensors that it holds for faulty [1]")] = {}
-    offset_a: Annotated[dict[str, float], msgspec.Meta(description="of the same [A]")] = {}
-    hardware_drift: Annotated[float, msgspec.Meta(description="[1]")] = 0.0
-    hardware_offset_a: Annotated[dict[str, float], msgspec.Meta(description="[A]")] = {}
+    drift: Annotated[dict[str, float], Meta(description="of the sensors that it holds for faulty [1]")] = {}
+    offset_a: Annotated[dict[str, float], Meta(description="of the same [A]")] = {}
+    hardware_drift: Annotated[float, Meta(description="[1]")] = 0.0
+    hardware_offset_a: Annotated[dict[str, float], Meta(description="[A]")] = {}
 
 
-class Finding(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Finding(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a check found in the recordings that no gain error and offset explain; the node ignores it."""
 
-    branch: Annotated[
-        _Text64 | None, msgspec.Meta(description="whose sensor it is about; null: the vehicle as a whole")
-    ] = None
-    cause: Annotated[_Text64, msgspec.Meta(description="what it looks like, such as 'inverted' or 'clipped'")]
-    probability: Annotated[_Share, msgspec.Meta(description="probability of this cause")]
-    text: Annotated[str, msgspec.Meta(min_length=1, max_length=500, description="the same in a sentence")]
+    branch: Annotated[_Text64 | None, Meta(description="whose sensor it is about; null: the vehicle as a whole")] = None
+    cause: Annotated[_Text64, Meta(description="what it looks like, such as 'inverted' or 'clipped'")]
+    probability: Annotated[_Share, Meta(description="probability of this cause")]
+    text: Annotated[str, Meta(min_length=1, max_length=500, description="the same in a sentence")]
 
 
-class JunctionResidual(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Kirchhoff sum on the drives used."""
+class JunctionResidual(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Kirchhoff sum on the drives used.
 
-    measured_a: Annotated[_RmsSum, msgspec.Meta(description="root mean square, from measured currents [A]")]
-    corrected_a: Annotated[_RmsSum, msgspec.Meta(description="the same from corrected currents [A]")]
-    correction_a: Annotated[
-        _RmsSum | None, msgspec.Meta(description="the same of the difference of the two; null: not known [A]")
-    ] = None
-    measured_mean_a: Annotated[
-        _MeanSum | None, msgspec.Meta(description="mean, from measured currents; null: not known [A]")
-    ] = None
-    corrected_mean_a: Annotated[
-        _MeanSum | None, msgspec.Meta(description="the same from corrected currents; null: not known [A]")
-    ] = None
-    expected_a: Annotated[
-        _MeanSum, msgspec.Meta(description="mean sum that right sensors show: a load that none of them sees [A]")
-    ] = 0.0
-    corrected_sd_a: Annotated[
-        _RmsSum | None,
-        msgspec.Meta(
-            description="standard deviation about expected_a of single corrected sums, as the node takes them, while "
-            "no current flows; null: not known [A]"
-        ),
-    ] = None
-    corrected_sd_per_a: Annotated[
-        _Share | None,
-        msgspec.Meta(
-            description="how much of it grows with the throughput, half the sum of the magnitudes of all currents: "
-            "sd^2 = corrected_sd_a^2 + (corrected_sd_per_a * throughput)^2; null: not known [1]"
-        ),
-    ] = None
+    Single corrected sums, as the node takes them, have about expected_a the variance corrected_sd_a^2 +
+    (corrected_sd_per_a * throughput)^2, where throughput is half the sum of the magnitudes of all currents.
+    """
+
+    measured_a: Annotated[_RmsSum, Meta(description="root mean square, from measured currents [A]")]
+    corrected_a: Annotated[_RmsSum, Meta(description="the same from corrected currents [A]")]
+    correction_a: Annotated[_RmsSum | None, Meta(description="the same of the difference of the two [A]")] = None
+    measured_mean_a: Annotated[_MeanSum | None, Meta(description="mean, from measured currents [A]")] = None
+    corrected_mean_a: Annotated[_MeanSum | None, Meta(description="the same from corrected currents [A]")] = None
+    expected_a: Annotated[_MeanSum, Meta(description="mean that right sensors show: a load that none sees [A]")] = 0.0
+    corrected_sd_a: Annotated[_RmsSum | None, Meta(description="standard deviation without current [A]")] = None
+    corrected_sd_per_a: Annotated[_Share | None, Meta(description="how much of it grows with the current [1]")] = None
 
     def about_expected(self) -> tuple[float, float]:
         """Root mean squares of measured and corrected sum less what is expected; as they are if no means are known."""
         if self.measured_mean_a is None or self.corrected_mean_a is None:
             return self.measured_a, self.corrected_a
-        sums = ((self.measured_a, self.measured_mean_a), (self.corrected_a, self.corrected_mean_a))
-        measured_a, corrected_a = (
-            math.sqrt(max(rms_a**2 - 2.0 * self.expected_a * mean_a + self.expected_a**2, 0.0))
-            for rms_a, mean_a in sums
-        )
-        return measured_a, corrected_a
+
+        def about(rms_a: float, mean_a: float) -> float:
+            return math.sqrt(max(rms_a**2 - 2.0 * self.expected_a * mean_a + self.expected_a**2, 0.0))
+
+        return about(self.measured_a, self.measured_mean_a), about(self.corrected_a, self.corrected_mean_a)
 
 
-class FileReference(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class FileReference(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A file that the parameters belong to."""
 
     name: str
     sha256: _Digest
 
 
-class Provenance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Provenance(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where the parameters come from."""
 
     tool: str
     method: str
-    created: Annotated[str, msgspec.Meta(description="ISO 8601, UTC")]
+    created: Annotated[str, Meta(description="ISO 8601, UTC")]
     fleet: str
-    fleet_size: Annotated[int, msgspec.Meta(ge=1)]
+    fleet_size: Annotated[int, Meta(ge=1)]
     drives: list[str]
-    duration_s: Annotated[_NotNegative, msgspec.Meta(description="length of the drives used [s]")]
+    duration_s: Annotated[_NotNegative, Meta(description="length of the drives used [s]")]
 
 
-class VehicleParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One parameter file."""
+class VehicleParameters(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One parameter file. Where a key may be null, that means not known, as if it were left out."""
 
     schema_version: Literal[1] = 1
-    vehicle: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
-    number: Annotated[
-        int, msgspec.Meta(ge=1, le=_LARGEST_NUMBER, description="number of the parameter set, published modulo 256")
-    ] = 1
+    vehicle: Annotated[str, Meta(min_length=1, max_length=64)]
+    number: Annotated[_Number, Meta(description="number of the parameter set, published modulo 256")] = 1
     layout: FileReference
     dbc: FileReference
     verdict: Verdict
-    confidence: Annotated[
-        _Share | None, msgspec.Meta(description="probability that the verdict holds; null if the method gives none")
-    ] = None
-    branches: Annotated[dict[str, BranchParameters], msgspec.Meta(min_length=1, max_length=16)]
+    confidence: Annotated[_Share | None, Meta(description="probability that the verdict holds")] = None
+    branches: Annotated[dict[str, BranchParameters], Meta(min_length=1, max_length=16)]
     hardware_fault: HardwareFault
-    explanations: Annotated[
-        list[Explanation], msgspec.Meta(description="the most probable ones, where the calibrator cannot tell")
-    ] = []
-    deciding_evidence: Annotated[
-        str, msgspec.Meta(description="what would tell the explanations apart; empty if nothing has to")
-    ] = ""
-    findings: Annotated[
-        list[Finding], msgspec.Meta(max_length=64, description="what a workshop should look at; no correction mends it")
-    ] = []
+    explanations: Annotated[list[Explanation], Meta(description="the likeliest, where the calibrator cannot tell")] = []
+    deciding_evidence: Annotated[str, Meta(description="what would tell the explanations apart")] = ""
+    findings: Annotated[list[Finding], Meta(max_length=64, description="what a workshop should look at")] = []
     junction_residual: JunctionResidual
     provenance: Provenance
 
@@ -244,11 +201,11 @@ def parameter_bytes(path: Path) -> bytes:
         return read_user_file(path, largest_bytes=MAX_FILE_BYTES)
     except FileNotFoundError:
         raise UnfitError(Reason.NO_PARAMETERS, f"{path}: no such parameter file; name one that is there") from None
+    except UnsuitableFileError as error:
+        raise UnfitError(Reason.MALFORMED_PARAMETERS, f"{path}: not a parameter file: {error}") from None
     except OSError as error:
         why = f"{path}: cannot read the parameter file: {error.strerror}; name one that may be read"
         raise UnfitError(Reason.NO_PARAMETERS, why) from None
-    except UnsuitableFileError as error:
-        raise UnfitError(Reason.MALFORMED_PARAMETERS, f"{path}: not a parameter file: {error}") from None
 
 
 def decode_parameters(content: bytes, where: str) -> VehicleParameters:
@@ -260,36 +217,25 @@ def decode_parameters(content: bytes, where: str) -> VehicleParameters:
         With reason MALFORMED_PARAMETERS if it is no JSON, outside the schema, signed, or has a key twice.
     """
     try:
-        found = msgspec.json.decode(content, type=VehicleParameters)
+        document = msgspec.json.decode(content)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise _malformed(where, _why_not(error, content)) from None
-    if (twice := repeated_key(content)) is not None:
-        raise _malformed(where, _stands_twice(twice))
-    return found
-
-
-def _stands_twice(key: str) -> str:
-    return f"'{shown_name(key)}' stands there twice in one place"
-
-
-def _malformed(where: str, why: str) -> UnfitError:
-    advice = _SIGNED_ADVICE if why == _SIGNED else "correct it, or write it anew with 'calibrator calibrate'"
-    return UnfitError(Reason.MALFORMED_PARAMETERS, f"{where}: not a parameter file: {printable(why)}; {advice}")
-
-
-def _why_not(error: Exception, content: bytes) -> str:
-    if not isinstance(error, msgspec.ValidationError):
-        return json_error(error, content)
+        raise _malformed(where, json_error(error, content)) from None
+    if twice := repeated_key(content):
+        raise _malformed(where, f"'{shown_name(twice)}' stands there twice in one place")
     try:
-        document, twice = msgspec.json.decode(content), repeated_key(content)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as first:
-        return json_error(first, content)
-    if twice is not None:  # the document keeps the last of the two, and the error may be about the first
-        return _stands_twice(twice)
-    if isinstance(document, dict) and {"payload", "payloadType", "signatures"} <= document.keys():
-        return _SIGNED
-    why = field_error(error, document, VehicleParameters, quoted_place)
-    return f"{why}: {_NO_MODELS}" if "'sensor_model': null is expected" in why else why
+        return msgspec.json.decode(content, type=VehicleParameters)
+    except msgspec.ValidationError as error:
+        if isinstance(document, dict) and {"payload", "payloadType", "signatures"} <= document.keys():
+            advice = "use 'ecu-node activate' and --state, or name the file that was signed"
+            raise _malformed(where, "this file is signed", advice) from None
+        steps, what = field_error(error, document, VehicleParameters)
+        raise _malformed(where, f"{', '.join(steps)}: {what}" if steps else what) from None
+
+
+def _malformed(
+    where: str, why: str, advice: str = "correct it, or write it anew with 'calibrator calibrate'"
+) -> UnfitError:
+    return UnfitError(Reason.MALFORMED_PARAMETERS, f"{where}: not a parameter file: {printable(why)}; {advice}")
 
 
 def encode_parameters(parameters: VehicleParameters, where: str) -> bytes:
@@ -353,8 +299,6 @@ def parameter_schema() -> dict[str, Any]:
 
 _LARGEST_DELAY_S = 5.0
 """Branches of one vehicle do not lag each other by more. [s]"""
-_UNDECIDED: tuple[Verdict, ...] = ("cannot tell", "not enough data")
-"""Verdicts with which nothing was found that could be applied."""
 
 
 def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:
@@ -377,68 +321,55 @@ def check_fit(parameters: VehicleParameters, database: VehicleDatabase, vehicle:
     UnfitError
         With the reason that the node then publishes; the message gives both values.
     """
-    _check_belongs(parameters, database, vehicle)
-    layout = database.layout
-    if not abs(parameters.junction_residual.expected_a) <= layout.offset_limit_a:
-        raise UnfitError(
-            Reason.IMPLAUSIBLE_PARAMETERS,
-            f"an expected Kirchhoff sum of {parameters.junction_residual.expected_a:+.4g} A is beyond the layout's "
-            f"limit of offsets, {layout.offset_limit_a:g} A",
-        )
-    applied = [name for name, branch in parameters.branches.items() if branch.apply]
-    if parameters.verdict in _UNDECIDED and applied:
-        raise UnfitError(
-            Reason.IMPLAUSIBLE_PARAMETERS,
-            f"verdict {parameters.verdict!r}, yet branch {', '.join(map(shown_name, applied))} has 'apply': true; "
-            f"nothing was found to apply, calibrate with more drives",
-        )
-    for name, branch in parameters.branches.items():
-        _check_branch(name, branch, layout)
+    for reason, text in (*_foreign(parameters, database, vehicle), *_implausible(parameters, database)):
+        raise UnfitError(reason, text)
 
 
-def _check_belongs(parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None) -> None:
-    """Check that parameters were made for this vehicle, layout and DBC."""
+def _foreign(
+    parameters: VehicleParameters, database: VehicleDatabase, vehicle: str | None
+) -> Iterator[tuple[Reason, str]]:
+    """Why parameters were not made for this vehicle, layout and DBC."""
     layout = database.layout
     if vehicle is not None and parameters.vehicle != vehicle:
-        raise UnfitError(
-            Reason.WRONG_VEHICLE, f"parameters are for vehicle {parameters.vehicle!r}, this is {vehicle!r}"
-        )
-    if parameters.layout.sha256 != layout.digest:
-        raise UnfitError(
-            Reason.WRONG_LAYOUT,
-            f"parameters were made with layout {shown_name(parameters.layout.name)} ({parameters.layout.sha256[:12]}), "
-            f"this is {layout.path} ({layout.digest[:12]}); calibrate with this layout; for a file "
-            "made by hand print a new 'ecu-node template'",
-        )
-    if parameters.dbc.sha256 != database.digest:
-        raise UnfitError(
-            Reason.WRONG_DBC,
-            f"parameters were made with DBC {shown_name(parameters.dbc.name)} ({parameters.dbc.sha256[:12]}), "
-            f"this is {layout.dbc_path} ({database.digest[:12]}); calibrate with this DBC; for a file "
-            "made by hand print a new 'ecu-node template'",
-        )
+        yield Reason.WRONG_VEHICLE, f"parameters are for vehicle {parameters.vehicle!r}, this is {vehicle!r}"
+    for reason, what, made_with, path, digest in (
+        (Reason.WRONG_LAYOUT, "layout", parameters.layout, layout.path, layout.digest),
+        (Reason.WRONG_DBC, "DBC", parameters.dbc, layout.dbc_path, database.digest),
+    ):
+        if made_with.sha256 != digest:
+            yield (
+                reason,
+                f"parameters were made with {what} {shown_name(made_with.name)} ({made_with.sha256[:12]}), this is "
+                f"{path} ({digest[:12]}); calibrate with this {what}; for a file made by hand print a new "
+                f"'ecu-node template'",
+            )
+    for name in parameters.branches.keys() - set(layout.branch_names):
+        yield Reason.WRONG_LAYOUT, f"parameters for branch {shown_name(name)!r}, which {layout.path} does not have"
 
 
-def _check_branch(name: str, branch: BranchParameters, layout: Layout) -> None:
-    """Check that the layout has a branch, and that what is applied to it is within the limits."""
-    if name not in layout.branch_names:
-        raise UnfitError(
-            Reason.WRONG_LAYOUT, f"parameters for branch {shown_name(name)!r}, which {layout.path} does not have"
+def _implausible(parameters: VehicleParameters, database: VehicleDatabase) -> Iterator[tuple[Reason, str]]:
+    """What was not decided, or is beyond the limits of the layout."""
+    limits, largest_a = database.layout.limits, database.layout.offset_limit_a
+    applied = {name: branch for name, branch in parameters.branches.items() if branch.apply}
+    texts = []
+    if parameters.verdict in {"cannot tell", "not enough data"} and applied:
+        texts.append(
+            f"verdict {parameters.verdict!r}, yet branch {', '.join(map(shown_name, applied))} has 'apply': true; "
+            f"nothing was found to apply, calibrate with more drives"
         )
-    if abs(branch.delay_s or 0.0) > _LARGEST_DELAY_S:
-        raise UnfitError(
-            Reason.IMPLAUSIBLE_PARAMETERS, f"branch {name}: delay {branch.delay_s:g} s is beyond {_LARGEST_DELAY_S:g} s"
+    if not abs(parameters.junction_residual.expected_a) <= largest_a:
+        texts.append(
+            f"an expected Kirchhoff sum of {parameters.junction_residual.expected_a:+.4g} A is beyond the layout's "
+            f"limit of offsets, {largest_a:g} A"
         )
-    if not branch.apply:
-        return
-    if not abs(branch.drift) <= layout.limits.drift:
-        raise UnfitError(
-            Reason.IMPLAUSIBLE_PARAMETERS,
-            f"branch {name}: drift {branch.drift:+.4g} is beyond the layout's limit of {layout.limits.drift:g}",
-        )
-    if not abs(branch.offset_a) <= layout.offset_limit_a:
-        raise UnfitError(
-            Reason.IMPLAUSIBLE_PARAMETERS,
-            f"branch {name}: offset {branch.offset_a:+.4g} A is beyond the layout's limit of "
-            f"{layout.offset_limit_a:g} A",
-        )
+    for name, branch in parameters.branches.items():
+        if abs(branch.delay_s or 0.0) > _LARGEST_DELAY_S:
+            texts.append(f"branch {name}: delay {branch.delay_s:g} s is beyond {_LARGEST_DELAY_S:g} s")
+    for name, branch in applied.items():
+        if not abs(branch.drift) <= limits.drift:
+            texts.append(f"branch {name}: drift {branch.drift:+.4g} is beyond the layout's limit of {limits.drift:g}")
+        if not abs(branch.offset_a) <= largest_a:
+            texts.append(
+                f"branch {name}: offset {branch.offset_a:+.4g} A is beyond the layout's limit of {largest_a:g} A"
+            )
+    yield from ((Reason.IMPLAUSIBLE_PARAMETERS, text) for text in texts)

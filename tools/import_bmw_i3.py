@@ -41,11 +41,11 @@ from calibrator.recordings.tables import Table, read_table
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import told_once
+from ecu_node.core.signals import AMPERE, unit_factor
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.layout import read_layout
 from ecu_node.program import say_error, write_output, write_text
-from ecu_node.units import AMPERE, unit_factor
 
 COLUMNS = {
     "speed": "Velocity [km/h]",

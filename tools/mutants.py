@@ -21,8 +21,8 @@ import msgspec
 import typer
 
 from calibrator.terminal.command_line import command_app, run_tool
+from ecu_node.documents import write_atomically
 from ecu_node.errors import UserError
-from ecu_node.user_files import write_atomically
 
 ROOT = Path(__file__).parents[1]
 GROUPS = ROOT / "tools" / "mutation"

@@ -26,8 +26,8 @@ from acceptance.speed import million_promises, speed_promises
 from acceptance.steps import BENCHES, Step, bench_file, steps
 from acceptance.tried import chain_promises, coverage_promises, fuzz_promises, promises_of_tests
 from calibrator.terminal.command_line import command_app, run_tool
+from ecu_node.documents import write_atomically
 from ecu_node.errors import UserError
-from ecu_node.user_files import write_atomically
 
 ROOT = Path(__file__).parents[1]
 SHARED_TRIPS = ROOT.parent / "shared" / "data" / "bmw_i3_summer"

@@ -19,9 +19,9 @@ from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.fleet_truth import VehicleTruth
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.recordings.canlog import FrameSeries, encode_message, sent_values, write_candump
+from ecu_node.core.signals import AMPERE, unit_factor
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Branch, split_signal
-from ecu_node.units import AMPERE, unit_factor
 
 __all__ = [
     "Disturbances",

@@ -8,7 +8,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from calibrator.errors import FleetError
-from ecu_node.user_files import write_atomically
+from ecu_node.documents import write_atomically
 
 __all__ = ["read_fleet_ids", "require_same_fleet", "write_fleet_ids"]
 

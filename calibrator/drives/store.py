@@ -7,9 +7,9 @@ from calibrator.drive import Drive, DriveFile
 from calibrator.drives.drive_file import encode_drive, read_drive_file, require_made_with
 from calibrator.drives.plain_names import require_plain_name
 from calibrator.errors import DriveError
+from ecu_node.documents import write_atomically
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout
-from ecu_node.user_files import write_atomically
 
 __all__ = ["has_drive", "iterate_drives", "list_drives", "write_drive"]
 

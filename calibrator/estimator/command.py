@@ -31,9 +31,9 @@ from calibrator.terminal.options import (
     number_option,
 )
 from calibrator.terminal.text import counted, dumps, print_report, told_once
+from ecu_node.documents import write_atomically
 from ecu_node.layout import UnmeasuredLoad
 from ecu_node.program import INTERNAL_ERROR, say_error, write_output
-from ecu_node.user_files import write_atomically
 
 if TYPE_CHECKING:
     from calibrator.fleet_truth import FleetTruth

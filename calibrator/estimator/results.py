@@ -26,9 +26,9 @@ from calibrator.errors import FleetError
 from calibrator.estimator.rows import VehicleEvidence
 from calibrator.summaries.buckets import bucket_of
 from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
+from ecu_node.documents import write_atomically
 from ecu_node.errors import ParameterError
 from ecu_node.parameters import VehicleParameters, encode_parameters
-from ecu_node.user_files import write_atomically
 
 __all__ = [
     "MOST_FILES",

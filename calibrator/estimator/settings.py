@@ -10,8 +10,8 @@ from calibrator.fleet_truth import FleetTruth
 from calibrator.options import Classifier, Method
 from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.terminal.text import counted, few, few_reasons
+from ecu_node.documents import text_digest
 from ecu_node.layout import UnmeasuredLoad, file_digest
-from ecu_node.user_files import text_digest
 
 __all__ = ["FEWEST_VEHICLES", "HARM_LIMIT", "CalibrationSettings", "require_learning"]
 

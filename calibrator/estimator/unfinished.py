@@ -16,8 +16,8 @@ from typing import Literal
 from calibrator.errors import FleetError
 from calibrator.estimator.results import ChunkResult
 from calibrator.files.storage import DISK_FULL
+from ecu_node.documents import write_atomically
 from ecu_node.layout import file_digest
-from ecu_node.user_files import write_atomically
 
 __all__ = ["Unfinished", "unfinished_run"]
 

@@ -39,10 +39,9 @@ from calibrator.experiments.table import (
     result_table,
 )
 from calibrator.experiments.trial import FleetLaw
+from calibrator.files.layout_files import vehicle_database
 from calibrator.terminal.progress import one_pass
-from ecu_node.database import read_database
-from ecu_node.layout import read_layout
-from ecu_node.user_files import write_atomically
+from ecu_node.documents import write_atomically
 
 __all__ = ["CALIBRATION", "EXPERIMENTS", "Recorded", "RunOptions", "read_results", "run_experiments", "write_result"]
 
@@ -230,7 +229,7 @@ def _default_layout() -> Path:
 
 
 def _recorded_fleet(options: RunOptions) -> RecordedFleet:
-    database = read_database(read_layout(options.layout or _default_layout()))
+    database = vehicle_database(options.layout or _default_layout())
     if options.drives is not None:
         fleet = read_fleet(options.drives, database)
         return fleet.take(QUICK_TRIPS, duration_s=QUICK_DURATION_S) if options.quick else fleet

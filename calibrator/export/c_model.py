@@ -14,9 +14,8 @@ from ecu_node.bus.guard import Mode, rewritten
 from ecu_node.bus.in_force import branch_plan, branch_signals
 from ecu_node.bus.wiring import wire
 from ecu_node.core.correction import IntegerPlan
-from ecu_node.core.signals import Codes, PlacedSignal, placed_signal, read_codes
+from ecu_node.core.signals import VOLT, Codes, PlacedSignal, placed_signal, read_codes
 from ecu_node.layout import Branch, SignalName, split_signal
-from ecu_node.units import VOLT
 
 __all__ = ["CBranch", "CInput", "CMessage", "CProgram", "c_program"]
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from ecu_node.bus.in_force import InForce, sensor_fault
 from ecu_node.core.correction import NO_FAULT, SensorFault
 from ecu_node.database import VehicleDatabase
+from ecu_node.documents import text_digest
 from ecu_node.errors import ParameterError, printable
 from ecu_node.parameters import VehicleParameters, check_fit, decode_parameters, parameter_bytes
 from ecu_node.trust.statements import SignedParameters, open_statement
-from ecu_node.user_files import text_digest
 
 __all__ = ["Checked", "read_checked"]
 

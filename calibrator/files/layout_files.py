@@ -4,6 +4,7 @@ from pathlib import Path
 
 import msgspec
 
+from calibrator.drives.derived import check_formulas
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import Layout, read_layout
@@ -12,8 +13,9 @@ __all__ = ["chosen_layout", "vehicle_database"]
 
 
 def chosen_layout(layout: Path, dbc: Path | None = None) -> Layout:
-    """Read a layout, and let it name another DBC if one is given; see :func:`vehicle_database`."""
+    """Read a layout, its formulas too, and let it name another DBC if one is given; see :func:`vehicle_database`."""
     settings = read_layout(layout)
+    check_formulas(settings)
     if dbc is None:
         return settings
     if not dbc.is_file():

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ecu_node.documents import write_atomically
 from ecu_node.errors import UserError
-from ecu_node.user_files import write_atomically
 
 __all__ = ["DISK_FULL", "Storage", "StorageError", "open_storage"]
 

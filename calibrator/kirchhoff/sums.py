@@ -30,10 +30,10 @@ from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.drives.align import align_channels
 from calibrator.drives.delays import MAX_DELAY_S
 from calibrator.errors import DriveError
+from ecu_node.core.signals import VOLT, WATT, unit_factor
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Input
 from ecu_node.parameters import VehicleParameters
-from ecu_node.units import VOLT, WATT, unit_factor
 
 __all__ = ["BAND", "SUM", "Comparison", "compare_kirchhoff", "sensor_of", "with_voltages"]
 

@@ -11,7 +11,7 @@ from calibrator.drive import Array
 from calibrator.errors import DriveError
 from calibrator.kirchhoff.sums import BAND, SUM, Comparison
 from calibrator.terminal.text import figure, table
-from ecu_node.user_files import write_atomically
+from ecu_node.documents import write_atomically
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,8 +17,8 @@ from calibrator.recordings.decode import decode_signal, raw_values, signal_range
 from calibrator.recordings.frame_arrays import Frames, frame_key
 from calibrator.recordings.log_time import repaired_time
 from calibrator.recordings.tables import Table
+from ecu_node.core.signals import AMPERE, VOLT, WATT, unit_factor
 from ecu_node.errors import DatabaseError
-from ecu_node.units import AMPERE, VOLT, WATT, unit_factor
 
 __all__ = ["FLOWS", "Candidate", "of_database", "of_table", "with_log", "with_table"]
 

@@ -15,9 +15,9 @@ from calibrator.processes.interrupts import importing
 from calibrator.terminal.command_line import example
 from calibrator.terminal.options import JsonOption
 from calibrator.terminal.text import dumps
+from ecu_node.documents import write_atomically
 from ecu_node.errors import printable
 from ecu_node.program import say_error, write_output
-from ecu_node.user_files import write_atomically
 
 if TYPE_CHECKING:
     from calibrator.proposal.branches import Verdict

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from calibrator.drive import Array, Channel, Drive
 from calibrator.recordings.frame_arrays import CLASSIC_BYTES
 from ecu_node.core.e2e import Protection, protection_of
+from ecu_node.core.signals import AMPERE, unit_factor
 from ecu_node.database import VehicleDatabase
+from ecu_node.documents import write_atomically
 from ecu_node.layout import split_signal
-from ecu_node.units import AMPERE, unit_factor
-from ecu_node.user_files import write_atomically
 
 __all__ = ["FrameSeries", "drive_series", "encode_message", "sent_values", "write_candump", "write_drive_log"]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.drives.align import at_instants, base_inputs
-from calibrator.drives.derived import evaluate_formula
+from calibrator.drives.derived import evaluate_formula, formula_names, parse_formula
 from calibrator.errors import LogError
 from calibrator.recordings.decode import codes_of_no_value, decode_signal, message_is_sound, signal_range
 from calibrator.recordings.frame_arrays import EXTENDED_BIT, Frames, frame_key
@@ -25,10 +25,9 @@ from calibrator.recordings.frames import read_frames
 from calibrator.recordings.log_time import CLOCK_GAP_S, repaired_time
 from calibrator.recordings.tables import Table, is_table, read_table
 from calibrator.terminal.text import Notice
+from ecu_node.core.signals import AMPERE, VOLT, WATT, factor_of, usual_unit
 from ecu_node.database import VehicleDatabase
-from ecu_node.formula import formula_names, parse_formula
 from ecu_node.layout import Branch, split_signal
-from ecu_node.units import AMPERE, VOLT, WATT, factor_of, usual_unit
 
 __all__ = [
     "ChannelReport",

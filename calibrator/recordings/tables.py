@@ -22,6 +22,7 @@ import pyarrow as pa
 
 from calibrator.drive import Array, Mask
 from calibrator.drives.charge import GAP_PERIODS
+from calibrator.drives.derived import check_formulas
 from calibrator.errors import LogError
 from calibrator.recordings.candump import is_candump
 from calibrator.recordings.log_files import (
@@ -36,10 +37,10 @@ from calibrator.recordings.log_files import (
 )
 from calibrator.recordings.log_time import repaired_time
 from calibrator.recordings.mf4 import is_bus_log, read_mf4_table
+from ecu_node.core.signals import AMPERE, usual_unit
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError
 from ecu_node.layout import layout_of
-from ecu_node.units import AMPERE, usual_unit
 
 __all__ = ["TABLE_SUFFIXES", "Table", "bare_name", "is_table", "layout_from_branches", "read_table"]
 
@@ -303,7 +304,9 @@ def layout_from_branches(
         longest_s = max(periods_s.values(), default=0.0)
         for branch in branches:
             branch["timeout_s"] = max(0.5, GAP_PERIODS * periods_s.get(branch["name"], longest_s))
-    return read_database(layout_of(keys, Path("--branches")))
+    layout = layout_of(keys, Path("--branches"))
+    check_formulas(layout)
+    return read_database(layout)
 
 
 def _period_s(time_s: Array) -> float:

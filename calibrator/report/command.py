@@ -9,8 +9,8 @@ from calibrator.files.folders import require_possible_file
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import JsonOption, number_option
 from calibrator.terminal.text import dumps
+from ecu_node.documents import write_atomically
 from ecu_node.program import write_output
-from ecu_node.user_files import write_atomically
 
 __all__ = ["report"]
 

@@ -19,11 +19,10 @@ from securesystemslib.signer import CryptoSigner, SSlibKey
 
 from calibrator.errors import SigningError
 from calibrator.signing.encryption import encrypted_pem, is_whole_pem
-from ecu_node.core.status import Reason
-from ecu_node.errors import TrustError
+from ecu_node.core.status import Reason, TrustError
+from ecu_node.documents import UnsuitableFileError, read_user_file, write_atomically
 from ecu_node.trust.canonical import canonical_bytes, read_bytes, read_canonical
 from ecu_node.trust.key_set import PublicKey
-from ecu_node.user_files import UnsuitableFileError, read_user_file, write_atomically
 
 __all__ = ["PASSPHRASE_VARIABLE", "NamedKey", "new_key", "read_public_key", "read_signer"]
 

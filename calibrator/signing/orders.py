@@ -10,7 +10,7 @@ from securesystemslib.signer import Signer
 from calibrator.errors import ContradictionError, SigningError
 from calibrator.signing.numbers import time_text
 from calibrator.signing.statements import signed_anew, signed_statement
-from ecu_node.errors import TrustError
+from ecu_node.core.status import TrustError
 from ecu_node.parameters import VehicleParameters, read_parameters
 from ecu_node.trust.canonical import read_bytes
 from ecu_node.trust.envelope import Envelope

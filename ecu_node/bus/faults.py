@@ -14,8 +14,8 @@ import msgspec
 
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Reason
+from ecu_node.documents import read_user_file, write_atomically
 from ecu_node.errors import UserError
-from ecu_node.user_files import UnsuitableFileError, read_user_file, write_atomically
 
 __all__ = ["Fault", "FaultMemory", "clear_faults", "faults_text", "read_faults"]
 
@@ -54,7 +54,7 @@ def read_faults(folder: Path) -> list[Fault]:
         return msgspec.json.decode(read_user_file(path, largest_bytes=_LARGEST_BYTES), type=list[Fault])
     except FileNotFoundError:
         return []
-    except (OSError, UnsuitableFileError, msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise UserError(f"{path}: cannot read the fault memory: {why}; 'ecu-node clear' begins a new one") from None
 

@@ -9,13 +9,12 @@ from ecu_node.bus.guard import PARAMETER_SETS, Mode
 from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault, Signals, correction_plan
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.junction import ExpectedSum
-from ecu_node.core.signals import Codes, as_written, read_codes, require_reach
-from ecu_node.core.status import Reason
+from ecu_node.core.signals import AMPERE, VOLT, WATT, Codes, as_written, read_codes, require_reach
+from ecu_node.core.status import Reason, UnfitError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import LayoutError, UnfitError
+from ecu_node.errors import LayoutError
 from ecu_node.layout import Branch, SignalName
 from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
-from ecu_node.units import AMPERE, VOLT, WATT
 
 __all__ = [
     "FileSignature",
@@ -51,7 +50,7 @@ def signal_codes(
     name : str
         The signal, as MESSAGE.SIGNAL.
     units : mapping of str to float
-        One of the tables of :mod:`ecu_node.units`; values come out in its base unit.
+        One of the tables of :mod:`ecu_node.core.signals`; values come out in its base unit.
     what : str
         What the signal is for, for messages of errors.
     no_value : list of int, optional

@@ -4,8 +4,10 @@ The structure depends on layout and DBC alone; the parameters are then put in fo
 :mod:`ecu_node.bus.in_force`.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 from ecu_node.bus.guard import Mode, check_output, is_fd, key_of, received
 from ecu_node.bus.in_force import (
@@ -22,20 +24,21 @@ from ecu_node.core.e2e import protection_of
 from ecu_node.core.frames import FrameKey, Reader, Source, Target, TargetField
 from ecu_node.core.junction import JunctionWatch
 from ecu_node.core.signals import (
-    BitPlace,
+    AMPERE,
     Codes,
     as_written,
     bit_place,
+    exact_code,
     not_available_code,
     placed_signal,
     read_codes,
     require_reach,
+    usual_unit,
     writable_range,
 )
 from ecu_node.core.status import Counters
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import SignalName, split_signal
-from ecu_node.units import AMPERE, VOLT
 
 __all__ = ["wire"]
 
@@ -75,20 +78,53 @@ def wire(
     """
     check_output(database, mode)
     require_branch_reach(database, mode)
-    layout = database.layout
-    parts = _parts(database)
-    targets = _targets(database, parts) if mode is Mode.OVERLAY else {}
-    counters = Counters()
+    layout, counters = database.layout, Counters()
+    readers: dict[FrameKey, list[Reader]] = defaultdict(list)
+
+    def read(name: SignalName, part: Auxiliary | LiveBranch) -> None:
+        message, signal = database.signal(name)
+        readers[key_of(message)].append(Reader(part, placed_signal(message, signal)))
+
+    branches: dict[str, LiveBranch] = {}
+    auxiliaries: dict[SignalName, Auxiliary] = {}
+    for branch in layout.branch:
+        signals = branch_signals(database, branch, Mode.GATEWAY)
+        if branch.voltage is not None and signals.voltage is not None and branch.voltage not in auxiliaries:
+            timeout_s = max(item.timeout_s for item in layout.branch if item.voltage == branch.voltage)
+            auxiliaries[branch.voltage] = Auxiliary(signals.voltage, timeout_s)
+            read(branch.voltage, auxiliaries[branch.voltage])
+        branches[branch.name] = LiveBranch(
+            name=branch.name,
+            codes=signals.source,
+            sign=branch.sign,
+            timeout_s=branch.timeout_s,
+            start_s=layout.watch.start_s,
+            voltage=auxiliaries[branch.voltage] if branch.voltage is not None else None,
+        )
+        read(branch.source, branches[branch.name])
+    state = _state_input(database)
+    if state is not None:
+        read(state.name, state.live)
+    answers = _answers(database, branches) if mode is Mode.OVERLAY else {}
     corrector = Corrector(
-        sources=_sources(database, parts, targets, counters),
-        branches=list(parts.branches.values()),
+        sources={
+            key: Source(
+                protection=protection_of(database, message),
+                readers=readers[key],
+                targets=answers.get(key, []),
+                counters=counters,
+                pass_on_invalid=layout.on_bad_frame == "invalid",
+            )
+            for key, message in received(database).items()
+        },
+        branches=list(branches.values()),
         status_fields=_status_fields(database),
         watch=JunctionWatch(
-            list(parts.branches.values()),
+            list(branches.values()),
             window_s=layout.watch.window_s,
             margin_a=layout.watch_margin_a,
             full_scale_a=layout.full_scale_a,
-            is_whole=parts.is_whole,
+            is_whole=lambda now_s: state is None or state.live.code_at(now_s) in state.valid,
         ),
         counters=counters,
         shadow=shadow,
@@ -98,106 +134,53 @@ def wire(
     return corrector
 
 
-@dataclass(kw_only=True)
-class _Parts:
-    """Branches and auxiliary signals, and by which signal each is read."""
+class _StateInput(NamedTuple):
+    """The input that tells whether all currents of the junction are measured."""
 
-    branches: dict[str, LiveBranch]
-    signals: list[tuple[SignalName, Auxiliary | LiveBranch]]
-    whole: tuple[Auxiliary, frozenset[int]] | None = None
-    """The input that tells whether all currents are measured, and its codes with which they are."""
-
-    def is_whole(self, now_s: float) -> bool:
-        """Whether all currents of the junction are measured now."""
-        return self.whole is None or self.whole[0].code_at(now_s) in self.whole[1]
+    name: SignalName
+    live: Auxiliary
+    valid: frozenset[int]
+    """Its codes with which they are."""
 
 
-def _parts(database: VehicleDatabase) -> _Parts:
-    """Make all of them."""
+def _state_input(database: VehicleDatabase) -> _StateInput | None:
     layout = database.layout
-    parts = _Parts(branches={}, signals=[])
-
-    def auxiliary(name: SignalName, codes: Codes, timeout_s: float) -> Auxiliary:
-        item = Auxiliary(codes, timeout_s)
-        parts.signals.append((name, item))
-        return item
-
-    whole_name = input_signal(database, layout.watch.input)
-    if whole_name is not None:
-        unit = database.signal(whole_name)[1].unit or ""
-        codes = signal_codes(database, whole_name, {unit: 1.0}, "[watch] input")
-        every_code = replace(codes, named={})  # states have names, which are no lack of a value here
-        valid = [(as_written(float(value)) - codes.offset) / codes.scale for value in layout.watch.valid]
-        parts.whole = auxiliary(whole_name, every_code, layout.max_age_s), frozenset(map(int, valid))
-    voltages: dict[SignalName, Auxiliary] = {}
-    for branch in layout.branch:
-        if branch.voltage is not None and branch.voltage not in voltages:
-            codes = signal_codes(database, branch.voltage, VOLT, f"branch {branch.name}")
-            timeout_s = max(item.timeout_s for item in layout.branch if item.voltage == branch.voltage)
-            voltages[branch.voltage] = auxiliary(branch.voltage, codes, timeout_s)
-    for branch in layout.branch:
-        signals = branch_signals(database, branch, Mode.GATEWAY)
-        live = LiveBranch(
-            name=branch.name,
-            codes=signals.source,
-            sign=branch.sign,
-            timeout_s=branch.timeout_s,
-            start_s=layout.watch.start_s,
-            voltage=voltages[branch.voltage] if branch.voltage is not None else None,
-        )
-        parts.branches[branch.name] = live
-        parts.signals.append((branch.source, live))
-    return parts
+    name = input_signal(database, layout.watch.input)
+    if name is None:
+        return None
+    _, signal = database.signal(name)
+    codes = signal_codes(database, name, {usual_unit(signal.unit or ""): 1.0}, "[watch] input")
+    every_code = replace(codes, named={})  # states have names, which are no lack of a value here
+    valid = frozenset(int(exact_code(signal, value)) for value in layout.watch.valid)
+    return _StateInput(name, Auxiliary(every_code, layout.max_age_s), valid)
 
 
-def _sources(
-    database: VehicleDatabase, parts: _Parts, targets: Mapping[str, Target], counters: Counters
-) -> dict[FrameKey, Source]:
-    """Incoming messages, with who reads them and which targets answer them."""
-    sources = {}
-    for key, message in received(database).items():
-        inside = [(name, part) for name, part in parts.signals if split_signal(name)[0] == message.name]
-        readers = [Reader(part, placed_signal(message, database.signal(name)[1])) for name, part in inside]
-        branches = [branch for branch in database.layout.branch if split_signal(branch.source)[0] == message.name]
-        answers = dict.fromkeys(
-            split_signal(branch.corrected)[0] for branch in branches if branch.corrected is not None
-        )
-        sources[key] = Source(
-            protection=protection_of(database, message),
-            readers=readers,
-            targets=[targets[name] for name in answers if name in targets],
-            counters=counters,
-            pass_on_invalid=database.layout.on_bad_frame == "invalid",
-        )
-    return sources
-
-
-def _targets(database: VehicleDatabase, parts: _Parts) -> dict[str, Target]:
-    """Corrected messages of an overlay node, by name."""
-    fields: dict[str, list[TargetField]] = {}
-    for branch in database.layout.branch:
-        if branch.corrected is None:
-            continue
-        codes = branch_signals(database, branch, Mode.OVERLAY).target
-        fields.setdefault(split_signal(branch.corrected)[0], []).append(
-            TargetField(
-                branch=parts.branches[branch.name],
-                place=codes.place,
-                not_available=not_available_code(codes, f"{database.layout.path}: branch {branch.name}"),
-                quality=bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None,
+def _answers(database: VehicleDatabase, branches: Mapping[str, LiveBranch]) -> dict[FrameKey, list[Target]]:
+    """Corrected messages of an overlay node, by the incoming messages that they answer."""
+    answers: dict[FrameKey, list[Target]] = defaultdict(list)
+    corrected = [(split_signal(branch.corrected)[0], branch) for branch in database.layout.branch if branch.corrected]
+    for name in dict.fromkeys(name for name, _ in corrected):
+        message, inside = database.message(name), [branch for other, branch in corrected if other == name]
+        fields = []
+        for branch in inside:
+            codes = branch_signals(database, branch, Mode.OVERLAY).target
+            not_available = not_available_code(codes, f"{database.layout.path}: branch {branch.name}")
+            quality = bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None
+            fields.append(
+                TargetField(
+                    branch=branches[branch.name], place=codes.place, not_available=not_available, quality=quality
+                )
             )
-        )
-    messages = {name: database.message(name) for name in fields}
-    return {
-        name: Target(
+        target = Target(
             key=key_of(message),
             length=message.length,
             fd=is_fd(message),
-            fields=fields[name],
+            fields=fields,
             protection=protection_of(database, message),
         )
-        for name, message in messages.items()
-    }
+        for incoming in dict.fromkeys(key_of(database.signal(branch.source)[0]) for branch in inside):
+            answers[incoming].append(target)
+    return answers
 
 
 def _status_fields(database: VehicleDatabase) -> StatusFields | None:
@@ -205,18 +188,14 @@ def _status_fields(database: VehicleDatabase) -> StatusFields | None:
     if status is None:
         return None
     message = database.message(status.message)
-    where = f"{database.layout.path}: status"
+    signals = {key: database.signal(name)[1] for key, name in status.signals.items()}
+    places = {key: bit_place(signal) for key, signal in signals.items()}
 
-    def place(name: str) -> BitPlace:
-        return bit_place(database.signal(f"{message.name}.{name}")[1])
-
-    def place_or_none(name: str | None) -> BitPlace | None:
-        return place(name) if name is not None else None
-
-    def current(name: str | None) -> tuple[Codes, int] | None:
-        if name is None:
+    def current(key: str) -> tuple[Codes, int] | None:
+        if key not in signals:
             return None
-        codes = read_codes(database.signal(f"{message.name}.{name}")[1], AMPERE, where)
+        where = f"{database.layout.path}: status"
+        codes = read_codes(signals[key], AMPERE, where)
         require_reach(codes, as_written(database.layout.full_scale_a), where)
         lowest, highest = writable_range(codes, where)
         return replace(codes, lowest=lowest, highest=highest), not_available_code(codes, where)
@@ -226,10 +205,10 @@ def _status_fields(database: VehicleDatabase) -> StatusFields | None:
         length=message.length,
         fd=is_fd(message),
         protection=protection_of(database, message),
-        state=place(status.state),
-        reason=place(status.reason),
-        parameter_set=place_or_none(status.parameter_set),
-        alive_counter=place_or_none(status.alive_counter),
-        sum_measured=current(status.sum_measured),
-        sum_corrected=current(status.sum_corrected),
+        state=places["state"],
+        reason=places["reason"],
+        parameter_set=places.get("parameter_set"),
+        alive_counter=places.get("alive_counter"),
+        sum_measured=current("sum_measured"),
+        sum_corrected=current("sum_corrected"),
     )

@@ -265,8 +265,9 @@ class LiveBranch:
         voltage_code = self._voltage_code(time_s)
         if voltage_code is None:
             return None, Quality.NOT_AVAILABLE
-        counters.saturated += self.plan.saturates(code, voltage_code)
-        return self.plan.apply(code, voltage_code), self.quality
+        out = self.plan.apply(code, voltage_code)
+        counters.saturated += out != self.plan.unbounded(code, voltage_code)
+        return out, self.quality
 
     def published(self, now_s: float) -> tuple[int | None, Quality]:
         """What is written of it where no frame of it just came."""

@@ -26,17 +26,7 @@ from fractions import Fraction
 
 from ecu_node.core.signals import Codes, as_written, writable_range
 
-__all__ = [
-    "AS_IT_IS",
-    "LARGEST_ERROR",
-    "NO_FAULT",
-    "IntegerPlan",
-    "Line",
-    "SensorFault",
-    "Signals",
-    "correction_plan",
-    "integer_plan",
-]
+__all__ = ["AS_IT_IS", "LARGEST_ERROR", "NO_FAULT", "IntegerPlan", "SensorFault", "Signals", "correction_plan"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,15 +88,6 @@ class Signals:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Line:
-    """Exact correction: code_out = slope * code + voltage_slope * voltage_code + constant. [code]"""
-
-    slope: Fraction
-    voltage_slope: Fraction
-    constant: Fraction
-
-
-@dataclass(frozen=True, kw_only=True)
 class IntegerPlan:
     """Correction of one branch in integers.
 
@@ -132,13 +113,10 @@ class IntegerPlan:
 
     def apply(self, code: int, voltage_code: int = 0) -> int:
         """Correct one code; the result saturates at the ends and never wraps."""
-        return min(max(self._unbounded(code, voltage_code), self.lowest), self.highest)
+        return min(max(self.unbounded(code, voltage_code), self.lowest), self.highest)
 
-    def saturates(self, code: int, voltage_code: int = 0) -> bool:
-        """Whether the result for a code lies beyond the ends, so that :meth:`apply` returns an end instead."""
-        return not self.lowest <= self._unbounded(code, voltage_code) <= self.highest
-
-    def _unbounded(self, code: int, voltage_code: int) -> int:
+    def unbounded(self, code: int, voltage_code: int = 0) -> int:
+        """The same, though it may lie beyond the ends."""
         return (code * self.gain + voltage_code * self.voltage_gain + self.bias + (1 << (self.shift - 1))) >> self.shift
 
 
@@ -167,68 +145,60 @@ def correction_plan(signals: Signals, fault: SensorFault) -> IntegerPlan:
     DatabaseError
         If the target's value table leaves no values around 0.
     """
-    return integer_plan(signals, _line(signals, as_written(fault.drift), as_written(fault.offset_a)))
+    source, target, voltage = signals.source, signals.target, signals.voltage
+    per_unit = 1 / (1 + as_written(fault.drift)) / target.scale
+    offset_a = signals.sign * as_written(fault.offset_a)
+    # a current is a power at 1 V, which needs no code
+    volts_per_code, volts_at_0 = (Fraction(0), Fraction(1)) if voltage is None else (voltage.scale, voltage.offset)
+    return integer_plan(
+        signals,
+        slope=source.scale * per_unit,
+        voltage_slope=-offset_a * volts_per_code * per_unit,
+        constant=(source.offset - offset_a * volts_at_0) * per_unit - target.offset / target.scale,
+    )
 
 
-def integer_plan(signals: Signals, line: Line) -> IntegerPlan:
-    """Integers that come closest to an exact line.
+def integer_plan(signals: Signals, *, slope: Fraction, voltage_slope: Fraction, constant: Fraction) -> IntegerPlan:
+    """Integers that come closest to code_out = slope * code_in + voltage_slope * voltage_code + constant. [code]
 
     Parameters
     ----------
     signals : Signals
         Whose codes it is for.
-    line : Line
-        Exact correction.
+    slope, voltage_slope, constant : Fraction
+        G, H and B.
 
     Returns
     -------
     IntegerPlan
-        Never below the line, and above it by less than :data:`LARGEST_ERROR` for every valid code.
+        Never below the line, and above it by less than :data:`LARGEST_ERROR` for every valid code. Beyond that its
+        shift is as large as 64-bit words allow.
 
     Raises
     ------
     DatabaseError
         If the target's value table leaves no values around 0.
     """
-    ranges = [(line.slope, signals.source)]
-    if signals.voltage is not None and line.voltage_slope:
-        ranges.append((line.voltage_slope, signals.voltage))
-    shift = _shift(ranges, line.constant)
-    gains = [round(slope * (1 << shift)) for slope, _ in ranges]
-    deepest = Fraction(0)
-    for gain, (slope, codes) in zip(gains, ranges, strict=True):
-        missing = slope * (1 << shift) - gain
+    terms = [(slope, signals.source)]
+    if signals.voltage is not None and voltage_slope:
+        terms.append((voltage_slope, signals.voltage))
+    span = sum(codes.highest - codes.lowest for _, codes in terms)
+    needed = _ERROR_BITS + (span // 2 + 1).bit_length()
+    largest = abs(constant) + 1
+    largest += sum(abs(factor) * max(abs(codes.lowest), abs(codes.highest)) for factor, codes in terms)
+    shift = max(needed, _WORD_BITS - math.ceil(largest).bit_length())
+    gains, deepest = [], Fraction(0)
+    for factor, codes in terms:
+        gain = round(factor * (1 << shift))
+        missing = factor * (1 << shift) - gain
         deepest += max(missing * codes.lowest, missing * codes.highest)
+        gains.append(gain)
     lowest, highest = writable_range(signals.target, f"corrected signal {signals.target.name}")
     return IntegerPlan(
         gain=gains[0],
         voltage_gain=gains[1] if len(gains) > 1 else 0,
-        bias=math.ceil(line.constant * (1 << shift) + deepest),
+        bias=math.ceil(constant * (1 << shift) + deepest),
         shift=shift,
         lowest=lowest,
         highest=highest,
     )
-
-
-def _line(signals: Signals, drift: Fraction, offset_a: Fraction) -> Line:
-    source, target, voltage = signals.source, signals.target, signals.voltage
-    slope = 1 / (1 + drift)
-    own_offset = signals.sign * offset_a
-    if voltage is None:
-        per_volt, at_zero = Fraction(0), own_offset
-    else:
-        per_volt, at_zero = own_offset * voltage.scale, own_offset * voltage.offset
-    return Line(
-        slope=source.scale * slope / target.scale,
-        voltage_slope=-per_volt * slope / target.scale,
-        constant=((source.offset - at_zero) * slope - target.offset) / target.scale,
-    )
-
-
-def _shift(ranges: list[tuple[Fraction, Codes]], constant: Fraction) -> int:
-    """Shift that keeps the error below LARGEST_ERROR, and beyond that as large as 64-bit words allow."""
-    span = sum(codes.highest - codes.lowest for _, codes in ranges)
-    needed = _ERROR_BITS + (span // 2 + 1).bit_length()
-    largest = abs(constant) + 1
-    largest += sum(abs(slope) * max(abs(codes.lowest), abs(codes.highest)) for slope, codes in ranges)
-    return max(needed, _WORD_BITS - math.ceil(largest).bit_length())

@@ -8,30 +8,101 @@ value table: a named code of a current ("SNA", "Error") is a message, not a numb
 """
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal, NamedTuple
 
 from cantools.database.can import Message, Signal
+from cantools.database.utils import start_bit
 
 from ecu_node.errors import DatabaseError
-from ecu_node.units import unit_factor
 
 __all__ = [
+    "AMPERE",
+    "VOLT",
+    "WATT",
     "BitPlace",
     "Codes",
+    "Multiplexer",
     "Order",
     "PlacedSignal",
     "as_written",
     "bit_place",
+    "exact_code",
+    "factor_of",
     "impossible_values",
     "not_available_code",
     "placed_signal",
     "read_codes",
     "require_reach",
+    "unit_factor",
+    "usual_unit",
     "writable_range",
 ]
+
+
+AMPERE: Mapping[str, float] = {"A": 1.0, "mA": 1e-3, "kA": 1e3}
+VOLT: Mapping[str, float] = {"V": 1.0, "mV": 1e-3, "kV": 1e3}
+WATT: Mapping[str, float] = {"W": 1.0, "kW": 1e3, "mW": 1e-3, "MW": 1e6}
+
+_SPELLED = re.compile(
+    r"(?:unit_|\w+:)?(milli|kilo|mega|[mk])?(a|v|w|(?:amp|amper|ampere|volt|watt)s?)([ _]?(ac|dc|rms))?", re.IGNORECASE
+)
+"""As databases of several makers have it: ``Unit_Amper``, ``current:A``."""
+_PER_BIT = re.compile(r"([\d.]+) ?(\w+)/bit\??", re.IGNORECASE)
+_PREFIX = {"": "", "milli": "m", "m": "m", "kilo": "k", "k": "k", "mega": "M"}
+
+
+def usual_unit(text: str) -> str:
+    """Unit as this program writes it: ``A`` for ``Amps``, ``[A]`` or ``A_DC``, ``kW`` for ``KW`` or ``kilowatt``.
+
+    What is no spelling of A, V or W comes back without blanks and brackets around it.
+    """
+    bare = text.strip().strip("[](){}<>").strip()
+    found = _SPELLED.fullmatch(bare)
+    if bare in WATT or found is None:  # mW and MW differ by their case alone
+        return bare
+    return _PREFIX[(found[1] or "").lower()] + found[2][0].upper()
+
+
+def unit_factor(signal: Signal, known: Mapping[str, float], where: str) -> float:
+    """Factor that turns the values of a signal into the base unit, such as 1000 for kW into W.
+
+    Parameters
+    ----------
+    signal : Signal
+        A signal of the DBC. A signal without unit counts as being in the base unit.
+    known : mapping of str to float
+        One of :data:`AMPERE`, :data:`VOLT`, :data:`WATT`.
+    where : str
+        What the signal is for, for the message of the error.
+
+    Returns
+    -------
+    float
+        The factor. [base unit / unit of the signal]
+
+    Raises
+    ------
+    DatabaseError
+        If the unit is of another quantity.
+    """
+    unit, step = signal.unit or "", 1.0
+    if per_bit := _PER_BIT.fullmatch(unit):  # the scale says the same as "50W/bit", or it is 1 and says nothing
+        unit, step = per_bit[2], float(per_bit[1]) if signal.scale == 1 else 1.0
+    return step * factor_of(unit, known, f"{where}: signal {signal.name}")
+
+
+def factor_of(unit: str, known: Mapping[str, float], what: str) -> float:
+    """As :func:`unit_factor`, of a unit; `what` is in it."""
+    if not unit:
+        return 1.0
+    try:
+        return known[usual_unit(unit)]
+    except KeyError:
+        raise DatabaseError(f"{what} is in {unit!r}; expected {', '.join(known)}") from None
 
 
 _BITS_PER_BYTE = 8
@@ -177,18 +248,14 @@ def bit_place(signal: Signal) -> BitPlace:
         raise DatabaseError(f"signal {signal.name} is a floating-point number; the node corrects integer signals only")
     if not 1 <= signal.length <= _LONGEST:
         raise DatabaseError(f"signal {signal.name} has {signal.length} bits; 1 to {_LONGEST} are expected")
-    if signal.byte_order == "little_endian":
-        low, high = signal.start, signal.start + signal.length - 1
-        shift = low % _BITS_PER_BYTE
-    else:  # the start bit is the most significant one, numbered from the top of its byte here
-        low = signal.start - signal.start % _BITS_PER_BYTE + (_BITS_PER_BYTE - 1 - signal.start % _BITS_PER_BYTE)
-        high = low + signal.length - 1
-        shift = _BITS_PER_BYTE - 1 - high % _BITS_PER_BYTE
+    low = start_bit(signal)  # of a big-endian signal its most significant bit, numbered from the top of its byte
+    high = low + signal.length - 1
+    is_little = signal.byte_order == "little_endian"
     return BitPlace(
         first=low // _BITS_PER_BYTE,
         end=high // _BITS_PER_BYTE + 1,
-        order="little" if signal.byte_order == "little_endian" else "big",
-        shift=shift,
+        order="little" if is_little else "big",
+        shift=low % _BITS_PER_BYTE if is_little else _BITS_PER_BYTE - 1 - high % _BITS_PER_BYTE,
         length=signal.length,
         signed=signal.is_signed,
     )
@@ -320,7 +387,7 @@ def read_codes(signal: Signal, units: Mapping[str, float], where: str) -> Codes:
     signal : Signal
         An integer signal of the DBC.
     units : mapping of str to float
-        One of the tables of :mod:`ecu_node.units`; values come out in its base unit.
+        One of the tables of :mod:`ecu_node.core.signals`; values come out in its base unit.
     where : str
         What the signal is for, for messages of errors.
 
@@ -423,6 +490,11 @@ def require_reach(codes: Codes, largest: Fraction, where: str) -> None:
         )
 
 
+def exact_code(signal: Signal, value: float) -> Fraction:
+    """Code of a signal that stands for a value in the unit of the DBC; no whole number if none does."""
+    return (as_written(float(value)) - as_written(signal.offset)) / as_written(signal.scale)
+
+
 def impossible_values(signal: Signal, values: Sequence[float]) -> list[float]:
     """Those of some values that a signal of the DBC can never have; none of a floating-point number's.
 
@@ -435,12 +507,12 @@ def impossible_values(signal: Signal, values: Sequence[float]) -> list[float]:
     """
     if signal.is_float or signal.scale == 0:
         return []
-    place, scale, offset = bit_place(signal), as_written(signal.scale), as_written(signal.offset)
-    codes = [(as_written(float(value)) - offset) / scale for value in values]
+    possible = bit_place(signal)
+    codes = {value: exact_code(signal, value) for value in values}
     return [
         value
-        for value, code in zip(values, codes, strict=True)
-        if code.denominator != 1 or not place.lowest <= code <= place.highest
+        for value, code in codes.items()
+        if code.denominator != 1 or not possible.lowest <= code <= possible.highest
     ]
 
 

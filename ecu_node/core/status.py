@@ -3,7 +3,9 @@
 from dataclasses import asdict, dataclass
 from enum import IntEnum
 
-__all__ = ["Counters", "Quality", "Reason", "State"]
+from ecu_node.errors import ParameterError
+
+__all__ = ["Counters", "Quality", "Reason", "State", "TrustError", "UnfitError"]
 
 
 class State(IntEnum):
@@ -43,6 +45,22 @@ class Reason(IntEnum):
     """Nothing is held back for it; in a signal of 4 bits NONE stands for it."""
     E2E_INVALID = 18
     """So many frames of a message fail their end-to-end check that it is not used. In 4 bits: INPUT_MISSING."""
+
+
+class UnfitError(ParameterError):
+    """Parameters that must not be applied here, with the reason as the node publishes it."""
+
+    def __init__(self, reason: Reason, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+    def __reduce__(self) -> tuple[type["UnfitError"], tuple[Reason, str]]:
+        """Let it travel between processes."""
+        return type(self), (self.reason, str(self))
+
+
+class TrustError(UnfitError):
+    """Parameters that nobody may vouch for: signature, time, order, or form."""
 
 
 class Quality(IntEnum):

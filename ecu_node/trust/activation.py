@@ -11,8 +11,8 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
+from ecu_node.core.status import TrustError, UnfitError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import TrustError, UnfitError
 from ecu_node.trust.audit import REFUSED, add_entry, event_now
 from ecu_node.trust.commit import commit, opened
 from ecu_node.trust.judgement import ALL_KINDS, Accepted, Arrival, judge_arrival

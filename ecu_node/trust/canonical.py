@@ -11,10 +11,9 @@ from typing import Any, TypeVar
 import msgspec
 import rfc8785
 
-from ecu_node.core.status import Reason
-from ecu_node.errors import TrustError, printable
-from ecu_node.fields import json_error
-from ecu_node.user_files import UnsuitableFileError, read_user_file
+from ecu_node.core.status import Reason, TrustError
+from ecu_node.documents import UnsuitableFileError, json_error, read_user_file
+from ecu_node.errors import printable
 
 __all__ = [
     "MAX_BYTES",

@@ -16,8 +16,7 @@ import msgspec
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-from ecu_node.core.status import Reason
-from ecu_node.errors import TrustError
+from ecu_node.core.status import Reason, TrustError
 from ecu_node.trust.canonical import canonical_bytes, malformed, printable, read_canonical
 from ecu_node.trust.key_set import KeyId, KeySet, PublicKey
 from ecu_node.trust.unsigned import UNSIGNED, unsigned_kind

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from ecu_node.errors import UnfitError
+from ecu_node.core.status import UnfitError
 from ecu_node.trust.audit import End, broken_line, end_of_log
 from ecu_node.trust.canonical import read_bytes, read_canonical
 from ecu_node.trust.key_set import KEY_SET, KeySet, check_key_set

@@ -10,9 +10,8 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Reason, TrustError, UnfitError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import TrustError, UnfitError
 from ecu_node.parameters import check_fit
 from ecu_node.trust.key_set import KeySet
 from ecu_node.trust.largest_step import require_small_step

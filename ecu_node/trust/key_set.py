@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from ecu_node.core.status import Reason
-from ecu_node.errors import TrustError
+from ecu_node.core.status import Reason, TrustError
 from ecu_node.trust.canonical import Expected
 
 __all__ = [

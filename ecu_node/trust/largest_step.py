@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Reason, TrustError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import TrustError
 from ecu_node.parameters import BranchParameters, VehicleParameters
 from ecu_node.trust.state import TrustState, signed_parameters
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from ecu_node.bus.guard import Mode
 from ecu_node.bus.in_force import FileSignature, InForce, put_in_force, signature
 from ecu_node.core.corrector import Corrector
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Reason, TrustError, UnfitError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import TrustError, UnfitError, UserError
+from ecu_node.errors import UserError
 from ecu_node.parameters import check_fit
 from ecu_node.trust.activation import conclude
 from ecu_node.trust.state import Slot, SlotName, TrustState, read_state, signed_parameters, slot_path, state_path

@@ -3,8 +3,8 @@
 from datetime import datetime
 from pathlib import Path
 
-from ecu_node.core.status import Reason
-from ecu_node.errors import TrustError, UserError
+from ecu_node.core.status import Reason, TrustError
+from ecu_node.errors import UserError
 from ecu_node.trust.audit import event_now
 from ecu_node.trust.commit import commit
 from ecu_node.trust.key_set import MAX_FIRST_VERSION, KeySet

@@ -17,14 +17,13 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from ecu_node.core.status import Reason
-from ecu_node.errors import TrustError
+from ecu_node.core.status import Reason, TrustError
+from ecu_node.documents import UnsuitableFileError, read_user_file
 from ecu_node.trust.audit import AuditEntry
 from ecu_node.trust.canonical import MAX_BYTES, Expected, canonical_bytes, malformed, read_bytes, read_canonical
 from ecu_node.trust.key_set import KeySet, check_key_set
 from ecu_node.trust.statements import SignedParameters, instant, open_statement
 from ecu_node.trust.storage import move_file, replace_file, write_file
-from ecu_node.user_files import UnsuitableFileError, read_user_file
 
 __all__ = [
     "Slot",

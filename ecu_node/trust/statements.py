@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from ecu_node.core.status import Reason
-from ecu_node.errors import TrustError
+from ecu_node.core.status import Reason, TrustError
 from ecu_node.parameters import VehicleParameters
 from ecu_node.trust.canonical import read_canonical
 from ecu_node.trust.envelope import Envelope, not_signed, read_envelope, require_known, signers, signers_among

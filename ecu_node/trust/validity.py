@@ -2,8 +2,7 @@
 
 from datetime import UTC, datetime
 
-from ecu_node.core.status import Reason
-from ecu_node.errors import TrustError
+from ecu_node.core.status import Reason, TrustError
 from ecu_node.trust.state import TrustState
 from ecu_node.trust.statements import SignedParameters, instant
 

@@ -458,14 +458,14 @@ WRONG = [
         ", profile: one of P01, P02, P04, P05, P06, P07, P11, counter CRC8 is expected, it is missing",
     ),
     ('profile = "P01"', ": 'messages' is missing"),
-    ('profile = "P01"\nmessages = []', ", messages: a list of at least 1 entry is expected, found a list of 0"),
+    ('profile = "P01"\nmessages = []', ", messages: a list of length >= 1 is expected, found a list of 0"),
     ('profile = "P01"\nmessages = ["Room", "Room"]', ", messages: Room is named twice"),
     ('profile = "P01"\nmessages = [1]', ", messages, entry number 1: a text is expected, found 1"),
     ('profile = "P01"\nmessages = ["Room"]\ndata_id = 3', ", data_id: a table is expected, found 3"),
     ('profile = "P01"\nmessages = ["Room"]\ndata_id = { Hall = 3 }', ", data_id: Hall is not in 'messages'"),
     (
         'profile = "P02"\nmessages = ["Room"]\ndata_id_list = { Room = [1] }',
-        ", data_id_list, Room: a list of at least",
+        ", data_id_list, Room: a list of length >=",
     ),
     ('profile = "P02"\nmessages = ["Room"]\ndata_id_list = {}', ", data_id_list: Room has none"),
     (

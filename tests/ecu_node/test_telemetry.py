@@ -191,7 +191,7 @@ def test_wrong_target_is_wrong_use(text: str, capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.parametrize("name", ["CurrentCurrent", "Vehicle", "vehicle.Current", "Vehicle.a b", "Vehicle..A"])
 def test_wrong_vss_name_is_refused(name: str, make_database: Callable[..., VehicleDatabase]) -> None:
-    with pytest.raises(LayoutError, match=r"branch battery: vss '.*': expected a name of the Vehicle Signal Spec"):
+    with pytest.raises(LayoutError, match=r"'battery', vss: a name of the Vehicle Signal Spec.* is expected"):
         make_database(NAMED.replace(VSS, name))
 
 

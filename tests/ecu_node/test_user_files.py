@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Reason, UnfitError
 from ecu_node.database import MAX_DBC_BYTES, read_database
-from ecu_node.errors import DatabaseError, UnfitError
+from ecu_node.documents import UnsuitableFileError, read_user_file
+from ecu_node.errors import DatabaseError
 from ecu_node.layout import MAX_LAYOUT_BYTES, read_layout
 from ecu_node.parameters import MAX_FILE_BYTES, read_parameters
-from ecu_node.user_files import UnsuitableFileError, read_user_file
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT
 
 
@@ -79,7 +79,7 @@ def test_files_of_the_largest_size_are_read(tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(filled)
     layout = read_layout(tmp_path / "small.toml")
     (tmp_path / "small.dbc").write_bytes(b"\n" * MAX_DBC_BYTES)
-    with pytest.raises(DatabaseError, match="the DBC is empty"):
+    with pytest.raises(DatabaseError, match="the DBC has no message"):
         read_database(layout)
     (tmp_path / "p.json").write_bytes(b" " * MAX_FILE_BYTES)
     with pytest.raises(UnfitError, match="it is empty"):

@@ -11,11 +11,10 @@ from ecu_node.bus.guard import Mode
 from ecu_node.bus.in_force import InForce, branch_plan, passing_plan, sensor_fault
 from ecu_node.bus.wiring import wire
 from ecu_node.core.e2e import Check, Receiver, protection_of
-from ecu_node.core.signals import placed_signal, read_codes
+from ecu_node.core.signals import AMPERE, placed_signal, read_codes
 from ecu_node.core.status import Quality
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout, split_signal
-from ecu_node.units import AMPERE
 from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, parameters_for
 
 HEADER = ' SG_ Crc : 0|8@1+ (1,0) [0|255] "" Node\n SG_ Alive : 8|4@1+ (1,0) [0|14] "" Node\n'

@@ -8,9 +8,8 @@ import pytest
 from bench import trust_fuzz
 from bench.trust_fuzz import Vehicle, WrongAnswerError, fuzz
 from bench.trust_fuzz_mutations import MUTATIONS
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Reason, TrustError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import TrustError
 from ecu_node.trust.judgement import Arrival
 
 

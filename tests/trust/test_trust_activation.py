@@ -9,9 +9,9 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Reason, TrustError, UnfitError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import TrustError, UnfitError, UserError
+from ecu_node.errors import UserError
 from ecu_node.parameters import FileReference, VehicleParameters
 from ecu_node.trust.activation import accept, conclude, examine
 from ecu_node.trust.audit import AuditEntry, broken_line

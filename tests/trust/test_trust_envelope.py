@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from securesystemslib.dsse import Envelope as DsseEnvelope
 
-from ecu_node.core.status import Reason
-from ecu_node.errors import TrustError
+from ecu_node.core.status import Reason, TrustError
 from ecu_node.parameters import VehicleParameters
 from ecu_node.trust.canonical import canonical_bytes, read_canonical
 from ecu_node.trust.envelope import read_envelope

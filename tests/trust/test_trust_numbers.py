@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Reason, TrustError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import TrustError
 from ecu_node.parameters import VehicleParameters
 from ecu_node.trust.activation import accept, conclude
 from ecu_node.trust.canonical import canonical_bytes

@@ -17,8 +17,9 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
+from ecu_node.core.status import TrustError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import TrustError, UserError
+from ecu_node.errors import UserError
 from ecu_node.parameters import VehicleParameters
 from ecu_node.trust.activation import accept, conclude
 from ecu_node.trust.audit import REFUSED, AuditEntry, broken_line

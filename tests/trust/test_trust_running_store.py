@@ -14,9 +14,8 @@ from msgspec.structs import replace
 from ecu_node.bus.guard import Mode
 from ecu_node.bus.wiring import wire
 from ecu_node.core.corrector import Corrector
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Reason, TrustError, UnfitError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import TrustError, UnfitError
 from ecu_node.parameters import JunctionResidual, VehicleParameters
 from ecu_node.trust.activation import accept
 from ecu_node.trust.parameter_store import ParameterStore

@@ -13,9 +13,9 @@ from msgspec.structs import replace
 
 from ecu_node.bus.service import Log
 from ecu_node.cli import main
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Reason, TrustError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import TrustError, UserError
+from ecu_node.errors import UserError
 from ecu_node.parameters import VehicleParameters
 from ecu_node.trust import storage
 from ecu_node.trust.activation import accept, conclude

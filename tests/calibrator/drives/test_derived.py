@@ -1,8 +1,14 @@
+"""Formulas of a layout: arithmetic is understood, everything else refused with file and place."""
+
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from calibrator.drives.derived import evaluate_formula
-from ecu_node.formula import parse_formula
+from calibrator.drives.derived import evaluate_formula, formula_names, parse_formula
+from calibrator.files.layout_files import chosen_layout
+from ecu_node.errors import LayoutError
+from tests.ecu_node.vehicles import SMALL_LAYOUT
 
 VALUES = {"a": np.array([1.0, -2.0, 4.0]), "b": np.array([2.0, 0.0, -1.0])}
 
@@ -36,3 +42,46 @@ def test_a_missing_value_stays_missing() -> None:
     values = {"a": np.array([np.nan, 1.0])}
     for formula in ("a + 1", "positive(a)", "negative(a)", "a * 0"):
         assert np.isnan(evaluate_formula(parse_formula(formula), values)).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("formula", "words"),
+    [
+        ("speed * 2", r"speed is no \[\[input\]\]"),
+        ("d + 1", r"d is no \[\[input\]\]"),
+        ("open(1)", "not allowed"),
+        ("a b", "not arithmetic"),
+    ],
+)
+def test_layout_with_wrong_formula_is_refused(tmp_path: Path, formula: str, words: str) -> None:
+    path = tmp_path / "small.toml"
+    derived = f'derived = [{{ name = "d", formula = "{formula}" }}]\nfull_scale_a'
+    path.write_text(SMALL_LAYOUT.replace("full_scale_a", derived))
+    with pytest.raises(LayoutError, match=rf"small\.toml: derived input d: .*{words}") as caught:
+        chosen_layout(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("torque * speed / voltage", ["speed", "torque", "voltage"]),
+        ("positive(a) - negative(b) ** 2", ["a", "b"]),
+        ("-(a + 1.5)", ["a"]),
+        ("sqrt(abs(a))", ["a"]),
+    ],
+)
+def test_arithmetic_is_understood(text: str, names: list[str]) -> None:
+    assert formula_names(parse_formula(text)) == names
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "a b", "a; b", "a if b else c", "a.b", "a[0]", "f(a)", "sqrt(a, b)", "a ** b", "'x'", "True",
+     "lambda: 1", "__import__('os')", "a < b", "a // b", "(" * 500 + "a" + ")" * 500, "-" * 5000 + "a", "\0",
+     "a" + " + a" * 1500],
+)  # fmt: skip
+def test_everything_else_is_refused(text: str) -> None:
+    with pytest.raises(LayoutError, match="formula") as caught:
+        parse_formula(text)
+    assert "\n" not in str(caught.value)

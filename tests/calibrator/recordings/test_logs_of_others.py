@@ -400,7 +400,7 @@ def test_branch_computed_by_a_formula(tmp_path: Path, layout: Path, formula: str
         (("signal = \"Motor.Current\"", 'formula = "f(1)"'), "motor: formula 'f(1)': 'f(1)' is not allowed"),
         (("sign = -1", 'sign = -1\nformula = "1"'), "'power' and 'voltage', or 'formula'"),
         (("sign = -1", "sign = -1\nuncertainty = 0.1"), "motor: 'uncertainty' is that of a 'formula'"),
-        (("sign = -1", 'sign = -1\nunit = "km"'), "motor: unit 'km' is unknown; expected A, kA, mA"),
+        (("sign = -1", 'sign = -1\nunit = "km"'), "branch motor: signal Current is in 'km'; expected A, mA, kA"),
         (("Motor.Current", "aux:Motor.Current"), "no [[bus]] is named 'aux'; known are none"),
         (("full_scale_a", f"{BUSES}\nfull_scale_a"), "unknown key 'full_scale_a'"),
         (('sign = -1', f'sign = -1\n{BUSES}'), "give either 'dbc', or [[bus]] with a 'dbc' each"),
