@@ -8,47 +8,29 @@ end it with 0). Errors are one line; ``--debug``, anywhere, shows the traceback 
 import argparse
 import json
 import logging
-import math
 import os
+import signal
 import sys
-from collections.abc import Sequence
-from contextlib import nullcontext, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import urlsplit
 
 from ecu_node import __version__
-from ecu_node.program import (
-    DEBUG,
-    DEBUG_HELP,
-    DEBUG_HINT,
-    CommandParser,
-    drop_output,
-    end_of,
-    ending_at_interrupt,
-    flush_output,
-    ignoring_hangups,
-    load_python_can,
-    say_error,
-    split_debug,
-    write_output,
-    write_text,
-)
+from ecu_node.errors import LayoutError
+from ecu_node.program import CommandParser, load_python_can, run_program, say_error, write_output, write_result
 from ecu_node.trust.commands import add_trust_commands
 
-__all__ = ["main"]
+if TYPE_CHECKING:
+    from ecu_node.database import VehicleDatabase
 
+__all__ = ["main", "template_text"]
+
+_Commands: TypeAlias = "argparse._SubParsersAction[CommandParser]"
 _VEHICLE_VARIABLE = "ECU_NODE_VEHICLE"
-_LONGEST_ONCE_S = 86400.0
-"""For ``monitor --once``. [s]"""
-_LARGEST_PORT = 65535
-_LONGEST_VEHICLE = 64
-"""Characters, as in the parameter file."""
-_EXIT_CODES = (
-    "Exit codes: 0 done (also when ended by a signal), 1 failed, 2 wrong use, 70 internal error, 130 interrupted at "
-    "start."
-)
+_AT_WORK = "done (also when ended by a signal at work)"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -65,51 +47,107 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0 done, 1 failed, 70 a fault of the program itself. Wrong use ends in SystemExit(2), Ctrl-C during
         start-up ends the process with 130.
     """
-    arguments, debug = split_debug(sys.argv[1:] if argv is None else argv)
-    try:
-        with ending_at_interrupt("ecu-node: interrupted"):
-            try:
-                return _main(arguments)
-            finally:
-                flush_output()
-    except BrokenPipeError:
-        drop_output()
-        return 1
-    except Exception as error:  # noqa: BLE001 (each is told, and ends the program)
-        return end_of("ecu-node", error, debug=debug)
+    return run_program("ecu-node", _main, sys.argv[1:] if argv is None else argv)
 
 
-def _main(arguments: Sequence[str]) -> int:
+def _main(arguments: list[str]) -> int:
     options = _parser().parse_args(arguments)
-    with ignoring_hangups() if options.command is _run else nullcontext():
-        logging.getLogger("can").addHandler(logging.NullHandler())
-        load_python_can()
-        return int(options.command(options))
+    if options.command is _run:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # it would end the node before it can handle it
+    logging.getLogger("can").addHandler(logging.NullHandler())
+    load_python_can()
+    return options.command(options) or 0
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = CommandParser(
         prog="ecu-node",
         description="Corrects the high-voltage currents on a CAN bus with the parameters of this vehicle.",
-        epilog=_EXIT_CODES,
+        done=_AT_WORK,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    parser.add_argument(DEBUG, action="store_true", help=DEBUG_HELP)
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error; may stand anywhere")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_run(commands)
     _add_monitor(commands)
-    add_trust_commands(commands)
+    add_trust_commands(commands, _VEHICLE)
     _add_faults(commands)
     _add_check(commands)
     _add_template(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of the parameter file")
     schema.set_defaults(command=_schema)
-    for command in commands.choices.values():
-        command.epilog = f"{command.epilog or _EXIT_CODES} {DEBUG_HINT}"
     return parser
 
 
-def _add_run(commands: "argparse._SubParsersAction[CommandParser]") -> None:
+def _option(read: Callable[[str], Any], is_right: Callable[[Any], Any], refusal: str) -> Callable[[str], Any]:
+    """Make a type for argparse: what `read` makes of a text, if that is right; else it is refused, and shown."""
+
+    def value_of(text: str) -> Any:
+        with suppress(ValueError):
+            value = read(text)
+            if is_right(value):
+                return value
+        found = ascii(text) if text.strip() else "none"
+        raise argparse.ArgumentTypeError(refusal.format(found if len(text) <= 64 else f"{len(text)} characters"))
+
+    return value_of
+
+
+_NAME = _option(str, str.strip, "a name is expected, such as can0, found {}")
+_PORT = _option(int, range(1, 65536).__contains__, "a TCP port from 1 to 65535 is expected, found {}")
+_SECONDS = _option(float, lambda s: 0.0 < s <= 86400.0, "{}: expected a number of seconds above 0, at most 86400")
+_VEHICLE = _option(
+    str,
+    lambda text: text.strip() and len(text) <= 64 and text.isprintable(),  # as in the parameter file
+    "the identity of the vehicle is expected, printable and of at most 64 characters, found {}",
+)
+
+
+def _read_target(text: str) -> Path | tuple[str, int] | None:
+    """File, or host and port, of ``--telemetry``; None if it is neither."""
+    if "://" not in text:
+        return Path(text) if text.strip() else None
+    found = urlsplit(text)
+    is_udp = found.scheme == "udp" and found.hostname and found.port and text.endswith(f":{found.port}")
+    return (found.hostname, found.port) if is_udp else None  # type: ignore[return-value]
+
+
+_TARGET = _option(_read_target, bool, "a file or udp://HOST:PORT is expected, found {}")
+
+
+def _add_layout(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--layout", type=Path, required=True, metavar="FILE", help="layout (TOML), which names the DBC")
+
+
+def _add_vehicle(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--vehicle",
+        type=_VEHICLE,
+        default=os.environ.get(_VEHICLE_VARIABLE) or None,
+        metavar="ID",
+        help=f"this vehicle; parameters of another are refused (default: ${_VEHICLE_VARIABLE}; else not checked)",
+    )
+
+
+def _add_bus(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
+    parser.add_argument("--channel", required=True, type=_NAME, help="channel of the interface, such as can0 or vcan0")
+    parser.add_argument("--fd", action="store_true", help="open the bus for CAN FD")
+    for name, what in (("--bitrate", "bit rate"), ("--data-bitrate", "bit rate of the data of CAN FD frames")):
+        words = f"{what}, where the adapter sets it; this and other settings may stand in python-can's can.conf"
+        parser.add_argument(name, type=int, metavar="BIT_PER_S", help=words)
+    parser.add_argument(
+        "--listen-only", action="store_true", help="send nothing; adapters that can do so acknowledge no frame either"
+    )
+
+
+def _bus_settings(options: argparse.Namespace) -> dict[str, Any]:
+    """Settings of the bus, as :func:`ecu_node.bus.adapters.bus_config` takes them."""
+    settings = {name: getattr(options, name) for name in ("interface", "channel", "fd", "listen_only")}
+    return {**settings, "bitrates": {"bitrate": options.bitrate, "data_bitrate": options.data_bitrate}}
+
+
+def _add_run(commands: _Commands) -> None:
     run = commands.add_parser(
         "run",
         help="correct until SIGTERM or SIGINT",
@@ -117,7 +155,7 @@ def _add_run(commands: "argparse._SubParsersAction[CommandParser]") -> None:
         "own on the same bus, or, with --gateway, in place on another bus. With parameters that do not fit it passes "
         "the measured values through and says so in its status message. SIGHUP, or a changed parameter file, makes it "
         "read the parameters again.",
-        epilog=_EXIT_CODES,
+        done=_AT_WORK,
     )
     source = run.add_mutually_exclusive_group(required=True)
     source.add_argument("--state", type=Path, metavar="FOLDER", help="state of this vehicle, with signed parameters")
@@ -126,35 +164,78 @@ def _add_run(commands: "argparse._SubParsersAction[CommandParser]") -> None:
     _add_layout(run)
     _add_vehicle(run)
     _add_bus(run)
-    _add_gateway(
-        run,
-        "be a gateway: the sensors are on --channel, the rest of the vehicle on this; branch frames are passed on with "
-        "the corrected current in place, all others as they are",
+    run.add_argument(
+        "--gateway",
+        type=_NAME,
+        metavar="CHANNEL",
+        help="be a gateway: the sensors are on --channel, the rest of the vehicle on this; branch frames are passed on "
+        "with the corrected current in place, all others as they are",
     )
     run.add_argument("--shadow", action="store_true", help="compute and report the corrected sum, but change nothing")
     run.add_argument("--dry-run", action="store_true", help="print what would be opened, read and sent; open nothing")
     run.add_argument(
-        "--metrics-port", type=_port, metavar="PORT", help="let Prometheus ask here (needs prometheus-client)"
+        "--metrics-port", type=_PORT, metavar="PORT", help="let Prometheus ask here (needs prometheus-client)"
     )
-    run.add_argument(
-        "--telemetry",
-        type=_outlet,
-        metavar="TARGET",
-        help="a line of JSON per second, added to a file or sent to udp://HOST:PORT",
-    )
-    run.add_argument(
-        "--realtime", action="store_true", help="run as a real-time process: SCHED_FIFO, locked memory, one processor"
-    )
+    words = "a line of JSON per second, added to a file or sent to udp://HOST:PORT"
+    run.add_argument("--telemetry", type=_TARGET, metavar="TARGET", help=words)
+    words = "run as a real-time process: SCHED_FIFO, locked memory, one processor"
+    run.add_argument("--realtime", action="store_true", help=words)
     run.set_defaults(command=_run)
 
 
-def _add_faults(commands: "argparse._SubParsersAction[CommandParser]") -> None:
+def _run(options: argparse.Namespace) -> int:
+    from ecu_node.bus.run import run_node  # noqa: PLC0415  # after load_python_can
+
+    if options.gateway == options.channel:
+        return _wrong_use(f"--gateway {options.gateway} is the bus of the sensors itself; two buses are expected")
+    if options.gateway is not None and options.listen_only:
+        return _wrong_use("--listen-only sends nothing, and a gateway must pass frames on; leave one of them out")
+    if options.state is not None and options.unsigned:
+        return _wrong_use("--state holds signed parameters; leave --unsigned out")
+    if options.params is not None and not options.unsigned:
+        return _wrong_use(
+            "--params names a file that nobody signed: give --state with signed parameters, or --unsigned as well"
+        )
+    return run_node(options, _bus_settings(options))
+
+
+def _wrong_use(text: str) -> int:
+    say_error(f"ecu-node: {text}")
+    return 2
+
+
+def _add_monitor(commands: _Commands) -> None:
+    monitor = commands.add_parser(
+        "monitor",
+        help="show the branches, their sum and the node, live",
+        description="Listens to a bus, and never sends: measured and corrected currents, frame rates, faults, the "
+        "Kirchhoff sum, and what the node says of itself. A table in a terminal, else a block of text per second.",
+        done=_AT_WORK,
+        failed="failed, or with --once no branch was seen",
+    )
+    _add_layout(monitor)
+    _add_bus(monitor)
+    monitor.add_argument(
+        "--once", type=_SECONDS, metavar="SECONDS", help="listen this long, print what was seen, and end"
+    )
+    monitor.add_argument("--json", action="store_true", help="print JSON; with --once")
+    monitor.set_defaults(command=_monitor, error=monitor.error)
+
+
+def _monitor(options: argparse.Namespace) -> int:
+    from ecu_node.monitor import run_monitor  # noqa: PLC0415  # after load_python_can
+
+    if options.json and options.once is None:
+        options.error("--json needs --once SECONDS")
+    return run_monitor(options.layout, _bus_settings(options), once_s=options.once, as_json=options.json)
+
+
+def _add_faults(commands: _Commands) -> None:
     faults = commands.add_parser(
         "faults",
         help="why the node fell back: first, last, how often, with which currents",
         description="Prints the fault memory of a state folder, the last fault first. What is active keeps a node from "
         "correcting, also after a restart.",
-        epilog="Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted.",
     )
     faults.add_argument("--json", action="store_true", help="print JSON")
     clear = commands.add_parser(
@@ -162,47 +243,54 @@ def _add_faults(commands: "argparse._SubParsersAction[CommandParser]") -> None:
         help="forget the faults, and correct again",
         description="Empties the fault memory of a state folder. A node that runs corrects again within a second; find "
         "out first what was wrong.",
-        epilog="Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted.",
     )
     for command, run in ((faults, _faults), (clear, _clear)):
         command.add_argument("--state", type=Path, required=True, metavar="FOLDER", help="state of this vehicle")
         command.set_defaults(command=run)
 
 
-def _add_check(commands: "argparse._SubParsersAction[CommandParser]") -> None:
+def _faults(options: argparse.Namespace) -> None:
+    from msgspec import to_builtins  # noqa: PLC0415
+
+    from ecu_node.bus.faults import faults_text, read_faults  # noqa: PLC0415  # after load_python_can
+
+    faults = read_faults(options.state)
+    write_result(to_builtins(faults), faults_text(faults), as_json=options.json)
+
+
+def _clear(options: argparse.Namespace) -> None:
+    from ecu_node.bus.faults import clear_faults  # noqa: PLC0415  # after load_python_can
+
+    clear_faults(options.state)
+
+
+def _add_check(commands: _Commands) -> None:
     check = commands.add_parser(
         "check",
         help="would these parameters be applied?",
         description="Checks parameters against layout, DBC and vehicle, and shows the integer plan of each branch. "
         "What it accepts, 'ecu-node run' accepts.",
-        epilog="Exit codes: 0 they fit, 1 they do not, 2 wrong use, 70 internal error, 130 interrupted.",
+        done="they fit",
+        failed="they do not",
     )
-    _add_files(check)
-    _add_gateway(check, "as a gateway would apply them; no bus is opened")
+    check.add_argument("--params", type=Path, required=True, metavar="FILE", help="parameter file of this vehicle")
+    _add_layout(check)
+    _add_vehicle(check)
+    words = "as a gateway would apply them; no bus is opened"
+    check.add_argument("--gateway", type=_NAME, metavar="CHANNEL", help=words)
     check.add_argument("--json", action="store_true", help="print JSON")
     check.set_defaults(command=_check)
 
 
-def _add_monitor(commands: "argparse._SubParsersAction[CommandParser]") -> None:
-    monitor = commands.add_parser(
-        "monitor",
-        help="show the branches, their sum and the node, live",
-        description="Listens to a bus, and never sends: measured and corrected currents, frame rates, faults, the "
-        "Kirchhoff sum, and what the node says of itself. A table in a terminal, else a block of text "
-        "per second.",
-        epilog="Exit codes: 0 done (also when ended by a signal), 1 failed, or with --once no branch was seen, "
-        "2 wrong use, 70 internal error, 130 interrupted at start.",
-    )
-    _add_layout(monitor)
-    _add_bus(monitor)
-    monitor.add_argument(
-        "--once", type=_seconds, metavar="SECONDS", help="listen this long, print what was seen, and end"
-    )
-    monitor.add_argument("--json", action="store_true", help="print JSON; with --once")
-    monitor.set_defaults(command=_monitor, error=monitor.error)
+def _check(options: argparse.Namespace) -> int:
+    from ecu_node.bus.run import check_report, report_text  # noqa: PLC0415  # after load_python_can
+
+    report = check_report(options.params, options.layout, options.vehicle, is_gateway=options.gateway is not None)
+    write_result(report, report_text(report), as_json=options.json)
+    return 0 if report["fit"] else 1
 
 
-def _add_template(commands: "argparse._SubParsersAction[CommandParser]") -> None:
+def _add_template(commands: _Commands) -> None:
     template = commands.add_parser(
         "template",
         help="print a parameter file to be filled in by hand",
@@ -211,212 +299,68 @@ def _add_template(commands: "argparse._SubParsersAction[CommandParser]") -> None
         '"apply": true; measured = (1 + drift) * true + offset. A load that no branch measures stands in '
         "expected_a [A], as [unmeasured_load] of the layout says. Take out branches that this vehicle does not have: "
         "the node would wait for their frames. All else can stay as it is.",
-        epilog="Exit codes: 0 done, 1 failed, 2 wrong use, 70 internal error, 130 interrupted.",
     )
     _add_layout(template)
-    template.add_argument(
-        "--vehicle", required=True, type=_template_vehicle, metavar="ID", help="identity of the vehicle"
-    )
+    template.add_argument("--vehicle", required=True, type=_VEHICLE, metavar="ID", help="identity of the vehicle")
     template.set_defaults(command=_template)
 
 
-def _template_vehicle(text: str) -> str:
-    if not text.strip() or len(text) > _LONGEST_VEHICLE or not text.isprintable():
-        raise argparse.ArgumentTypeError(
-            f"the identity of the vehicle is expected, of at most {_LONGEST_VEHICLE} characters that can be printed"
-        )
-    return text
-
-
-def _seconds(text: str) -> float:
-    """A time of the command line. [s]"""
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0.0 < seconds <= _LONGEST_ONCE_S:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a number of seconds above 0, at most {_LONGEST_ONCE_S:g}")
-    return seconds
-
-
-def _add_bus(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--interface", default="socketcan", help="python-can interface (default: %(default)s)")
-    parser.add_argument("--channel", required=True, type=_name, help="channel of the interface, such as can0 or vcan0")
-    parser.add_argument("--fd", action="store_true", help="open the bus for CAN FD")
-    for name, what in (("--bitrate", "bit rate"), ("--data-bitrate", "bit rate of the data of CAN FD frames")):
-        parser.add_argument(
-            name,
-            type=int,
-            metavar="BIT_PER_S",
-            help=f"{what}, where the adapter sets it; this and other settings may stand in python-can's can.conf",
-        )
-    parser.add_argument(
-        "--listen-only", action="store_true", help="send nothing; adapters that can do so acknowledge no frame either"
-    )
-
-
-def _add_layout(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--layout", type=Path, required=True, metavar="FILE", help="layout (TOML), which names the DBC")
-
-
-def _add_gateway(parser: argparse.ArgumentParser, words: str) -> None:
-    parser.add_argument("--gateway", type=_name, metavar="CHANNEL", help=words)
-
-
-def _bus_options(options: argparse.Namespace) -> dict[str, Any]:
-    """What :func:`_add_bus` has added, as the options of a run or a monitor."""
-    return {
-        "interface": options.interface,
-        "channel": options.channel,
-        "fd": options.fd,
-        "listen_only": options.listen_only,
-        "bitrates": {"bitrate": options.bitrate, "data_bitrate": options.data_bitrate},
-    }
-
-
-def _name(text: str) -> str:
-    if not text.strip():
-        raise argparse.ArgumentTypeError("a name is expected, such as can0, found none")
-    return text
-
-
-def _vehicle(text: str) -> str:
-    if not text.strip():
-        raise argparse.ArgumentTypeError("the identity of this vehicle is expected, found none; or leave it out")
-    if not text.isprintable():
-        raise argparse.ArgumentTypeError(f"{text!a}: the identity of this vehicle is a text without control characters")
-    return text
-
-
-def _port(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= _LARGEST_PORT:
-        raise argparse.ArgumentTypeError(f"a TCP port from 1 to {_LARGEST_PORT} is expected, found {text!r}")
-    return int(text)
-
-
-def _outlet(text: str) -> Path | tuple[str, int]:
-    if text.strip() and "://" not in text:
-        return Path(text)
-    with suppress(ValueError):  # a port that is none
-        found = urlsplit(text)
-        if found.scheme == "udp" and found.hostname and found.port and text.endswith(f":{found.port}"):
-            return found.hostname, found.port
-    raise argparse.ArgumentTypeError(f"a file or udp://HOST:PORT is expected, found {text!r}")
-
-
-def _add_files(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--params", type=Path, required=True, metavar="FILE", help="parameter file of this vehicle")
-    _add_layout(parser)
-    _add_vehicle(parser)
-
-
-def _add_vehicle(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--vehicle",
-        type=_vehicle,
-        default=os.environ.get(_VEHICLE_VARIABLE) or None,
-        metavar="ID",
-        help=f"this vehicle; parameters of another are refused (default: ${_VEHICLE_VARIABLE}; else not checked)",
-    )
-
-
-def _run(options: argparse.Namespace) -> int:
-    from ecu_node.bus.run import RunOptions, run_node  # noqa: PLC0415  # after load_python_can
-
-    if options.gateway == options.channel:
-        say_error(f"ecu-node: --gateway {options.gateway} is the bus of the sensors itself; two buses are expected")
-        return 2
-    if options.gateway is not None and options.listen_only:
-        _say("--listen-only sends nothing, and a gateway must pass frames on; leave one of them out")
-        return 2
-    if (options.params is not None) != options.unsigned:
-        _say(
-            "--state holds signed parameters; leave --unsigned out"
-            if options.unsigned
-            else "--params names a file that nobody signed: give --state with signed parameters, or --unsigned as well"
-        )
-        return 2
-    return run_node(
-        RunOptions(
-            params=options.params,
-            state=options.state,
-            layout=options.layout,
-            vehicle=options.vehicle,
-            **_bus_options(options),
-            gateway=options.gateway,
-            shadow=options.shadow,
-            dry_run=options.dry_run,
-            metrics_port=options.metrics_port,
-            telemetry=options.telemetry,
-            realtime=options.realtime,
-        ),
-        vehicle_hint=f"give --vehicle or ${_VEHICLE_VARIABLE}",
-    )
-
-
-def _monitor(options: argparse.Namespace) -> int:
-    from ecu_node.monitor import MonitorOptions, run_monitor  # noqa: PLC0415  # after load_python_can
-
-    if options.json and options.once is None:
-        options.error("--json needs --once SECONDS")
-    return run_monitor(
-        MonitorOptions(
-            layout=options.layout,
-            **_bus_options(options),
-            once_s=options.once,
-            as_json=options.json,
-        )
-    )
-
-
-def _check(options: argparse.Namespace) -> int:
-    from ecu_node.bus.guard import Mode  # noqa: PLC0415
-    from ecu_node.check import check_report, report_text  # noqa: PLC0415  # after load_python_can
-
-    mode = Mode.OVERLAY if options.gateway is None else Mode.GATEWAY
-    report = check_report(options.params, options.layout, options.vehicle, mode)
-    if options.json:
-        write_output(json.dumps(report, indent=2))
-    else:
-        write_text(report_text(report))
-    return 0 if report["fit"] else 1
-
-
-def _faults(options: argparse.Namespace) -> int:
-
-    from ecu_node.bus.faults import faults_text, read_faults  # noqa: PLC0415  # after load_python_can
-
-    faults = read_faults(options.state)
-    if options.json:
-        write_output(
-            json.dumps([{name: getattr(fault, name) for name in fault.__struct_fields__} for fault in faults], indent=2)
-        )
-    else:
-        write_text(faults_text(faults))
-    return 0
-
-
-def _clear(options: argparse.Namespace) -> int:
-    from ecu_node.bus.faults import clear_faults  # noqa: PLC0415  # after load_python_can
-
-    clear_faults(options.state)
-    return 0
-
-
-def _template(options: argparse.Namespace) -> int:
-    from ecu_node.check import template_text  # noqa: PLC0415  # after load_python_can
-    from ecu_node.database import node_database  # noqa: PLC0415
+def _template(options: argparse.Namespace) -> None:
+    from ecu_node.database import node_database  # noqa: PLC0415  # after load_python_can
 
     write_output(template_text(node_database(options.layout), options.vehicle, datetime.now(UTC)))
-    return 0
 
 
-def _schema(options: argparse.Namespace) -> int:  # noqa: ARG001
+def template_text(database: "VehicleDatabase", vehicle: str, now: datetime) -> str:
+    """Make a parameter file that corrects nothing yet.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        Layout and DBC of the vehicle.
+    vehicle : str
+        Its identity.
+    now : datetime
+        Time of day.
+
+    Returns
+    -------
+    str
+        JSON without what can be left out. The sum that right sensors show is the layout's unmeasured load: it takes
+        current out of the junction, so what the branches measure sums to as much above 0 A. The verdict is that of a
+        file that corrects, as it is to be once it is filled in.
+    """
+    layout = database.layout
+    expected_a = layout.unmeasured_load.mean_a if layout.unmeasured_load is not None else 0.0
+    if expected_a > layout.offset_limit_a:
+        raise LayoutError(
+            f"{layout.path}: [unmeasured_load] mean_a = {expected_a:g} is beyond the layout's limit of "
+            f"{layout.offset_limit_a:g} A ([limits] offset_a), so that no parameters would fit; correct one of them"
+        )
+    document = {
+        "schema_version": 1,
+        "vehicle": vehicle,
+        "number": 1,
+        "layout": {"name": layout.path.name, "sha256": layout.digest},
+        "dbc": {"name": layout.dbc_path.name, "sha256": database.digest},
+        "verdict": "corrected",
+        "branches": {name: {"drift": 0.0, "offset_a": 0.0, "apply": False} for name in layout.branch_names},
+        "hardware_fault": {"suspected": False},
+        "junction_residual": {"measured_a": 0.0, "corrected_a": 0.0, "expected_a": expected_a},
+        "provenance": {
+            "tool": f"ecu-node template {__version__}",
+            "method": "by hand",
+            "created": now.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+            "fleet": "none",
+            "fleet_size": 1,
+            "drives": [],
+            "duration_s": 0.0,
+        },
+    }
+    return json.dumps(document, indent=2)
+
+
+def _schema(options: argparse.Namespace) -> None:  # noqa: ARG001
     from ecu_node.parameters import parameter_schema  # noqa: PLC0415  # after load_python_can
 
     write_output(json.dumps(parameter_schema(), indent=2))
-    return 0
-
-
-def _say(text: str) -> None:
-    say_error(f"ecu-node: {text}")

@@ -14,14 +14,12 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
-
-from cantools.database.can import Message
 
 from ecu_node.bus.adapters import acknowledgement
 from ecu_node.bus.guard import Mode, key_of, received, transmitted
@@ -31,26 +29,15 @@ from ecu_node.bus.node import steady_time_s
 from ecu_node.bus.service import Log, Requests
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.core.branch import REMEMBERED_FRAMES, Auxiliary, Frames, LiveBranch
-from ecu_node.core.e2e import Check, Receiver, protection_of
-from ecu_node.core.frames import FrameKey
+from ecu_node.core.e2e import Check, Protection, Receiver, protection_of
 from ecu_node.core.junction import simultaneous_currents
 from ecu_node.core.signals import AMPERE, Codes, PlacedSignal, bit_place, placed_signal, read_codes
 from ecu_node.core.status import Counters, Quality, Reason, State
 from ecu_node.database import VehicleDatabase, node_database
-from ecu_node.layout import Branch, SignalName, StatusMessage
+from ecu_node.layout import Branch, StatusMessage
 from ecu_node.program import say_error, wrapped, write_output, write_text
 
-__all__ = [
-    "BranchView",
-    "BusMonitor",
-    "MonitorOptions",
-    "NodeView",
-    "Sums",
-    "View",
-    "listen_until",
-    "run_monitor",
-    "view_lines",
-]
+__all__ = ["BranchView", "BusMonitor", "NodeView", "Sums", "View", "listen_until", "run_monitor", "view_lines"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,20 +165,18 @@ class _HeardMessage:
 
     Attributes
     ----------
-    rate_hz : float
-        Of its frames, intact or not, as of the last :meth:`count_rate`. [1/s]
     frames : deque
         Times [s] and payloads of the last intact frames.
+    faults : dict of str to int
+        Frames that were not intact, as in :class:`BranchView`.
     answers_to : list of _HeardMessage
         Of a corrected message: what it answers.
     """
 
-    def __init__(self, database: VehicleDatabase, message: Message, start_s: float) -> None:
-        protection = protection_of(database, message)
-        self._check = Receiver(protection).check if protection is not None else None
+    def __init__(self, protection: Protection | None, start_s: float) -> None:
+        self._check = Receiver(protection).check if protection is not None else lambda _: Check.OK
         self._count = 0
         self._counts = deque([(start_s, 0)])
-        self.rate_hz = 0.0
         self.frames: Frames = deque(maxlen=REMEMBERED_FRAMES)
         self.faults = dict.fromkeys(_FAULTS.values(), 0)
         self.answers_to: list[_HeardMessage] = []
@@ -199,32 +184,24 @@ class _HeardMessage:
     def take(self, payload: bytearray, time_s: float) -> None:
         """Take a frame; like the node, use it only if it is intact, new, and not after a jump of its counter."""
         self._count += 1
-        found = self._check(payload) if self._check is not None else Check.OK
+        found = self._check(payload)
         if found in _FAULTS:
             self.faults[_FAULTS[found]] += 1
         if found in (Check.OK, Check.LOST):
             self.frames.append((time_s, payload))
 
-    def count_rate(self, now_s: float) -> None:
-        """Work out the frame rate."""
+    def rate_hz(self, now_s: float) -> float:
+        """Rate of its frames, intact or not, since it was asked for the last time two seconds ago or more. [1/s]"""
         counts = self._counts
         while len(counts) > 1 and counts[1][0] <= now_s - _RATE_WINDOW_S:
             counts.popleft()
-        since_s, before = counts[0]
-        self.rate_hz = (self._count - before) / (now_s - since_s) if now_s > since_s else 0.0
         counts.append((now_s, self._count))
+        since_s, before = counts[0]
+        return (self._count - before) / (now_s - since_s) if now_s > since_s else 0.0
 
 
-class _Followed(NamedTuple):
-    """A signal, and the frames that it is in."""
-
-    signal: PlacedSignal
-    heard: _HeardMessage
-
-
-def _followed(database: VehicleDatabase, name: SignalName, heard: Mapping[FrameKey, _HeardMessage]) -> _Followed:
-    message, signal = database.signal(name)
-    return _Followed(placed_signal(message, signal), heard[key_of(message)])
+_Heard = Mapping[tuple[int, bool], _HeardMessage]
+"""Messages by identifier, and whether that has 29 bits."""
 
 
 class BusMonitor:
@@ -244,12 +221,13 @@ class BusMonitor:
     """
 
     def __init__(self, database: VehicleDatabase, start_s: float) -> None:
-        messages = {**received(database), **transmitted(database, Mode.OVERLAY)}
-        heard = {key: _HeardMessage(database, message, start_s) for key, message in messages.items()}
-        self._heard: Mapping[tuple[int, bool], _HeardMessage] = dict(heard.items())
-        self._branches = [_Pair(database, branch, heard) for branch in database.layout.branch]
+        messages = received(database) | transmitted(database, Mode.OVERLAY)
+        self._heard: _Heard = {
+            key: _HeardMessage(protection_of(database, message), start_s) for key, message in messages.items()
+        }
+        self._branches = [_BranchOnBus(database, branch, self._heard) for branch in database.layout.branch]
         status = database.layout.status
-        self._status = _Status(database, status, heard) if status is not None else None
+        self._status = _Status(database, status, self._heard) if status is not None else None
 
     def take(self, key: tuple[int, bool], payload: bytearray, time_s: float) -> None:
         """Take a frame.
@@ -268,36 +246,38 @@ class BusMonitor:
 
     def look(self, now_s: float) -> View:
         """Work out what is to be shown now [s], and begin a new step of the frame rates."""
-        for heard in self._heard.values():
-            heard.count_rate(now_s)
-        publishes = any(pair.corrected is not None and pair.corrected.seen for pair in self._branches)
+        publishes = any(branch.corrected.seen for branch in self._branches)
         return View(
-            branches=tuple(pair.view(now_s) for pair in self._branches),
-            sums=_sums([pair for pair in self._branches if pair.measured.seen], now_s, publishes=publishes),
+            branches=tuple(branch.view(now_s) for branch in self._branches),
+            sums=_sums([branch for branch in self._branches if branch.measured.seen], now_s, publishes=publishes),
             node=self._status.view(now_s) if self._status is not None else None,
             has_status=self._status is not None,
             publishes_corrected=publishes,
         )
 
 
-class _Pair:
-    """One branch: the measured current, and the corrected one if the layout gives it a signal."""
+class _BranchOnBus:
+    """One branch: the measured current, and the corrected one, of which nothing comes if the layout has none."""
 
-    def __init__(self, database: VehicleDatabase, branch: Branch, heard: Mapping[FrameKey, _HeardMessage]) -> None:
+    def __init__(self, database: VehicleDatabase, branch: Branch, heard: _Heard) -> None:
+        def followed(name: str) -> tuple[PlacedSignal, _HeardMessage]:
+            message, signal = database.signal(name)
+            return placed_signal(message, signal), heard[key_of(message)]
+
         signals = branch_signals(database, branch, Mode.OVERLAY)
-        self._branch, self._target_codes = branch, signals.target
-        self._voltage = None
+        self._branch, self._voltage = branch, None
         if branch.voltage is not None and signals.voltage is not None:
-            voltage = _followed(database, branch.voltage, heard)
+            voltage, message = followed(branch.voltage)
             self._voltage = Auxiliary(signals.voltage, branch.timeout_s)
-            self._voltage.follow(voltage.signal, voltage.heard.frames)
-        self._source = _followed(database, branch.source, heard)
-        self.measured = self._live(signals.source, self._source.signal, self._source.heard.frames)
-        self._target = self.corrected = None
+            self._voltage.follow(voltage, message.frames)
+        self._source, self._asked = followed(branch.source)
+        self._target, self._answers = self._source, _HeardMessage(None, 0.0)
         if branch.corrected is not None:
-            self._target = _followed(database, branch.corrected, heard)
-            self._target.heard.answers_to.append(self._source.heard)
-            self.corrected = self._live(signals.target, self._target.signal, self._target.heard.frames)
+            self._target, self._answers = followed(branch.corrected)
+            self._answers.answers_to.append(self._asked)
+        self._target_codes = signals.target
+        self.measured = self._live(signals.source, self._source, self._asked.frames)
+        self.corrected = self._live(signals.target, self._target, self._answers.frames)
         self._quality = bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None
 
     def _live(self, codes: Codes, signal: PlacedSignal, frames: Frames) -> LiveBranch:
@@ -315,56 +295,45 @@ class _Pair:
         answers several frames at once. Answers to frames without the current repeat what was said before, and are left
         out.
         """
-        if self._target is None:
+        if self._branch.corrected is None:
             return self.measured
-        own = self._source.heard
         asked = [
-            (time_s, heard is own and self._source.signal.code(payload) is not None)
-            for heard in dict.fromkeys(self._target.heard.answers_to)
+            (time_s, heard is self._asked and self._source.code(payload) is not None)
+            for heard in dict.fromkeys(self._answers.answers_to)
             for time_s, payload in heard.frames
         ]
         newest_first = iter(sorted(asked, reverse=True))
         answers: Frames = deque()
-        for answer_s, answer in reversed(self._target.heard.frames):
+        for answer_s, answer in reversed(self._answers.frames):
             asked_s, has_current = next((frame for frame in newest_first if frame[0] <= answer_s), (0.0, False))
             if has_current:
                 answers.appendleft((asked_s, answer))
-        return self._live(self._target_codes, self._target.signal, answers)
+        return self._live(self._target_codes, self._target, answers)
 
     def view(self, now_s: float) -> BranchView:
-        """What is to be shown."""
-        source, target = self._source.heard, self._target.heard if self._target is not None else None
-        measured_a, corrected_a = self._currents(now_s)
+        """What is to be shown: the measured current that the corrected one was made of, while answers come."""
+        measured, corrected, answered_s = self.measured, self.corrected, self.answered().time_s
+        is_answered = now_s - answered_s <= self._branch.timeout_s
+        measured_a = _current_at(measured, answered_s if is_answered else measured.time_s)
+        corrected_a = _current_at(corrected, corrected.time_s)
+        quality = None
+        if self._quality is not None and self._answers.frames:
+            quality = _name(Quality, self._quality.extract(self._answers.frames[-1][1]))
         return BranchView(
             name=self._branch.name,
-            is_seen=self.measured.seen,
+            is_seen=measured.seen,
             measured_a=measured_a,
             corrected_a=corrected_a,
-            correction_a=corrected_a - measured_a if measured_a is not None and corrected_a is not None else None,
-            quality=self._shown_quality(),
-            rate_hz=source.rate_hz,
-            corrected_rate_hz=target.rate_hz if target is not None else 0.0,
-            age_s=max(now_s - self.measured.time_s, 0.0) if self.measured.seen else None,
-            is_stale=self.measured.is_stale(now_s),
-            corrected_is_stale=self.corrected is not None and self.corrected.is_stale(now_s),
-            faults=dict(source.faults),
-            corrected_faults=dict.fromkeys(_FAULTS.values(), 0) if target is None else dict(target.faults),
+            correction_a=_difference(corrected_a, measured_a),
+            quality=quality if isinstance(quality, str) else None,
+            rate_hz=self._asked.rate_hz(now_s),
+            corrected_rate_hz=self._answers.rate_hz(now_s),
+            age_s=max(now_s - measured.time_s, 0.0) if measured.seen else None,
+            is_stale=measured.is_stale(now_s),
+            corrected_is_stale=corrected.is_stale(now_s),
+            faults=dict(self._asked.faults),
+            corrected_faults=dict(self._answers.faults),
         )
-
-    def _currents(self, now_s: float) -> tuple[float | None, float | None]:
-        """Measured and corrected current, the one made of the other where it goes on being corrected. [A]"""
-        measured, corrected = self.measured, self.corrected
-        if corrected is None or not corrected.seen:
-            return _current_at(measured, measured.time_s), None
-        answered_s = self.answered().time_s
-        shown_s = answered_s if now_s - answered_s <= self._branch.timeout_s else measured.time_s
-        return _current_at(measured, shown_s), _current_at(corrected, corrected.time_s)
-
-    def _shown_quality(self) -> str | None:
-        if self._quality is None or self._target is None or not self._target.heard.frames:
-            return None
-        code = self._quality.extract(self._target.heard.frames[-1][1])
-        return Quality(code).name if code in set(Quality) else None
 
 
 def _current_at(branch: LiveBranch, time_s: float) -> float | None:
@@ -373,10 +342,18 @@ def _current_at(branch: LiveBranch, time_s: float) -> float | None:
     return currents[0] if currents is not None else None
 
 
-def _sums(pairs: Sequence[_Pair], now_s: float, *, publishes: bool) -> Sums:
+def _difference(later_a: float | None, earlier_a: float | None) -> float | None:
+    return later_a - earlier_a if later_a is not None and earlier_a is not None else None
+
+
+def _name(names: type[Quality | Reason | State], code: int | None) -> str | int | None:
+    return names(code).name if code in set(names) else code
+
+
+def _sums(branches: Sequence[_BranchOnBus], now_s: float, *, publishes: bool) -> Sums:
     """Sums in the newest instant that all have reached; None while a branch is stale or has no value. [A]"""
-    measured = [pair.measured for pair in pairs]
-    after = simultaneous_currents([pair.answered() for pair in pairs], {}, now_s) if publishes else None
+    measured = [branch.measured for branch in branches]
+    after = simultaneous_currents([branch.answered() for branch in branches], {}, now_s) if publishes else None
     found = after or simultaneous_currents(measured, {}, now_s)
     if found is None:
         return Sums()
@@ -395,19 +372,15 @@ _SILENT_PERIODS, _LEAST_SILENCE_S = 5.0, 1.0
 class _Status:
     """The node's status message."""
 
-    def __init__(
-        self, database: VehicleDatabase, status: StatusMessage, heard: Mapping[FrameKey, _HeardMessage]
-    ) -> None:
+    def __init__(self, database: VehicleDatabase, status: StatusMessage, heard: _Heard) -> None:
         self._heard = heard[key_of(database.message(status.message))]
         self._silent_s = max(_SILENT_PERIODS * status.period_s, _LEAST_SILENCE_S)
+        names = {"state": status.state, "reason": status.reason, "parameter_set": status.parameter_set}
+        names |= {"measured_a": status.sum_measured, "corrected_a": status.sum_corrected}
+        signals = {field: database.signal(f"{status.message}.{name}")[1] for field, name in names.items() if name}
+        self._places = {field: bit_place(signal) for field, signal in signals.items()}
         where = f"{database.layout.path}: status"
-        fields = {
-            field: database.signal(f"{status.message}.{name}")[1]
-            for field in ("state", "reason", "parameter_set", "sum_measured", "sum_corrected")
-            if (name := getattr(status, field)) is not None
-        }
-        self._places = {field: bit_place(signal) for field, signal in fields.items()}
-        self._sums = {field: read_codes(fields[field], AMPERE, where) for field in fields if field.startswith("sum_")}
+        self._sums = {field: read_codes(signals[field], AMPERE, where) for field in signals if field.endswith("_a")}
 
     def view(self, now_s: float) -> NodeView | None:
         """What is to be shown."""
@@ -425,57 +398,16 @@ class _Status:
             state=_name(State, codes["state"]),
             reason=_name(Reason, codes["reason"]),
             parameter_set=codes.get("parameter_set"),
-            sums=Sums(measured_a=sums_a.get("sum_measured"), corrected_a=sums_a.get("sum_corrected")),
+            sums=Sums(**sums_a),
             age_s=age_s,
             is_silent=age_s > self._silent_s,
             faults=dict(self._heard.faults),
         )
 
 
-def _name(names: type[Reason | State], code: int | None) -> str | int | None:
-    return names(code).name if code in set(names) else code
-
-
-_STATES = {
-    "STARTING": "starting: waiting for the first frames of all branches",
-    "CORRECTING": "correcting",
-    "PASSING_THROUGH": "passing measured values through",
-    "SHADOW": "shadow mode: computing, but passing measured values through",
-    "ASLEEP": "asleep: no branch sends",
-    "PARTLY_CORRECTING": "partly correcting: something of it cannot be corrected now",
-}
-_REASONS = {
-    "NO_PARAMETERS": "there is no parameter file",
-    "MALFORMED_PARAMETERS": "the parameter file cannot be read",
-    "WRONG_VEHICLE": "the parameters are of another vehicle",
-    "WRONG_LAYOUT": "the parameters are for another layout",
-    "WRONG_DBC": "the parameters are for another DBC",
-    "IMPLAUSIBLE_PARAMETERS": "the parameters are beyond the limits of the layout",
-    "BRANCH_STALE": "a branch has sent nothing for longer than its timeout",
-    "CORRECTION_WORSE": "the corrected Kirchhoff sum is worse than the measured one",
-    "BRANCH_STUCK": "a branch never changes while the others do",
-    "INPUT_MISSING": "a voltage, or a value of a branch, is missing; not everything is corrected",
-    "NOT_SIGNED": "the parameters are not what trusted signers have signed",
-    "NOT_VALID_NOW": "the parameters have expired, or do not hold yet",
-    "REPLAYED": "the parameters are older than what was accepted before",
-    "REVOKED": "the parameters were revoked",
-    "ON_TRIAL": "the parameters are on trial",
-    "SUM_IMPLAUSIBLE": "the corrected Kirchhoff sum is not what it may be: a sensor is wrong",
-    "E2E_INVALID": "so many frames of a message fail their end-to-end check that it is not used",
-    "FOREIGN_FRAMES": "another node sends frames that only this gateway may send; they are dropped",
-}
-_COLUMNS = (  # "rate" of the measured frames, "answers" of the corrected ones
-    ("branch", ""),
-    ("measured", "[A]"),
-    ("corrected", "[A]"),
-    ("correction", "[A]"),
-    ("quality", ""),
-    ("rate", "[1/s]"),
-    ("answers", "[1/s]"),
-    ("age", "[s]"),
-    ("faults", ""),
-)
-"""Name and unit; those without unit are words, and stand at the left."""
+_AMPERES = {"measured": "[A]", "corrected": "[A]", "correction": "[A]"}
+_COLUMNS = {"branch": "", **_AMPERES, "quality": "", "rate": "[1/s]", "answers": "[1/s]", "age": "[s]", "faults": ""}
+"""Names and units: "rate" of the measured frames, "answers" of the corrected ones; words stand at the left."""
 _BOLD, _DIM, _YELLOW = "1", "2", "33"
 """Styles as in the terminal's control sequence "select graphic rendition"."""
 
@@ -505,16 +437,16 @@ def view_lines(view: View, where: str, more: Sequence[str] = ()) -> list[ShownLi
     list of ShownLine
         A number that is not known is "-". Yellow: a fault that lasts; dim: a branch that was never seen.
     """
-    node = view.node
-    head = [([name if unit else "" for name, unit in _COLUMNS], ""), ([unit or name for name, unit in _COLUMNS], "")]
-    table = [*head, *map(_branch_row, view.branches), (_sum_cells("sum", view.sums), "")]
-    if node is not None and not node.is_silent:
-        table.append((_sum_cells("node's sum", node.sums), ""))
+    units = [unit or name for name, unit in _COLUMNS.items()]
+    table = [([name if unit else "" for name, unit in _COLUMNS.items()], ""), (units, "")]
+    table += [*map(_branch_row, view.branches), (_sum_cells("sum", view.sums), "")]
+    if view.node is not None and not view.node.is_silent:
+        table.append((_sum_cells("node's sum", view.node.sums), ""))
     widths = [max(map(len, column)) for column in zip(*(cells for cells, _ in table), strict=True)]
     lines = [ShownLine(f"{where}: {_node_text(view)}", _BOLD)]
     for cells, style in table:
-        columns = zip(_COLUMNS, cells, widths, strict=True)
-        padded = [cell.rjust(width) if unit else cell.ljust(width) for (_, unit), cell, width in columns]
+        columns = zip(_COLUMNS.values(), cells, widths, strict=True)
+        padded = [cell.rjust(width) if unit else cell.ljust(width) for unit, cell, width in columns]
         lines.append(ShownLine(" ".join(padded).rstrip(), style))
     return [*lines, *map(ShownLine, [*_notes(view), *more])]
 
@@ -530,12 +462,17 @@ def _node_text(view: View) -> str:
         return "no node on this bus"
     if node.is_silent:
         return f"no node on this bus any more: its last status came {node.age_s:.1f} s ago"
-    words = _words(_STATES, node.state, "state")
+    words = _words(State, node.state)
     if node.reason not in (None, "NONE"):
-        words += f", because {_words(_REASONS, node.reason, 'reason')}"
+        words += f", because {_words(Reason, node.reason)}"
     which = f"; parameter set {node.parameter_set}" if node.parameter_set else ""
-    faults = _fault_texts(node.faults)
-    return f"node: {words}{which}; status {node.age_s:.1f} s ago{'; ' if faults else ''}{', '.join(faults)}"
+    faults = ", ".join(_fault_texts(node.faults))
+    return f"node: {words}{which}; status {node.age_s:.1f} s ago{'; ' if faults else ''}{faults}"
+
+
+def _words(names: type[Reason | State], shown: str | int | None) -> str:
+    known = names.__members__.get(str(shown))
+    return known.words if known is not None else f"{names.__name__.lower()} {shown}, which this version does not know"
 
 
 def _notes(view: View) -> list[str]:
@@ -555,8 +492,8 @@ def _notes(view: View) -> list[str]:
 def _branch_row(branch: BranchView) -> tuple[list[str], str]:
     """Cells and style of a branch."""
     if not branch.is_seen:
-        faults = ["not fitted?", *_fault_texts(branch.faults)]
-        return [branch.name, *["-"] * (len(_COLUMNS) - 2), ", ".join(faults)], _DIM
+        faults = ", ".join(["not fitted?", *_fault_texts(branch.faults)])
+        return [branch.name, *["-"] * (len(_COLUMNS) - 2), faults], _DIM
     lasting = []
     if branch.is_stale:
         lasting.append("stale")
@@ -579,10 +516,9 @@ def _branch_row(branch: BranchView) -> tuple[list[str], str]:
 
 
 def _sum_cells(name: str, sums: Sums) -> list[str]:
-    known = sums.measured_a is not None and sums.corrected_a is not None
-    correction_a = sums.corrected_a - sums.measured_a if known else None  # type: ignore[operator]
+    correction_a = _difference(sums.corrected_a, sums.measured_a)
     cells = [name, *map(_number, (sums.measured_a, sums.corrected_a, correction_a))]
-    return [*cells, *[""] * (len(_COLUMNS) - len(cells))]
+    return cells + [""] * (len(_COLUMNS) - len(cells))
 
 
 def _fault_texts(faults: Mapping[str, int]) -> list[str]:
@@ -591,10 +527,6 @@ def _fault_texts(faults: Mapping[str, int]) -> list[str]:
 
 def _number(value_a: float | None) -> str:
     return f"{value_a:+.2f}" if value_a is not None else "-"
-
-
-def _words(table: Mapping[Any, str], code: str | int | None, what: str) -> str:
-    return table.get(code, f"{what} {code}, which this version does not know")
 
 
 _WITHOUT_CURSOR = ("dumb", "unknown")
@@ -617,43 +549,19 @@ def _draw(lines: Sequence[ShownLine]) -> None:
     write_output(_HOME + "\n".join(f"\x1b[{style}m{text}\x1b[m{_CLEAR_LINE}" for text, style in shown) + _CLEAR_BELOW)
 
 
-@dataclass(frozen=True, kw_only=True)
-class MonitorOptions:
-    """What was asked for on the command line.
-
-    Attributes
-    ----------
-    layout : Path
-        Layout of the vehicle.
-    interface, channel : str
-        Bus, as python-can names it.
-    fd : bool
-        Whether to open it for CAN FD.
-    listen_only, bitrates :
-        As for :func:`ecu_node.bus.adapters.bus_config`.
-    once_s : float or None
-        Listen this long, and print once what was seen [s]; None: until interrupted.
-    as_json : bool
-        Print it as JSON.
-    """
-
-    layout: Path
-    interface: str
-    channel: str
-    fd: bool
-    listen_only: bool
-    bitrates: Mapping[str, int | None]
-    once_s: float | None
-    as_json: bool
-
-
-def run_monitor(options: MonitorOptions) -> int:
+def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, as_json: bool) -> int:
     """Show what is on a bus until SIGINT, SIGTERM or SIGHUP: a live table in a terminal, else a block per second.
 
     Parameters
     ----------
-    options : MonitorOptions
-        What was asked for.
+    layout : Path
+        Layout of the vehicle.
+    bus : mapping
+        The bus, as the arguments of :func:`ecu_node.bus.adapters.bus_config`.
+    once_s : float or None
+        Listen this long, and print once what was seen [s]; None: until interrupted.
+    as_json : bool
+        Print it as JSON.
 
     Returns
     -------
@@ -665,64 +573,42 @@ def run_monitor(options: MonitorOptions) -> int:
     UserError
         If layout, DBC or bus cannot be used.
     """
-    database = node_database(options.layout)
+    database = node_database(layout)
     stop = Requests().stop
     signal.signal(signal.SIGHUP, signal.getsignal(signal.SIGTERM))  # the terminal was closed
-    counters = Counters()
-    interface, channel = options.interface, options.channel
-    where = f"{interface} {channel}"
-    opened = partial(
-        open_bus,
-        database,
-        interface=interface,
-        channel=channel,
-        fd=options.fd,
-        mode=Mode.OVERLAY,
-        listen_only=options.listen_only,
-        bitrates=options.bitrates,
-    )
-    if options.listen_only:
-        Log().say(acknowledgement(interface, channel))
-    is_once = options.once_s is not None
-    is_live = (
-        not is_once and sys.stdout is not None and sys.stdout.isatty() and os.environ.get("TERM") not in _WITHOUT_CURSOR
-    )
-    period_s = options.once_s or (_LIVE_PERIOD_S if is_live else _PLAIN_PERIOD_S)
-    with _own_screen() if is_live else nullcontext():
-        bus = SteadyBus(opened, counters, Log().say)
-        try:
-            monitor = BusMonitor(database, time.monotonic())
-            view = None
-            while view is None or (not is_once and not stop()):
-                listen_until(bus, monitor, time.monotonic() + period_s, stop)
-                view = replace(monitor.look(time.monotonic()), is_bus_open=bus.is_open)
-                bus.count_dropped()
-                lines = view_lines(view, where, _bus_notes(counters))
-                text = "\n".join(line.text for line in lines)
-                if is_live:
-                    _draw(lines)
-                elif options.as_json:
-                    write_output(json.dumps(asdict(view), indent=2))
-                else:
-                    write_text(text if is_once else f"{text}\n")
-        finally:
-            bus.close()
+    counters, say = Counters(), Log().say
+    where = f"{bus['interface']} {bus['channel']}"
+    if bus["listen_only"]:
+        say(acknowledgement(bus["interface"], bus["channel"]))
+    is_terminal = sys.stdout is not None and sys.stdout.isatty() and os.environ.get("TERM") not in _WITHOUT_CURSOR
+    is_live = once_s is None and is_terminal
+    period_s = once_s or (_LIVE_PERIOD_S if is_live else _PLAIN_PERIOD_S)
+    opened = partial(open_bus, database, mode=Mode.OVERLAY, **bus)
+    with ExitStack() as left_at_end:
+        if is_live:
+            write_output(_ENTER_SCREEN, end="")
+            left_at_end.callback(write_output, _LEAVE_SCREEN, end="")
+        steady = left_at_end.enter_context(closing(SteadyBus(opened, counters, say)))
+        monitor = BusMonitor(database, time.monotonic())
+        view = None
+        while view is None or (once_s is None and not stop()):
+            listen_until(steady, monitor, time.monotonic() + period_s, stop)
+            view = replace(monitor.look(time.monotonic()), is_bus_open=steady.is_open)
+            steady.count_dropped()
+            lines = view_lines(view, where, _bus_notes(counters))
+            text = "\n".join(line.text for line in lines)
+            if is_live:
+                _draw(lines)
+            elif as_json:
+                write_output(json.dumps(asdict(view), indent=2))
+            else:
+                write_text(text if once_s else f"{text}\n")
     if is_live:
         write_text(text)  # what was seen last stays on the screen
-    if is_once and not view.is_any_branch_seen:
-        say_error(f"ecu-node: {where}: no branch of {options.layout} was seen; see that the bus is the right one")
+    if once_s is not None and not view.is_any_branch_seen:
+        say_error(f"ecu-node: {where}: no branch of {layout} was seen; see that the bus is the right one")
         return 1
     return 0
-
-
-@contextmanager
-def _own_screen() -> Iterator[None]:
-    sys.stdout.write(_ENTER_SCREEN)
-    try:
-        yield
-    finally:
-        sys.stdout.write(_LEAVE_SCREEN)
-        sys.stdout.flush()
 
 
 def listen_until(bus: SteadyBus, monitor: BusMonitor, until_s: float, stop: Callable[[], bool]) -> None:
@@ -739,21 +625,19 @@ def listen_until(bus: SteadyBus, monitor: BusMonitor, until_s: float, stop: Call
     stop : callable
         Whether to return earlier; asked at least every 0.25 s.
     """
-    clock, receive, take = time.monotonic, bus.receive, monitor.take
-    while (now_s := clock()) < until_s and not stop():
+    while (now_s := time.monotonic()) < until_s and not stop():
         ahead_s = time.time() - now_s
         turn_end_s = min(until_s, now_s + _LONGEST_WAIT_S)
-        while now_s < turn_end_s and (message := receive(turn_end_s - now_s)) is not None:
-            now_s = clock()
+        while now_s < turn_end_s and (message := bus.receive(turn_end_s - now_s)) is not None:
+            now_s = time.monotonic()
             if not message.is_remote_frame:
                 time_s = steady_time_s(message.timestamp, now_s, ahead_s)
-                take((message.arbitration_id, message.is_extended_id), message.data, time_s)
+                monitor.take((message.arbitration_id, message.is_extended_id), message.data, time_s)
 
 
 def _bus_notes(counters: Counters) -> list[str]:
-    lines = []
-    if counters.bus_errors:
-        lines.append(f"error frames of the bus: {counters.bus_errors}; a wrong bit rate, or a fault in the wiring?")
-    if counters.dropped:
-        lines.append(f"frames that this computer was too slow to read: {counters.dropped}; they count as lost above")
-    return lines
+    notes = {
+        "error frames of the bus: {}; a wrong bit rate, or a fault in the wiring?": counters.bus_errors,
+        "frames that this computer was too slow to read: {}; they count as lost above": counters.dropped,
+    }
+    return [text.format(count) for text, count in notes.items() if count]

@@ -6,16 +6,17 @@ program itself: its line names the place, for a report.
 """
 
 import argparse
+import json
 import os
 import signal
 import sys
 import textwrap
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from ecu_node.errors import UserError, printable
 
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
 __all__ = [
-    "DEBUG",
-    "DEBUG_HELP",
     "DEBUG_HINT",
     "FAILED",
     "INTERNAL_ERROR",
@@ -35,12 +34,13 @@ __all__ = [
     "ending_at_interrupt",
     "fitted",
     "flush_output",
-    "ignoring_hangups",
     "load_python_can",
+    "run_program",
     "say_error",
     "split_debug",
     "wrapped",
     "write_output",
+    "write_result",
     "write_text",
 ]
 
@@ -77,24 +77,14 @@ def fitted(text: str, stream: TextIO | None) -> str:
 
 def wrapped(text: str, columns: int) -> str:
     """Lines of at most so many columns, broken at spaces; a word that is longer stays whole."""
-    return "\n".join(_wrapped_line(line, columns) for line in text.split("\n"))
-
-
-def _wrapped_line(line: str, columns: int) -> str:
-    if len(line) <= columns:
-        return line
-    words = line.lstrip()
-    indent = " " * (len(line) - len(words))
-    return textwrap.fill(
-        words,
-        columns,
-        initial_indent=indent,
-        subsequent_indent=f"{indent}{' ' * _MORE_INDENT}",
-        break_long_words=False,
-        break_on_hyphens=False,
-        expand_tabs=False,
-        replace_whitespace=False,
-    )
+    lines = []
+    for line in text.split("\n"):
+        words = line.lstrip()
+        indent = " " * (len(line) - len(words))
+        more = indent + " " * _MORE_INDENT
+        wrapper = textwrap.TextWrapper(columns, indent, more, break_long_words=False, break_on_hyphens=False)
+        lines += wrapper.wrap(words) or [line]
+    return "\n".join(lines)
 
 
 def write_text(text: str) -> None:
@@ -102,13 +92,23 @@ def write_text(text: str) -> None:
     write_output(fitted(text, sys.stdout))
 
 
-def write_output(text: str) -> None:
-    """Print a text with a line end as it is, and see that it is written.
+def write_result(document: Any, text: str, *, as_json: bool) -> None:
+    """Print what was found: as JSON, or as a text for people; errors as for :func:`write_output`."""
+    if as_json:
+        write_output(json.dumps(document, indent=2))
+    else:
+        write_text(text)
+
+
+def write_output(text: str, end: str = "\n") -> None:
+    """Print a text as it is, and see that it is written.
 
     Parameters
     ----------
     text : str
         What to print; nothing happens where standard output is closed.
+    end : str
+        What stands behind it.
 
     Raises
     ------
@@ -117,20 +117,8 @@ def write_output(text: str) -> None:
     BrokenPipeError
         If its reader has left.
     """
-    _write(f"{text}\n")
-
-
-def flush_output() -> None:
-    """See that all that was printed is written; raises as :func:`write_output` does."""
-    _write("")
-
-
-def _write(text: str) -> None:
-    if sys.stdout is None:
-        return
     try:
-        sys.stdout.write(text)
-        sys.stdout.flush()
+        print(text, end=end, flush=True)
     except BrokenPipeError:
         raise
     except OSError as error:
@@ -138,6 +126,11 @@ def _write(text: str) -> None:
         raise UserError(
             f"standard output: cannot write the result: {error.strerror}; give it somewhere else to go"
         ) from None
+
+
+def flush_output() -> None:
+    """See that all that was printed is written; raises as :func:`write_output` does."""
+    write_output("", end="")
 
 
 def drop_output() -> None:
@@ -148,8 +141,7 @@ def drop_output() -> None:
 FAILED = 1
 INTERNAL_ERROR = 70
 """Exit code of a fault of the program itself, EX_SOFTWARE of sysexits.h."""
-DEBUG = "--debug"
-DEBUG_HELP = "show the traceback of an error; may stand anywhere"
+_DEBUG = "--debug"
 DEBUG_HINT = "--debug shows the traceback of an error."
 _REMEDY = "see that it is there, may be used by you, and that its disk has room"
 
@@ -170,7 +162,7 @@ def split_debug(arguments: Sequence[str]) -> tuple[list[str], bool]:
         Whether it was there.
     """
     end = arguments.index("--") if "--" in arguments else len(arguments)
-    others = [argument for argument in arguments[:end] if argument != DEBUG]
+    others = [argument for argument in arguments[:end] if argument != _DEBUG]
     return [*others, *arguments[end:]], len(others) < end
 
 
@@ -204,7 +196,7 @@ def end_of(program: str, error: Exception, *, debug: bool, packages: Sequence[st
             where = error.filename or "file or standard output"
             text, code = f"{where}: {error.strerror or error}; {_REMEDY}", FAILED
         case _:
-            text = f"internal error: {_place(error, packages)}; run again with {DEBUG} and report it"
+            text = f"internal error: {_place(error, packages)}; run again with {_DEBUG} and report it"
             code = INTERNAL_ERROR
     say_error(f"{program}: {text}")
     return code
@@ -225,7 +217,19 @@ def _place(error: Exception, packages: Sequence[str]) -> str:
 
 
 class CommandParser(argparse.ArgumentParser):
-    """Says wrong use in one line, and that help cannot be written, where argparse would end as if it were."""
+    """Says wrong use in one line, and that help cannot be written, where argparse would end as if it were.
+
+    Parameters
+    ----------
+    done, failed : str
+        What the exit codes 0 and 1 of the command mean; its help ends with them.
+    **settings
+        Of ``argparse.ArgumentParser``.
+    """
+
+    def __init__(self, *, done: str = "done", failed: str = "failed", **settings: Any) -> None:
+        codes = f"Exit codes: 0 {done}, 1 {failed}, 2 wrong use, 70 internal error, 130 interrupted."
+        super().__init__(epilog=f"{codes} {DEBUG_HINT}", **settings)
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong, and where help is."""
@@ -237,6 +241,38 @@ class CommandParser(argparse.ArgumentParser):
             write_output(message.removesuffix("\n"))
         else:
             super()._print_message(message, file)
+
+
+def run_program(name: str, work: Callable[[list[str]], int], arguments: Sequence[str]) -> int:
+    """Run a program; whatever ends it is one line on standard error.
+
+    Parameters
+    ----------
+    name : str
+        Of the program.
+    work : callable
+        Takes the arguments less ``--debug``, and returns the exit code; Ctrl-C in it ends the process with 130, until
+        it handles SIGINT itself.
+    arguments : sequence of str
+        Without the program's name.
+
+    Returns
+    -------
+    int
+        Exit code: that of `work`, :data:`FAILED`, or :data:`INTERNAL_ERROR`.
+    """
+    others, debug = split_debug(arguments)
+    try:
+        with ending_at_interrupt(f"{name}: interrupted"):
+            try:
+                return work(others)
+            finally:
+                flush_output()
+    except BrokenPipeError:
+        drop_output()
+        return FAILED
+    except Exception as error:  # noqa: BLE001 (each is told, and ends the program)
+        return end_of(name, error, debug=debug)
 
 
 INTERRUPTED = 130
@@ -252,24 +288,12 @@ def ending_at_interrupt(message: str) -> Iterator[None]:
         os._exit(INTERRUPTED)
 
     before = signal.getsignal(signal.SIGINT)
-    if before is signal.SIG_IGN:
-        yield
-        return
-    signal.signal(signal.SIGINT, end)
+    if before is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, end)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def ignoring_hangups() -> Iterator[None]:
-    """Within the block SIGHUP, which would end the process, does nothing until somebody else handles it."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGHUP, before)
 
 
 def load_python_can() -> None:

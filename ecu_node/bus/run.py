@@ -1,36 +1,54 @@
-"""``ecu-node run``: parameters, core, buses and service put together."""
+"""``ecu-node run``: parameters, core, buses and service put together; ``ecu-node check``: what a run would apply."""
 
+import argparse
 import gc
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
+from typing import Any, Protocol
 
-import can
 from cantools.database.can import Message
 
 from ecu_node.bus.adapters import acknowledgement, bus_config, config_text
 from ecu_node.bus.faults import FaultMemory
-from ecu_node.bus.guard import Mode, received, rewritten, transmitted
-from ecu_node.bus.in_force import ParameterFile, ParameterSource, not_published
-from ecu_node.bus.kernel_routes import KernelRoutes, kernel_routes
+from ecu_node.bus.guard import Mode, needs_fd, received, rewritten, transmitted
+from ecu_node.bus.in_force import (
+    InForce,
+    ParameterFile,
+    ParameterSource,
+    branch_plan,
+    choose_parameters,
+    not_published,
+    sensor_fault,
+)
+from ecu_node.bus.kernel_routes import kernel_routes
 from ecu_node.bus.links import carries_fd, open_bus, require_fd
 from ecu_node.bus.node import GatewayNode, OverlayNode
-from ecu_node.bus.service import Log, Requests, ServiceManager, be_real_time
+from ecu_node.bus.service import Log, Requests, ServiceManager, be_real_time, serve_metrics
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.telemetry import Latency, Telemetry
 from ecu_node.bus.wiring import wire
-from ecu_node.check import warnings_of
 from ecu_node.core.corrector import OF_ONE_DRIVE, Corrector
 from ecu_node.core.frames import FrameKey
 from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase, node_database
+from ecu_node.errors import printable
+from ecu_node.layout import Branch
 from ecu_node.program import write_text
 
-__all__ = ["RunOptions", "StateChanges", "run_node"]
+__all__ = ["StateChanges", "check_report", "report_text", "run_node"]
+
+
+_WHY_LATCHED = {
+    Reason.BRANCH_STALE: "no frames of {}",
+    Reason.BRANCH_STUCK: "{} never changes",
+    Reason.SUM_IMPLAUSIBLE: "the Kirchhoff sum is not what it may be; most likely the sensor of {} is wrong",
+}
 
 
 class StateChanges:
@@ -49,34 +67,17 @@ class StateChanges:
     def news(self) -> str | None:
         """One line on what has changed since the last time; None if nothing has."""
         corrector = self._corrector
-        before = self._before
+        latched_before, asleep_before = self._before
         latched, asleep = self._before = corrector.latched, corrector.is_asleep
-        if self._before == before:
-            return None
-        if latched not in {before[0], Reason.NONE}:
-            return f"passing measured values through until {self._until()}: {self._why()}"
-        if asleep != before[1]:
+        if latched not in {latched_before, Reason.NONE}:
+            until = "the bus has slept" if latched in OF_ONE_DRIVE else "other parameters or 'ecu-node clear'"
+            names = (" or " if latched is Reason.SUM_IMPLAUSIBLE else ", ").join(corrector.latched_branches)
+            why = _WHY_LATCHED.get(latched, "the corrected Kirchhoff sum is worse than the measured one")
+            return f"passing measured values through until {until}: {why.format(names)}"
+        if asleep != asleep_before:
             return "the bus sleeps" if asleep else "the bus is awake again"
-        return "correcting again" if corrector.reason is Reason.NONE and not asleep else None
-
-    def _until(self) -> str:
-        return (
-            "the bus has slept" if self._corrector.latched in OF_ONE_DRIVE else "other parameters or 'ecu-node clear'"
-        )
-
-    def _why(self) -> str:
-        names = self._corrector.latched_branches
-        which = ", ".join(names)
-        match self._corrector.latched:
-            case Reason.BRANCH_STALE:
-                return f"no frames of {which}"
-            case Reason.BRANCH_STUCK:
-                return f"{which} never changes"
-            case Reason.SUM_IMPLAUSIBLE:
-                return (
-                    f"the Kirchhoff sum is not what it may be; most likely the sensor of {' or '.join(names)} is wrong"
-                )
-        return "the corrected Kirchhoff sum is worse than the measured one"
+        corrects_again = latched != latched_before and corrector.reason is Reason.NONE and not asleep
+        return "correcting again" if corrects_again else None
 
 
 _DEFAULT_PERIOD_S = 0.1
@@ -84,66 +85,16 @@ _GARBAGE = 10_000
 """Objects that were made and not freed, after which garbage is looked for among them, in about a millisecond."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunOptions:
-    """What was asked for on the command line.
-
-    Attributes
-    ----------
-    params : Path or None
-        Parameter file that nobody signed.
-    state : Path or None
-        State of the vehicle, with signed parameters; one of the two is given.
-    layout : Path
-        Layout.
-    vehicle : str or None
-        Identity of the vehicle; None: not checked, or as the state says.
-    interface, channel : str
-        Bus of the sensors, as python-can names it.
-    gateway : str or None
-        Channel of the bus on the other side; None: overlay.
-    fd : bool
-        Whether to use CAN FD.
-    listen_only, bitrates :
-        As for :func:`ecu_node.bus.adapters.bus_config`.
-    shadow : bool
-        Compute and report, change nothing.
-    dry_run : bool
-        Print what would be opened, read and sent, and open nothing.
-    metrics_port : int or None
-        Port on which Prometheus may ask.
-    telemetry : Path, tuple of str and int, or None
-        File, or host and UDP port, for a line per second.
-    realtime : bool
-        Whether to run as a real-time process.
-    """
-
-    params: Path | None
-    state: Path | None
-    layout: Path
-    vehicle: str | None
-    interface: str
-    channel: str
-    gateway: str | None
-    fd: bool
-    listen_only: bool
-    bitrates: Mapping[str, int | None]
-    shadow: bool
-    dry_run: bool
-    metrics_port: int | None
-    telemetry: Path | tuple[str, int] | None
-    realtime: bool
-
-
-def run_node(options: RunOptions, vehicle_hint: str) -> int:
+def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:
     """Run a node until SIGTERM or SIGINT.
 
     Parameters
     ----------
-    options : RunOptions
-        What was asked for.
-    vehicle_hint : str
-        What to do for the vehicle to be checked.
+    options : argparse.Namespace
+        Those of ``ecu-node run``, see :mod:`ecu_node.cli`.
+    bus : mapping
+        Bus of the sensors, as the arguments of :func:`ecu_node.bus.adapters.bus_config`; of a gateway the other one is
+        alike.
 
     Returns
     -------
@@ -159,73 +110,66 @@ def run_node(options: RunOptions, vehicle_hint: str) -> int:
     if options.realtime:
         say(be_real_time())
     mode = Mode.OVERLAY if options.gateway is None else Mode.GATEWAY
+    bus_settings = [bus] if options.gateway is None else [bus, {**bus, "channel": options.gateway}]
     database = node_database(options.layout)
-    file = _source(options, database, mode, say)
-    corrector = wire(database, file.in_force, time.monotonic(), mode=mode, shadow=options.shadow)
-    channels = [channel for channel in (options.channel, options.gateway) if channel is not None]
+    source = _source(options, database, mode, say)
+    corrector = wire(database, source.in_force, time.monotonic(), mode=mode, shadow=options.shadow)
     if options.dry_run:
-        write_text(_dry_run(database, options, channels, mode))
+        write_text(_dry_run(bus_settings, database, mode))
         return 0
     routes = None
     if options.gateway is not None and options.interface == "socketcan":
         routes = kernel_routes((options.channel, options.gateway), database, fd=options.fd, say=say)
-    buses, latency = list[SteadyBus](), Latency()
-    try:
-        for channel in channels:
-            opener = _opener(database, options, channel, mode, routes)
-            buses.append(SteadyBus(opener, corrector.counters, say, listen_only=options.listen_only))
+    routed, latency = routes is not None, Latency()
+    with ExitStack() as closed_at_end:
+        # A node that only listens may stand beside the one that sends.
+        opener = partial(open_bus, database, mode=mode, routed=routed, own=not options.listen_only)
+        opened = (
+            SteadyBus(partial(opener, **settings), corrector.counters, say, listen_only=options.listen_only)
+            for settings in bus_settings
+        )
+        buses = [closed_at_end.enter_context(closing(bus)) for bus in opened]
         requests = Requests()
         if options.metrics_port is not None:
-            from ecu_node.bus.service import serve_metrics  # noqa: PLC0415  # prometheus_client is optional
-
             serve_metrics(corrector, latency, options.metrics_port)
-        for text in (
-            *_notes(options, file, vehicle_hint),
-            *warnings_of(database, file.in_force, mode, fd=options.fd),
-            *_unseen(options),
-        ):
+        hidden = _unpublished(database, source.in_force, mode)
+        for text in _notes(options, source, hidden.values()):
             say(text)
-        if options.listen_only:
-            say(acknowledgement(options.interface, options.channel))
-        what = _what(corrector, database, file, mode)
-        where = f"{options.interface} {options.channel}{f' to {options.gateway}' if options.gateway else ''}"
+        applied = [branch.name for branch in corrector.branches if branch.fault.applied and branch.name not in hidden]
+        correcting = f"correcting {', '.join(applied) or 'nothing'}"
+        to, shadow = f" to {options.gateway}" if options.gateway else "", ", shadow mode" if options.shadow else ""
+
+        def bus_states() -> dict[str, str]:
+            return {bus.channel: bus.state for bus in buses}
 
         def ready() -> None:
             if routes is not None:
                 routes.set()
-            say(f"running on {where}{', shadow mode' if options.shadow else ''}, correcting {what or 'nothing'}")
-            manager.ready(f"correcting {what or 'nothing'}")
+            say(f"running on {options.interface} {options.channel}{to}{shadow}, {correcting}")
+            manager.ready(correcting)
 
         memory = FaultMemory(corrector, options.state, say, ThreadPoolExecutor(1, "faults")) if options.state else None
         telemetry = (
-            Telemetry(options.telemetry, corrector, layout=database.layout, latency=latency, buses=buses, say=say)
-            if options.telemetry is not None
+            Telemetry(options.telemetry, corrector, database.layout, latency, bus_states, say)
+            if options.telemetry
             else None
         )
-        tick = _Tick(
-            corrector=corrector,
-            buses=buses,
-            routes=routes,
-            file=file,
-            memory=memory,
-            telemetry=telemetry,
-            requests=requests,
-            manager=manager,
-            say=say,
-        )
+        looks = [part for part in (memory, telemetry, routes) if part is not None]
+        tick = _Tick(corrector, buses, source, looks, requests, manager, say)
+        closed_at_end.callback(lambda: say(f"ended: {corrector.counters.text()}"))
+        closed_at_end.callback(manager.stopping)
+        if routes is not None:
+            closed_at_end.enter_context(routes)
         period_s = database.layout.status.period_s if database.layout.status is not None else _DEFAULT_PERIOD_S
-        try:
-            with routes or nullcontext():
-                routed = routes is not None
-                node = _node(buses, corrector, database, period_s, tick=tick, latency=latency, routed=routed)
-                _freeze()
-                node.run(requests.stop, ready)
-        finally:
-            manager.stopping()
-            say(f"ended: {corrector.counters.text()}")
-    finally:
-        for bus in buses:
-            bus.close()
+        node: OverlayNode | GatewayNode
+        if mode is Mode.OVERLAY:
+            node = OverlayNode(buses[0], corrector, database, period_s=period_s, on_tick=tick, latency=latency)
+        else:
+            node = GatewayNode(
+                buses[0], buses[1], corrector, database, period_s=period_s, on_tick=tick, routed=routed, latency=latency
+            )
+        _freeze()
+        node.run(requests.stop, ready)
     return 0
 
 
@@ -236,50 +180,34 @@ def _freeze() -> None:
     gc.set_threshold(_GARBAGE)
 
 
-def _opener(
-    database: VehicleDatabase, options: RunOptions, channel: str, mode: Mode, routes: KernelRoutes | None
-) -> Callable[[], can.BusABC]:
-    return lambda: open_bus(
-        database,
-        interface=options.interface,
-        channel=channel,
-        fd=options.fd,
-        mode=mode,
-        routed=routes is not None,
-        own=not options.listen_only,  # a node that only listens may stand beside the one that sends
-        listen_only=options.listen_only,
-        bitrates=options.bitrates,
+def _source(
+    options: argparse.Namespace, database: VehicleDatabase, mode: Mode, say: Callable[[str], None]
+) -> ParameterSource:
+    if options.params is not None:
+        return ParameterFile(options.params, database, options.vehicle, mode=mode, say=say)
+    from ecu_node.trust.parameter_store import ParameterStore  # noqa: PLC0415  # cryptography takes time to import
+
+    now, background = partial(datetime.now, UTC), ThreadPoolExecutor(1, "state of the vehicle")
+    return ParameterStore(
+        options.state, database, mode=mode, say=say, now=now, vehicle=options.vehicle, background=background
     )
 
 
-def _notes(options: RunOptions, file: ParameterSource, vehicle_hint: str) -> Iterator[str]:
-    """What to know of the parameters."""
-    if options.params is not None:
-        yield "parameters are used that nobody signed (--unsigned)"
-    if file.why_not is not None:
-        yield f"passing measured values through: {file.why_not}"
-    elif options.params is not None and options.vehicle is None:
-        yield f"the vehicle is not checked: {vehicle_hint}"
-
-
-def _dry_run(database: VehicleDatabase, options: RunOptions, channels: Sequence[str], mode: Mode) -> str:
-    """What a node with these options would open, read and send."""
-    require_fd(database, mode, fd=options.fd)
-    read, written = _names(received(database)), _names(transmitted(database, mode))
+def _dry_run(buses: Sequence[Mapping[str, Any]], database: VehicleDatabase, mode: Mode) -> str:
+    """What a node on these buses would open, read and send."""
+    near = buses[0]
+    require_fd(database, mode, fd=near["fd"])
+    written = _names(transmitted(database, mode))
+    ways = [(_names(received(database)), "nothing" if near["listen_only"] else written)]
     if mode is Mode.GATEWAY:
-        others = "all other frames of the other bus, as they are"
-        reads = [f"all frames; corrects {_names(rewritten(database))}", "all frames"]
-        sends = [others, f"{_names(rewritten(database))}, corrected; {written}; {others}"]
-    else:
-        reads, sends = [read], ["nothing" if options.listen_only else written]
+        corrected, others = _names(rewritten(database)), "all other frames of the other bus, as they are"
+        to_vehicle = f"{corrected}, corrected; {written}; {others}"
+        ways = [(f"all frames; corrects {corrected}", others), ("all frames", to_vehicle)]
     lines = []
-    for channel, reading, sending in zip(channels, reads, sends, strict=True):
-        config = bus_config(
-            options.interface, channel, fd=options.fd, listen_only=options.listen_only, bitrates=options.bitrates
-        )
-        lines += [f"would open {config_text(config)}", f"  reads {reading}", f"  sends {sending}"]
-    if options.listen_only:
-        lines.append(acknowledgement(options.interface, options.channel))
+    for bus, (reads, sends) in zip(buses, ways, strict=True):
+        lines += [f"would open {config_text(bus_config(**bus))}", f"  reads {reads}", f"  sends {sends}"]
+    if near["listen_only"]:
+        lines.append(acknowledgement(near["interface"], near["channel"]))
     return "\n".join(lines)
 
 
@@ -287,60 +215,44 @@ def _names(messages: Mapping[FrameKey, Message]) -> str:
     return ", ".join(f"{message.name} (0x{key.identifier:X})" for key, message in messages.items()) or "nothing"
 
 
-def _source(options: RunOptions, database: VehicleDatabase, mode: Mode, say: Callable[[str], None]) -> ParameterSource:
+def _notes(options: argparse.Namespace, source: ParameterSource, unpublished: Iterable[str]) -> Iterator[str]:
+    """What to know of the parameters and the buses at the start."""
     if options.params is not None:
-        return ParameterFile(options.params, database, options.vehicle, mode=mode, say=say)
-    from ecu_node.trust.parameter_store import ParameterStore  # noqa: PLC0415  # cryptography takes time to import
-
-    assert options.state is not None
-    return ParameterStore(
-        options.state,
-        database,
-        mode=mode,
-        say=say,
-        now=lambda: datetime.now(UTC),
-        vehicle=options.vehicle,
-        background=ThreadPoolExecutor(1, "state of the vehicle"),
-    )
+        yield "parameters are used that nobody signed (--unsigned)"
+    if source.why_not is not None:
+        yield f"passing measured values through: {source.why_not}"
+    elif options.params is not None and options.vehicle is None:
+        yield "the vehicle is not checked: give --vehicle or $ECU_NODE_VEHICLE"
+    yield from unpublished
+    names = [options.channel, options.gateway] if options.gateway is not None and not options.fd else []
+    if unseen := [name for name in names if carries_fd(options.interface, name)]:
+        yield f"{' and '.join(unseen)}: set up for CAN FD, of which nothing is passed on without --fd"
+    if options.listen_only:
+        yield acknowledgement(options.interface, options.channel)
 
 
-def _unseen(options: RunOptions) -> list[str]:
-    """What a gateway would not pass on, as the kernel does not show it CAN FD frames."""
-    if options.gateway is None or options.fd:
-        return []
-    names = [name for name in (options.channel, options.gateway) if carries_fd(options.interface, name)]
-    if not names:
-        return []
-    return [f"{' and '.join(names)}: set up for CAN FD, of which nothing is passed on without --fd"]
+def _unpublished(database: VehicleDatabase, in_force: InForce, mode: Mode) -> dict[str, str]:
+    """Branches with a fault that is not corrected, as no signal is there for it, and what to say of each."""
+    names = not_published(database, in_force) if mode is Mode.OVERLAY else []
+    why = "the parameters apply a fault to it, but the layout has no 'corrected' for it"
+    return {name: f"branch {name} is not published: {why}" for name in names}
 
 
-def _node(
-    buses: list[SteadyBus],
-    corrector: Corrector,
-    database: VehicleDatabase,
-    period_s: float,
-    *,
-    tick: "_Tick",
-    latency: Latency,
-    routed: bool,
-) -> OverlayNode | GatewayNode:
-    if len(buses) == 1:
-        return OverlayNode(buses[0], corrector, database, period_s=period_s, on_tick=tick, latency=latency)
-    return GatewayNode(
-        buses[0], buses[1], corrector, database, period_s=period_s, on_tick=tick, latency=latency, routed=routed
-    )
+class _Looks(Protocol):
+    """What has something to do now and then, beside the frames."""
+
+    def look(self, now_s: float) -> None:
+        """Do it if it is due."""
 
 
-@dataclass(kw_only=True)
+@dataclass
 class _Tick:
     """What is done beside the frames: watchdog, parameters, and a line in the log when the state changes."""
 
     corrector: Corrector
     buses: Sequence[SteadyBus]
     file: ParameterSource
-    memory: FaultMemory | None
-    routes: KernelRoutes | None = None
-    telemetry: Telemetry | None = None
+    looks: Sequence[_Looks]
     requests: Requests
     manager: ServiceManager
     say: Callable[[str], None]
@@ -349,25 +261,95 @@ class _Tick:
         self._changes = StateChanges(self.corrector)
 
     def __call__(self, now_s: float, works: bool) -> None:
-        corrector = self.corrector
         if works:
             self.manager.alive(now_s)
         for bus in self.buses:
             bus.count_dropped()
-        if self.file.look(corrector, now_s, asked=self.requests.take_reload()):
-            self.manager.status(f"parameter set {corrector.parameter_set} is in force")
-        if self.memory is not None:
-            self.memory.look(now_s)
-        if self.telemetry is not None:
-            self.telemetry.look(now_s)
-        if self.routes is not None:
-            self.routes.look(now_s)
+        if self.file.look(self.corrector, now_s, asked=self.requests.take_reload()):
+            self.manager.status(f"parameter set {self.corrector.parameter_set} is in force")
+        for each in self.looks:
+            each.look(now_s)
         text = self._changes.news()
         if text is not None:
             self.say(text)
             self.manager.status(text)
 
 
-def _what(corrector: Corrector, database: VehicleDatabase, file: ParameterSource, mode: Mode) -> str:
-    hidden = not_published(database, file.in_force) if mode is Mode.OVERLAY else []
-    return ", ".join(item.name for item in corrector.branches if item.fault.applied and item.name not in hidden)
+def check_report(params: Path, layout: Path, vehicle: str | None, *, is_gateway: bool = False) -> dict[str, Any]:
+    """Check parameters against layout, DBC and vehicle.
+
+    Parameters
+    ----------
+    params, layout : Path
+        Parameter file and layout.
+    vehicle : str or None
+        Identity of the vehicle; None: not checked.
+    is_gateway : bool
+        Whether corrected values are written in place, or under identifiers of their own.
+
+    Returns
+    -------
+    dict
+        ``fit`` [bool], ``reason`` (name in the status message), ``message`` (why not, or None), ``vehicle``,
+        ``parameter_set``, ``warnings`` (texts), and ``branches``: per branch drift [1], offset_a [A] and apply, as the
+        file says (0 and None where it does not name the branch), applied (whether it is corrected), target, and plan: a
+        dict with gain, voltage_gain, bias and shift; None where the branch is not written.
+
+    Raises
+    ------
+    LayoutError, DatabaseError
+        If layout or DBC cannot be used at all, by which ``ecu-node run`` would be refused too.
+    """
+    mode = Mode.GATEWAY if is_gateway else Mode.OVERLAY
+    database = node_database(layout)
+    in_force, why_not = choose_parameters(params, database, vehicle)
+    wire(database, in_force, start_s=0.0, mode=mode)
+    warnings = list(_unpublished(database, in_force, mode).values())
+    if names := needs_fd(database, mode):
+        warnings.append(f"CAN FD messages ({', '.join(names)}): 'ecu-node run' needs --fd")
+    parameters = in_force.parameters
+    return {
+        "fit": why_not is None,
+        "reason": in_force.reason.name,
+        "message": why_not,
+        "vehicle": parameters.vehicle if parameters is not None else None,
+        "parameter_set": parameters.number if parameters is not None else None,
+        "warnings": warnings,
+        "branches": {branch.name: _branch(database, branch, in_force, mode) for branch in database.layout.branch},
+    }
+
+
+def _branch(database: VehicleDatabase, branch: Branch, in_force: InForce, mode: Mode) -> dict[str, Any]:
+    said = in_force.parameters.branches.get(branch.name) if in_force.parameters is not None else None
+    facts: dict[str, Any] = {"drift": 0.0, "offset_a": 0.0, "apply": None}
+    if said is not None:
+        facts = {"drift": said.drift, "offset_a": said.offset_a, "apply": said.apply}
+    fault = sensor_fault(in_force, branch.name)
+    target = branch.corrected if mode is Mode.OVERLAY else branch.source
+    facts |= {"applied": fault.applied, "target": target, "plan": None}
+    if target is not None:
+        plan = branch_plan(database, branch, fault, mode)
+        facts["plan"] = {name: getattr(plan, name) for name in ("gain", "voltage_gain", "bias", "shift")}
+    return facts
+
+
+def report_text(report: dict[str, Any]) -> str:
+    """Show a report of :func:`check_report` as text."""
+    head = f"vehicle {report['vehicle']}, parameter set {report['parameter_set']}: fit"
+    lines = [head if report["fit"] else f"NOT FIT ({report['reason']}): {printable(report['message'])}"]
+    width = max(map(len, ["branch", *report["branches"]]))
+    lines.append(f"{'branch':<{width}}{'drift':>11}{'offset':>13}")
+    formula = ["corrected code = (measured code * gain + bias + 2^(shift - 1)) >> shift"]
+    for name, branch in report["branches"].items():
+        is_written = branch["target"] is not None
+        mark = "not published" if not is_written else "corrected" if branch["applied"] else "passed through"
+        has_fault = branch["drift"] or branch["offset_a"]
+        held_back = ', "apply" is false' if has_fault and branch["apply"] is False else ""
+        lines.append(f"{name:<{width}}{branch['drift']:>+11.4%}{branch['offset_a']:>+11.3f} A  {mark}{held_back}")
+        lines += [f"  target {branch['target']}"] if is_written else []
+        if is_written and branch["applied"]:
+            plan = {key: value for key, value in branch["plan"].items() if value or key != "voltage_gain"}
+            lines.append("  " + ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in plan.items()))
+            if "voltage_gain" in plan:
+                formula = [*formula[:1], "  of a power: + voltage code * voltage gain in the parentheses"]
+    return "\n".join([*lines, *formula, *(f"warning: {text}" for text in report["warnings"])])

@@ -1,20 +1,20 @@
 """What the node tells beside the bus: how long its answers take, and a line of JSON per second."""
 
 import errno
-import json
 import os
 import queue
 import socket
 import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from ecu_node.bus.steady_bus import SteadyBus
+import msgspec
+
 from ecu_node.core.branch import LiveBranch
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Quality
@@ -47,9 +47,7 @@ class Latency:
     def sent(self, not_sent: int) -> None:
         """Count the frames that came since the last time, unless the bus did not take some of their answers."""
         waiting = self._waiting
-        if not waiting:
-            return
-        if not not_sent:
+        if waiting and not not_sent:
             latency_s = time.monotonic() - waiting[0]
             self.counts[int(latency_s * 1e6).bit_length()] += len(waiting)
             self.largest_s = max(self.largest_s, latency_s)
@@ -65,6 +63,7 @@ class Latency:
 _PERIOD_S = 1.0
 
 
+@dataclass
 class Telemetry:
     """Writes a line per second, in a thread of its own: neither a disk nor a network holds up the bus.
 
@@ -78,24 +77,21 @@ class Telemetry:
         Names of the branches.
     latency : Latency
         Of the answers.
-    buses : sequence of SteadyBus
-        Buses of the node.
+    bus_states : callable
+        State of each bus, by its name.
     say : callable
         Takes one line for the log, when lines begin to get lost and when they do no more.
     """
 
-    def __init__(
-        self,
-        target: Path | tuple[str, int],
-        corrector: Corrector,
-        *,
-        layout: Layout,
-        latency: Latency,
-        buses: Sequence[SteadyBus],
-        say: Callable[[str], None],
-    ) -> None:
-        self._target, self._corrector, self._latency, self._buses, self._say = target, corrector, latency, buses, say
-        self._names = {branch.name: branch.vss or branch.name for branch in layout.branch}
+    target: Path | tuple[str, int]
+    corrector: Corrector
+    layout: Layout
+    latency: Latency
+    bus_states: Callable[[], dict[str, str]]
+    say: Callable[[str], None]
+
+    def __post_init__(self) -> None:
+        self._names = {branch.name: branch.vss or branch.name for branch in self.layout.branch}
         self._due_s = time.monotonic()
         self._lines: queue.Queue[bytes] = queue.Queue(maxsize=1)
         threading.Thread(target=self._write_lines, name="telemetry", daemon=True).start()
@@ -105,14 +101,13 @@ class Telemetry:
         if now_s < self._due_s:
             return
         self._due_s = max(self._due_s + _PERIOD_S, now_s)
-        line = json.dumps(self._record(now_s), separators=(",", ":"))
         try:
-            self._lines.put_nowait(f"{line}\n".encode())
+            self._lines.put_nowait(msgspec.json.encode(self._record(now_s)) + b"\n")
         except queue.Full:
-            self._corrector.counters.telemetry_lost += 1
+            self.corrector.counters.telemetry_lost += 1
 
     def _record(self, now_s: float) -> dict[str, Any]:
-        corrector, latency, sums = self._corrector, self._latency, self._corrector.watch.sums
+        corrector, latency, sums = self.corrector, self.latency, self.corrector.watch.sums
         state, reason = corrector.told
         return {
             "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -127,28 +122,25 @@ class Telemetry:
                 "p99.9": round(1e6 * latency.at_most_s(0.999)),
                 "max": round(1e6 * latency.largest_s),
             },
-            "buses": {bus.channel: bus.state for bus in self._buses},
-            "counters": asdict(corrector.counters),
+            "buses": self.bus_states(),
+            "counters": corrector.counters,
         }
 
     def _write_lines(self) -> None:
-        failed = False
+        is_lost = False
         while True:
-            line = self._lines.get()
+            line, was_lost = self._lines.get(), is_lost
             try:
-                if isinstance(self._target, Path):
-                    _append(self._target, line)
+                if isinstance(self.target, Path):
+                    _append(self.target, line)
                 else:
-                    _send(self._target, line)
+                    _send(self.target, line)
+                is_lost, news = False, "lines are written again"
             except OSError as error:
-                self._corrector.counters.telemetry_lost += 1
-                if not failed:
-                    self._say(f"--telemetry: {error.strerror}; lines are lost until that has changed")
-                failed = True
-            else:
-                if failed:
-                    self._say("--telemetry: lines are written again")
-                failed = False
+                is_lost, news = True, f"{error.strerror}; lines are lost until that has changed"
+                self.corrector.counters.telemetry_lost += 1
+            if is_lost != was_lost:
+                self.say(f"--telemetry: {news}")
 
 
 def _branch(branch: LiveBranch, now_s: float) -> dict[str, Any]:
@@ -159,11 +151,7 @@ def _branch(branch: LiveBranch, now_s: float) -> dict[str, Any]:
         _, quality = branch.published(now_s)
         return {"measured_a": None, "corrected_a": None, "quality": quality.name}
     published_a = currents_a[branch.quality is Quality.CORRECTED]
-    return {
-        "measured_a": round(currents_a[0], 3),
-        "corrected_a": round(published_a, 3),
-        "quality": branch.quality.name,
-    }
+    return {"measured_a": round(currents_a[0], 3), "corrected_a": round(published_a, 3), "quality": branch.quality.name}
 
 
 def _append(path: Path, line: bytes) -> None:

@@ -2,49 +2,62 @@
 
 from dataclasses import asdict, dataclass
 from enum import IntEnum
+from typing import Self
 
 from ecu_node.errors import ParameterError
 
 __all__ = ["Counters", "Quality", "Reason", "State", "TrustError", "UnfitError"]
 
 
-class State(IntEnum):
+class _WithWords(IntEnum):
+    """Codes, each with words for people."""
+
+    words: str
+    """What it means, within a sentence."""
+
+    def __new__(cls, code: int, words: str = "") -> Self:
+        member = int.__new__(cls, code)
+        member._value_, member.words = code, words
+        return member
+
+
+class State(_WithWords):
     """What the node does with the branch currents."""
 
-    STARTING = 0
-    CORRECTING = 1
-    PASSING_THROUGH = 2
-    SHADOW = 3
-    ASLEEP = 4
-    PARTLY_CORRECTING = 5
-    """Corrects, but not every branch; the reason says why."""
+    STARTING = 0, "starting: waiting for the first frames of all branches"
+    CORRECTING = 1, "correcting"
+    PASSING_THROUGH = 2, "passing measured values through"
+    SHADOW = 3, "shadow mode: computing, but passing measured values through"
+    ASLEEP = 4, "asleep: no branch sends"
+    PARTLY_CORRECTING = 5, "partly correcting: something of it cannot be corrected now"
+    """The reason says why."""
 
 
-class Reason(IntEnum):
+class Reason(_WithWords):
     """Why the node does not correct, or not everything."""
 
-    NONE = 0
-    NO_PARAMETERS = 1
-    MALFORMED_PARAMETERS = 2
-    WRONG_VEHICLE = 3
-    WRONG_LAYOUT = 4
-    WRONG_DBC = 5
-    IMPLAUSIBLE_PARAMETERS = 6
-    BRANCH_STALE = 7
-    CORRECTION_WORSE = 8
-    BRANCH_STUCK = 9
-    INPUT_MISSING = 10
-    NOT_SIGNED = 11
-    NOT_VALID_NOW = 12
-    REPLAYED = 13
-    REVOKED = 14
-    ON_TRIAL = 15
-    SUM_IMPLAUSIBLE = 16
+    NONE = 0, "nothing keeps it from correcting"
+    NO_PARAMETERS = 1, "there is no parameter file"
+    MALFORMED_PARAMETERS = 2, "the parameter file cannot be read"
+    WRONG_VEHICLE = 3, "the parameters are of another vehicle"
+    WRONG_LAYOUT = 4, "the parameters are for another layout"
+    WRONG_DBC = 5, "the parameters are for another DBC"
+    IMPLAUSIBLE_PARAMETERS = 6, "the parameters are beyond the limits of the layout"
+    BRANCH_STALE = 7, "a branch has sent nothing for longer than its timeout"
+    CORRECTION_WORSE = 8, "the corrected Kirchhoff sum is worse than the measured one"
+    BRANCH_STUCK = 9, "a branch never changes while the others do"
+    INPUT_MISSING = 10, "a voltage, or a value of a branch, is missing; not everything is corrected"
+    NOT_SIGNED = 11, "the parameters are not what trusted signers have signed"
+    NOT_VALID_NOW = 12, "the parameters have expired, or do not hold yet"
+    REPLAYED = 13, "the parameters are older than what was accepted before"
+    REVOKED = 14, "the parameters were revoked"
+    ON_TRIAL = 15, "the parameters are on trial"
+    SUM_IMPLAUSIBLE = 16, "the corrected Kirchhoff sum is not what it may be: a sensor is wrong"
     """In a signal of 4 bits CORRECTION_WORSE stands for it."""
-    FOREIGN_FRAMES = 17
+    FOREIGN_FRAMES = 17, "another node sends frames that only this gateway may send; they are dropped"
     """Nothing is held back for it; in a signal of 4 bits NONE stands for it."""
-    E2E_INVALID = 18
-    """So many frames of a message fail their end-to-end check that it is not used. In 4 bits: INPUT_MISSING."""
+    E2E_INVALID = 18, "so many frames of a message fail their end-to-end check that it is not used"
+    """In a signal of 4 bits INPUT_MISSING stands for it."""
 
 
 class UnfitError(ParameterError):

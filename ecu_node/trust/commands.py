@@ -1,36 +1,36 @@
 """Commands of ``ecu-node`` for signed parameters: provision, activate, revoke, verify, inspect."""
 
 import argparse
-import json
 import os
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from ecu_node.errors import printable
-from ecu_node.program import say_error, write_output, write_text
+from ecu_node.program import say_error, write_output, write_result, write_text
 
 __all__ = ["add_trust_commands"]
 
-_CODES = "Exit codes: 0 done, 1 refused or failed, 2 wrong use, 70 internal error, 130 interrupted."
 
-
-def add_trust_commands(commands: "argparse._SubParsersAction[Any]") -> None:
+def add_trust_commands(commands: "argparse._SubParsersAction[Any]", vehicle: Callable[[str], str]) -> None:
     """Add the commands to a parser.
 
     Parameters
     ----------
     commands : argparse's subparsers
         Of ``ecu-node``; each command is left in ``command`` as a callable that takes the options.
+    vehicle : callable
+        Reads the identity of a vehicle, as a type for argparse.
     """
     provision = commands.add_parser(
         "provision",
         help="begin the state of a vehicle: whom it trusts",
         description="Makes the folder in which a vehicle keeps what it has accepted, with the key set that it trusts "
         "from the beginning. Done once, where the vehicle is made.",
-        epilog=_CODES,
+        failed="refused or failed",
     )
-    provision.add_argument("--vehicle", required=True, type=_vehicle, metavar="ID", help="identity of this vehicle")
+    provision.add_argument("--vehicle", required=True, type=vehicle, metavar="ID", help="identity of this vehicle")
     provision.add_argument("--keys", required=True, type=Path, metavar="FILE", help="first key set ('calibrator keys')")
     _add_state(provision)
     _add_json(provision)
@@ -45,7 +45,7 @@ def add_trust_commands(commands: "argparse._SubParsersAction[Any]") -> None:
             help=what,
             description=f"Checks signatures, vehicle, number, time, layout, DBC, limits and the step from what is in "
             f"force. {details}",
-            epilog=_CODES,
+            failed="refused or failed",
         )
         command.add_argument("file", type=Path, metavar="FILE", help="signed file")
         _add_state(command)
@@ -60,8 +60,8 @@ def add_trust_commands(commands: "argparse._SubParsersAction[Any]") -> None:
         description="Shows what is said there. Of a file signatures are verified only with --keys. Of a state it is "
         "verified that the slots and the audit log are as they were written, and that what is in force or on trial "
         "holds now; whether it fits layout and DBC, 'ecu-node run' says.",
-        epilog="Exit codes: 0 done, 1 what is in force or on trial cannot be used, the audit log is not whole, or with "
-        "--keys not enough signers, 2 wrong use, 70 internal error, 130 interrupted.",
+        failed="what is in force or on trial cannot be used, the audit log is not whole, or with --keys not enough "
+        "signers",
     )
     inspect.add_argument("what", type=Path, metavar="FILE|FOLDER", help="signed file, or state of a vehicle")
     inspect.add_argument("--keys", type=Path, metavar="FILE", help="key set with which signatures are verified")
@@ -77,16 +77,6 @@ def _add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
-def _vehicle(text: str) -> str:
-    if not text.strip() or len(text) > 64:  # as in the parameter file
-        raise argparse.ArgumentTypeError(
-            f"the vehicle's identity is expected, of at most 64 characters, found {len(text)} characters"
-        )
-    if not text.isprintable():
-        raise argparse.ArgumentTypeError(f"{text!a}: the vehicle's identity is a text without control characters")
-    return text
-
-
 def _provision(options: argparse.Namespace) -> int:
     from ecu_node.trust.canonical import read_bytes, read_canonical  # noqa: PLC0415
     from ecu_node.trust.inspection import signers_text, statement_facts  # noqa: PLC0415
@@ -97,11 +87,9 @@ def _provision(options: argparse.Namespace) -> int:
     content = read_bytes(options.keys, KEY_SET).removesuffix(b"\n")
     keys = check_key_set(read_canonical(content, KeySet, where, KEY_SET), where)
     provision(options.state, options.vehicle, keys, _now())
-    if options.json:
-        facts = {"state": str(options.state), "vehicle": options.vehicle, "key_set": statement_facts(keys)}
-        write_output(json.dumps(facts, indent=2))
-    else:
-        write_text(printable(f"{options.state}: vehicle {options.vehicle} trusts {signers_text(keys)}"))
+    facts = {"state": str(options.state), "vehicle": options.vehicle, "key_set": statement_facts(keys)}
+    text = printable(f"{options.state}: vehicle {options.vehicle} trusts {signers_text(keys)}")
+    write_result(facts, text, as_json=options.json)
     return 0
 
 
@@ -119,18 +107,15 @@ def _take(options: argparse.Namespace) -> int:
     else:
         kinds = (Revocation,) if options.name == "revoke" else (SignedParameters, KeySet)
         accepted = accept(options.state, content, where, database, _now(), kinds=kinds, on_wait=_say_waiting)
-    if options.json:
-        facts = {
-            "taken": options.name != "verify",
-            "event": accepted.event,
-            "sequence": accepted.sequence,
-            "text": accepted.text,
-        }
-        write_output(json.dumps(facts, indent=2))
-        return 0
+    facts = {
+        "taken": options.name != "verify",
+        "event": accepted.event,
+        "sequence": accepted.sequence,
+        "text": accepted.text,
+    }
     number = f"number {accepted.sequence}, " if accepted.sequence is not None else ""
     would = "would be accepted: " if options.name == "verify" else ""
-    write_text(printable(f"{would}{accepted.event}: {number}{accepted.text}"))
+    write_result(facts, printable(f"{would}{accepted.event}: {number}{accepted.text}"), as_json=options.json)
     return 0
 
 

@@ -167,14 +167,15 @@ def test_an_empty_vehicle_is_wrong_use(
         main([command, *check(params)[1:], "--vehicle", vehicle])
     assert caught.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "--vehicle: the identity of this vehicle is expected, found none; or leave it out; see 'ecu-node " in line
+    expected = "the identity of the vehicle is expected, printable and of at most 64 characters"
+    assert f"--vehicle: {expected}, found none; see 'ecu-node " in line
 
 
 def test_a_vehicle_with_control_characters_is_wrong_use(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         main(check(params, "--vehicle", "v\x1b[2J"))
     assert caught.value.code == 2
-    assert r"'v\x1b[2J': the identity of this vehicle is a text without control" in capsys.readouterr().err
+    assert r"printable and of at most 64 characters, found 'v\x1b[2J'" in capsys.readouterr().err
 
 
 def test_a_gateway_needs_two_buses(params: Path, capsys: pytest.CaptureFixture[str]) -> None:

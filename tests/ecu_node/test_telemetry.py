@@ -48,7 +48,12 @@ class Outlet:
         self.bus = SteadyBus(lambda: can.Bus("telemetry", "virtual"), self.corrector.counters)
         self.said: list[str] = []
         self.telemetry = Telemetry(
-            target, self.corrector, layout=database.layout, latency=Latency(), buses=[self.bus], say=self.said.append
+            target,
+            self.corrector,
+            layout=database.layout,
+            latency=Latency(),
+            bus_states=lambda: {self.bus.channel: self.bus.state},
+            say=self.said.append,
         )
 
     def second(self) -> None:

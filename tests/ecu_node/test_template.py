@@ -12,8 +12,7 @@ import pytest
 from ecu_node.bus.guard import key_of
 from ecu_node.bus.in_force import InForce
 from ecu_node.bus.wiring import wire
-from ecu_node.check import template_text
-from ecu_node.cli import main
+from ecu_node.cli import main, template_text
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
