@@ -21,10 +21,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ecu_node.bus.adapters import acknowledgement
+from ecu_node.bus.adapters import acknowledgement, open_bus
 from ecu_node.bus.guard import Mode, key_of, received, transmitted
 from ecu_node.bus.in_force import branch_signals
-from ecu_node.bus.links import open_bus
 from ecu_node.bus.node import steady_time_s
 from ecu_node.bus.service import Log, Requests
 from ecu_node.bus.steady_bus import SteadyBus

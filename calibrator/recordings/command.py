@@ -39,7 +39,7 @@ def replay(
     with importing():
         from calibrator.recordings.frames import LOG_SUFFIXES, read_frames
         from calibrator.recordings.live import play_frames
-        from ecu_node.bus.links import connect
+        from ecu_node.bus.adapters import connect
 
     logging.getLogger("can").addHandler(logging.NullHandler())
     if log.is_dir():

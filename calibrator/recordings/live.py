@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 import can
 
 from calibrator.recordings.frame_arrays import FrameCollector, Frames
-from ecu_node.bus.links import connect
+from ecu_node.bus.adapters import connect
 from ecu_node.errors import BusError
 
 __all__ = ["play_frames", "record_bus"]

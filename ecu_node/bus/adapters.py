@@ -1,20 +1,38 @@
-"""What python-can is to open a bus with: the command line first, then python-can's own configuration.
+"""Opening a bus of python-can: its settings by the command line first, then by python-can's own configuration.
 
 That is CAN_BITRATE and CAN_CONFIG of the environment, and can.conf: its section named as the channel, then [default].
 An adapter's driver takes 500 kbit/s where nothing is said, which disturbs a bus of another rate: it is never asked to.
 """
 
 import configparser
+import errno
+import socket
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
 
 import can
-from can.typechecking import BitTimingDict, BitTimingFdDict
+from can.typechecking import BitTimingDict, BitTimingFdDict, CanFilter
 from can.util import load_config
 
+from ecu_node.bus.guard import Mode, needs_fd, received, transmitted
+from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
 
-__all__ = ["acknowledgement", "bus_config", "config_text"]
+__all__ = [
+    "Settings",
+    "acknowledgement",
+    "bus_config",
+    "carries_fd",
+    "config_text",
+    "connect",
+    "error_text",
+    "is_interface",
+    "open_bus",
+    "receive_filters",
+    "require_fd",
+    "socketcan_socket",
+]
 
 
 _SPEED_SET_ELSEWHERE = frozenset({"serial", "socketcan", "socketcand", "udp_multicast", "virtual"})
@@ -34,26 +52,148 @@ _LISTEN_ONLY: dict[str, dict[str, Any]] = {
     "vector": {"listen_only": True},
 }
 """Settings with which a driver's adapter sends nothing at all, not even acknowledgements."""
+_RECEIVE_BUFFER_BYTES = 1 << 20
+"""Asked of the kernel, which gives what it allows: frames of the time in which the node does something else."""
+_FD_MTU = 72
+"""Bytes of a frame of an interface of SocketCAN that carries CAN FD."""
 
 
-def bus_config(
+class Settings(TypedDict, total=False):
+    """How a bus is used, and its speed."""
+
+    fd: bool
+    """Whether to use CAN FD."""
+    listen_only: bool
+    """Whether to send nothing, acknowledgements included where the adapter can do without."""
+    bitrates: Mapping[str, int | None]
+    """``bitrate`` and ``data_bitrate`` of the command line, or None. [bit/s]"""
+
+
+def open_bus(
+    database: VehicleDatabase,
+    *,
     interface: str,
     channel: str | None,
-    *,
-    fd: bool = False,
-    listen_only: bool = False,
-    bitrates: Mapping[str, int | None] = {},
-) -> dict[str, Any]:
+    mode: Mode,
+    routed: bool = False,
+    own: bool = True,
+    **settings: Unpack[Settings],
+) -> can.BusABC:
+    """Open a bus for the node.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        Layout and DBC.
+    mode : Mode
+        An overlay node receives what it needs, a gateway everything.
+    routed : bool
+        Whether the kernel carries what a gateway does not need.
+    own : bool
+        Whether an overlay node also receives what only one node may send, as sent by others.
+    interface, channel, **settings :
+        As for :func:`bus_config`.
+
+    Returns
+    -------
+    can.BusABC
+        The bus; it does not receive what it sends.
+
+    Raises
+    ------
+    BusError
+        If there is no such bus, or the DBC needs CAN FD and ``fd`` is not given.
+    """
+    require_fd(database, mode, fd=settings.get("fd", False))
+    filters = receive_filters(database, mode, own=own) if mode is Mode.OVERLAY or routed else None
+    return connect(interface, channel, filters=filters, **settings)
+
+
+def require_fd(database: VehicleDatabase, mode: Mode, *, fd: bool) -> None:
+    """Raise BusError if the DBC needs CAN FD and ``fd`` is not given."""
+    if not fd and (names := needs_fd(database, mode)):
+        raise BusError(f"{database.layout.dbc_path}: CAN FD messages ({', '.join(names)}); start with --fd")
+
+
+def receive_filters(database: VehicleDatabase, mode: Mode, *, own: bool = True) -> list[CanFilter]:
+    """Filters for the kernel to apply: what the node needs of the vehicle, and its own messages as sent by others."""
+    keys = (*received(database), *(transmitted(database, mode) if own else ()))
+    return [{"can_id": key, "can_mask": 0x1FFFFFFF if long else 0x7FF, "extended": long} for key, long in keys]
+
+
+def connect(
+    interface: str, channel: str | None, *, filters: list[CanFilter] | None = None, **settings: Unpack[Settings]
+) -> can.BusABC:
+    """Open any bus of python-can.
+
+    Parameters
+    ----------
+    filters : list of CanFilter, optional
+        What to receive; everything if not given.
+    interface, channel, **settings :
+        As for :func:`bus_config`.
+
+    Returns
+    -------
+    can.BusABC
+        The bus; it does not receive what it sends.
+
+    Raises
+    ------
+    BusError
+        If it cannot be opened; the message says why.
+    """
+    config = bus_config(interface, channel, **settings)
+    config |= {"can_filters": filters, "receive_own_messages": False}
+    try:
+        bus = can.Bus(**config, ignore_config=True)
+    except (can.CanError, OSError, ValueError, TypeError, KeyError, NotImplementedError) as error:
+        raise BusError(f"{interface} {channel}: cannot open the bus: {error_text(error)}") from None
+    if bus.channel_info == can.BusABC.channel_info:
+        bus.channel_info = f"{interface} {channel}"  # what an interface does not tell of itself
+    opened = socketcan_socket(bus)
+    if opened is not None:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+    return bus
+
+
+def error_text(error: Exception) -> str:
+    """What went wrong, in one line; where it is known, what to do."""
+    if isinstance(error, OSError) and error.errno == errno.EAFNOSUPPORT:
+        return "this kernel has no SocketCAN (modules can, can_raw and, for virtual buses, vcan)"
+    if isinstance(error, OSError) and error.errno == errno.ENODEV:
+        return "no such interface (see 'ip link')"
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def is_interface(bus: can.BusABC, name: str) -> bool:
+    """Whether a bus is one of python-can's interface of this name."""
+    return any(f"{kind.__module__}.".startswith(f"can.interfaces.{name}.") for kind in type(bus).__mro__)
+
+
+def socketcan_socket(bus: can.BusABC) -> socket.socket | None:
+    """Socket of a bus of SocketCAN; None for other interfaces."""
+    found = getattr(bus, "socket", None) if is_interface(bus, "socketcan") else None
+    return found if isinstance(found, socket.socket) else None
+
+
+def carries_fd(interface: str, channel: str) -> bool:
+    """Whether an interface of SocketCAN is set up for CAN FD; False where that is not known."""
+    try:
+        return interface == "socketcan" and int(Path(f"/sys/class/net/{channel}/mtu").read_text()) >= _FD_MTU
+    except (OSError, ValueError):
+        return False
+
+
+def bus_config(interface: str, channel: str | None, **settings: Unpack[Settings]) -> dict[str, Any]:
     """Settings of a bus, checked as far as that goes without opening it.
 
     Parameters
     ----------
     interface, channel : str
         As python-can names them; None: the channel of its configuration.
-    fd, listen_only : bool
-        Whether to use CAN FD, and to send nothing, acknowledgements included where the adapter can do without.
-    bitrates : mapping
-        ``bitrate`` and ``data_bitrate`` of the command line, or None. [bit/s]
+    **settings : Settings
+        By keyword, what is not as it is set up or as python-can's configuration says.
 
     Returns
     -------
@@ -65,7 +205,8 @@ def bus_config(
     BusError
         If the interface is not known, or the bus's speed is not given, cannot be set, or contradicts itself.
     """
-    given = {"interface": interface, "channel": channel, "fd": fd or None, **bitrates}
+    given: dict[str, Any] = {"interface": interface, "channel": channel, "fd": settings.get("fd") or None}
+    given |= settings.get("bitrates", {})
     said = {name: value for name, value in given.items() if value is not None}
     try:
         config: dict[str, Any] = {**load_config(config=said, context=channel)}
@@ -74,61 +215,66 @@ def bus_config(
         raise BusError(
             f"{interface} {channel}: cannot open the bus: {reason}; see --interface, CAN_CONFIG, can.conf"
         ) from None
-    _check_speed(config, f"{interface} {channel}")
-    return {**config, **_LISTEN_ONLY.get(interface, {})} if listen_only else config
+    if problem := _wrong_speed(config):
+        raise BusError(f"{interface} {channel}: {problem}")
+    return {**config, **_LISTEN_ONLY.get(interface, {})} if settings.get("listen_only") else config
 
 
-def _check_speed(config: Mapping[str, Any], where: str) -> None:
-    """Refuse a bus whose speed would not be the one that was meant."""
-    interface, channel, fd = config["interface"], config["channel"], bool(config.get("fd"))
+def _wrong_speed(config: Mapping[str, Any]) -> str | None:
+    """Why the speed of the bus would not be the one that was meant; None if it will be."""
+    interface, channel = config["interface"], config["channel"]
     rates = {name: config[name] for name in ("bitrate", "data_bitrate") if name in config}
     has_timing = "timing" in config or "f_clock" in config
     if interface in _SPEED_SET_ELSEWHERE:
-        if rates or has_timing:
-            how = f" (ip link set {channel} type can bitrate ...)" if interface == "socketcan" else ""
-            raise BusError(
-                f"{where}: the bit rate of {interface} is not set from here{how}; take {', '.join(rates) or 'f_clock'} "
-                f"out of the options, CAN_BITRATE, CAN_CONFIG and can.conf, whose section [channel] is for one bus"
-            )
-    elif has_timing:
-        _check_timing(config, rates, where)
-    elif fd and interface in _TAKE_NO_DATA_BITRATE:
+        if not rates and not has_timing:
+            return None
+        how = f" (ip link set {channel} type can bitrate ...)" if interface == "socketcan" else ""
+        return (
+            f"the bit rate of {interface} is not set from here{how}; take {', '.join(rates) or 'f_clock'} out of the "
+            f"options, CAN_BITRATE, CAN_CONFIG and can.conf, whose section [channel] is for one bus"
+        )
+    return _wrong_timing(config, rates) if has_timing else _wrong_rates(config, rates)
+
+
+def _wrong_rates(config: Mapping[str, Any], rates: Mapping[str, int]) -> str | None:
+    """Which bit rate is missing, or is none of the adapter's; None if neither."""
+    interface, channel, fd = config["interface"], config["channel"], bool(config.get("fd"))
+    if fd and interface in _TAKE_NO_DATA_BITRATE:
         keys = ", ".join(BitTimingFdDict.__annotations__)
-        raise BusError(f"{where}: CAN FD needs its bit timing: {keys} in section [{channel}] of can.conf")
-    else:
-        for name in ("bitrate", "data_bitrate") if fd else ("bitrate",):
-            if name not in rates:
-                raise BusError(
-                    f"{where}: no {name}: this adapter sets the speed of the bus, and a wrong one disturbs it; give "
-                    f"ecu-node --{name.replace('_', '-')} BIT_PER_S, or {name} in section [{channel}] of can.conf"
-                )
-            if not isinstance(rates[name], int) or rates[name] <= 0:
-                raise BusError(f"{where}: {name} = {rates[name]}: a number of bit/s is expected, such as 250000")
-        if interface == "pcan":
-            from can.interfaces.pcan.basic import PCAN_BITRATES  # noqa: PLC0415  # warns of what it lacks
+        return f"CAN FD needs its bit timing: {keys} in section [{channel}] of can.conf"
+    for name in ("bitrate", "data_bitrate") if fd else ("bitrate",):
+        if name not in rates:
+            return (
+                f"no {name}: this adapter sets the speed of the bus, and a wrong one disturbs it; give ecu-node "
+                f"--{name.replace('_', '-')} BIT_PER_S, or {name} in section [{channel}] of can.conf"
+            )
+        if not isinstance(rates[name], int) or rates[name] <= 0:
+            return f"{name} = {rates[name]}: a number of bit/s is expected, such as 250000"
+    if interface == "pcan":
+        from can.interfaces.pcan.basic import PCAN_BITRATES  # noqa: PLC0415  # warns of what it lacks
 
-            if rates["bitrate"] not in PCAN_BITRATES:  # the driver would set 500 kbit/s
-                known = ", ".join(map(str, PCAN_BITRATES))
-                raise BusError(f"{where}: bitrate = {rates['bitrate']}: pcan has {known}; or give the bit timing")
+        if rates["bitrate"] not in PCAN_BITRATES:  # the driver would set 500 kbit/s
+            known = ", ".join(map(str, PCAN_BITRATES))
+            return f"bitrate = {rates['bitrate']}: pcan has {known}; or give the bit timing"
+    return None
 
 
-def _check_timing(config: Mapping[str, Any], rates: Mapping[str, int], where: str) -> None:
-    """Refuse a bit timing that python-can would drop, or that contradicts the bit rates given beside it."""
+def _wrong_timing(config: Mapping[str, Any], rates: Mapping[str, int]) -> str | None:
+    """Why python-can would drop a bit timing, or how it contradicts the bit rates given beside it; None if neither."""
     timing, fd = config.get("timing"), bool(config.get("fd"))
     if config["interface"] not in _TAKE_TIMING:
-        raise BusError(f"{where}: python-can cannot set a bit timing there; take f_clock out, and give a bit rate")
+        return "python-can cannot set a bit timing there; take f_clock out, and give a bit rate"
     if isinstance(timing, can.BitTimingFd) and fd:
         own = {"bitrate": timing.nom_bitrate, "data_bitrate": timing.data_bitrate}
     elif isinstance(timing, can.BitTiming) and not fd:
         own = {"bitrate": timing.bitrate}
     else:
         keys = ", ".join((BitTimingFdDict if fd else BitTimingDict).__annotations__)
-        raise BusError(
-            f"{where}: the bit timing is incomplete, impossible, or not one of "
-            f"{'CAN FD' if fd else 'classic CAN (CAN FD: --fd)'}, which has {keys}"
-        )
+        kind = "CAN FD" if fd else "classic CAN (CAN FD: --fd)"
+        return f"the bit timing is incomplete, impossible, or not one of {kind}, which has {keys}"
     if wrong := [f"{name} = {rate}" for name, rate in rates.items() if own.get(name) != rate]:
-        raise BusError(f"{where}: {', '.join(wrong)} contradicts the bit timing ({timing}); leave one of them out")
+        return f"{', '.join(wrong)} contradicts the bit timing ({timing}); leave one of them out"
+    return None
 
 
 def config_text(config: Mapping[str, Any]) -> str:

@@ -100,8 +100,8 @@ class FaultMemory:
     def __init__(self, corrector: Corrector, folder: Path, say: Callable[[str], None], background: Executor) -> None:
         self._corrector, self._folder, self._say, self._background = corrector, folder, say, background
         self._due_s = float("-inf")
-        self._failed = False
-        self._writing: Future[None] | None = None
+        self._written: Future[bool] | None = None
+        """Whether the file is as the faults are, once that is known; None: as it was read."""
         try:
             self._faults = read_faults(folder)
         except UserError as error:
@@ -117,7 +117,8 @@ class FaultMemory:
         corrector = self._corrector
         if now_s >= self._due_s and corrector.latched:
             self._due_s = now_s + _LOOK_EVERY_S
-            if self._faults and self._is_written() and not (self._folder / _NAME).exists():
+            is_kept = self._written is None or (self._written.done() and self._written.result())
+            if self._faults and is_kept and not (self._folder / _NAME).exists():
                 self._faults = []
                 corrector.release()
         found = corrector.latched, corrector.latched_branches
@@ -129,14 +130,12 @@ class FaultMemory:
         if corrector.latched:
             self._add(Reason(corrector.latched).name, list(corrector.latched_branches))
         content = msgspec.json.format(msgspec.json.encode(self._faults), indent=2) + b"\n"
-        self._writing = self._background.submit(self._write, content)
-
-    def _is_written(self) -> bool:
-        return not self._failed and (self._writing is None or self._writing.done())
+        self._written = self._background.submit(self._write, content)
 
     def _add(self, reason: str, branches: list[str]) -> None:
         corrector, now = self._corrector, datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         before = next((item for item in self._faults if (item.reason, item.branches) == (reason, branches)), None)
+        currents_a = corrector.watch.currents_a
         fault = Fault(
             reason=reason,
             branches=branches,
@@ -144,15 +143,15 @@ class FaultMemory:
             first=before.first if before is not None else now,
             last=now,
             count=before.count + 1 if before is not None else 1,
-            measured_a={name: round(pair[0], 3) for name, pair in corrector.watch.currents_a.items()},
-            corrected_a={name: round(pair[1], 3) for name, pair in corrector.watch.currents_a.items()},
+            measured_a={name: round(pair[0], 3) for name, pair in currents_a.items()},
+            corrected_a={name: round(pair[1], 3) for name, pair in currents_a.items()},
         )
         self._faults = [fault, *(item for item in self._faults if item is not before)][:_MOST_FAULTS]
 
-    def _write(self, content: bytes) -> None:
+    def _write(self, content: bytes) -> bool:
         try:
             write_atomically(self._folder / _NAME, content)
-            self._failed = False
         except OSError as error:
-            self._failed = True
             self._say(f"{self._folder / _NAME}: cannot keep the fault: {error.strerror}; see that its disk has room")
+            return False
+        return True

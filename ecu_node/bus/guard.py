@@ -6,9 +6,9 @@ nothing that is read. And each bit the node sends belongs to one signal only. A 
 on the other bus, and in its own name the status alone.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from enum import Enum
+from typing import NamedTuple
 
 from cantools.database.can import Message, Signal
 
@@ -73,18 +73,50 @@ def rewritten(database: VehicleDatabase) -> dict[FrameKey, Message]:
 
 def transmitted(database: VehicleDatabase, mode: Mode) -> dict[FrameKey, Message]:
     """Messages that the node sends in its own name, by identifier."""
-    messages = {key_of(item.message): item.message for item in _written(database, mode)}
-    layout = database.layout
-    if layout.status is not None:
-        message = database.message(layout.status.message)
-        messages[key_of(message)] = message
-    return messages
+    messages = [item.message for item in _written(database, mode) if item.own]
+    if database.layout.status is not None:
+        messages.append(database.message(database.layout.status.message))
+    return {key_of(message): message for message in messages}
 
 
 def needs_fd(database: VehicleDatabase, mode: Mode) -> list[str]:
     """Names of the messages, received or sent, that need CAN FD."""
     messages = {**received(database), **transmitted(database, mode)}
     return [message.name for message in messages.values() if is_fd(message)]
+
+
+class _Written(NamedTuple):
+    """A signal that the node writes, and what for."""
+
+    message: Message
+    signal: Signal
+    purpose: str
+    largest: int
+    """The greatest code it must hold."""
+    own: bool = True
+    """Whether the whole message is the node's."""
+
+
+def _written(database: VehicleDatabase, mode: Mode) -> Iterator[_Written]:
+    """All signals that the node writes; a gateway writes the branches where it reads them."""
+    for branch in database.layout.branch:
+        places = ((branch.corrected, 0), (branch.quality, Quality.INVALID))
+        for name, largest in places if mode is Mode.OVERLAY else ((branch.source, 0),):
+            if name is not None:
+                yield _Written(*database.signal(name), f"branch {branch.name}", largest, mode is Mode.OVERLAY)
+    status = database.layout.status
+    if status is not None:
+        fields = (
+            (status.state, max(State)),
+            (status.reason, Reason.ON_TRIAL),
+            (status.parameter_set, PARAMETER_SETS - 1),
+            (status.alive_counter, 1),
+            (status.sum_measured, 0),
+            (status.sum_corrected, 0),
+        )
+        for name, largest in fields:
+            if name is not None:
+                yield _Written(*database.signal(f"{status.message}.{name}"), "status", largest)
 
 
 def check_output(database: VehicleDatabase, mode: Mode) -> None:
@@ -114,12 +146,13 @@ def check_output(database: VehicleDatabase, mode: Mode) -> None:
             f"--gateway CHANNEL"
         )
     _require_own_messages(database, sent)
-    taken = {key: _header(database, message) for key, message in sent.items()}
-    for key, message in rewritten(database).items() if mode is Mode.GATEWAY else ():
-        taken[key] = _header(database, message)
-    for item in (*_written(database, mode), *(_rewritten(database) if mode is Mode.GATEWAY else ())):
+    taken: dict[FrameKey, int] = {}
+    for item in _written(database, mode):
         _check_place(item)
         key, mask = key_of(item.message), bit_place(item.signal).mask
+        if key not in taken:
+            protection = protection_of(database, item.message)
+            taken[key] = protection.header_mask if protection is not None else 0
         if taken[key] & mask and item.signal.multiplexer_ids is None:
             raise LayoutError(
                 f"{where}: {item.purpose}: {item.message.name}.{item.signal.name} is written twice, or overlaps "
@@ -128,62 +161,18 @@ def check_output(database: VehicleDatabase, mode: Mode) -> None:
         taken[key] |= mask
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Written:
-    """A signal that the node writes."""
-
-    message: Message
-    signal: Signal
-    purpose: str
-    largest: int = 0
-    """The greatest code it must hold."""
-    own: bool = True
-    """Whether the whole message is the node's."""
-
-
-def _rewritten(database: VehicleDatabase) -> Iterable[_Written]:
-    for branch in database.layout.branch:
-        message, signal = database.signal(branch.source)
-        yield _Written(message=message, signal=signal, purpose=f"branch {branch.name}", own=False)
-
-
-def _written(database: VehicleDatabase, mode: Mode) -> Iterable[_Written]:
-    layout = database.layout
-    for branch in layout.branch if mode is Mode.OVERLAY else ():
-        for name, largest in ((branch.corrected, 0), (branch.quality, Quality.INVALID)):
-            if name is not None:
-                message, signal = database.signal(name)
-                yield _Written(message=message, signal=signal, purpose=f"branch {branch.name}", largest=largest)
-    status = layout.status
-    if status is None:
-        return
-    fields = (
-        (status.state, max(State)),
-        (status.reason, Reason.ON_TRIAL),
-        (status.parameter_set, PARAMETER_SETS - 1),
-        (status.alive_counter, 1),
-        (status.sum_measured, 0),
-        (status.sum_corrected, 0),
-    )
-    for name, largest in fields:
-        if name is not None:
-            message, signal = database.signal(f"{status.message}.{name}")
-            yield _Written(message=message, signal=signal, purpose="status", largest=largest)
-
-
 def _require_own_messages(database: VehicleDatabase, sent: Mapping[FrameKey, Message]) -> None:
     """Refuse to send what the layout reads, or what the DBC says is not sent by one control unit of its own."""
     where = database.layout.path
     inputs = (database.signal(item.signal)[0] for item in database.layout.input)
     read = {**received(database), **{key_of(message): message for message in inputs}}
-    both = [message.name for key, message in sent.items() if key in read]
-    if both:
+    if both := [message.name for key, message in sent.items() if key in read]:
         raise LayoutError(
             f"{where}: {', '.join(both)} would be both received and sent; corrected values and status need messages "
             f"of their own"
         )
-    others = {sender for message in read.values() for sender in _senders(message)}
-    senders = {sender: message.name for message in sent.values() for sender in _senders(message)}
+    others = {sender for message in read.values() for sender in message.senders} - {_NOBODY}
+    senders = {name: message.name for message in sent.values() for name in message.senders if name != _NOBODY}
     if len(senders) > 1 or others & senders.keys():
         found = ", ".join(f"{message} by {sender}" for sender, message in senders.items())
         raise LayoutError(
@@ -192,27 +181,12 @@ def _require_own_messages(database: VehicleDatabase, sent: Mapping[FrameKey, Mes
         )
 
 
-def _senders(message: Message) -> list[str]:
-    return [sender for sender in message.senders if sender != _NOBODY]
-
-
 def _check_place(item: _Written) -> None:
     place = bit_place(item.signal)
-    name = f"{item.message.name}.{item.signal.name}"
+    what = f"{item.purpose}: signal {item.message.name}.{item.signal.name}"
     if place.end > item.message.length:
-        raise DatabaseError(
-            f"{item.purpose}: signal {name} ends in byte {place.end}, but the message has {item.message.length} bytes"
-        )
+        raise DatabaseError(f"{what} ends in byte {place.end}, but the message has {item.message.length} bytes")
     if item.own and item.signal.multiplexer_ids is not None:
-        raise DatabaseError(
-            f"{item.purpose}: signal {name} is multiplexed; what the node sends in its own name must be in every frame"
-        )
+        raise DatabaseError(f"{what} is multiplexed; what the node sends in its own name must be in every frame")
     if place.highest < item.largest:
-        raise DatabaseError(
-            f"{item.purpose}: signal {name} holds at most {place.highest}; {item.largest} must fit, widen it in the DBC"
-        )
-
-
-def _header(database: VehicleDatabase, message: Message) -> int:
-    protection = protection_of(database, message)
-    return protection.header_mask if protection is not None else 0
+        raise DatabaseError(f"{what} holds at most {place.highest}; {item.largest} must fit, widen it in the DBC")

@@ -183,23 +183,22 @@ class KernelRoutes:
     def _change(self, kind: int, route: _Route) -> None:
         flags, source, target, *pair = route
         attributes = _ATTRIBUTES.pack(8, _FROM, source, 8, _TO, target, 12, _FILTER, *pair, 5, _LIMIT, 1)
-        for _ in self._ask(kind, _ACKNOWLEDGE, _RULE.pack(socket.AF_CAN, _CAN_TO_CAN, flags) + attributes):
-            pass
+        self._ask(kind, _ACKNOWLEDGE, _RULE.pack(socket.AF_CAN, _CAN_TO_CAN, flags) + attributes)
 
-    def _ask(self, kind: int, flags: int, body: bytes) -> Iterator[bytes]:
+    def _ask(self, kind: int, flags: int, body: bytes) -> list[bytes]:
         """Ask the kernel; what it answers, without headers."""
         self._socket.send(_MESSAGE.pack(_MESSAGE.size + len(body), kind, _REQUEST | flags, 0, 0) + body)
+        found: list[bytes] = []
         while True:
             answer, at = self._socket.recv(1 << 16), 0
             while at < len(answer):
                 length, what, *_ = _MESSAGE.unpack_from(answer, at)
                 payload = answer[at + _MESSAGE.size : at + length]
-                if what in {_ERROR, _DONE}:
-                    code = -struct.unpack_from("=i", payload)[0] if what == _ERROR else 0
-                    if code:
-                        raise OSError(code, os.strerror(code))
-                    return
-                yield payload
+                if what == _ERROR and (code := -struct.unpack_from("=i", payload)[0]):
+                    raise OSError(code, os.strerror(code))
+                if what in {_ERROR, _DONE}:  # an error of 0 acknowledges
+                    return found
+                found.append(payload)
                 at += length + 3 & ~3
 
 

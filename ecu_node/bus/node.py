@@ -9,11 +9,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import can
 
 from ecu_node.bus.guard import Mode, rewritten, transmitted
-from ecu_node.bus.links import data_frame
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.telemetry import Latency
 from ecu_node.core.corrector import Corrector
@@ -90,25 +90,29 @@ def _ahead_s() -> float | None:
 
 _REMEMBERED = 256
 """Frames of one identifier that may be on their way back."""
+_Key = tuple[int, bool]
+"""An identifier, and whether it has 29 bits."""
 
 
 class OwnFrames:
-    """What was sent lately, by identifier.
+    """Frames that nobody but this node may send on a bus, and which of them it may hear itself.
 
     Parameters
     ----------
     keys : iterable of tuple
-        Identifiers, each with whether it has 29 bits, that nobody but this node may send on a bus.
+        Identifiers, each with whether it has 29 bits.
+    remembered : int
+        So many frames of each may be on their way.
     """
 
-    def __init__(self, keys: Iterable[tuple[int, bool]]) -> None:
-        self._sent: dict[tuple[int, bool], deque[bytes | bytearray]] = {key: deque(maxlen=_REMEMBERED) for key in keys}
+    def __init__(self, keys: Iterable[_Key], remembered: int = _REMEMBERED) -> None:
+        self._sent: dict[_Key, deque[bytes | bytearray]] = {key: deque(maxlen=remembered) for key in keys}
 
-    def sent(self, key: tuple[int, bool], data: bytes | bytearray) -> None:
+    def sent(self, key: _Key, data: bytes | bytearray) -> None:
         """Remember a frame that is sent."""
         self._sent[key].append(data)
 
-    def is_foreign(self, key: tuple[int, bool], data: bytes | bytearray) -> bool:
+    def is_foreign(self, key: _Key, data: bytes | bytearray) -> bool:
         """Whether another node must have sent this frame; one that was sent from here may come back once."""
         try:
             self._sent[key].remove(data)
@@ -116,168 +120,161 @@ class OwnFrames:
             return True
         return False
 
-    def __contains__(self, key: tuple[int, bool]) -> bool:
+    def __contains__(self, key: _Key) -> bool:
         return key in self._sent
 
 
-LONGEST_WAIT_S = 0.1
+_LONGEST_WAIT_S = 0.1
 """A wake-up at least this often, so that a request to stop is seen. [s]"""
 _LOOK_EVERY_S = 0.02
 """The junction is looked at, and the watchdog fed, at least this often, however rare the status is. [s]"""
+_LISTEN_PERIODS, _LONGEST_LISTEN_S = 1.5, 1.5
+"""So many status periods, but no longer than this [s], the node listens for another one before it says anything."""
 
 OnTick = Callable[[float, bool], None]
 """Takes the steady clock's time [s], and whether the whole node works."""
 
 
-class Ticking:
-    """Does each of these when it is due.
+@dataclass
+class _Job:
+    """Something to be done beside the frames, again and again."""
+
+    period_s: float
+    do: Callable[[float], None]
+    due_s: float = float("-inf")
+
+    def run(self, now_s: float) -> None:
+        """Do it; it is due again in step, unless it is late by a whole period."""
+        self.do(now_s)
+        in_step_s = self.due_s + self.period_s
+        self.due_s = in_step_s if in_step_s > now_s else now_s + self.period_s
+
+
+class _Node:
+    """What both nodes do: take frames as they come, and in between look, tell the status, and tick.
+
+    Of these one at a time is done: a frame that comes meanwhile waits for no more than that.
 
     Parameters
     ----------
-    corrector : Corrector
-        The core.
-    period_s : float
-        Between status messages. [s]
-    on_tick : OnTick
-        Called after each look.
-    works : callable
-        Whether all that works beside this does.
+    heard, told : SteadyBus
+        Where the sensors are heard, and where the node answers and tells its status.
+    own : iterable of tuple
+        Identifiers that only this node may send there.
+    corrector, period_s, on_tick, latency :
+        As for :class:`OverlayNode`.
     """
 
     def __init__(
-        self, corrector: Corrector, period_s: float, on_tick: OnTick, works: Callable[[], bool] = lambda: True
+        self,
+        heard: SteadyBus,
+        told: SteadyBus,
+        own: Iterable[_Key],
+        corrector: Corrector,
+        *,
+        period_s: float,
+        on_tick: OnTick,
+        latency: Latency | None,
     ) -> None:
-        self._corrector, self.period_s, self._on_tick, self._works = corrector, period_s, on_tick, works
-        self._due_s = self._status_due_s = float("-inf")
-        self.time_of_day = TimeOfDay(corrector.counters)
+        self._heard, self._told, self._own, self._corrector = heard, told, OwnFrames(own), corrector
+        self._period_s, self._on_tick, self._latency = period_s, on_tick, latency or Latency()
+        self._time_of_day = TimeOfDay(corrector.counters)
+        self._heard_s = self._due_s = float("-inf")
+        often_s = min(period_s, _LOOK_EVERY_S)
+        self._jobs = [_Job(often_s, self._look), _Job(period_s, self._tell), _Job(often_s, self._tick)]
 
-    def is_due(self, now_s: float) -> bool:
-        """Whether there is something else to do than to receive."""
-        return now_s >= self._due_s
+    def _work(self, stop: Callable[[], bool]) -> None:
+        self._heard_s = time.monotonic()
+        while not stop():
+            now_s = self._heard.asked_s
+            job = min(self._jobs, key=lambda job: job.due_s)
+            if now_s >= job.due_s:
+                job.run(now_s)
+                self._due_s = min(job.due_s for job in self._jobs)
+            self._hear()
 
-    def wait_s(self, now_s: float) -> float:
-        """How long there is nothing to do but to receive; 0 if it is time. [s]"""
-        return min(LONGEST_WAIT_S, max(0.0, self._due_s - now_s))
+    def _look(self, _: float) -> None:
+        self._corrector.look(self._heard_s)  # no branch is stale for what has not been heard yet
 
-    def tick(self, now_s: float, heard_s: float, bus: SteadyBus, own: OwnFrames) -> None:
-        """Do it if it is due; no branch is stale for what has not been heard yet."""
-        if now_s < self._due_s:
-            return
-        self._due_s = _next_s(self._due_s, min(self.period_s, _LOOK_EVERY_S), now_s)
-        corrector = self._corrector
-        corrector.look(heard_s)
-        status = corrector.status() if now_s >= self._status_due_s else None
+    def _tell(self, _: float) -> None:
+        status = self._corrector.status()
         if status is not None:
-            self._status_due_s = _next_s(self._status_due_s, self.period_s, now_s)
             fields, data = status
-            own.sent(fields.key, data)
-            bus.send(data_frame(fields.key, data, fd=fields.fd))
-            corrector.counters.send_errors += bus.flush()[1]
+            self._own.sent(fields.key, data)
+            self._told.send(_data_frame(fields.key, data, fd=fields.fd))
+            self._corrector.counters.send_errors += self._told.flush()[1]
+
+    def _tick(self, now_s: float) -> None:
         self._on_tick(now_s, self._works())
 
+    def _works(self) -> bool:
+        """Whether all that works beside this does."""
+        return True
 
-def _next_s(due_s: float, period_s: float, now_s: float) -> float:
-    """When something periodic is due again: in step, unless it is late by a whole period. [s]"""
-    return due_s + period_s if due_s + period_s > now_s else now_s + period_s
+    def _hear(self) -> None:
+        """Take what comes until there is something else to do, and note up to when the bus was heard.
 
+        That is until it was asked last, or, if there may be more, until the last frame came. After a pause of the whole
+        process, frames of all branches wait to be read, and none of these is stale.
+        """
+        bus = self._heard
+        message = bus.receive(min(_LONGEST_WAIT_S, max(0.0, self._due_s - bus.asked_s)))
+        ahead_s = self._time_of_day.ahead_s()  # after the wait, in which the clock may have been set
+        while message is not None:
+            now_s = bus.read_s
+            self._take(message, now_s, ahead_s)
+            if not bus.at_hand:
+                self._flush()
+                if now_s >= self._due_s:
+                    if message.timestamp:
+                        self._heard_s = steady_time_s(message.timestamp, now_s, ahead_s)
+                    return
+            message = bus.receive(0.0)
+        self._flush()  # error frames may have ended a batch, or the bus
+        self._heard_s = bus.asked_s
 
-_LISTEN_PERIODS, _LONGEST_LISTEN_S = 1.5, 1.5
-"""So many status periods, but no longer than this [s], the node listens for another one before it says anything."""
+    def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
+        """Take a frame; given are the steady clock, and by how much the time of day is ahead of it. [s]"""
+        raise NotImplementedError
 
+    def _flush(self) -> int:
+        """Send what was made of the frames; how many the bus took."""
+        sent, not_sent = self._told.flush()
+        self._corrector.counters.send_errors += not_sent
+        self._latency.sent(not_sent)
+        return sent
 
-def listen(bus: SteadyBus, own: OwnFrames, stop: Callable[[], bool], period_s: float) -> None:
-    """Hear whether anybody else sends what only this node may send; what else comes meanwhile is too old afterwards.
-
-    Parameters
-    ----------
-    bus : SteadyBus
-        Where to listen.
-    own : OwnFrames
-        What only this node may send there.
-    stop : callable
-        Asked at every wake-up; True ends it.
-    period_s : float
-        Between status messages, which another node would send, too. [s]
-
-    Raises
-    ------
-    BusError
-        If another node sends such a message.
-    """
-    end_s = time.monotonic() + min(_LISTEN_PERIODS * period_s, _LONGEST_LISTEN_S)
-    while (left_s := end_s - time.monotonic()) > 0.0 and not stop():
-        message = bus.receive(min(left_s, LONGEST_WAIT_S))
-        if message is None or message.is_remote_frame:
-            continue
-        if (message.arbitration_id, message.is_extended_id) in own:
-            require_own(message, own, bus)
-
-
-def discard(bus: SteadyBus) -> None:
-    """Forget what has come so far, within a short time: on a full bus more comes meanwhile."""
-    end_s = time.monotonic() + LONGEST_WAIT_S
-    while time.monotonic() < end_s and bus.receive(0.0) is not None:
-        pass
-
-
-def hear(
-    bus: SteadyBus,
-    heard_s: float,
-    ticking: Ticking,
-    take: Callable[[can.Message, float, float], None],
-    flush: Callable[[], None],
-) -> float:
-    """Take what comes until there is something else to do.
-
-    Parameters
-    ----------
-    bus : SteadyBus
-        Where to listen.
-    heard_s : float
-        Up to when it was heard before. [s]
-    ticking : Ticking
-        Says when there is something else to do.
-    take : callable
-        Takes a frame, the steady clock [s], and by how much the time of day is ahead of it [s].
-    flush : callable
-        Sends what was made of the frames; called before this waits for more, and at the end.
-
-    Returns
-    -------
-    float
-        Up to when the bus was heard: until it was asked last, or, if there may be more, until the last frame came; as
-        before if that is not known. After a pause of the whole process, frames of all branches wait to be read, and
-        none of these is stale. [s]
-    """
-    message = bus.receive(ticking.wait_s(bus.asked_s))
-    ahead_s = ticking.time_of_day.ahead_s()  # after the wait, in which the clock may have been set
-    while message is not None:
-        now_s = bus.read_s
-        take(message, now_s, ahead_s)
-        if not bus.at_hand:
-            flush()
-            if ticking.is_due(now_s):
-                return steady_time_s(message.timestamp, now_s, ahead_s) if message.timestamp else heard_s
-        message = bus.receive(0.0)
-    flush()  # error frames may have ended a batch, or the bus
-    return bus.asked_s
+    def _listen(self, own: OwnFrames, stop: Callable[[], bool]) -> None:
+        """Hear whether another node sends what only this one may; what else comes is too old afterwards."""
+        end_s = time.monotonic() + min(_LISTEN_PERIODS * self._period_s, _LONGEST_LISTEN_S)
+        while (left_s := end_s - time.monotonic()) > 0.0 and not stop():
+            message = self._told.receive(min(left_s, _LONGEST_WAIT_S))
+            if message is not None and not message.is_remote_frame:
+                key = (message.arbitration_id, message.is_extended_id)
+                if key in own and own.is_foreign(key, message.data):
+                    raise _another_node(message, self._told)
 
 
-def require_own(message: can.Message, own: OwnFrames, bus: SteadyBus) -> None:
-    """Refuse one of the node's own frames that it did not send; raises as :func:`another_node` says."""
-    if own.is_foreign((message.arbitration_id, message.is_extended_id), bytes(message.data)):
-        raise another_node(message, bus)
+def _data_frame(key: _Key, data: bytes | bytearray, *, fd: bool, bitrate_switch: bool = False) -> can.Message:
+    """Make a frame to be sent."""
+    return can.Message(
+        arbitration_id=key[0],
+        is_extended_id=key[1],
+        is_fd=fd,
+        bitrate_switch=bitrate_switch,
+        data=data,
+        is_rx=False,
+    )
 
 
-def another_node(message: can.Message, bus: SteadyBus) -> BusError:
-    """What to say of a frame that only this node may send, and another one did."""
+def _another_node(message: can.Message, bus: SteadyBus) -> BusError:
     return BusError(
         f"{bus.channel}: another node sends frames 0x{message.arbitration_id:X}, which only this one may send there; "
         f"two nodes on one bus, or two buses that are joined? Stop one"
     )
 
 
-class OverlayNode:
+class OverlayNode(_Node):
     """Corrects on one bus.
 
     Parameters
@@ -306,9 +303,8 @@ class OverlayNode:
         on_tick: OnTick = lambda _, __: None,
         latency: Latency | None = None,
     ) -> None:
-        self._bus, self._corrector, self._latency = bus, corrector, latency or Latency()
-        self._own = OwnFrames(transmitted(database, Mode.OVERLAY))
-        self._ticking = Ticking(corrector, period_s, on_tick)
+        own = transmitted(database, Mode.OVERLAY)
+        super().__init__(bus, bus, own, corrector, period_s=period_s, on_tick=on_tick, latency=latency)
 
     def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
         """Correct until told to stop.
@@ -325,13 +321,9 @@ class OverlayNode:
         BusError
             If another node sends this node's messages.
         """
-        listen(self._bus, self._own, stop, self._ticking.period_s)
+        self._listen(self._own, stop)
         ready()
-        bus, ticking = self._bus, self._ticking
-        heard_s = time.monotonic()
-        while not stop():
-            ticking.tick(bus.asked_s, heard_s, bus, self._own)
-            heard_s = hear(bus, heard_s, ticking, self._take, self._flush)
+        self._work(stop)
 
     def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
         if message.is_remote_frame:
@@ -339,7 +331,8 @@ class OverlayNode:
         key = (message.arbitration_id, message.is_extended_id)
         corrector, own = self._corrector, self._own
         if key in own:
-            require_own(message, own, self._bus)
+            if own.is_foreign(key, message.data):
+                raise _another_node(message, self._told)
             corrector.counters.echoes += 1
             return
         source = corrector.sources.get(key)
@@ -351,31 +344,22 @@ class OverlayNode:
             return
         for target in source.answer(message.data, time_s):
             own.sent(target.key, target.data)
-            answer = data_frame(
-                target.key, target.data, fd=target.fd or message.is_fd, bitrate_switch=message.bitrate_switch
-            )
-            self._bus.send(answer)
+            fd = target.fd or message.is_fd
+            self._told.send(_data_frame(target.key, target.data, fd=fd, bitrate_switch=message.bitrate_switch))
             self._latency.came(time_s)
-
-    def _flush(self) -> None:
-        _, not_sent = self._bus.flush()
-        self._corrector.counters.send_errors += not_sent
-        self._latency.sent(not_sent)
 
 
 _LONGEST_TURN_S = 2.0
 """A gateway's way back is at work if it has looked for frames within this time. [s]"""
 _LONGEST_DELAY_S = 1.0
 """A gateway passes a branch's frame on only if it waited no longer than this, or than the branch's timeout. [s]"""
-
-
 _COPIES, _COPIES_WITHIN_S = 10, 2.0
 """So many copies of one bus's frames on the other one, in so long [s], show that both are one."""
 _REMEMBERED_COPIES = 16
 """Frames of each identifier that may be on their way round."""
 
 
-class GatewayNode:
+class GatewayNode(_Node):
     """Corrects between two buses.
 
     Parameters
@@ -402,59 +386,47 @@ class GatewayNode:
         routed: bool = False,
         latency: Latency | None = None,
     ) -> None:
-        self._sensors, self._vehicle, self._corrector, self._routed = sensors, vehicle, corrector, routed
-        self._latency = latency or Latency()
         own = transmitted(database, Mode.GATEWAY)
-        self._status = OwnFrames(own)
-        self._not_from_vehicle = OwnFrames([*own, *rewritten(database)])
-        self._ticking = Ticking(corrector, period_s, on_tick, self._is_back_at_work)
-        self._back_s = float("-inf")
-        self._lately: dict[tuple[int, bool], deque[bytearray]] = {
-            key: deque(maxlen=_REMEMBERED_COPIES) for key in rewritten(database)
-        }
+        super().__init__(sensors, vehicle, own, corrector, period_s=period_s, on_tick=on_tick, latency=latency)
+        self._not_from_vehicle = OwnFrames([*own, *rewritten(database)], _REMEMBERED_COPIES)
+        self._routed, self._back_s = routed, float("-inf")
         self._copies: deque[float] = deque(maxlen=_COPIES)
         """When copies of one bus's frames came from the other one. [s]"""
 
     def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
         """Correct until told to stop; parameters and errors as for :meth:`~ecu_node.bus.node.OverlayNode.run`."""
-        listen(self._vehicle, self._not_from_vehicle, stop, self._ticking.period_s)
-        discard(self._sensors)
+        self._listen(self._not_from_vehicle, stop)
+        end_s = time.monotonic() + _LONGEST_WAIT_S  # on a full bus more comes meanwhile
+        while time.monotonic() < end_s and self._heard.receive(0.0) is not None:
+            pass  # too old by now
         ready()
         self._back_s = time.monotonic()
         ended = threading.Event()
         with ThreadPoolExecutor(1, "back") as pool:
             back = pool.submit(self._pass_back, lambda: stop() or ended.is_set())
             try:
-                self._pass_on(lambda: stop() or back.done())
+                self._work(lambda: stop() or back.done())
             finally:
                 ended.set()
         back.result()  # raises what ended it
 
-    def _is_back_at_work(self) -> bool:
+    def _works(self) -> bool:
         return time.monotonic() - self._back_s < _LONGEST_TURN_S
-
-    def _pass_on(self, stop: Callable[[], bool]) -> None:
-        sensors, vehicle, ticking = self._sensors, self._vehicle, self._ticking
-        heard_s = time.monotonic()
-        while not stop():
-            ticking.tick(sensors.asked_s, heard_s, vehicle, self._status)
-            heard_s = hear(sensors, heard_s, ticking, self._take, self._flush)
 
     def _take(self, message: can.Message, now_s: float, ahead_s: float) -> None:
         key = (message.arbitration_id, message.is_extended_id)
-        corrector = self._corrector
-        source = None if message.is_remote_frame else corrector.sources.get(key)
-        if key in self._status and not message.is_remote_frame:
-            if not self._status.is_foreign(key, message.data):
-                self._require_two_buses(message, self._sensors)
-            self._drop(message, self._sensors)
-            return
+        source = None
+        if not message.is_remote_frame:
+            if key in self._own:
+                self._refuse(message, self._heard, self._own)
+                return
+            source = self._corrector.sources.get(key)
         if source is not None:
-            if key in self._lately:
-                self._lately[key].append(message.data)
+            if key in self._not_from_vehicle:
+                self._not_from_vehicle.sent(key, message.data)
             time_s = steady_time_s(message.timestamp, now_s, ahead_s)
             if now_s - time_s > max(source.timeout_s, _LONGEST_DELAY_S):
-                corrector.counters.late += 1
+                self._corrector.counters.late += 1
                 return
             data = source.forward(message.data, time_s)
             if data is None:
@@ -462,51 +434,48 @@ class GatewayNode:
             message.data = data
             self._latency.came(time_s)
         if not self._routed or key in self._not_from_vehicle:
-            self._vehicle.send(message)
+            self._told.send(message)
 
-    def _flush(self) -> None:
-        counters = self._corrector.counters
-        sent, not_sent = self._vehicle.flush()
-        counters.forwarded += sent
-        counters.send_errors += not_sent
-        self._latency.sent(not_sent)
+    def _flush(self) -> int:
+        sent = super()._flush()
+        self._corrector.counters.forwarded += sent
+        return sent
+
+    def _pass_back(self, stop: Callable[[], bool]) -> None:
+        """Pass on what the vehicle sends to the sensors' bus; a branch's frame from there must not be."""
+        vehicle, sensors, own = self._told, self._heard, self._not_from_vehicle
+        while not stop():
+            message = vehicle.receive(_LONGEST_WAIT_S)
+            while message is not None:
+                key = (message.arbitration_id, message.is_extended_id)
+                if key in own and not message.is_remote_frame:
+                    self._refuse(message, vehicle, own)
+                elif not self._routed or key in own:
+                    sensors.send(message)
+                if not vehicle.at_hand:
+                    self._flush_back()
+                message = None if stop() else vehicle.receive(0.0)
+            self._flush_back()
 
     def _flush_back(self) -> None:
         self._back_s = time.monotonic()
         counters = self._corrector.counters
-        sent, not_sent = self._sensors.flush()
+        sent, not_sent = self._heard.flush()
         counters.returned += sent
         counters.not_returned += not_sent
 
-    def _drop(self, message: can.Message, bus: SteadyBus) -> None:
-        """Somebody sends what only this node may send there: that must not stop the branches' frames."""
+    def _refuse(self, message: can.Message, bus: SteadyBus, own: OwnFrames) -> None:
+        """Drop a frame that only this node may send there: whoever sends it must not stop the branches' frames.
+
+        Many copies of the other bus's frames end the node, rather than go round in circles: both buses are one.
+        """
+        if not own.is_foreign((message.arbitration_id, message.is_extended_id), message.data):
+            now_s = time.monotonic()
+            self._copies.append(now_s)
+            if len(self._copies) == _COPIES and now_s - self._copies[0] < _COPIES_WITHIN_S:
+                raise _another_node(message, bus)
         self._corrector.counters.foreign += 1
         bus.say(
             f"{bus.channel}: another node sends frames 0x{message.arbitration_id:X}, which only this one may send "
             f"there; they are dropped; find out who it is"
         )
-
-    def _require_two_buses(self, message: can.Message, bus: SteadyBus) -> None:
-        """Refuse to go round in circles: on buses that are joined each frame comes from both sides."""
-        now_s = time.monotonic()
-        self._copies.append(now_s)
-        if len(self._copies) == _COPIES and now_s - self._copies[0] < _COPIES_WITHIN_S:
-            raise another_node(message, bus)
-
-    def _pass_back(self, stop: Callable[[], bool]) -> None:
-        """Pass on what the vehicle sends to the sensors' bus; a branch's frame from there must not be."""
-        vehicle, sensors = self._vehicle, self._sensors
-        while not stop():
-            received = vehicle.receive(LONGEST_WAIT_S)
-            while received is not None:
-                key = (received.arbitration_id, received.is_extended_id)
-                if key in self._not_from_vehicle and not received.is_remote_frame:
-                    if received.data in list(self._lately.get(key, ())):
-                        self._require_two_buses(received, vehicle)
-                    self._drop(received, vehicle)
-                elif not self._routed or key in self._not_from_vehicle:
-                    sensors.send(received)
-                if not vehicle.at_hand:
-                    self._flush_back()
-                received = None if stop() else vehicle.receive(0.0)
-            self._flush_back()

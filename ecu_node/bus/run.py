@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from cantools.database.can import Message
 
-from ecu_node.bus.adapters import acknowledgement, bus_config, config_text
+from ecu_node.bus.adapters import acknowledgement, bus_config, carries_fd, config_text, open_bus, require_fd
 from ecu_node.bus.faults import FaultMemory
 from ecu_node.bus.guard import Mode, needs_fd, received, rewritten, transmitted
 from ecu_node.bus.in_force import (
@@ -27,7 +27,6 @@ from ecu_node.bus.in_force import (
     sensor_fault,
 )
 from ecu_node.bus.kernel_routes import kernel_routes
-from ecu_node.bus.links import carries_fd, open_bus, require_fd
 from ecu_node.bus.node import GatewayNode, OverlayNode
 from ecu_node.bus.service import Log, Requests, ServiceManager, be_real_time, serve_metrics
 from ecu_node.bus.steady_bus import SteadyBus

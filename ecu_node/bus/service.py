@@ -69,16 +69,16 @@ class Log:
     def say(self, text: str) -> None:
         """Write a line."""
         now_s = time.monotonic()
-        since_s, times = self._said.get(text, (now_s, 0))
-        is_over = now_s - since_s >= _WHILE_S
-        if times >= _SAME_LINE_TIMES and not is_over:
-            self._said[text] = since_s, times + 1
-            return
+        since_s, times = self._said.pop(text, (now_s, 0))
+        held_back = 0
+        if now_s - since_s >= _WHILE_S:
+            since_s, times, held_back = now_s, 0, max(times - _SAME_LINE_TIMES, 0)
         if len(self._said) >= _REMEMBERED_LINES:
             self._said.clear()
-        held_back = times - _SAME_LINE_TIMES if is_over else 0
-        self._said[text] = (now_s, 1) if is_over else (since_s, times + 1)
-        again = f" (and {held_back} times before)" if held_back > 0 else ""
+        self._said[text] = since_s, times + 1
+        if times >= _SAME_LINE_TIMES:
+            return
+        again = f" (and {held_back} times before)" if held_back else ""
         if not _takes_a_line():
             self._lost += 1
             return
@@ -103,7 +103,8 @@ class ServiceManager:
     """systemd, if it started the node: told that the node is ready, alive, and what it does; see sd_notify(3)."""
 
     def __init__(self) -> None:
-        self._address = os.environ.get("NOTIFY_SOCKET")
+        address = os.environ.get("NOTIFY_SOCKET")
+        self._address = address.replace("@", "\0", 1) if address and address.startswith("@") else address or None
         period_us = os.environ.get("WATCHDOG_USEC", "")
         is_for_us = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())  # see sd_watchdog_enabled(3)
         self._period_s = int(period_us) / 2e6 if period_us.isdecimal() and is_for_us else None
@@ -128,15 +129,12 @@ class ServiceManager:
         self._notify("STOPPING=1")
 
     def _notify(self, text: str) -> None:
-        if not self._address:
+        if self._address is None:
             return
-        address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
-        try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
-                notify.settimeout(_LONGEST_NOTIFY_S)
-                notify.sendto(text.encode(), address)
-        except OSError:
-            pass  # a service manager that is gone must not end the node
+        # A service manager that is gone must not end the node.
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+            notify.settimeout(_LONGEST_NOTIFY_S)
+            notify.sendto(text.encode(), self._address)
 
 
 _LATENCY_BITS = 21

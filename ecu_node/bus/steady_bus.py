@@ -1,22 +1,29 @@
 """A bus in use: it is sent on with bounded patience, and opened again after it was gone.
 
-Whatever python-can's interfaces raise meanwhile is counted here.
+Any interface of python-can works frame by frame. On SocketCAN one system call, recvmmsg(2) and sendmmsg(2), takes all
+frames that wait and sends all that were made of them: a system call per frame, and python-can makes four to pass one
+on, is what a node's time goes to. Structures are those of linux/can.h and of socket.h.
 """
 
 import contextlib
+import ctypes
+import errno
+import os
+import select
 import socket
 import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import can
+from can.util import dlc2len, len2dlc
 
-from ecu_node.bus.links import Link, OneByOne, SocketCanLink, error_text, is_of_frame, means_gone, socketcan_socket
+from ecu_node.bus.adapters import error_text, is_interface, socketcan_socket
 from ecu_node.core.status import Counters
 from ecu_node.errors import BusError
 
-__all__ = ["SteadyBus"]
+__all__ = ["MOST_AT_ONCE", "SocketCanLink", "SteadyBus", "is_of_frame", "means_gone"]
 
 
 _SEND_ATTEMPTS = 3
@@ -26,10 +33,23 @@ _FULL_S = 1.0
 """A send queue that is full for longer is told. [s]"""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 2.0
 """Between attempts to open a bus again. [s]"""
-_SO_MEMINFO, _DROPS = 55, 8
-"""Socket option, and the place of the dropped frames in it (asm-generic/socket.h, linux/sock_diag.h)."""
 _BUS_OFF = 0x40
 """Class of error frames of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
+
+
+def means_gone(error: Exception) -> bool:
+    """Whether after an error of sending only opening the bus again helps."""
+    return _number(error) in {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF}
+
+
+def is_of_frame(error: Exception) -> bool:
+    """Whether it is this frame that the bus does not take, whatever its state, as one that is too long for it."""
+    return _number(error) in {errno.EINVAL, errno.EMSGSIZE}
+
+
+def _number(error: Exception) -> int | None:
+    code = getattr(error, "error_code", None)
+    return code if code is not None else getattr(error, "errno", None)
 
 
 class SteadyBus:
@@ -64,56 +84,66 @@ class SteadyBus:
     ) -> None:
         self._open, self._counters, self.say = open_bus, counters, say
         bus = open_bus()
-        self._opened: _Opened | None = _Opened(bus)
-        self._failed: tuple[_Opened, Exception] | None = None
+        self.channel = bus.channel_info
+        self._link: _Link | None = _link(bus)
+        self._failed: tuple[_Link, Exception] | None = None
         self._retry_s, self._pause_s = 0.0, _FIRST_PAUSE_S
         self._queue: list[can.Message] = []
-        self._is_full = self._is_full_told = False
-        self._full_since_s = 0.0
+        self._full_since_s: float | None = None
+        self._is_full_told = False
         self._closing = threading.Lock()
         self.send: Callable[[can.Message], None] = (lambda _: None) if listen_only else self._queue.append
         """Takes a frame to be sent at the next :meth:`flush`."""
-        self.asked_s = time.monotonic()
-        """When the bus was asked last; if it had no more, all that came before was received. [s]"""
-        self.read_s = self.asked_s
-        """When the last frame was read. [s]"""
-        self.channel = bus.channel_info
+        self.asked_s = self.read_s = time.monotonic()
+        """When the bus was asked last (if it had no more, all that came before was received), and when the last frame
+        was read: it came before that. [s]"""
 
     @property
     def at_hand(self) -> bool:
-        """Whether a frame that came is here already."""
-        opened = self._opened
-        return opened is not None and opened.link.at_hand
+        """Whether a frame that came is here already, and the bus need not be asked for it."""
+        link = self._link
+        return link is not None and link.at_hand
 
     @property
     def is_open(self) -> bool:
         """Whether it is there; False from when it failed until it is open again."""
-        return self._opened is not None
+        return self._link is not None
 
     @property
     def state(self) -> str:
         """What it is: gone, full for longer than a second, or open."""
-        return "gone" if self._opened is None else "full" if self._is_full_told else "open"
+        return "gone" if self._link is None else "full" if self._is_full_told else "open"
 
     def receive(self, timeout_s: float) -> can.Message | None:
-        """Wait for a data or remote frame; None if none came in time, or the bus is gone."""
+        """Wait for a data or remote frame.
+
+        Parameters
+        ----------
+        timeout_s : float
+            How long to wait; 0: not at all, and the bus is not asked if it had no more the last time. [s]
+
+        Returns
+        -------
+        can.Message or None
+            None if none came in time, or the bus is gone. The time stamp is of the time of day [s]; 0: not known.
+        """
         if self._failed is not None:
             failed, error = self._failed
             self._failed = None
-            if failed is self._opened:
+            if failed is self._link:
                 self._gone(error)
-        opened = self._opened
-        if opened is None:
+        link = self._link
+        if link is None:
             return self._reopened(timeout_s)
         try:
-            message = opened.link.receive(timeout_s)
+            message = link.receive(timeout_s)
             while message is not None and message.is_error_frame:
                 self._count_error(message)
-                message = opened.link.receive(0.0)
+                message = link.receive(0.0)
         except (can.CanError, OSError) as error:
             self._gone(error)
             return None
-        self.asked_s, self.read_s = opened.link.asked_s, opened.link.read_s
+        self.asked_s, self.read_s = link.asked_s, link.read_s
         return message
 
     def flush(self) -> tuple[int, int]:
@@ -126,67 +156,62 @@ class SteadyBus:
         """
         queue, done, lost = self._queue, 0, 0
         while done < len(queue):
-            opened = self._opened
-            if opened is None:
-                lost += len(queue) - done
-                break
-            taken, error = self._given(opened, done)
-            done += taken
-            if error is None:
-                continue
-            if means_gone(error):
-                # Whoever asks first is told that the bus is gone, and nobody after: receiving need not fail, too.
-                self._failed = opened, error
-            refused = 1 if is_of_frame(error) else len(queue) - done  # what is full is full for all that follow
+            refused = len(queue) - done  # what is full, or gone, is so for all that follow
+            link = self._link
+            if link is not None:
+                try:
+                    done += self._send_some(link, done)
+                    continue
+                except (can.CanError, OSError, ValueError) as error:  # ValueError: just closed by the other thread
+                    if means_gone(error):
+                        # Whoever asks first is told that the bus is gone, and nobody after: receiving may not fail.
+                        self._failed = link, error
+                    elif is_of_frame(error):
+                        refused = 1
             done, lost = done + refused, lost + refused
         sent = len(queue) - lost
         queue.clear()
         return sent, lost
 
-    def _given(self, opened: "_Opened", done: int) -> tuple[int, Exception | None]:
-        """Give the bus what it takes now: how many frames, and why not the next one after some patience."""
-        for attempt in range(1 if self._is_full else _SEND_ATTEMPTS):
-            if attempt:
-                time.sleep(_SEND_PAUSE_S)
+    def _send_some(self, link: "_Link", first: int) -> int:
+        """Give the bus what it takes now, with some patience if it is full; how many frames, or why not the first."""
+        for attempts_left in reversed(range(_SEND_ATTEMPTS if self._full_since_s is None else 1)):
             try:
                 with self._closing:
-                    taken = opened.link.send(self._queue, done)
-            except (can.CanError, OSError, ValueError) as error:  # ValueError: closed by the other thread just now
-                last = error
+                    taken = link.send(self._queue, first)
+                break
+            except (can.CanError, OSError, ValueError) as error:
                 if means_gone(error) or is_of_frame(error):
-                    return 0, error
-            else:
-                if self._is_full:
-                    self._opens()
-                return taken, None
-        self._stays_full()
-        return 0, last
+                    raise
+                if not attempts_left:
+                    self._stays_full()
+                    raise
+            time.sleep(_SEND_PAUSE_S)
+        if self._is_full_told:
+            self.say(f"{self.channel}: the bus takes frames again")
+        self._full_since_s, self._is_full_told = None, False
+        return taken
 
     def _stays_full(self) -> None:
         now_s = time.monotonic()
-        if not self._is_full:
-            self._is_full, self._full_since_s = True, now_s
+        if self._full_since_s is None:
+            self._full_since_s = now_s
         elif not self._is_full_told and now_s - self._full_since_s > _FULL_S:
             self._is_full_told = True
             self.say(f"{self.channel}: the send queue stays full, frames are lost: is anybody else on this bus?")
 
-    def _opens(self) -> None:
-        if self._is_full_told:
-            self.say(f"{self.channel}: the bus takes frames again")
-        self._is_full = self._is_full_told = False
-
     def count_dropped(self) -> None:
         """Count the frames that the kernel dropped since the last time, because they were not read in time."""
-        opened = self._opened
-        if opened is not None:
-            self._counters.dropped += opened.newly_dropped()
+        link = self._link
+        if link is not None:
+            self._counters.dropped += link.newly_dropped()
 
     def close(self) -> None:
         """Close it."""
-        opened, self._opened = self._opened, None
-        if opened is not None:
+        link, self._link = self._link, None
+        if link is not None:
             with self._closing:  # else the other thread might send into whatever takes the socket's number
-                opened.bus.shutdown()
+                link.close()
 
     def _count_error(self, message: can.Message) -> None:
         self._counters.bus_errors += 1
@@ -208,16 +233,16 @@ class SteadyBus:
         self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
         self._retry_s = now_s + self._pause_s
         try:
-            opened = _Opened(self._open())
+            link = _link(self._open())
         except BusError:
             return None
         try:
-            message = opened.link.receive(0.0)  # an interface that is down can be opened, but not received from
+            message = link.receive(0.0)  # an interface that is down can be opened, but not received from
         except (can.CanError, OSError):
             with contextlib.suppress(can.CanError, OSError):
-                opened.bus.shutdown()
+                link.close()
             return None
-        self._opened = opened
+        self._link = link
         self._counters.reopened += 1
         self.say(f"{self.channel}: the bus is open again")
         if message is not None and message.is_error_frame:
@@ -226,19 +251,203 @@ class SteadyBus:
         return message
 
 
-class _Opened:
-    """An open bus, and what belongs to it alone."""
+class _FrameByFrame:
+    """A bus of any interface, as python-can uses it; attributes and methods are those of :class:`SocketCanLink`."""
+
+    at_hand = False
 
     def __init__(self, bus: can.BusABC) -> None:
-        self.bus = bus
-        self._socket = socketcan_socket(bus)
-        self.link: Link = OneByOne(bus) if self._socket is None else SocketCanLink(self._socket)
-        self._dropped = 0
+        self._bus, self.close = bus, bus.shutdown
+        self.asked_s = self.read_s = time.monotonic()
+        # Time stamps of other interfaces are of an adapter's own clock, which tells nothing here.
+        self._has_time_of_day = any(is_interface(bus, name) for name in ("socketcan", "udp_multicast", "virtual"))
+
+    def receive(self, timeout_s: float) -> can.Message | None:
+        asked_s = time.monotonic()
+        message = self._bus.recv(timeout_s)
+        now_s = time.monotonic()
+        self.asked_s = now_s if timeout_s > 0.0 else asked_s
+        if message is not None:
+            self.read_s = now_s
+            if not self._has_time_of_day:
+                message.timestamp = 0.0
+        return message
+
+    def send(self, messages: Sequence[can.Message], first: int) -> int:
+        self._bus.send(messages[first])
+        return 1
+
+    def newly_dropped(self) -> int:
+        return 0
+
+
+MOST_AT_ONCE = 16
+"""Frames per system call, and so the most that a frame waits for others: they take a fraction of a millisecond."""
+_CLASSIC_BYTES, _FD_BYTES = 16, 72
+"""Of struct can_frame and struct canfd_frame; by its length a frame is known as one of CAN FD."""
+_FRAME = struct.Struct("=IBBxB64s")
+"""Identifier with flags, length, flags of CAN FD, DLC if above 8, data; the first 16 bytes are a classic frame."""
+_EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
+_BITRATE_SWITCH, _ERROR_STATE, _FD = 0x01, 0x02, 0x04
+_LONGEST_CLASSIC, _LARGEST_DLC = 8, 15
+_FD_LENGTHS = [dlc2len(len2dlc(length)) for length in range(65)]
+"""The length that CAN FD has for each number of bytes."""
+_STAMP = struct.Struct("@Niill")
+"""Control message with a time stamp: its length, level and type, seconds, nanoseconds."""
+_SO_TIMESTAMPNS, _SO_MEMINFO, _DROPS = 35, 55, 8
+"""Socket options, and the place of the dropped frames in the second one (asm-generic/socket.h, linux/sock_diag.h)."""
+_VECTOR = struct.Struct("@PN")
+"""struct iovec: address and length of a frame."""
+_HEADER = struct.Struct("@PIPNPNi0PI0P")
+"""struct mmsghdr: no address of a peer and its length; a vector's address, one; a control message's address and length;
+flags; bytes that came."""
+_CAME, _CAME_AT = struct.Struct("@Ni0PI"), struct.calcsize("@PIPNP")
+"""The part of it that the kernel fills in: a control message's length, flags, bytes that came."""
+
+_libc = ctypes.PyDLL(None, use_errno=True)  # calls that never wait: handing over Python's lock would cost more
+
+
+class _Batch:
+    """Memory for frames and their control messages, and the headers that tell the kernel where it is."""
+
+    def __init__(self, control_bytes: int) -> None:
+        sizes = _FD_BYTES, _STAMP.size, _VECTOR.size, _HEADER.size
+        parts = [(ctypes.c_char * (MOST_AT_ONCE * size))() for size in sizes]
+        self.frames, self.control, self._vectors, self.headers = (memoryview(part).cast("B") for part in parts)
+        self._frames_at, control_at, vectors_at, headers_at = map(ctypes.addressof, parts)
+        self.headers_at = ctypes.c_void_p(headers_at)
+        for number in range(MOST_AT_ONCE):
+            self.set_length(number, _FD_BYTES)
+            vector_at, stamp_at = vectors_at + number * _VECTOR.size, control_at + number * _STAMP.size
+            place = number * _HEADER.size
+            _HEADER.pack_into(self.headers, place, 0, 0, vector_at, 1, stamp_at, control_bytes, 0, 0)
+        self._fresh = bytes(self.headers)
+
+    def set_length(self, number: int, length: int) -> None:
+        """Let the kernel take, or put, so many bytes of a frame."""
+        _VECTOR.pack_into(self._vectors, number * _VECTOR.size, self._frames_at + number * _FD_BYTES, length)
+
+    def reset(self, used: int) -> None:
+        """Undo what the kernel wrote into so many headers."""
+        self.headers[: used * _HEADER.size] = self._fresh[: used * _HEADER.size]
+
+
+class SocketCanLink:
+    """A socket of SocketCAN, used many frames at a time.
+
+    Parameters
+    ----------
+    opened : socket.socket
+        Raw CAN socket, as python-can has opened it.
+    close : callable, optional
+        Closes what the socket belongs to.
+
+    Attributes
+    ----------
+    at_hand : bool
+        Whether the next frame is here already, and the bus need not be asked for it.
+    asked_s, read_s : float
+        When the bus was asked last, and when it had frames last, on the steady clock. [s]
+    """
+
+    def __init__(self, opened: socket.socket, close: Callable[[], None] | None = None) -> None:
+        self._socket, self.close = opened, close or opened.close
+        opened.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self._waiting = select.poll()
+        self._waiting.register(opened, select.POLLIN)
+        self._in, self._out = _Batch(_STAMP.size), _Batch(0)
+        self._next = self._came = self._dropped = 0
+        self._had_no_more = self.at_hand = False
+        self.asked_s = self.read_s = time.monotonic()
+
+    def receive(self, timeout_s: float) -> can.Message | None:
+        """Wait for a frame of any kind; see :meth:`SteadyBus.receive`. Raises OSError if the bus is gone or down."""
+        if not self.at_hand and not self._fill(timeout_s):
+            return None
+        number = self._next
+        self._next = number + 1
+        self.at_hand = self._next < self._came
+        return self._message(number)
+
+    def _fill(self, timeout_s: float) -> bool:
+        """Take all frames that wait; whether there were any."""
+        if timeout_s > 0.0:
+            is_asked = bool(self._waiting.poll(1e3 * timeout_s))
+            self.asked_s = time.monotonic()
+        else:
+            is_asked, self._had_no_more = not self._had_no_more, False
+            if is_asked:
+                self.asked_s = time.monotonic()
+        if not is_asked:
+            return False
+        self._in.reset(self._came)
+        self._next = self._came = 0
+        came = _libc.recvmmsg(self._socket.fileno(), self._in.headers_at, MOST_AT_ONCE, socket.MSG_DONTWAIT, None)
+        if came < 0:
+            error = _last_error()
+            if isinstance(error, BlockingIOError):
+                return False
+            raise error
+        self.read_s = time.monotonic()
+        self._came, self._had_no_more = came, came < MOST_AT_ONCE
+        return True
+
+    def _message(self, number: int) -> can.Message:
+        batch = self._in
+        word, length, flags, dlc, data = _FRAME.unpack_from(batch.frames, number * _FD_BYTES)
+        control_bytes, _, came_bytes = _CAME.unpack_from(batch.headers, number * _HEADER.size + _CAME_AT)
+        stamp_s = 0.0
+        if control_bytes:  # the one kind that was asked for
+            _, _, _, seconds, nanoseconds = _STAMP.unpack_from(batch.control, number * _STAMP.size)
+            stamp_s = seconds + 1e-9 * nanoseconds
+        is_fd = came_bytes == _FD_BYTES
+        extended = bool(word & _EXTENDED)
+        return can.Message(
+            stamp_s,
+            word & (0x1FFFFFFF if extended else 0x7FF),
+            extended,
+            bool(word & _REMOTE),
+            bool(word & _ERROR),
+            None,
+            length if is_fd or length < _LONGEST_CLASSIC or dlc <= _LONGEST_CLASSIC else dlc,
+            bytearray(data[:length]),
+            is_fd,
+            True,
+            bool(is_fd and flags & _BITRATE_SWITCH),
+            bool(is_fd and flags & _ERROR_STATE),
+        )
+
+    def send(self, messages: Sequence[can.Message], first: int) -> int:
+        """Send as many frames as the bus takes now.
+
+        Parameters
+        ----------
+        messages : sequence of can.Message
+            Frames in the order in which they are to be sent.
+        first : int
+            The first one of them that is still to be sent.
+
+        Returns
+        -------
+        int
+            How many were taken, at least 1.
+
+        Raises
+        ------
+        OSError
+            If the first one was not taken.
+        """
+        batch = self._out
+        some = messages[first : first + MOST_AT_ONCE]
+        for number, message in enumerate(some):
+            batch.set_length(number, _put(batch.frames, number * _FD_BYTES, message))
+        sent: int = _libc.sendmmsg(self._socket.fileno(), batch.headers_at, len(some), socket.MSG_DONTWAIT)
+        if sent < 0:
+            raise _last_error()
+        return sent
 
     def newly_dropped(self) -> int:
         """Frames that the kernel dropped since the last time; 0 where that is not known."""
-        if self._socket is None:
-            return 0
         try:
             info = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_DROPS + 1))
             (dropped,) = struct.unpack_from("=I", info, 4 * _DROPS)
@@ -246,3 +455,33 @@ class _Opened:
             return 0
         before, self._dropped = self._dropped, int(dropped)
         return max(self._dropped - before, 0)
+
+
+def _put(frames: memoryview, at: int, message: can.Message) -> int:
+    """Write a frame; the bytes that it takes."""
+    word = message.arbitration_id
+    if message.is_extended_id:
+        word |= _EXTENDED
+    if message.is_remote_frame:
+        word |= _REMOTE
+    length = message.dlc
+    if message.is_fd:
+        flags = _FD | message.bitrate_switch * _BITRATE_SWITCH | message.error_state_indicator * _ERROR_STATE
+        _FRAME.pack_into(frames, at, word, _FD_LENGTHS[length], flags, 0, message.data)
+        return _FD_BYTES
+    long_dlc = length if _LONGEST_CLASSIC < length <= _LARGEST_DLC else 0
+    _FRAME.pack_into(frames, at, word, min(length, _LONGEST_CLASSIC), 0, long_dlc, message.data)
+    return _CLASSIC_BYTES
+
+
+def _last_error() -> OSError:
+    number = ctypes.get_errno()
+    return OSError(number, os.strerror(number))
+
+
+_Link = SocketCanLink | _FrameByFrame
+
+
+def _link(bus: can.BusABC) -> _Link:
+    opened = socketcan_socket(bus)
+    return _FrameByFrame(bus) if opened is None else SocketCanLink(opened, bus.shutdown)

@@ -22,8 +22,7 @@ import cantools
 import pytest
 from can.typechecking import BitTimingFdDict
 
-from ecu_node.bus.adapters import bus_config
-from ecu_node.bus.links import connect
+from ecu_node.bus.adapters import bus_config, connect
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError

@@ -5,7 +5,8 @@ import errno
 import can
 import pytest
 
-from ecu_node.bus.links import error_text, is_of_frame, means_gone
+from ecu_node.bus.adapters import error_text
+from ecu_node.bus.steady_bus import is_of_frame, means_gone
 
 
 @pytest.mark.parametrize(

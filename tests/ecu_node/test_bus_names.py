@@ -2,7 +2,7 @@
 
 import pytest
 
-from ecu_node.bus.links import carries_fd, connect
+from ecu_node.bus.adapters import carries_fd, connect
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.core.status import Counters
 from ecu_node.errors import BusError

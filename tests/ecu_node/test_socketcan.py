@@ -11,7 +11,7 @@ import can
 import pytest
 from can.interfaces.socketcan.socketcan import build_can_frame, dissect_can_frame
 
-from ecu_node.bus.links import MOST_AT_ONCE, SocketCanLink
+from ecu_node.bus.steady_bus import MOST_AT_ONCE, SocketCanLink
 
 CLASSIC_BYTES, FD_BYTES = 16, 72
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)

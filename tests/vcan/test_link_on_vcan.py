@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import can
 import pytest
 
-from ecu_node.bus.links import SocketCanLink, connect
+from ecu_node.bus.adapters import connect
+from ecu_node.bus.steady_bus import SocketCanLink
 from tests.ecu_node.test_socketcan import fields, random_frame
 from tests.vcan.processes import CHANNEL
 
