@@ -13,8 +13,7 @@ from typing import NamedTuple
 from cantools.database.can import Message, Signal
 
 from ecu_node.core.e2e import protection_of
-from ecu_node.core.frames import FrameKey
-from ecu_node.core.signals import bit_place
+from ecu_node.core.signals import FrameKey, bit_place
 from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError, LayoutError

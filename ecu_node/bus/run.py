@@ -33,7 +33,7 @@ from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.telemetry import Latency, Telemetry
 from ecu_node.bus.wiring import wire
 from ecu_node.core.corrector import OF_ONE_DRIVE, Corrector
-from ecu_node.core.frames import FrameKey
+from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase, node_database
 from ecu_node.errors import printable

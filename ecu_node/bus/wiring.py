@@ -21,11 +21,12 @@ from ecu_node.bus.in_force import (
 from ecu_node.core.branch import Auxiliary, LiveBranch
 from ecu_node.core.corrector import Corrector, StatusFields
 from ecu_node.core.e2e import protection_of
-from ecu_node.core.frames import FrameKey, Reader, Source, Target, TargetField
+from ecu_node.core.frames import Reader, Source, Target, TargetField
 from ecu_node.core.junction import JunctionWatch
 from ecu_node.core.signals import (
     AMPERE,
     Codes,
+    FrameKey,
     as_written,
     bit_place,
     exact_code,

@@ -5,7 +5,7 @@ Currents are positive into the junction. Times are those of one steady clock, pa
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from typing import NamedTuple
 
 from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault
@@ -36,13 +36,20 @@ class Past:
     def __init__(self, signal: PlacedSignal | None = None, frames: Frames | None = None) -> None:
         self._signal = signal
         self._frames: Frames = deque() if frames is None else frames
+        self._read: tuple[float, bytearray] | None = None
+        """The last frame that was read."""
+        self._codes: deque[tuple[float, int]] = deque(maxlen=REMEMBERED_FRAMES)
 
     def newest_first(self) -> Iterator[tuple[float, int]]:
-        """Times and codes, back from the last frame that has the signal. [s]"""
-        for time_s, payload in reversed(self._frames):
-            code = self._signal.code(payload) if self._signal is not None else None
-            if code is not None:
-                yield time_s, code
+        """Times and codes, back from the last frame that has the signal; each frame is read once. [s]"""
+        if self._signal is not None and self._frames and self._frames[-1] is not self._read:
+            new = list(takewhile(lambda frame: frame is not self._read, reversed(self._frames)))
+            self._read = new[0]
+            for time_s, payload in reversed(new):
+                code = self._signal.code(payload)
+                if code is not None:
+                    self._codes.append((time_s, code))
+        return reversed(self._codes)
 
 
 class Auxiliary:

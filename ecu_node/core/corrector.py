@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 from ecu_node.core.branch import LiveBranch
 from ecu_node.core.e2e import Protection
-from ecu_node.core.frames import FrameKey, Source
+from ecu_node.core.frames import Source
 from ecu_node.core.junction import NOTHING_EXPECTED, ExpectedSum, JunctionWatch
-from ecu_node.core.signals import BitPlace, Codes, as_written
+from ecu_node.core.signals import BitPlace, Codes, FrameKey, as_written
 from ecu_node.core.status import Counters, Reason, State
 
 __all__ = ["OF_ONE_DRIVE", "Corrector", "StatusFields"]

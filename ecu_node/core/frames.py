@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 from ecu_node.core.branch import REMEMBERED_FRAMES, Auxiliary, Frames, LiveBranch
 from ecu_node.core.e2e import Check, E2EState, Protection, Receiver
-from ecu_node.core.signals import BitPlace, Order, PlacedSignal
+from ecu_node.core.signals import BitPlace, FrameKey, Order, PlacedSignal
 from ecu_node.core.status import Counters, Quality
 
-__all__ = ["FrameKey", "Reader", "Source", "Target", "TargetField"]
+__all__ = ["Reader", "Source", "Target", "TargetField"]
 
 
 _OK, _LAST_USABLE, _CORRUPT = Check.OK, Check.LOST, Check.CORRUPT  # looking up members of an enumeration is slow
@@ -24,13 +24,6 @@ _INVALID, _from_bytes = E2EState.INVALID, int.from_bytes
 _BITS_PER_BYTE = 8
 _LEAST_SILENCE_S = 1.0
 """After a silence of this long, or of a branch's timeout, a message's counter begins anew. [s]"""
-
-
-class FrameKey(NamedTuple):
-    """Identifier of a frame; one number with 11 and with 29 bits are two identifiers."""
-
-    identifier: int
-    extended: bool
 
 
 class Reader(NamedTuple):

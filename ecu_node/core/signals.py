@@ -25,6 +25,7 @@ __all__ = [
     "WATT",
     "BitPlace",
     "Codes",
+    "FrameKey",
     "Multiplexer",
     "Order",
     "PlacedSignal",
@@ -112,6 +113,13 @@ _LONGEST = 64
 
 Order = Literal["little", "big"]
 """Byte order."""
+
+
+class FrameKey(NamedTuple):
+    """Identifier of a frame; one number with 11 and with 29 bits are two identifiers."""
+
+    identifier: int
+    extended: bool
 
 
 class WordField(NamedTuple):

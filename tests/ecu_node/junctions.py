@@ -9,7 +9,7 @@ import numpy as np
 
 from ecu_node.bus.in_force import InForce
 from ecu_node.bus.wiring import wire
-from ecu_node.core.frames import FrameKey
+from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Quality
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout

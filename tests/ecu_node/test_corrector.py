@@ -13,7 +13,7 @@ from ecu_node.bus.in_force import InForce, put_in_force
 from ecu_node.bus.wiring import wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.e2e import protection_of
-from ecu_node.core.frames import FrameKey
+from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Quality, Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError, LayoutError

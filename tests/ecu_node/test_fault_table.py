@@ -10,7 +10,7 @@ from ecu_node.bus.guard import Mode
 from ecu_node.bus.in_force import InForce
 from ecu_node.bus.wiring import wire
 from ecu_node.core.corrector import Corrector
-from ecu_node.core.frames import FrameKey
+from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Counters
 from ecu_node.database import VehicleDatabase
 from tests.ecu_node.vehicles import Frame, answers, parameters_for, passed_on, protected

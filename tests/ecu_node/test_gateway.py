@@ -9,7 +9,7 @@ from ecu_node.bus.guard import Mode, transmitted
 from ecu_node.bus.in_force import InForce
 from ecu_node.bus.wiring import wire
 from ecu_node.core.corrector import Corrector
-from ecu_node.core.frames import FrameKey
+from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError, LayoutError

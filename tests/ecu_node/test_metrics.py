@@ -17,7 +17,7 @@ from ecu_node.bus.service import serve_metrics
 from ecu_node.bus.telemetry import Latency
 from ecu_node.bus.wiring import wire
 from ecu_node.cli import main
-from ecu_node.core.frames import FrameKey
+from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase
 from tests.ecu_node.vehicles import LAYOUT, Frame, answers, parameters_for, protected

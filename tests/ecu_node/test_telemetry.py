@@ -26,7 +26,7 @@ from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.telemetry import Latency, Telemetry
 from ecu_node.bus.wiring import wire
 from ecu_node.cli import main
-from ecu_node.core.frames import FrameKey
+from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Counters
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError

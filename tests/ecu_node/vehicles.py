@@ -7,7 +7,7 @@ import msgspec
 from e2e.p01 import e2e_p01_protect
 
 from ecu_node.core.corrector import Corrector
-from ecu_node.core.frames import FrameKey
+from ecu_node.core.signals import FrameKey
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import (
     BranchParameters,

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from ecu_node.bus.guard import Mode
 from ecu_node.bus.wiring import wire
-from ecu_node.core.frames import FrameKey
+from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout

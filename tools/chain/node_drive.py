@@ -13,8 +13,7 @@ from calibrator.recordings.canlog import FrameSeries
 from ecu_node.bus.guard import Mode, key_of
 from ecu_node.bus.in_force import branch_signals
 from ecu_node.core.corrector import Corrector
-from ecu_node.core.frames import FrameKey
-from ecu_node.core.signals import Codes
+from ecu_node.core.signals import Codes, FrameKey
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import split_signal
 
