@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrator.drive import Array, Channel, Drive, Mask
-from calibrator.drives.derived import evaluate_formula, formula_names, parse_formula
 from calibrator.errors import DriveError
+from calibrator.files.formulas import evaluate_formula, formula_names, parse_formula
 from ecu_node.layout import Layout
 
 __all__ = ["Samples", "align", "align_channels", "at_instants", "base_inputs", "choose_inputs"]

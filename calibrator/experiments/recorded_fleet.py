@@ -11,8 +11,8 @@ from calibrator.artificial.ground_truth import GroundTruth, choose_branches, wit
 from calibrator.artificial.trips import read_recorded_trips
 from calibrator.drive import Array
 from calibrator.drives.align import base_inputs, choose_inputs
-from calibrator.drives.derived import evaluate_formula, parse_formula
 from calibrator.errors import FleetError
+from calibrator.files.formulas import evaluate_formula, parse_formula
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.terminal.progress import shown
 from ecu_node.database import VehicleDatabase

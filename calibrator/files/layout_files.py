@@ -4,7 +4,7 @@ from pathlib import Path
 
 import msgspec
 
-from calibrator.drives.derived import check_formulas
+from calibrator.files.formulas import check_formulas
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import Layout, read_layout

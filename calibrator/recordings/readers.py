@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.drives.align import at_instants, base_inputs
-from calibrator.drives.derived import evaluate_formula, formula_names, parse_formula
 from calibrator.errors import LogError
+from calibrator.files.formulas import evaluate_formula, formula_names, parse_formula
 from calibrator.recordings.decode import codes_of_no_value, decode_signal, message_is_sound, signal_range
 from calibrator.recordings.frame_arrays import EXTENDED_BIT, Frames, frame_key
 from calibrator.recordings.frames import read_frames

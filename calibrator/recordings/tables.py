@@ -22,8 +22,8 @@ import pyarrow as pa
 
 from calibrator.drive import Array, Mask
 from calibrator.drives.charge import GAP_PERIODS
-from calibrator.drives.derived import check_formulas
 from calibrator.errors import LogError
+from calibrator.files.formulas import check_formulas
 from calibrator.recordings.candump import is_candump
 from calibrator.recordings.log_files import (
     UNREADABLE,

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrator.drives.derived import evaluate_formula, formula_names, parse_formula
+from calibrator.files.formulas import evaluate_formula, formula_names, parse_formula
 from calibrator.files.layout_files import chosen_layout
 from ecu_node.errors import LayoutError
 from tests.ecu_node.vehicles import SMALL_LAYOUT
