@@ -99,18 +99,10 @@ and greatest number with an ordinary result; gain, bias and shift from number to
 outgoing payload; and what is done with other numbers."""
 
 
-class _Pass(NamedTuple):
-    """Branches that are read in one byte order and written in one."""
-
-    order: Order
-    to: Order
-    signs: int
-    """Sign bits in the frame."""
-    keep: int
-    """Bits of the outgoing payload that stay."""
-    good: int
-    """Qualities, where all results are ordinary, and the sign bits, which these turn over."""
-    cells: list[_Cell]
+_Pass = tuple[Order, Order, int, int, int, list[_Cell]]
+"""Branches that are read in one byte order and written in one: both orders; sign bits in the frame; bits of the
+outgoing payload that stay; qualities where all results are ordinary, and the sign bits, which these turn over; the
+branches. A plain tuple, as naming its parts would cost a twentieth of a frame's time."""
 
 
 class Target:
@@ -142,15 +134,6 @@ class Target:
         self.written = {field.branch: _Written(field, length) for field in fields}
 
 
-class _Way(NamedTuple):
-    """How a target answers payloads of one length."""
-
-    target: Target
-    passes: list[_Pass]
-    others: list[_Written]
-    """Branches that are not in these payloads."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Ways:
     """What is done with payloads of one length."""
@@ -158,7 +141,8 @@ class _Ways:
     missing: list[LiveBranch]
     """Branches that such a payload is too short for."""
     in_place: list[_Pass]
-    targets: list[_Way]
+    targets: list[tuple[Target, list[_Pass], list[_Written]]]
+    """Messages that answer it, each with what is done for it, and its branches that are not in these payloads."""
 
 
 class Source:
@@ -235,7 +219,7 @@ class Source:
         if not is_usable or (self._receiver is not None and self._receiver.state is _INVALID):
             for branch, _ in self._branches:
                 branch.spoil(now_s)
-            answers = [_Way(target, [], list(target.written.values())) for target in self._targets]
+            answers = [(target, [], list(target.written.values())) for target in self._targets]
         for target, passes, others in answers:
             made = self._rewritten(payload, target.data, passes, now_s)
             for written in others:
@@ -322,7 +306,7 @@ class Source:
         for target in self._targets:
             inside = [(*item, target.written[item[0]]) for item in present if item[0] in target.written]
             others = [target.written[branch] for branch in target.written.keys() - {item[0] for item in inside}]
-            answers.append(_Way(target, self._passes(inside, length, len(target.data)), others))
+            answers.append((target, self._passes(inside, length, len(target.data)), others))
         found = self._ways[length] = _Ways(
             missing=[branch for branch, signal in self._branches if signal.end > length],
             in_place=self._passes([(*item, None) for item in present], length, length),
@@ -336,32 +320,29 @@ class Source:
         """What is done with these branches, per pair of byte orders."""
         passes: dict[tuple[Order, Order], _Pass] = {}
         for branch, signal, written in branches:
-            source, plan = signal.place.in_word(length), branch.plan
-            to, place = (signal.place.order, source) if written is None else (written.order, written.word)
+            source, plan, order = signal.place.in_word(length), branch.plan, signal.place.order
+            to, place = (order, source) if written is None else (written.order, written.word)
             first, last = (1, 0) if signal.above else branch.ordinary_codes()
-            is_ordinary = first <= last  # else no number lies between them
-            cell = (
-                source.shift,
-                source.ones,
-                first + source.sign,
-                last + source.sign,
-                plan.gain,
-                plan.bias + (1 << (plan.shift - 1)) - source.sign * plan.gain + (place.sign << plan.shift),
-                plan.shift,
-                place.shift,
-                _Unusual(branch, signal, written, self._counters),
-            )
-            found = passes.get((signal.place.order, to)) or _Pass(
-                signal.place.order, to, 0, (1 << _BITS_PER_BYTE * made_length) - 1, 0, []
-            )
-            found.cells.append(cell)
-            if is_ordinary:
-                found = found._replace(
-                    signs=found.signs | source.sign << source.shift,
-                    keep=found.keep & ~(place.ones << place.shift if written is None else written.mask),
-                    good=found.good
-                    | place.sign << place.shift
-                    | (0 if written is None else written.quality_bits[branch.quality]),
+            _, _, signs, keep, good, cells = passes.get((order, to)) or (
+                order, to, 0, (1 << _BITS_PER_BYTE * made_length) - 1, 0, []
+            )  # fmt: skip
+            cells.append(
+                (
+                    source.shift,
+                    source.ones,
+                    first + source.sign,
+                    last + source.sign,
+                    plan.gain,
+                    plan.bias + (1 << (plan.shift - 1)) - source.sign * plan.gain + (place.sign << plan.shift),
+                    plan.shift,
+                    place.shift,
+                    _Unusual(branch, signal, written, self._counters),
                 )
-            passes[found.order, found.to] = found
+            )
+            if first <= last:  # else no number lies between them, and none is ordinary
+                signs |= source.sign << source.shift
+                keep &= ~(place.ones << place.shift if written is None else written.mask)
+                good |= place.sign << place.shift
+                good |= 0 if written is None else written.quality_bits[branch.quality]
+            passes[order, to] = order, to, signs, keep, good, cells
         return list(passes.values())
