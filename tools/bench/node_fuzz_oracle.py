@@ -305,9 +305,11 @@ class Oracle:
         return f"bits {changed & ~mask:X} changed, which are nobody's business" if changed & ~mask else None
 
     def _answered(self, source: _Source, sent: Sequence[FuzzFrame]) -> str | None:
-        names = dict.fromkeys(
-            branch.branch.target[0].name for branch in self._own(source) if branch.branch.target is not None
+        in_layout, own = (
+            dict.fromkeys(branch.branch.target[0].name for branch in branches if branch.branch.target is not None)
+            for branches in (self._branches, self._own(source))
         )
+        names = [name for name in in_layout if name in own]
         if len(sent) != len(names):
             return f"{len(sent)} frames were sent, must be {len(names)}"
         for name, out in zip(names, sent, strict=True):
