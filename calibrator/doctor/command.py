@@ -3,7 +3,6 @@
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,8 +15,8 @@ from calibrator.terminal.text import counted, dumps, figure, table
 from ecu_node.program import write_output, write_text
 
 if TYPE_CHECKING:
-    from calibrator.doctor.checks import Diagnosis
     from calibrator.doctor.facts import ChannelFacts, Facts
+    from calibrator.findings import Finding
 
 __all__ = ["doctor", "doctor_json", "doctor_text"]
 
@@ -53,7 +52,7 @@ def doctor(
         raise typer.Exit(1)
 
 
-def doctor_text(facts: "Facts", findings: Sequence["Diagnosis"], steps: Mapping[str, str]) -> str:
+def doctor_text(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
     """Tables of branches and inputs, findings, and what can be done next; long lines are for the terminal to fold."""
     seconds, frames = sum(log.duration_s for log in facts.logs), sum(log.report.frames for log in facts.logs)
     shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in facts.explained.items())
@@ -80,43 +79,40 @@ def _next_commands(facts: "Facts", ready: Sequence[str]) -> list[str]:
     from calibrator.estimator.settings import FEWEST_VEHICLES
 
     layout = f"--layout {shlex.quote(str(facts.layout.path))}"
-    branches = [facts.layout.find_branch(name) for name in facts.usable]
-    computed = [branch.name for branch in branches if branch.signal is None]
-    found = []
-    if "calibrate --trusted" in ready:
-        trusted = next((branch.name for branch in branches if branch.signal is not None), "BRANCH")
-        log = facts.logs[0].name if len(facts.logs) == 1 else "FOLDER"
-        poor = f" ({', '.join(computed)}: computed from other signals, a poor reference)" if computed else ""
-        found.append(
-            f"one vehicle and a sensor you trust{poor}; --load A:SD, what flows where nobody measures, tells offsets: "
-            f"calibrator calibrate {shlex.quote(log)} {layout} --trusted "
-            f"{trusted} --out result"
-        )
-    if "calibrate" in ready:
-        found.append(
-            f"{FEWEST_VEHICLES} vehicles or more: calibrator calibrate FOLDER_OF_VEHICLES {layout} --out result"
-        )
-    return found
+    branches = [facts.layout.find_branch(name) for name in facts.junction.branches]
+    computed = ", ".join(branch.name for branch in branches if branch.signal is None)
+    poor = f" ({computed}: computed from other signals, a poor reference)" if computed else ""
+    trusted = next((branch.name for branch in branches if branch.signal is not None), "BRANCH")
+    log = shlex.quote(facts.logs[0].name) if len(facts.logs) == 1 else "FOLDER"
+    offsets = "--load A:SD, what flows where nobody measures, tells offsets"
+    lines = {
+        "calibrate --trusted": f"one vehicle and a sensor you trust{poor}; {offsets}: calibrator calibrate {log} "
+        f"{layout} --trusted {trusted} --out result",
+        "calibrate": f"{FEWEST_VEHICLES} vehicles or more: calibrator calibrate FOLDER_OF_VEHICLES {layout} "
+        f"--out result",
+    }
+    return [text for step, text in lines.items() if step in ready]
 
 
-def doctor_json(facts: "Facts", findings: Sequence["Diagnosis"], steps: Mapping[str, str]) -> str:
+def doctor_json(facts: "Facts", findings: Sequence["Finding"], steps: Mapping[str, str]) -> str:
     """The report for programs: facts by branch and input, findings with their figures, next steps."""
+    sum_a, comparisons = facts.junction.sum_a, facts.junction.comparisons
     return dumps(
         {
             "layout": str(facts.layout.path),
             "logs": [log.name for log in facts.logs],
-            "branches": {item.name: asdict(item) for item in facts.branches},
-            "inputs": {item.name: asdict(item) for item in facts.inputs},
+            "branches": {item.name: item for item in facts.branches},
+            "inputs": {item.name: item for item in facts.inputs},
             "explained": facts.explained,
-            "sum": None
-            if not len(facts.sum_a)
-            else {
-                "mean_a": float(facts.sum_a.mean()),
-                "sd_a": float(facts.sum_a.std()),
-                "instants": sum(len(comparison.valid) for comparison in facts.comparisons),
-                "valid": len(facts.sum_a),
-            },
-            "findings": [asdict(finding) for finding in findings],
+            "sum": {
+                "mean_a": float(sum_a.mean()),
+                "sd_a": float(sum_a.std()),
+                "instants": sum(len(comparison.valid) for comparison in comparisons),
+                "valid": len(sum_a),
+            }
+            if len(sum_a)
+            else None,
+            "findings": findings,
             "ready": [name for name, why in steps.items() if not why],
             "not_ready": {name: why for name, why in steps.items() if why},
         }

@@ -1,9 +1,8 @@
 """What logs or tables hold of the branches and inputs of a layout: the facts that the doctor's checks look at."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +10,12 @@ import msgspec
 import numpy as np
 from cantools.database.can import Signal
 
-from calibrator.doctor.junction import JunctionFacts, junction_facts, multiplied
-from calibrator.doctor.words import is_battery
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.align import TIME_RESOLUTION_S, align, base_inputs, choose_inputs
 from calibrator.errors import DriveError, LogError
-from calibrator.kirchhoff.conditions import Conditions, conditions_of
-from calibrator.kirchhoff.sums import Comparison, compare_kirchhoff, with_voltages
+from calibrator.kirchhoff.findings import Junction, look_at_junction
+from calibrator.kirchhoff.signs import multiplied
+from calibrator.kirchhoff.sums import VOLTAGE, junction_voltage, with_voltages
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.log_time import repaired_time
 from calibrator.recordings.readers import (
@@ -33,21 +31,17 @@ from ecu_node.database import VehicleDatabase, look_everything_up, read_database
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import Branch, Input, Layout
 
-__all__ = ["ChannelFacts", "ExaminedLog", "Facts", "facts_of"]
+__all__ = ["MOST_MINUTES", "ChannelFacts", "ExaminedLog", "Facts", "facts_of"]
 
-NOTHING = Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_))
-VOLTAGE = "_junction_voltage"
-"""Input that the doctor adds for itself: what powers are divided by."""
 MOST_MINUTES = 60.0
 """Of each log: an hour tells what is wrong with a layout, and takes some seconds. [min]"""
 FEWEST_CLIPPED = 3
 """In a row at the end of the range: one or two may be the true peak."""
 LEAST_V, GREATEST_V, USUAL_V = 30.0, 1500.0, 400.0
 """From 48 V systems to the highest that road vehicles have; a slip is a power of ten that leads nearest to most. [V]"""
-FEWEST_INSTANTS = 300
-"""Of aligned samples, to say how well inputs explain a current: half a minute at 0.1 s."""
-LEAST_SHARE = 0.05
-"""Of the greatest branch's variation: that of a smaller one is mostly noise. [1]"""
+FEWEST_INSTANTS, LEAST_SHARE = 300, 0.05
+"""Of aligned samples, to say how well inputs explain a current: half a minute at 0.1 s; share of the greatest branch's
+variation, below which that of a branch is mostly noise. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,23 +52,17 @@ class ChannelFacts:
     ----------
     name, signal, unit : str
         Name in the layout; signal, column or formula; unit of `low` and `high`.
-    frames : int
-        Frames, or rows, that carry it.
-    in_logs, logs : int
-        In how many of how many logs.
+    frames, in_logs, logs : int
+        Frames, or rows, that carry it, in how many of how many logs.
     period_s, jitter_s, gap_s : float
         Median distance of frames, the 95th percentile of how far distances are from it, and the longest distance; NaN
         with fewer than two frames. [s]
     late : int
         Distances longer than its time-out.
-    same_time : int
-        Frames with the time stamp of the one before.
     bad : dict of str to int
         Frames that cannot be used, by reason.
     low, high : float
         Least and greatest good value; branches are positive into the junction; NaN without any. [unit]
-    moves : bool
-        Whether good values differ at all.
     clipped : int
         Good values at an end of what the signal can show, several in a row.
     """
@@ -89,11 +77,9 @@ class ChannelFacts:
     jitter_s: float
     gap_s: float
     late: int
-    same_time: int
     bad: dict[str, int]
     low: float
     high: float
-    moves: bool
     clipped: int
 
     @property
@@ -119,10 +105,8 @@ class ExaminedLog:
         Look-ups of signals in it.
     report : RecordingReport
         Its account.
-    drive : Drive or None
-        None if it has no branch of the layout; `why` then tells what it has.
-    why : LogError or None
-        None if there is a drive.
+    drive : Drive or LogError
+        What it has of the layout, or that it has no branch of it.
     duration_s : float
         From the first to the last frame. [s]
     cut : bool
@@ -132,8 +116,7 @@ class ExaminedLog:
     name: str
     source: SignalSource
     report: RecordingReport
-    drive: Drive | None
-    why: LogError | None
+    drive: Drive | LogError
     duration_s: float
     cut: bool
 
@@ -150,22 +133,14 @@ class Facts:
         DBC and the part of the layout that it can serve.
     missing : mapping of (str, str) to str
         Why a ``branch`` or ``input`` of this name, or the ``layout``, cannot be looked up.
-    logs : tuple of Log
+    logs : tuple of ExaminedLog
         What was looked at.
     branches, inputs : tuple of ChannelFacts
         Of those that the DBC has, in the order of the layout.
-    usable : tuple of str
-        Branches with good values.
     slip : tuple of (str, float, float) or None
         Signal of a voltage that is impossible, its median [V], and the power of ten that makes it usual.
-    comparisons : tuple of Comparison
-        The currents of each log on one time base, with such a slip put right.
-    whole_drives : tuple of Drive
-        Those with all usable branches, with such a slip put right.
-    conditions : Conditions
-        How long the usable branches have values together, and whether they move.
-    junction : JunctionFacts or None
-        What the sum tells; None with fewer than two usable branches.
+    junction : Junction
+        The sum of the branches, with such a slip put right.
     explained : mapping of str to float
         Share of each current's variation that the model inputs explain; empty if that cannot be told.
     """
@@ -176,49 +151,23 @@ class Facts:
     logs: tuple[ExaminedLog, ...]
     branches: tuple[ChannelFacts, ...]
     inputs: tuple[ChannelFacts, ...]
-    usable: tuple[str, ...]
     slip: tuple[str, float, float] | None
-    comparisons: tuple[Comparison, ...]
-    whole_drives: tuple[Drive, ...]
-    conditions: Conditions
-    junction: JunctionFacts | None
-    explained: Mapping[str, float] = field(default_factory=dict)
+    junction: Junction
+    explained: Mapping[str, float]
 
-    @cached_property
+    @property
     def drives(self) -> list[Drive]:
         """What the logs gave."""
-        return [log.drive for log in self.logs if log.drive is not None]
+        return [log.drive for log in self.logs if isinstance(log.drive, Drive)]
 
-    @cached_property
-    def sum_a(self) -> Array:
-        """Sum of the branches at all valid instants. [A]"""
-        return np.concatenate([np.zeros(0), *(c.sums_a["before"][c.valid] for c in self.comparisons)])
-
-    @cached_property
-    def available(self) -> set[str]:
-        """Inputs that were recorded."""
-        return {name for drive in self.drives for name in drive.inputs}
-
-    @cached_property
+    @property
     def needed(self) -> set[str]:
         """Inputs that the model is made of."""
         return base_inputs(self.database.layout, self.database.layout.model_inputs)
 
 
 def facts_of(layout: Layout, paths: Sequence[Path]) -> Facts:
-    """Gather the facts of a layout and logs of one vehicle.
-
-    Parameters
-    ----------
-    layout : Layout
-        The layout; its DBC is read.
-    paths : sequence of Path
-        At least one log or table.
-
-    Returns
-    -------
-    Facts
-        For :func:`calibrator.doctor.checks.findings_of`.
+    """Gather the facts of a layout, whose DBC is read, and of logs or tables of one vehicle.
 
     Raises
     ------
@@ -226,55 +175,25 @@ def facts_of(layout: Layout, paths: Sequence[Path]) -> Facts:
         If DBC or a log cannot be read at all.
     """
     database, missing = _usable_part(layout)
-    voltage = _voltage_signal(database)
-    more = [] if voltage is None else [Input(name=VOLTAGE, signal=voltage)]
-    extended = with_voltages(_with_layout(database, input=[*database.layout.input, *more]))
+    extended = with_voltages(database)
     logs = [_read(path, extended) for path in paths]
-    branches = tuple(_channel_facts(item, item.timeout_s, logs, database) for item in database.layout.branch)
-    inputs = tuple(_channel_facts(item, database.layout.max_age_s, logs, database) for item in database.layout.input)
-    drives = [log.drive for log in logs if log.drive is not None]
-    usable = [facts.name for facts in branches if facts.good]
-    slip = None if voltage is None else _voltage_slip(drives, voltage, database)
-    right = drives
+    drives = [log.drive for log in logs if isinstance(log.drive, Drive)]
+    slip, right = _voltage_slip(drives, database), drives
     if slip is not None:
-        divided = {item.name for item in database.layout.branch if item.voltage == voltage}
+        divided = {item.name for item in database.layout.branch if item.voltage == slip[0]}
         right = [multiplied(drive, dict.fromkeys(divided, 1.0 / slip[2])) for drive in drives]
-    whole = [drive for drive in right if {name for name in usable if drive.branches[name].good.any()} == set(usable)]
-    comparisons, junction = [], None
-    for drive in whole if len(usable) > 1 else ():
-        with suppress(DriveError):
-            comparisons.append(compare_kirchhoff(drive, extended))
-    conditions = conditions_of(whole, comparisons, extended)
-    if len(usable) > 1:
-        junction = junction_facts(
-            right,
-            usable,
-            full_scale_a=layout.full_scale_a,
-            least_a=float(np.linalg.norm([*conditions.steps_a.values()])),
-            battery=next((name for name in usable if is_battery(name, layout.find_branch(name).source)), None),
-            voltage=VOLTAGE,
-        )
+    junction = look_at_junction(right, extended)
     return Facts(
         layout=layout,
         database=database,
         missing=missing,
         logs=tuple(logs),
-        branches=branches,
-        inputs=inputs,
-        usable=tuple(usable),
+        branches=tuple(_channel_facts(item, item.timeout_s, logs, database) for item in database.layout.branch),
+        inputs=tuple(_channel_facts(item, database.layout.max_age_s, logs, database) for item in database.layout.input),
         slip=slip,
-        comparisons=tuple(comparisons),
-        whole_drives=tuple(whole),
-        conditions=conditions,
         junction=junction,
-        explained=_explained_shares(drives, database.layout, usable) if usable else {},
+        explained=_explained_shares(drives, database.layout, junction.branches),
     )
-
-
-_NOTHING: dict[str, Any] = {
-    "branch": [], "input": [], "derived": [], "model_inputs": [], "fleet_inputs": [], "contactor": None, "status": None,
-    "temperature": None, "e2e": [],
-}  # fmt: skip
 
 
 def _with_layout(database: VehicleDatabase, **keys: Any) -> VehicleDatabase:
@@ -286,8 +205,10 @@ def _usable_part(layout: Layout) -> tuple[VehicleDatabase, dict[tuple[str, str],
     try:
         return read_database(layout), {}
     except (DatabaseError, LayoutError) as error:
-        nothing = msgspec.structs.replace(layout, **_NOTHING, watch=type(layout.watch)())
-        bare, reason = read_database(nothing), str(error)
+        reason = str(error)
+    lists = ("branch", "input", "derived", "model_inputs", "fleet_inputs", "e2e")
+    others: dict[str, Any] = {**dict.fromkeys(("contactor", "status", "temperature")), "watch": type(layout.watch)()}
+    bare = read_database(msgspec.structs.replace(layout, **{name: [] for name in lists}, **others))
     missing: dict[tuple[str, str], str] = {}
 
     def kept(items: Iterable[Any], what: str) -> list[Any]:
@@ -309,10 +230,7 @@ def _usable_part(layout: Layout) -> tuple[VehicleDatabase, dict[tuple[str, str],
         derived=[item for item in layout.derived if base_inputs(layout, [item.name]) <= set(names)],
         model_inputs=list(choose_inputs(layout, names)[0]),
         fleet_inputs=list(choose_inputs(layout, names, names=layout.fleet_inputs)[0]),
-        contactor=None,
-        status=None,
-        temperature=None,
-        watch=type(layout.watch)(),
+        **others,
     )
     return replace(bare, layout=pruned), missing or {("layout", layout.path.name): reason}
 
@@ -330,15 +248,13 @@ def _read(path: Path, database: VehicleDatabase) -> ExaminedLog:
         frames, cut = whole.take(np.sort(time.order[:first])), first < len(whole)  # in the order of the file
         source, duration_s = FrameSource(frames, database, str(path)), float(time.time_s[first - 1])
         make = partial(drive_from_frames, frames, database, **names, where=str(path))
-    drive, why, report = None, None, source.report(())
+    drive: Drive | LogError
     try:
         recording = make()
         drive, report = recording.drive, recording.report
     except LogError as error:
-        why = error
-    return ExaminedLog(
-        name=str(path), source=source, report=report, drive=drive, why=why, duration_s=duration_s, cut=cut
-    )
+        drive, report = error, source.report(())
+    return ExaminedLog(name=str(path), source=source, report=report, drive=drive, duration_s=duration_s, cut=cut)
 
 
 def _channel_facts(
@@ -346,18 +262,21 @@ def _channel_facts(
 ) -> ChannelFacts:
     """Gather what logs hold of one branch [A], or of one input in the unit of its signal."""
     is_branch = isinstance(item, Branch)
-    name, signal = (item.name, item.source) if isinstance(item, Branch) else (item.name, item.signal)
+    signal = item.source if isinstance(item, Branch) else item.signal
     computed = isinstance(item, Branch) and item.computed
     unit, clipped, bad, frames = "A" if is_branch else "", 0, dict[str, int](), list[int]()
     values, steps = list[Array]([np.zeros(0)]), list[Array]([np.zeros(0)])
     for log in logs:
-        if log.drive is None:
+        if isinstance(log.drive, LogError):
             continue
-        made = (log.drive.branches if is_branch else log.drive.inputs).get(name)
+        made = (log.drive.branches if is_branch else log.drive.inputs).get(item.name)
         if made is not None:
             values.append(made.value[made.good])
-        raw, reasons = (made or NOTHING, {}) if computed else log.source.samples(signal)
-        reasons = {"no value": ~raw.good} if computed else reasons
+        if computed:
+            raw = made or Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_))
+            reasons: Mapping[str, Any] = {"no value": ~raw.good}
+        else:
+            raw, reasons = log.source.samples(signal)
         counted = np.zeros(len(raw.time_s), np.bool_)
         for reason, mask in reasons.items():
             bad[reason] = bad.get(reason, 0) + int((mask & ~counted).sum())
@@ -372,7 +291,7 @@ def _channel_facts(
         bad["no voltage"] = other
     period_s = float(np.median(step_s)) if len(step_s) else np.nan
     return ChannelFacts(
-        name=name,
+        name=item.name,
         signal=signal,
         unit=unit,
         frames=sum(frames),
@@ -382,11 +301,9 @@ def _channel_facts(
         jitter_s=float(np.quantile(np.abs(step_s - period_s), 0.95)) if len(step_s) else np.nan,
         gap_s=float(step_s.max()) if len(step_s) else np.nan,
         late=int(np.sum(step_s > timeout_s + TIME_RESOLUTION_S)),
-        same_time=int(np.sum(step_s <= 0.0)),
         bad={reason: count for reason, count in bad.items() if count},
         low=float(value.min()) if len(value) else np.nan,
         high=float(value.max()) if len(value) else np.nan,
-        moves=bool(len(value) and value.max() > value.min()),
         clipped=clipped,
     )
 
@@ -406,18 +323,17 @@ def _clipped(signal: Signal, value: Array) -> int:
     return sum(len(run) for run in runs if len(run) >= FEWEST_CLIPPED and run.all())
 
 
-def _voltage_signal(database: VehicleDatabase) -> str | None:
-    """What powers are divided by, or else the first input in volts."""
-    volts = [item.signal for item in database.layout.input if database.signal(item.signal)[1].unit == "V"]
-    return next((item.voltage for item in database.layout.branch if item.voltage), volts[0] if volts else None)
-
-
-def _voltage_slip(drives: Sequence[Drive], signal: str, database: VehicleDatabase) -> tuple[str, float, float] | None:
+def _voltage_slip(drives: Sequence[Drive], database: VehicleDatabase) -> tuple[str, float, float] | None:
     """Signal, median and factor of a voltage that is none of a vehicle; zero (contactors open) is possible."""
-    channels = [drive.inputs[VOLTAGE] for drive in drives if VOLTAGE in drive.inputs]
+    signal, channels = (
+        junction_voltage(database),
+        [drive.inputs[VOLTAGE] for drive in drives if VOLTAGE in drive.inputs],
+    )
     value = np.concatenate([np.zeros(0), *(channel.value[channel.good] for channel in channels)])
     median_v = float(np.median(np.abs(value))) if len(value) else 0.0
-    if database.signal(signal)[1].unit != "V" or median_v <= 0.0 or LEAST_V <= median_v <= GREATEST_V:
+    if signal is None or median_v <= 0.0 or LEAST_V <= median_v <= GREATEST_V:
+        return None
+    if database.signal(signal)[1].unit != "V":
         return None
     return signal, median_v, 10.0 ** float(np.rint(np.log10(USUAL_V / median_v)))
 
@@ -428,7 +344,7 @@ def _explained_shares(drives: Sequence[Drive], layout: Layout, branches: Sequenc
     By branch that matters, 1 for all of it; empty if the inputs are not recorded or too little is valid.
     """
     recorded = choose_inputs(layout, set.intersection(*(set(drive.inputs) for drive in drives)))[0] if drives else ()
-    if not recorded:
+    if not recorded or not branches:
         return {}
     try:
         samples = [align(drive, layout, branches, inputs=recorded) for drive in drives]

@@ -12,9 +12,14 @@ from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import DbcOption, JsonOption, number_option
 from calibrator.terminal.text import dumps
-from ecu_node.program import say_error, write_text
+from ecu_node.program import say_error, write_output, write_text
 
 __all__ = ["kirchhoff"]
+
+TOLD = ("too short", "stands still", "delay")
+"""Hints that are told: what the figures cannot tell, and what no figure shows."""
+USUAL_SCALE_A = 500.0
+"""Currents are plausible up to it where nothing tells full scale but the currents themselves. [A]"""
 
 
 def _option(help_text: str, *suffixes: str) -> Any:
@@ -81,7 +86,7 @@ def kirchhoff(
         if wrong:
             raise typer.BadParameter(what)
     with importing():
-        from calibrator.kirchhoff.conditions import conditions_of
+        from calibrator.kirchhoff.findings import look_at_junction, sum_findings
         from calibrator.kirchhoff.sums import compare_kirchhoff, with_voltages
         from calibrator.kirchhoff.view import draw_kirchhoff, kirchhoff_text, save_table
         from calibrator.recordings.frames import is_log
@@ -93,15 +98,15 @@ def kirchhoff(
 
     logs = [] if log is None else [log, *filter(is_log, files_in(log))]
     _require_others(filter(None, (plot, table)), filter(None, (*logs, layout, dbc, parameters)))
-    found = read_parameters(parameters) if parameters is not None else None
     if layout is not None:
         database = with_voltages(vehicle_database(layout, dbc))
     elif log is not None and (is_table(log) or not log.exists()):
         database = layout_from_branches(str(branches), full_scale_a=full_scale, table=read_table(log))
     else:
         raise typer.BadParameter("--branches names columns of a table; a log of frames and a bus need --layout")
-    if found is not None:
-        check_fit(found, database, None)
+    found = None
+    if parameters is not None:
+        check_fit(found := read_parameters(parameters), database, None)
     vehicle, where = database.layout.name, f"{interface}:{channel}" if log is None else log.name
     if log is not None:
         recording = read_recording(log, database, vehicle=vehicle, name=where.partition(".")[0])
@@ -113,18 +118,27 @@ def kirchhoff(
         draw_kirchhoff(comparison, plot, title=f"Branch currents, positive into the junction: {where}")
     if table is not None:
         save_table(comparison, table)
-    conditions = conditions_of([recording.drive], [comparison], database)
-    if conditions.short or conditions.stands_still:
+    scale_a = USUAL_SCALE_A if branches is not None and full_scale is None else None
+    junction = look_at_junction([recording.drive], database, full_scale_a=scale_a)
+    findings = [each for each in sum_findings(junction) if each.severity != "hint" or each.code in TOLD]
+    if junction.is_short or junction.stands_still:
         comparison = replace(comparison, residual=dict.fromkeys(comparison.residual))
     notices = [*map(str, recording.report.log_notices()), *comparison.notices()]
-    notices += filter(None, (conditions.how_short, conditions.how_still))
-    write_text(dumps(comparison.as_json() | {"notices": notices}) if json else kirchhoff_text(comparison, notices))
-    if not json and log is not None and "after" not in comparison.currents_a:
-        _say_next(log, layout, branches)
+    if json:
+        write_output(dumps(comparison.as_json() | {"notices": notices, "findings": findings}))
+        return
+    said = [
+        each.text if each.subject == "sum" and each.code in TOLD else f"{each.severity}: {each.line}"
+        for each in findings
+    ]
+    write_text(kirchhoff_text(comparison, [*notices, *said]))
+    _say_next(log if "after" not in comparison.currents_a else None, layout, branches)
 
 
-def _say_next(log: Path, layout: Path | None, branches: str | None) -> None:
-    """Say how to have a correction."""
+def _say_next(log: Path | None, layout: Path | None, branches: str | None) -> None:
+    """Say how to have a correction of a log that has none."""
+    if log is None:
+        return
     steps: dict[str, object] = {"calibrate": log, "--layout": layout, "--trusted": "BRANCH", "--out": "result"}
     if layout is None:
         steps = {"layout init": log, "--branches": branches, "--out": "my_car.toml"}

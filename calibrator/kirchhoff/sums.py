@@ -35,8 +35,19 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Input
 from ecu_node.parameters import VehicleParameters
 
-__all__ = ["BAND", "SUM", "Comparison", "compare_kirchhoff", "sensor_of", "with_voltages"]
+__all__ = [
+    "BAND",
+    "SUM",
+    "VOLTAGE",
+    "Comparison",
+    "compare_kirchhoff",
+    "junction_voltage",
+    "sensor_of",
+    "with_voltages",
+]
 
+VOLTAGE = "_junction_voltage"
+"""Input that is the battery's voltage; drives may lack it."""
 SUM = "sum"
 """Name of the sum among the branches."""
 BAND = 2.0
@@ -66,6 +77,14 @@ class Sensor(NamedTuple):
     period_s: float
 
 
+@dataclass(frozen=True)
+class GainAlone:
+    """Gain error of a branch that the sum asks for, and the share of the sum's variation that it explains. [1]"""
+
+    gain_error: float
+    gain_share: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Residual:
     """Shares in the mean square of the sum about what is expected.
@@ -77,9 +96,8 @@ class Residual:
         of what remains. They add up to 1. [1]
     rest_a : float
         Root mean square of what remains. [A]
-    alone : mapping of str to mapping of str to float
-        By branch, as if its gain alone were wrong: the ``gain_error`` that the sum asks for, and ``gain_share``, the
-        share of the sum's variation that it explains. Branches that move too little to tell are absent. [1]
+    alone : mapping of str to GainAlone
+        By branch, as if its gain alone were wrong. Branches that move too little to tell are absent.
     """
 
     constant: float
@@ -87,7 +105,7 @@ class Residual:
     delays: float
     rest: float
     rest_a: float
-    alone: Mapping[str, Mapping[str, float]]
+    alone: Mapping[str, GainAlone]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,10 +235,18 @@ def _noise(value: Array) -> float:
 
 
 def with_voltages(database: VehicleDatabase) -> VehicleDatabase:
-    """The same with the voltages of branches that are powers as inputs more, for :func:`sensor_of`."""
-    layout = database.layout
+    """The same with inputs more: voltages of branches that are powers, for :func:`sensor_of`, and :data:`VOLTAGE`."""
+    layout, signal = database.layout, junction_voltage(database)
     more = [Input(name=f"_voltage_{item.name}", signal=item.voltage) for item in layout.branch if item.voltage]
+    more += [Input(name=VOLTAGE, signal=signal)] if signal is not None else []
     return replace(database, layout=msgspec.structs.replace(layout, input=[*layout.input, *more]))
+
+
+def junction_voltage(database: VehicleDatabase) -> str | None:
+    """The signal that powers are divided by, or else the first input in volts."""
+    layout = database.layout
+    volts = [item.signal for item in layout.input if database.signal(item.signal)[1].unit == "V"]
+    return next((item.voltage for item in layout.branch if item.voltage), volts[0] if volts else None)
 
 
 def sensor_of(database: VehicleDatabase, name: str, drive: Drive) -> Sensor:
@@ -384,7 +410,7 @@ def _residual(
         if moving[k]:
             gain = float((covariance[k] - noise2[k]) / (variance[k] - noise2[k]))
             error = gain / (1.0 - gain) if gain < 1.0 else np.inf
-            alone[name] = {"gain_error": error, "gain_share": _gone(s, s - gain * x[:, k])}
+            alone[name] = GainAlone(error, _gone(s, s - gain * x[:, k]))
     others = np.flatnonzero(moving & (np.arange(len(moving)) != np.argmax(variance)))
     gram = x[:, others].T @ x[:, others] / len(s) - np.diag(noise2[others])
     straight = s - x[:, others] @ (np.linalg.pinv(gram) @ (covariance - noise2)[others])

@@ -56,17 +56,12 @@ def kirchhoff_text(comparison: Comparison, notices: Sequence[str]) -> str:
             lines.append(f"of the sum {stage} (mean square): {', '.join(shares)} ({figure(residual.rest_a, 2)} A)")
     last = list(comparison.residual.values())[-1]
     if last is not None and last.alone:
-        alone = {name: (item["gain_error"], item["gain_share"]) for name, item in last.alone.items()}
         rows = [
-            (name, f"{100.0 * error:+.1f} %" if abs(error) <= SLIP else "-", _percent(share))
-            for name, (error, share) in alone.items()
+            (name, f"{100.0 * own.gain_error:+.1f} %" if abs(own.gain_error) <= SLIP else "-", _percent(own.gain_share))
+            for name, own in last.alone.items()
         ]
         title = "What the gain of one branch alone could explain of how the sum varies"
         lines += ["", title, table(["", "gain error", "explains"], rows), ""]
-        if any(abs(error) > SLIP and share > 0.5 for error, share in alone.values()):
-            lines.append("run 'calibrator doctor': a sign or a unit looks wrong")
-        elif last.delays > 0.5:
-            lines.append("run 'calibrator doctor': it tells which branch is late")
     total = f"RMSE of the sum: {(before_a := stages['before'][SUM].rmse_a):.2f} A before"
     if "after" in stages:
         after_a = stages["after"][SUM].rmse_a

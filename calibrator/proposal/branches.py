@@ -2,15 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
-from calibrator.doctor.junction import WELL_CORRELATED, branch_bands, sag
-from calibrator.doctor.words import CURRENT, PLACES, POSITIONS, POWER, places_of, word_set, words_of
-from calibrator.drive import Array, Channel, Drive
+from calibrator.drive import Array, Channel
+from calibrator.kirchhoff.signs import WELL_CORRELATED, bands_of, likely_multipliers, sag
 from calibrator.proposal.candidates import Candidate
 from calibrator.terminal.text import figure
+from calibrator.words import CURRENT, PLACES, POSITIONS, POWER, places_of, word_set, words_of
 
 __all__ = ["ONLY_CHARGING", "TAKEN", "Verdict", "close_sum", "closure", "find_signs", "judge_all", "with_usual_sign"]
 
@@ -56,8 +55,6 @@ OWN_GAIN, FEWEST_BINS = 1.3, 20
 """Gain errors that a load which closes the sum may leave to any branch, and means that it takes to tell. [1]"""
 MEANS = 50
 """One row of means for so many instants: loads that no branch measures are in them."""
-MOST_TURNED = 12
-"""Branches of which all combinations of signs are tried."""
 ONLY_CHARGING = "carries nothing while the car drives, which a log of charging would show (--log)"
 
 
@@ -70,7 +67,7 @@ class Verdict:
     candidate : Candidate
         The signal or column.
     place : str
-        Where it probably flows, of :data:`calibrator.doctor.words.PLACES`.
+        Where it probably flows, of :data:`calibrator.words.PLACES`.
     score : float
         From 0 on it is worth looking at; from :data:`TAKEN` on it can be a branch.
     why : str
@@ -199,7 +196,10 @@ def judge_all(found: Sequence[Candidate], everything: Sequence[Candidate]) -> li
     volts = [item for item in found if item.quantity == "voltage"]
     verdicts = []
     for item in (item for item in found if item.quantity in {"current", "power"}):
-        rated = {place: _score(item, place, everything, volts) for place in places_of(item.words) or [NOWHERE]}
+        rated = {
+            place: _score(item, place, everything, volts)
+            for place in [*filter(places_of(item.words).__contains__, PLACES)] or [NOWHERE]
+        }
         place = max(rated, key=lambda name: rated[name][0])
         verdicts.append(Verdict(candidate=item, place=place, score=rated[place][0], why=rated[place][1]))
     verdicts.sort(key=lambda verdict: -verdict.score)
@@ -260,7 +260,7 @@ def close_sum(verdicts: Sequence[Verdict], voltage: Candidate | None) -> list[Ve
         if not is_free or verdict.candidate.quantity != "current" or len(taken) < 2 or taken[0].place != "battery":
             continue
         channels = _channels((*taken, verdict), voltage)
-        if not channels or len(current := bands(channels)) < FEWEST_BINS:
+        if not channels or len(current := bands_of([channels]).current_a) < FEWEST_BINS:
             continue
         battery, others = current[:, 0], current[:, 1:]
         gain = np.abs(np.linalg.lstsq(others, battery)[0])
@@ -318,12 +318,6 @@ def _channels(verdicts: Sequence[Verdict], voltage: Candidate | None) -> list[Ch
     return channels if len(channels) == len(found) else []
 
 
-def bands(channels: Sequence[Channel]) -> Array:
-    """Comparable currents, as the doctor compares them, shape (T, K); without slow changes: loads may be in these."""
-    branches = {str(k): channel for k, channel in enumerate(channels)}
-    return branch_bands([Drive(vehicle="", name="", branches=branches, inputs={})], list(branches)).current_a
-
-
 def find_signs(chosen: Sequence[Verdict], voltage: Candidate | None) -> list[Verdict]:
     """Give branches the signs with which the sum of all varies least, and the battery's voltage sags under its load.
 
@@ -341,18 +335,22 @@ def find_signs(chosen: Sequence[Verdict], voltage: Candidate | None) -> list[Ver
     """
     known = _channels(chosen, voltage)
     battery = next((k for k, verdict in enumerate(chosen) if verdict.place == "battery"), None)
-    if battery is None or not known or len(chosen) > MOST_TURNED:
+    if battery is None or not known:
         return list(chosen)
     current = _with_means(known)
     usual = np.array([verdict.sign for verdict in chosen], np.float64)
     volts = voltage.channel if voltage is not None else None
-    falls = 0.0 if volts is None else sag([known[battery]], [volts])
+    falls = 0.0 if volts is None else sag([(known[battery], volts)])
     charger = next((k for k, verdict in enumerate(chosen) if verdict.place == "charger"), battery)
     by_voltage = abs(falls) >= WELL_CORRELATED
     sure = battery if by_voltage else charger  # which only feeds
     usual[sure] = -np.sign(falls) if by_voltage else usual[sure]
-    tried = [np.array(signs) for signs in product((1.0, -1.0), repeat=len(chosen)) if signs[sure] == usual[sure]]
-    best = min(tried, key=lambda signs: (_rms(current @ signs), -float(signs @ usual)))
+    part = current * usual
+
+    def price(turned: Array) -> float:
+        return np.inf if turned[sure] < 0.0 else 1e-6 * float(np.sum(turned < 0.0))
+
+    best = usual * likely_multipliers((part.T @ part)[None], price, factors=(1.0,))
     told = []
     for k, verdict in enumerate(chosen):
         other = best * np.where(np.arange(len(chosen)) == k, -1.0, 1.0)
@@ -368,7 +366,7 @@ def find_signs(chosen: Sequence[Verdict], voltage: Candidate | None) -> list[Ver
 
 def _with_means(channels: Sequence[Channel]) -> Array:
     """Comparable currents, and their means for a share of the rows: they tell where the currents are steady."""
-    current = bands(channels)
+    current = bands_of([channels]).current_a
     mean = [float(channel.value[channel.good].mean()) for channel in channels]
     return np.concatenate([current, np.tile(mean, (len(current) // MEANS + 1, 1))])
 
@@ -377,7 +375,7 @@ def closure(chosen: Sequence[Verdict], voltage: Candidate | None) -> float:
     """How much the sum of all varies, as a share of the greatest current [1]; NaN where no recording tells."""
     if not (known := _channels(chosen, voltage)):
         return float("nan")
-    current = bands(known) * np.array([verdict.sign for verdict in chosen])
+    current = bands_of([known]).current_a * np.array([verdict.sign for verdict in chosen])
     steady = [STEADY_SHARE * float(np.abs(channel.value[channel.good]).max(initial=0.0)) for channel in known]
     greatest = max(float(current.std(axis=0).max()), *steady) if len(current) else 0.0
     return _rms(current.sum(axis=1)) / greatest if greatest > 0.0 else float("nan")

@@ -4,9 +4,9 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from calibrator.doctor.words import PLACES, POSITIONS, word_set
 from calibrator.drive import Channel
 from calibrator.proposal.candidates import Candidate
+from calibrator.words import PLACES, POSITIONS, word_set
 
 __all__ = ["FOR_FLEETS", "computed_motor", "derive", "find_inputs"]
 

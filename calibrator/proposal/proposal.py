@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrator.doctor.words import PLACES, places_of, words_of
 from calibrator.errors import LogError, ProposalError
 from calibrator.proposal.branches import (
     ONLY_CHARGING,
@@ -27,6 +26,7 @@ from calibrator.proposal.candidates import Candidate, of_database, of_table, wit
 from calibrator.proposal.inputs import FOR_FLEETS, computed_motor, derive, find_inputs
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.tables import bare_name, is_table, layout_from_branches, read_table
+from calibrator.words import PLACES, places_of, words_of
 from ecu_node.database import read_database
 from ecu_node.errors import DatabaseError, printable
 from ecu_node.layout import Layout

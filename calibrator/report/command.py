@@ -1,7 +1,7 @@
 """``calibrator report``: the page of a result."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -52,12 +52,11 @@ def report(
     if target.suffix.lower() != ".html":
         raise typer.BadParameter(f"{target}: expected a file name that ends with .html", param_hint="--out")
     require_possible_file(target)
-    about: dict[str, Any]
+    options = {"battery": battery, "limit_a": limit, "voltage_v": voltage}
     if vehicle is None:
-        text, found = fleet_report(result, battery=battery, limit_a=limit, voltage_v=voltage)
-        about = vars(found)
+        text, about = fleet_report(result, **options)
     else:
-        text, parameters = vehicle_report(result, vehicle, battery=battery, limit_a=limit, voltage_v=voltage)
+        text, parameters = vehicle_report(result, vehicle, **options)
         about = {"parameters": parameters}
     content = text.encode()
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -5,7 +5,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from calibrator.report.fleet_table import FleetTable, ParameterDetails
 from calibrator.terminal.text import few
 from ecu_node.parameters import HeldBack
 
-__all__ = ["FLEET_CAUSES", "SIGMAS", "BatteryMargin", "Overview", "WorkshopRow", "amperes", "battery_margin"]
+__all__ = ["FLEET_CAUSES", "SIGMAS", "WorkshopRow", "amperes", "battery_margin"]
 __all__ += ["overview_of", "percent", "probability", "steps_to_take", "workshop_list"]
 
 MOST_REASONS = 20
@@ -39,108 +39,60 @@ FLEET_CAUSES = ("load", "batch", "variant")
 """Findings that many vehicles share and a workshop cannot mend: they come last in its list."""
 
 
-class Quantiles(NamedTuple):
-    """Median, and the values between which the middle 90 % lie; NaN if nothing is known."""
+def overview_of(table: FleetTable) -> dict[str, Any]:
+    """Count and summarise a result.
 
-    median: float
-    p05: float
-    p95: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Overview:
-    """Numbers of a fleet.
-
-    Attributes
-    ----------
-    vehicles, left_out : int
-        Vehicles with parameters, and without.
-    verdicts : mapping of str to int
-        Vehicles per verdict.
-    corrected : int
-        Vehicles of which a branch is corrected.
-    hardware_suspected : int or None
-        Vehicles in which a hardware fault is suspected; None if the method cannot see one.
-    faulty_sensors, applied_sensors : int
-        Sensors in which a fault was found; those of them that are corrected.
-    held_back : mapping of str to int
-        Faults that are not corrected, by reason.
-    junction_measured_a, junction_deployed_a : Quantiles
-        Root mean square of the Kirchhoff sum per vehicle, before and after correction with what is applied. [A]
-    unmeasured_a : float or None
-        Mean load that no branch measures: the sum that right sensors show. [A]
-    duration_h : Quantiles
-        Length of the drives of a vehicle. [h]
-    delay_ms : mapping of str to Quantiles
-        How much later than the largest branch each is seen, where it is known. [ms]
-    reference : mapping of str to mapping of str to float or None
-        By branch ``agreeing_share``, of the vehicles whose sensors agree, and ``model_spread``, standard deviation of
-        the slopes of vehicles without a fault; empty if the method has no reference. [1]
-    left_out_reasons : mapping of str to int
-        Vehicles left out, by reason; the most frequent ones.
-    moved_sensors : int
-        Sensors that have changed since the earlier result of ``calibrate --since``.
+    Returns
+    -------
+    dict
+        Numbers of vehicles with parameters and without (``vehicles``, ``left_out``), per verdict, of those that are
+        corrected, and of those in which a hardware fault is suspected (None if the method cannot see one); of sensors
+        with a fault, of those of them that are corrected, of others by reason (``held_back``), and of those that
+        changed since the earlier result of ``calibrate --since``. The Kirchhoff sum per vehicle before and after what
+        is applied [A], the load that no branch measures [A], length of the drives [h] and delay of each branch [ms],
+        as median and the values between which the middle 90 % lie; of the ``reference`` by branch the share of the
+        vehicles that agree, and the spread of their slopes [1]; the most frequent reasons of vehicles left out.
     """
-
-    vehicles: int
-    left_out: int
-    verdicts: Mapping[str, int]
-    corrected: int
-    hardware_suspected: int | None
-    faulty_sensors: int
-    applied_sensors: int
-    held_back: Mapping[str, int]
-    junction_measured_a: Quantiles
-    junction_deployed_a: Quantiles
-    unmeasured_a: float | None
-    duration_h: Quantiles
-    delay_ms: Mapping[str, Quantiles]
-    reference: Mapping[str, Mapping[str, float | None]]
-    left_out_reasons: Mapping[str, int]
-    moved_sensors: int
-
-
-def overview_of(table: FleetTable) -> Overview:
-    """Count and summarise a result."""
     reference = table.run.details.get("reference", {})
     spread = table.run.details.get("hyperparameters", {}).get("model_spread", {})
     agreeing = reference.get("agreeing_share", {})
     held_back, faulty, suspected = table["held_back"], table.faulty, table.of_vehicles("hardware_fault")
     seen = suspected.any() or np.isfinite(table.of_vehicles("hardware_probability")).any()
-    return Overview(
-        vehicles=len(table),
-        left_out=len(table.left_out),
-        verdicts=dict(Counter(table.of_vehicles("verdict").tolist()).most_common()),
-        corrected=int(table.corrected.sum()),
-        hardware_suspected=int(suspected.sum()) if seen else None,
-        faulty_sensors=int(faulty.sum()),
-        applied_sensors=int((faulty & table["applied"]).sum()),
-        held_back=dict(Counter(held_back[held_back.astype(bool)].tolist()).most_common()),
-        junction_measured_a=_spread(table.of_vehicles("junction_rms_measured_a")),
-        junction_deployed_a=_spread(table.deployed_a),
-        unmeasured_a=reference.get("unmeasured_a"),
-        duration_h=_spread(table.of_vehicles("duration_s") / 3600.0),
-        delay_ms={
+    return {
+        "vehicles": len(table),
+        "left_out": len(table.left_out),
+        "verdicts": dict(Counter(table.of_vehicles("verdict").tolist()).most_common()),
+        "corrected": int(table.corrected.sum()),
+        "hardware_suspected": int(suspected.sum()) if seen else None,
+        "faulty_sensors": int(faulty.sum()),
+        "applied_sensors": int((faulty & table["applied"]).sum()),
+        "held_back": dict(Counter(held_back[held_back.astype(bool)].tolist()).most_common()),
+        "junction_measured_a": _spread(table.of_vehicles("junction_rms_measured_a")),
+        "junction_deployed_a": _spread(table.deployed_a),
+        "unmeasured_a": reference.get("unmeasured_a"),
+        "duration_h": _spread(table.of_vehicles("duration_s") / 3600.0),
+        "delay_ms": {
             name: _spread(1e3 * delay_s)
             for name, delay_s in zip(table.branches, table["delay_s"].T, strict=True)
             if np.isfinite(delay_s).any()
         },
-        reference={  # a share of exactly 0 stands for a branch that no vehicle shows
+        "reference": {  # a share of exactly 0 stands for a branch that no vehicle shows
             name: {"agreeing_share": agreeing.get(name) or None, "model_spread": spread.get(name)}
             for name in (table.branches if reference and spread else ())
         },
-        left_out_reasons=dict(Counter(table.left_out.values()).most_common(MOST_REASONS)),
-        moved_sensors=int(table["moved"].astype(bool).sum()),
-    )
+        "left_out_reasons": dict(Counter(table.left_out.values()).most_common(MOST_REASONS)),
+        "moved_sensors": int(table["moved"].astype(bool).sum()),
+    }
 
 
-def _spread(values: Array) -> Quantiles:
+def _spread(values: Array) -> dict[str, float]:
+    """Median, and the values between which the middle 90 % lie; NaN if nothing is known."""
     known = values[np.isfinite(values)]
-    low, middle, high = np.quantile(known, [0.05, 0.5, 0.95]).tolist() if len(known) else (np.nan,) * 3
-    return Quantiles(median=middle, p05=low, p95=high)
+    found = np.quantile(known, [0.5, 0.05, 0.95]).tolist() if len(known) else (np.nan,) * 3
+    return dict(zip(("median", "p05", "p95"), found, strict=True))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class WorkshopRow:
     """What a workshop should look at: which vehicle and branch (empty: the vehicle), cause, probability [1], why."""
 
@@ -163,10 +115,7 @@ def workshop_list(table: FleetTable, files: Mapping[int, ParameterDetails]) -> l
     """
 
     def row(j: int, branch: str | None, cause: str, text: str, value: float) -> WorkshopRow:
-        known = value if math.isfinite(value) else None
-        return WorkshopRow(
-            vehicle=str(table.vehicle[j]), branch=branch or "", cause=cause, probability=known, text=text
-        )
+        return WorkshopRow(str(table.vehicle[j]), branch or "", cause, value if math.isfinite(value) else None, text)
 
     hardware = table.of_vehicles("hardware_probability").tolist()
     rows = [
@@ -232,47 +181,12 @@ def steps_to_take(table: FleetTable, workshop: Sequence[WorkshopRow]) -> list[st
     return steps or ["Nothing: no fault was found, and no question is open."]
 
 
-@dataclass(frozen=True, kw_only=True)
-class BatteryMargin:
-    """What a controller must stay below the battery's limit by, as its sensor can be wrong: figure 1 of the paper.
-
-    Attributes
-    ----------
-    branch : str
-        The battery's.
-    limit_a, voltage_v : float, float or None
-        Current limit, and the voltage that makes kW of A. [A], [V]
-    vehicles, not_known, corrected : int
-        Vehicles of which the sensor is known; others, which are not counted; and of the first those that are corrected.
-    common_before_a, common_after_a, common_gain_a : float
-        One margin for all vehicles, as measured and after correction, and the difference. [A]
-    own_gain_a : float or None
-        What a margin per vehicle gives back: the median of those that are corrected, None if there is none. [A]
-    largest : list of (str, float)
-        Vehicles that keep the common margin large, as they are not corrected, and the margin that each needs. [A]
-    """
-
-    branch: str
-    limit_a: float
-    voltage_v: float | None
-    vehicles: int
-    not_known: int
-    corrected: int
-    common_before_a: float
-    common_after_a: float
-    common_gain_a: float
-    own_gain_a: float | None
-    largest: list[tuple[str, float]]
-
-    def power_kw(self, current_a: float | None) -> float | None:
-        """A current at the voltage; None if one of both is not known. [kW]"""
-        return None if current_a is None or self.voltage_v is None else current_a * self.voltage_v / 1e3
-
-
 def battery_margin(
     table: FleetTable, branch: str, *, limit_a: float | None = None, voltage_v: float | None = None
-) -> BatteryMargin | None:
-    """Find the battery's protection margin; docs/report.md derives it.
+) -> dict[str, Any] | None:
+    """Find what a controller must stay below the battery's limit by, as its sensor can be wrong: figure 1 of the paper.
+
+    docs/report.md derives it.
 
     Parameters
     ----------
@@ -281,12 +195,16 @@ def battery_margin(
     branch : str
         The battery's.
     limit_a, voltage_v : float or None
-        As in :class:`BatteryMargin`; without a limit full scale is taken. [A], [V]
+        Current limit, without one full scale, and the voltage that makes kW of A. [A], [V]
 
     Returns
     -------
-    BatteryMargin or None
-        None if the sensor of no vehicle is known.
+    dict or None
+        Numbers of ``vehicles`` of which the sensor is known, of others, which are not counted, and of the first those
+        that are corrected; one margin for all as measured and after correction, and the difference; what a margin per
+        vehicle gives back, in the median of those corrected (None if there is none); the ``largest``: vehicles that
+        keep the common margin large, as they are not corrected, and the margin that each needs [A]. None if the sensor
+        of no vehicle is known.
     """
     k, limit_a = table.branches.index(branch), limit_a or table.run.full_scale_a
     known = np.flatnonzero(~(table.open_gain | table.open_offset)[:, k])
@@ -298,19 +216,19 @@ def battery_margin(
     after_a = unsure_a + np.where(applied, 0.0, error_a)
     before, after = (float(np.quantile(each, QUANTILE, method="higher")) for each in (error_a + unsure_a, after_a))
     order = [i for i in np.argsort(-after_a, kind="stable") if not applied[i] and after_a[i] > after / 2.0]
-    return BatteryMargin(
-        branch=branch,
-        limit_a=limit_a,
-        voltage_v=voltage_v,
-        vehicles=len(known),
-        not_known=len(table) - len(known),
-        corrected=int(applied.sum()),
-        common_before_a=before,
-        common_after_a=after,
-        common_gain_a=before - after,
-        own_gain_a=float(np.median(error_a[applied])) if applied.any() else None,
-        largest=[(str(table.vehicle[known[i]]), float(after_a[i])) for i in order[:MOST_LARGE]],
-    )
+    return {
+        "branch": branch,
+        "limit_a": limit_a,
+        "voltage_v": voltage_v,
+        "vehicles": len(known),
+        "not_known": len(table) - len(known),
+        "corrected": int(applied.sum()),
+        "common_before_a": before,
+        "common_after_a": after,
+        "common_gain_a": before - after,
+        "own_gain_a": float(np.median(error_a[applied])) if applied.any() else None,
+        "largest": [(str(table.vehicle[known[i]]), float(after_a[i])) for i in order[:MOST_LARGE]],
+    }
 
 
 def amperes(value: float | None, *, digits: int = 2, sign: bool = False) -> str:

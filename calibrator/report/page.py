@@ -7,7 +7,6 @@ which ``assets/page.js`` makes tables and figures, with plotly.js from the same 
 import base64
 import gzip
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,9 +25,6 @@ from calibrator.report.fleet_table import Details, FleetTable, read_details, rea
 from calibrator.report.overview import (
     FLEET_CAUSES,
     SIGMAS,
-    BatteryMargin,
-    Overview,
-    WorkshopRow,
     amperes,
     battery_margin,
     overview_of,
@@ -40,14 +36,12 @@ from calibrator.report.overview import (
 from calibrator.terminal.text import counted, few
 from ecu_node.parameters import VehicleParameters, decode_parameters
 
-__all__ = ["FleetReport", "fleet_report", "vehicle_report"]
+__all__ = ["fleet_report", "vehicle_report"]
 
-MOST_BYTES = 9_500_000
-"""Size of a page that a mail and a browser still take well. [byte]"""
-REST_BYTES = 500_000
-"""Of the text and the tables around the data. [byte]"""
 MOST_SENSORS = 300_000
 """Sensors of the vehicles that a page lists one by one: those of 100,000 vehicles with three branches."""
+MOST_DETAILED = 5_000
+"""Vehicles of which a page has explanations and evidence: with them it stays below 10 MB."""
 MOST_WORKSHOP, MOST_MOVED = 500, 200
 """Rows of the lists."""
 BATTERY = "battery"
@@ -65,38 +59,23 @@ DIGITS_OF_VEHICLE = {
 """Decimals of the columns of sensors and of vehicles: what a reader can see."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FleetReport:
-    """Numbers of the page of a fleet."""
-
-    overview: Overview
-    next_steps: list[str]
-    workshop: list[WorkshopRow]
-    protection: BatteryMargin | None
-
-
-def fleet_report(
-    result: Path, *, battery: str | None = None, limit_a: float | None = None, voltage_v: float | None = None
-) -> tuple[str, FleetReport]:
+def fleet_report(result: Path, **options: Any) -> tuple[str, dict[str, Any]]:
     """Make the page of a result.
 
     Parameters
     ----------
     result : Path
         Folder that ``calibrator calibrate`` wrote.
-    battery : str or None
-        Branch of the battery; None: :data:`BATTERY`.
-    limit_a : float or None
-        Its current limit; None: full scale. [A]
-    voltage_v : float or None
-        Its voltage; None: the margin is given in A alone. [V]
+    **options
+        ``battery``, branch of the battery (without it :data:`BATTERY`); ``limit_a``, its current limit (full scale);
+        ``voltage_v``, its voltage (the margin is given in A alone). [A], [V]
 
     Returns
     -------
     page : str
         HTML. A result of one vehicle gives the page of this vehicle.
-    report : FleetReport
-        Its numbers.
+    numbers : dict
+        ``overview``, ``next_steps``, ``workshop`` and ``protection`` of the page.
 
     Raises
     ------
@@ -104,17 +83,10 @@ def fleet_report(
         If the folder is no result, or no branch has this name.
     """
     table = read_fleet_table(result)
-    return _page(table, table, battery, limit_a, voltage_v)
+    return _page(table, table, **options)
 
 
-def vehicle_report(
-    result: Path,
-    vehicle: str,
-    *,
-    battery: str | None = None,
-    limit_a: float | None = None,
-    voltage_v: float | None = None,
-) -> tuple[str, VehicleParameters]:
+def vehicle_report(result: Path, vehicle: str, **options: Any) -> tuple[str, VehicleParameters]:
     """Make the page of one vehicle of a result, with its parameters; FleetError if it is not in it, or left out.
 
     Options as those of :func:`fleet_report`.
@@ -122,12 +94,17 @@ def vehicle_report(
     written = written_of(result, vehicle)
     parameters = decode_parameters(written.text, f"{result}: parameters of {vehicle}")
     table = read_fleet_table(result)
-    return _page(table.only(vehicle), table, battery, limit_a, voltage_v)[0], parameters
+    return _page(table.only(vehicle), table, **options)[0], parameters
 
 
 def _page(
-    table: FleetTable, fleet: FleetTable, battery: str | None, limit_a: float | None, voltage_v: float | None
-) -> tuple[str, FleetReport]:
+    table: FleetTable,
+    fleet: FleetTable,
+    *,
+    battery: str | None = None,
+    limit_a: float | None = None,
+    voltage_v: float | None = None,
+) -> tuple[str, dict[str, Any]]:
     """Write the page of some vehicles: all of a fleet, or one of them; `fleet` is all of the result."""
     branch, protection = battery or BATTERY, None
     no_protection = f"No branch is called {BATTERY!r}; name the battery's with --battery to see its margin."
@@ -142,9 +119,12 @@ def _page(
     listed: NDArray[np.int64] = order[: MOST_SENSORS // len(table.branches)]
     details, overview, alone = read_details(table, listed), overview_of(table), len(table) == 1
     workshop = workshop_list(table, details.files)
-    report = FleetReport(
-        overview=overview, next_steps=steps_to_take(table, workshop), workshop=workshop, protection=protection
-    )
+    numbers = {
+        "overview": overview,
+        "next_steps": steps_to_take(table, workshop),
+        "workshop": workshop,
+        "protection": protection,
+    }
     reasons = dict[str, str](REASONS.items())
     if "reference" not in table.run.details:  # no fleet
         reasons["reference in doubt"] = "only ratios of gains are known"
@@ -153,13 +133,20 @@ def _page(
         {}
         if alone
         else {
-            "junction": junction_figure(*sums_a, expected_a=overview.unmeasured_a),
+            "junction": junction_figure(*sums_a, expected_a=overview["unmeasured_a"]),
             "sensors": sensor_figure(table, details.files),
         }
     )
-    columns = _as_text(msgspec.json.encode(_columns(table, listed, details, reasons)))
-    room = MOST_BYTES - REST_BYTES - len(_plotly()) - len(columns) - len(msgspec.json.encode(figures))
-    count, texts = _details_within(room, table, listed, details)
+    detailed = [
+        {
+            "explanations": details.files[j].explanations,
+            "findings": details.files[j].findings,
+            "delays_ms": (1e3 * table["delay_s"][j]).round().tolist(),
+            "reason": table["reason"][j, 0],
+            "evidence": details.rows[i].round(4).tolist(),
+        }
+        for i, j in enumerate(listed[:MOST_DETAILED].tolist())
+    ]
     facts = {
         "branches": table.branches,
         "alone": alone,
@@ -167,7 +154,6 @@ def _page(
         "fleet_causes": FLEET_CAUSES,
         "evidence": details.names,
         "ratios": sum(not name.startswith(("intercept ", "junction ", "offset ")) for name in details.names),
-        "detailed": count,
         "figures": figures,
     }
     moved = np.argwhere(table["moved"] != "")[:MOST_MOVED].tolist()
@@ -177,7 +163,7 @@ def _page(
         alone=alone,
         table=table,
         listed=len(listed),
-        **vars(report),
+        **numbers,
         most_workshop=MOST_WORKSHOP,
         drawn_limited=bool((table.faulty.sum(axis=0) > MOST_POINTS).any()),
         most_points=MOST_POINTS,
@@ -185,14 +171,18 @@ def _page(
         reasons=reasons,
         left_out=[
             (count, reason, few([name for name, why in table.left_out.items() if why == reason]))
-            for reason, count in overview.left_out_reasons.items()
+            for reason, count in overview["left_out_reasons"].items()
         ],
         no_protection=no_protection,
         sigmas=f"{SIGMAS:g}",
         facts=facts,
-        data={"columns": columns, "details": texts, "plotly": _plotly()},
+        data={
+            "columns": _as_text(msgspec.json.encode(_columns(table, listed, details, reasons))),
+            "details": _as_text(msgspec.json.encode(detailed)),
+            "plotly": _plotly(),
+        },
     )
-    return text, report
+    return text, numbers
 
 
 def _columns(
@@ -221,27 +211,6 @@ def _columns(
             for name, (values, digits) in numbers.items()
         },
     }
-
-
-def _details_within(room: int, table: FleetTable, listed: NDArray[np.int64], details: Details) -> tuple[int, str]:
-    """Explanations, findings, reasons and evidence of as many vehicles as there is room for, the first ones."""
-    count = min(len(listed), max(room, 0) // (3 * len(details.names) + 1))  # a number needs a byte at least
-    delays_ms, rows = (1e3 * table["delay_s"][listed]).round(), np.round(details.rows, 4)
-    while True:
-        found = [
-            {
-                "explanations": details.files[j].explanations,
-                "findings": details.files[j].findings,
-                "delays_ms": delays_ms[i].tolist(),
-                "reason": table["reason"][j, 0],
-                "evidence": rows[i].tolist(),
-            }
-            for i, j in enumerate(listed[:count].tolist())
-        ]
-        text = _as_text(msgspec.json.encode(found))
-        if len(text) <= room or not count:
-            return count, text
-        count = int(0.97 * count * max(room, 0) / len(text))
 
 
 def _as_text(content: bytes) -> str:

@@ -47,7 +47,7 @@ def test_doctor_sees_that_a_charge_at_full_current_stands_still(i3: Path, shared
 def test_end_of_a_charge_has_frames_without_a_value_and_no_error(i3: Path, shared_data: Path) -> None:
     told = examined(i3, shared_data / "bmw_i3_charging" / "2019_Circontrol_end.csv.gz")
     assert told.errors == []
-    assert {item.kind for item in told.findings()} == {"bad frames", "too short", "mean"}
+    assert {item.code for item in told.findings()} == {"bad frames", "too short", "mean"}
     assert "19 of 153 frames (12 %) cannot be used: not available 19" in told.findings("bad frames")[0].text
 
 

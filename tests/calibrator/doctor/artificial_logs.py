@@ -96,12 +96,12 @@ class Told:
     def findings(self, *kinds: str) -> list[SimpleNamespace]:
         """Those of some kinds, or all."""
         found = [SimpleNamespace(**item) for item in self.report["findings"]]
-        return [item for item in found if item.kind in kinds or not kinds]
+        return [item for item in found if item.code in kinds or not kinds]
 
     @property
     def errors(self) -> list[tuple[str, str]]:
         """Kind and subject of each error."""
-        return [(item.kind, item.subject) for item in self.findings() if item.severity == "error"]
+        return [(item.code, item.subject) for item in self.findings() if item.severity == "error"]
 
 
 def examined(layout: Path, *logs: Path) -> Told:

@@ -136,7 +136,7 @@ def test_vehicles_and_branches_are_counted_as_the_report_page_counts_them(
     page = overview_of(read_fleet_table(folder))
     assert report.verdicts == {"corrected": 2, "no sensor fault": 2, "cannot tell": 2}
     assert report.held_back == {"harm limit": 1, "beyond the limits": 1}
-    assert (report.verdicts, report.held_back) == (page.verdicts, page.held_back)
-    assert report.hardware_count == page.hardware_suspected == report.moved_count == 1
+    assert (report.verdicts, report.held_back) == (page["verdicts"], page["held_back"])
+    assert report.hardware_count == page["hardware_suspected"] == report.moved_count == 1
     assert set(report.corrected) == {"V1", "V10"}
     assert np.isfinite(report.junction_rms_deployed_a)

@@ -1,6 +1,6 @@
 import pytest
 
-from calibrator.doctor.words import is_battery, places_of, words_of
+from calibrator.words import is_battery, places_of, words_of
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,12 @@
 """The battery's protection margin, through the report; the limit is full scale, 400 A."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from calibrator.report.overview import SIGMAS, BatteryMargin
+from calibrator.report.overview import SIGMAS
 from calibrator.report.page import fleet_report
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters
@@ -27,14 +28,15 @@ class Margin:
     def __init__(self, folder: Path, database: VehicleDatabase) -> None:
         self.folder, self.database, self.text = folder, database, ""
 
-    def __call__(self, *batteries: BranchParameters, **options: float) -> BatteryMargin | None:
+    def __call__(self, *batteries: BranchParameters, **options: float) -> dict[str, Any] | None:
         number = len(list(self.folder.iterdir()))
         items = [vehicle(self.database, f"V{j}", battery, sensor()) for j, battery in enumerate(batteries, start=1)]
         text, report = fleet_report(write_result(self.folder / str(number), items), **options)  # type: ignore[arg-type]
         self.text = visible(text)
-        return report.protection
+        protection: dict[str, Any] | None = report["protection"]
+        return protection
 
-    def known(self, *batteries: BranchParameters, **options: float) -> BatteryMargin:
+    def known(self, *batteries: BranchParameters, **options: float) -> dict[str, Any]:
         found = self(*batteries, **options)
         assert found is not None
         return found
@@ -42,40 +44,40 @@ class Margin:
 
 def test_sensor_needs_its_error_at_the_limit_and_corrected_its_doubt_alone(margin: Margin) -> None:
     found = margin.known(sensor(0.1, -4.0, apply=True), sensor(0.02, 1.0, apply=True))
-    assert found.common_before_a == pytest.approx(44.0 + DOUBT_A)
-    assert found.common_after_a == pytest.approx(DOUBT_A)
-    assert found.common_gain_a == pytest.approx(44.0)
-    assert found.own_gain_a == pytest.approx((44.0 + 9.0) / 2.0)
-    assert (found.vehicles, found.corrected, found.largest) == (2, 2, [])
+    assert found["common_before_a"] == pytest.approx(44.0 + DOUBT_A)
+    assert found["common_after_a"] == pytest.approx(DOUBT_A)
+    assert found["common_gain_a"] == pytest.approx(44.0)
+    assert found["own_gain_a"] == pytest.approx((44.0 + 9.0) / 2.0)
+    assert (found["vehicles"], found["corrected"], found["largest"]) == (2, 2, [])
     half = margin.known(sensor(0.1, -4.0, apply=True), sensor(), limit_a=200.0)
-    assert half.common_gain_a == pytest.approx(24.0)
+    assert half["common_gain_a"] == pytest.approx(24.0)
 
 
 def test_doubt_of_a_trusted_sensor_counts(margin: Margin) -> None:
     """A gain that is trusted to 0.2 % is wrong by up to 0.8 A and more."""
     found = margin.known(sensor(sd=0.002))
-    assert found.common_before_a == found.common_after_a == pytest.approx(2.0 * DOUBT_A)
+    assert found["common_before_a"] == found["common_after_a"] == pytest.approx(2.0 * DOUBT_A)
     assert f"{2.0 * DOUBT_A:.1f} A margin as measured" in margin.text
 
 
 def test_doubt_gives_nothing_back(margin: Margin) -> None:
     found = margin.known(sensor(0.1, 4.0, sd=0.02), sensor(0.01, 1.0, sd=0.02, apply=True))
-    assert found.common_gain_a == 0.0
-    assert found.own_gain_a == pytest.approx(5.0)
+    assert found["common_gain_a"] == 0.0
+    assert found["own_gain_a"] == pytest.approx(5.0)
 
 
 def test_one_margin_for_all_falls_no_lower_than_the_worst_that_is_not_corrected(margin: Margin) -> None:
     found = margin.known(sensor(0.1, 4.0, apply=True), sensor(0.02, -1.0), sensor())
-    assert found.common_after_a == pytest.approx(9.0 + DOUBT_A)
-    assert [name for name, _ in found.largest] == ["V2"]
+    assert found["common_after_a"] == pytest.approx(9.0 + DOUBT_A)
+    assert [name for name, _ in found["largest"]] == ["V2"]
     assert f"Not corrected, these keep it large: V2 ({9.0 + DOUBT_A:.1f} A)." in margin.text
 
 
 def test_sensor_that_is_not_known_is_not_counted_and_that_is_said(margin: Margin) -> None:
     lost = sensor(0.3, 50.0, sd=0.2)
     found = margin.known(lost, sensor(0.1, 4.0), sensor())
-    assert (found.vehicles, found.not_known) == (2, 1)
-    assert found.common_before_a == pytest.approx(44.0 + DOUBT_A)
+    assert (found["vehicles"], found["not_known"]) == (2, 1)
+    assert found["common_before_a"] == pytest.approx(44.0 + DOUBT_A)
     assert "1 of which the sensor is not known are not counted" in margin.text
     assert margin(lost, lost) is None
     assert "How wrong the battery sensor can be is not known, so no margin follows." in margin.text
@@ -87,10 +89,10 @@ def test_gains_are_told_in_kilowatts_where_the_voltage_is_known(margin: Margin) 
     margin.known(sensor(0.1, 4.0, apply=True), sensor())
     assert "With --voltage the same is given in kW." in margin.text
     none = margin.known(sensor(0.1, 4.0), sensor(), voltage_v=350.0)
-    assert (none.common_gain_a, none.own_gain_a) == (0.0, None)
+    assert (none["common_gain_a"], none["own_gain_a"]) == (0.0, None)
 
 
 def test_of_a_large_fleet_one_in_a_thousand_may_need_more(margin: Margin) -> None:
     usual = [sensor(0.0, 5.0)] * 2998
-    assert margin.known(*usual, sensor(0.0, 300.0)).common_before_a == pytest.approx(5.0 + DOUBT_A)
-    assert margin.known(*usual[:500], sensor(0.0, 300.0)).common_before_a == pytest.approx(300.0 + DOUBT_A)
+    assert margin.known(*usual, sensor(0.0, 300.0))["common_before_a"] == pytest.approx(5.0 + DOUBT_A)
+    assert margin.known(*usual[:500], sensor(0.0, 300.0))["common_before_a"] == pytest.approx(300.0 + DOUBT_A)

@@ -11,6 +11,7 @@ right, come the delays as the calibrator estimates them, and without the delays 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,12 @@ from calibrator.drives.charge import Band, charge_curve
 from calibrator.drives.delay_search import covered
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
+from calibrator.kirchhoff.sums import VOLTAGE
+from calibrator.words import is_battery
+from ecu_node.layout import Layout
 
-__all__ = ["WELL_CORRELATED", "Bands", "JunctionFacts", "branch_bands", "junction_facts", "multiplied", "sag"]
+__all__ = ["WELL_CORRELATED", "Bands", "SumFacts", "bands_of", "look_at_sum", "multiplied", "sag"]
+__all__ += ["likely_multipliers"]
 
 BAND = Band(short_s=0.75, long_s=10.0)
 """Half widths of the averages: several times the delays of real cars, and as long as driving keeps its pace. [s]"""
@@ -34,10 +39,9 @@ FACTORS = (1.0, 1e-1, 1e-2, 1e-3, 1e1, 1e2, 1e3)
 """Slips of units and scales. [1]"""
 LEAST_RATIO = 1e-4
 """V / N below this is as good as nothing: sensors are not better than 1 %. [1]"""
-CHANGE_PRICE = 0.7
-"""Each branch that is changed must halve V / N: its variation must then be above that of the sum's rest. [1]"""
-UNIT_PRICE = 0.3
-"""What a slip of a unit costs beyond a wrong sign: where both explain the same, the sign is wrong. [1]"""
+CHANGE_PRICE, UNIT_PRICE = 0.7, 0.3
+"""Each branch that is changed must halve V / N: its variation must then be above that of the sum's rest. The second is
+what a slip of a unit costs beyond a wrong sign: where both explain the same, the sign is wrong. [1]"""
 PLAUSIBLE_PRICE = 2.0
 """For each branch whose current would be beyond what the layout calls full scale, or almost nothing of it. [1]"""
 ORIENTATION_PRICE = 1.5
@@ -56,21 +60,9 @@ PEAK_QUANTILE = 0.999
 """Of the magnitudes: a few wild samples are no peak. [1]"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Bands:
-    """Comparable currents of the branches of one vehicle.
+class Bands(NamedTuple):
+    """Comparable currents of K branches [A], shape (T, K), positive into the junction, and each instant's block."""
 
-    Attributes
-    ----------
-    branches : tuple of str
-        Names of the K branches.
-    current_a : ndarray of shape (T, K)
-        Band of each current, positive into the junction as the layout has it. [A]
-    block : ndarray of int, shape (T,)
-        Number of the block of time of each instant, from 0 on.
-    """
-
-    branches: tuple[str, ...]
     current_a: Array
     block: NDArray[np.intp]
 
@@ -86,26 +78,12 @@ class Bands:
         return float(np.sqrt(np.mean(total**2))) if len(total) else 0.0
 
 
-def branch_bands(drives: Sequence[Drive], branches: Sequence[str]) -> Bands:
-    """Compute the bands of some branches over all drives of one vehicle.
-
-    Parameters
-    ----------
-    drives : sequence of Drive
-        A drive that lacks one of the branches adds nothing.
-    branches : sequence of str
-        Names of the K branches.
-
-    Returns
-    -------
-    Bands
-        Of no instant where no drive is long enough.
-    """
-    parts, blocks, count = [np.zeros((0, len(branches)))], [np.zeros(0, np.intp)], 0
-    for drive in drives:
-        found = [charge_curve(drive.branches[name]) for name in branches if name in drive.branches]
-        curves = [curve for curve in found if curve is not None]
-        if len(curves) < len(branches):
+def bands_of(recordings: Sequence[Sequence[Channel]]) -> Bands:
+    """Bands of the same K >= 1 channels in some recordings; of no instant where none is long enough."""
+    parts, blocks, count = [np.zeros((0, max(map(len, recordings), default=1)))], [np.zeros(0, np.intp)], 0
+    for channels in recordings:
+        curves = [curve for channel in channels if (curve := charge_curve(channel)) is not None]
+        if len(curves) < len(channels):
             continue
         start_s, stop_s = max(curve.time_s[0] for curve in curves), min(curve.time_s[-1] for curve in curves)
         time_s = np.arange(start_s, max(stop_s, start_s), STEP_S)
@@ -115,13 +93,29 @@ def branch_bands(drives: Sequence[Drive], branches: Sequence[str]) -> Bands:
             parts.append(np.stack([curve.band(time_s, BAND)[0] for curve in curves], axis=1))
             blocks.append(np.asarray(block, np.intp) + count)
             count = int(blocks[-1][-1]) + 1
-    return Bands(branches=tuple(branches), current_a=np.concatenate(parts), block=np.concatenate(blocks))
+    return Bands(np.concatenate(parts), np.concatenate(blocks))
 
 
-def _signs_and_units(moments: Array, price_besides: Callable[[Array], float]) -> Array:
+def likely_multipliers(
+    moments: Array,
+    price_besides: Callable[[Array], float],
+    *,
+    factors: Sequence[float] = FACTORS,
+    is_sure: Callable[[Array, Array, Array, float], bool] = lambda *_: True,
+) -> Array:
     """Multipliers with the least price: the logarithm of V / N, and what else is held against them.
 
-    The search changes one branch, or two at a time, as long as V / N falls by much more than chance.
+    Parameters
+    ----------
+    moments : ndarray of shape (B, K, K)
+        Second moments of B blocks. [A^2]
+    price_besides : callable
+        What is held against multipliers of shape (K,). [1]
+    factors : sequence of float
+        Magnitudes that are tried, of one branch or two at a time. [1]
+    is_sure : callable
+        Whether a change, of multipliers, to others, with these moments, that lowers the price by so much, is none of
+        chance.
     """
 
     def price(multipliers: Array) -> float:
@@ -129,10 +123,10 @@ def _signs_and_units(moments: Array, price_besides: Callable[[Array], float]) ->
 
     best: Array = np.ones(moments.shape[1])
     while True:
-        found = min(_neighbours(best), key=price)
+        found = min(_neighbours(best, factors), key=price)
         fall = price(best) - price(found)
         only_turned = np.array_equal(found, -best)  # of which the sum tells nothing
-        if fall <= 1e-9 or not (only_turned or _is_sure(best, found, moments, fall)):
+        if fall <= 1e-9 or not (only_turned or is_sure(best, found, moments, fall)):
             return best
         best = found
 
@@ -144,10 +138,10 @@ def _ratios(moments: Array, multipliers: Array) -> Array:
     return np.asarray(np.maximum(np.divide(values, power, out=np.ones(len(moments)), where=power > 0.0), LEAST_RATIO))
 
 
-def _neighbours(multipliers: Array) -> Iterator[Array]:
+def _neighbours(multipliers: Array, factors: Sequence[float]) -> Iterator[Array]:
     """Multipliers that differ in one branch or two, and those with all signs turned."""
     yield -multipliers
-    alternatives = [sign * factor for sign, factor in product((1.0, -1.0), FACTORS)]
+    alternatives = [sign * factor for sign, factor in product((1.0, -1.0), factors)]
     for group in combinations(range(len(multipliers)), min(2, len(multipliers))):
         for values in product(alternatives, repeat=len(group)):
             tried = multipliers.copy()
@@ -164,23 +158,19 @@ def _is_sure(before: Array, after: Array, moments: Array, fall: float) -> bool:
     return bool(often or fall > OVERWHELMING)
 
 
+def sag(pairs: Sequence[tuple[Channel, Channel]]) -> float:
+    """Correlation of a battery's currents with its voltages [1]: -1 where these fall under load; 0 if nothing tells."""
+    band = bands_of(pairs).current_a
+    return float(np.corrcoef(band[:, 0], band[:, 1])[0, 1]) if len(band) and np.all(band.std(axis=0) > 0.0) else 0.0
+
+
 def _values(drives: Sequence[Drive], branch: str) -> Array:
     """Good values of a branch over all drives. [A]"""
     channels = [drive.branches[branch] for drive in drives if branch in drive.branches]
     return np.concatenate([np.zeros(0), *(channel.value[channel.good] for channel in channels)])
 
 
-def sag(currents: Sequence[Channel], voltages: Sequence[Channel]) -> float:
-    """Correlation of a battery's currents with its voltages [1]: -1 where these fall under load; 0 if nothing tells."""
-    drives = [
-        Drive(vehicle="", name="", branches={"i": current, "u": voltage}, inputs={})
-        for current, voltage in zip(currents, voltages, strict=True)
-    ]
-    band = branch_bands(drives, ("i", "u")).current_a
-    return float(np.corrcoef(band[:, 0], band[:, 1])[0, 1]) if len(band) and np.all(band.std(axis=0) > 0.0) else 0.0
-
-
-def _orientation(drives: Sequence[Drive], battery: str | None, voltage: str) -> float:
+def _orientation(drives: Sequence[Drive], battery: str | None) -> float:
     """Tell from the battery's voltage whether its current is positive into the junction.
 
     Near 1 if the voltage falls when the current rises, near -1 if it rises; without a voltage that follows the current,
@@ -188,8 +178,8 @@ def _orientation(drives: Sequence[Drive], battery: str | None, voltage: str) -> 
     """
     if battery is None:
         return 0.0
-    both = [drive for drive in drives if battery in drive.branches and voltage in drive.inputs]
-    correlation = sag([drive.branches[battery] for drive in both], [drive.inputs[voltage] for drive in both])
+    both = [drive for drive in drives if battery in drive.branches and VOLTAGE in drive.inputs]
+    correlation = sag([(drive.branches[battery], drive.inputs[VOLTAGE]) for drive in both])
     if abs(correlation) > WELL_CORRELATED:
         return -correlation
     value = _values(drives, battery)
@@ -198,7 +188,7 @@ def _orientation(drives: Sequence[Drive], battery: str | None, voltage: str) -> 
 
 
 @dataclass(frozen=True, kw_only=True)
-class JunctionFacts:
+class SumFacts:
     """What the sum of some branches tells.
 
     Attributes
@@ -230,41 +220,38 @@ class JunctionFacts:
         """Numbers of the branches that are not as the layout has them."""
         return [int(k) for k in np.flatnonzero(self.multipliers != 1.0)]
 
+    def is_small(self, name: str) -> bool:
+        """Whether a branch varies too little beside the greatest for the sum to tell much of it."""
+        right_a = self.rms_a * np.abs(self.multipliers)
+        return bool(right_a[self.branches.index(name)] < SMALL_SHARE * np.max(right_a))
 
-def junction_facts(
-    drives: Sequence[Drive],
-    branches: Sequence[str],
-    *,
-    full_scale_a: float,
-    least_a: float,
-    battery: str | None,
-    voltage: str,
-) -> JunctionFacts:
+
+SMALL_SHARE = 0.05
+"""Of the greatest branch's variation; a smaller branch's gain is drawn to 0 by its noise. [1]"""
+
+
+def look_at_sum(
+    drives: Sequence[Drive], branches: Sequence[str], layout: Layout, *, least_a: float, full_scale_a: float
+) -> SumFacts:
     """Look at the sum of some branches.
 
     Parameters
     ----------
     drives : sequence of Drive
-        Of one vehicle.
+        Of one vehicle, with :data:`VOLTAGE` where it is recorded; one that lacks a branch adds nothing.
     branches : sequence of str
         At least two, with good samples.
-    full_scale_a : float
-        Of the junction. [A]
-    least_a : float
-        A sum that varies by no more than this is right: it is what quantisation leaves. [A]
-    battery : str or None
-        The branch that feeds the others, if it is known.
-    voltage : str
-        Input that is its voltage; drives may lack it.
-
-    Returns
-    -------
-    JunctionFacts
-        What was found.
+    layout : Layout
+        Whose names tell the battery.
+    least_a, full_scale_a : float
+        A sum that varies by no more than the first is right: it is what quantisation leaves. Currents beyond the
+        second, or far below it, are not plausible. [A]
     """
     peaks_a = [np.quantile(np.abs(_values(drives, name)), PEAK_QUANTILE) for name in branches]
     peak_share = np.array(peaks_a) / full_scale_a
-    orientation = _orientation(drives, battery, voltage)
+    battery = next((name for name in branches if is_battery(name, layout.find_branch(name).source)), None)
+    orientation = _orientation(drives, battery)
+    whole = [drive for drive in drives if set(branches) <= drive.branches.keys()]
 
     def price(multipliers: Array) -> float:
         share = np.abs(multipliers) * peak_share
@@ -277,30 +264,30 @@ def junction_facts(
             + ORIENTATION_PRICE * max(-turned * orientation, 0.0)
         )
 
-    def explained() -> Array:
-        ones = np.ones(len(branches))
-        return _signs_and_units(bands.moments, price) if bands.rms_a(ones) > least_a else ones
+    def explained(delays: BranchDelays | None) -> tuple[Bands, Array]:
+        on_time = whole if delays is None else [without_delays(drive, delays.by_branch()) for drive in whole]
+        bands = bands_of([[drive.branches[name] for name in branches] for drive in on_time])
+        if bands.rms_a(np.ones(len(branches))) <= least_a:
+            return bands, np.ones(len(branches))
+        return bands, likely_multipliers(bands.moments, price, is_sure=_is_sure)
 
-    bands, whole = branch_bands(drives, branches), [drive for drive in drives if set(branches) <= drive.branches.keys()]
-    best, delays = explained(), None
-    right = [multiplied(drive, dict(zip(branches, best.tolist(), strict=True))) for drive in whole]
-    power = np.sum((bands.current_a * best) ** 2, axis=0)
-    try:
-        order = [branches[k] for k in np.argsort(-power, kind="stable")]
-        delays = estimate_delays(right, order) if len(bands.block) else None
-        if delays is not None:
-            late_s = delays.by_branch()
-            bands = branch_bands([without_delays(drive, late_s) for drive in whole], branches)
-    except DriveError:
-        delays = None
-    best = explained()
-    return JunctionFacts(
+    (bands, best), delays = explained(None), None
+    if len(bands.block):
+        right = [multiplied(drive, dict(zip(branches, best.tolist(), strict=True))) for drive in whole]
+        order = np.argsort(-np.sum((bands.current_a * best) ** 2, axis=0), kind="stable")
+        try:
+            delays = estimate_delays(right, [branches[k] for k in order])
+        except DriveError:
+            pass
+        else:
+            bands, best = explained(delays)
+    return SumFacts(
         branches=tuple(branches),
         rms_a=np.sqrt(np.mean(bands.current_a**2, axis=0)) if len(bands.block) else np.zeros(len(branches)),
         bands=bands,
         multipliers=best,
         delays=delays,
-        gains={} if delays is None else _gains(bands, best, branches.index(delays.branches[0])),
+        gains={} if delays is None else _gains(bands, best, branches, branches.index(delays.branches[0])),
     )
 
 
@@ -313,7 +300,7 @@ def multiplied(drive: Drive, multipliers: Mapping[str, float]) -> Drive:
     return replace(drive, branches=branches)
 
 
-def _gains(bands: Bands, multipliers: Array, first: int) -> dict[str, tuple[float, float]]:
+def _gains(bands: Bands, multipliers: Array, branches: Sequence[str], first: int) -> dict[str, tuple[float, float]]:
     """Least squares of one branch on the others, standard deviations from blocks left out."""
     moments = bands.moments * np.outer(multipliers, multipliers)
     total, count = moments.sum(axis=0), len(moments)
@@ -323,5 +310,5 @@ def _gains(bands: Bands, multipliers: Array, first: int) -> dict[str, tuple[floa
     cases = np.concatenate([total[None], total - moments])
     ratio = -np.linalg.pinv(cases[:, others][:, :, others]) @ cases[:, others, first, None]
     sd = np.sqrt((count - 1) * np.var(ratio[1:, :, 0], axis=0))
-    found = {bands.branches[k]: (float(ratio[0, j, 0]), float(sd[j])) for j, k in enumerate(others)}
-    return {bands.branches[first]: (1.0, 0.0)} | found
+    found = {branches[k]: (float(ratio[0, j, 0]), float(sd[j])) for j, k in enumerate(others)}
+    return {branches[first]: (1.0, 0.0)} | found

@@ -1,0 +1,57 @@
+"""A finding: one thing that is wrong with a recording, a layout or a vehicle, or worth knowing of it."""
+
+from collections.abc import Iterable
+from enum import StrEnum
+
+import msgspec
+
+__all__ = ["Finding", "Severity", "worst_first"]
+
+
+class Severity(StrEnum):
+    """How much a finding matters."""
+
+    ERROR = "error"
+    """Results would be wrong, or there would be none."""
+    WARNING = "warning"
+    """Results may be worse, or a branch be missing."""
+    HINT = "hint"
+    """Worth knowing; nothing has to be done."""
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One thing that is wrong, or worth knowing.
+
+    Attributes
+    ----------
+    severity : Severity
+        How much it matters.
+    code : str
+        What it is, in a word or two, for programs: ``sign``, ``unit``, ``delay``, ...
+    subject : str
+        Branch, input or log that it is about; ``sum`` for the sum of the currents.
+    text : str
+        What, with its figure.
+    advice : str
+        What to do: which line of the layout to change, where it is the layout; empty if the text says it.
+    number : float or None
+        The figure of the text, in its unit: A, s, or a share or factor of 1.
+    """
+
+    severity: Severity
+    code: str
+    subject: str
+    text: str
+    advice: str = ""
+    number: float | None = None
+
+    @property
+    def line(self) -> str:
+        """The finding as one line, without its severity."""
+        return f"{self.subject}: {self.text}" + (f"; {self.advice}" if self.advice else "")
+
+
+def worst_first(findings: Iterable[Finding]) -> list[Finding]:
+    """Errors, then warnings, then hints, each in the order in which they were found."""
+    order = list(Severity)
+    return sorted(findings, key=lambda each: order.index(each.severity))
