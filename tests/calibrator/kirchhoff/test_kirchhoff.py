@@ -1,7 +1,6 @@
 """Through the command line: the sum of the currents of logs, tables and live buses, before and after."""
 
 import json
-import re
 import signal
 import subprocess
 import threading
@@ -146,9 +145,7 @@ def test_sum_of_a_gain_error_is_told_from_a_constant_and_a_delay(tmp_path: Path)
             assert battery["gain_error"] == pytest.approx(0.03, abs=0.001)
             assert battery["gain_share"] > 0.99
     said = run(*table(tmp_path, battery=late + noise, motor=-MOTOR_A)).stdout
-    assert re.search(
-        r"(battery: its frames are 80 \+- \d+ ms late against motor|motor: .* early against battery)", said
-    )
+    assert "battery: its frames are 80 +- " in said
 
 
 def test_noise_of_a_small_branch_is_not_taken_for_its_gain(tmp_path: Path) -> None:
