@@ -61,7 +61,8 @@ def logs_as_a_whole(facts: Facts) -> Findings:
             )
             yield warning("time", log.name, text, advice, count)
         if report.unfit:
-            yield warning("unfit", log.name, *report.unfit)
+            text, advice = report.unfit
+            yield warning("unfit", log.name, text, advice)
         for number, code, text, advice in (
             (report.disordered, "time", f"of {report.frames:,} frames come with an earlier time stamp than one before "
              "them", f"they are sorted; {nothing}"),

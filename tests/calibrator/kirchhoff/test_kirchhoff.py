@@ -188,12 +188,14 @@ def test_empty_cell_widens_the_band_there_alone(tmp_path: Path) -> None:
 def test_slip_of_sign_or_unit_is_said_with_what_to_do_and_no_gain_error(
     factor: float, told: str, tmp_path: Path
 ) -> None:
-    right = {"battery": MOTOR_A + 5.0 * np.sin(2.0 * TABLE_S), "heater": -5.0 * np.sin(2.0 * TABLE_S)}
-    path, *rest, _, _ = table(tmp_path, **right, motor=-factor * MOTOR_A)  # nothing tells full scale
+    heater = 5.0 * np.sin(2.0 * TABLE_S)
+    path, *rest, _, _ = table(
+        tmp_path, battery=MOTOR_A + heater, heater=-heater, motor=-factor * MOTOR_A
+    )  # nothing tells full scale
     (line,) = [line for line in run(path, *rest).stdout.splitlines() if line.startswith("error")]
     assert line.startswith(told)
     assert "in --branches" in line if factor < 0.0 else "such as 'motor [mA]'" in line
-    right_too = run(*table(tmp_path, **right, motor=-1.2 * MOTOR_A)).stdout
+    right_too = run(*table(tmp_path, battery=MOTOR_A + heater, heater=-heater, motor=-1.2 * MOTOR_A)).stdout
     assert "error:" not in right_too
 
 

@@ -31,7 +31,7 @@ class Margin:
     def __call__(self, *batteries: BranchParameters, **options: float) -> dict[str, Any] | None:
         number = len(list(self.folder.iterdir()))
         items = [vehicle(self.database, f"V{j}", battery, sensor()) for j, battery in enumerate(batteries, start=1)]
-        text, report = fleet_report(write_result(self.folder / str(number), items), **options)  # type: ignore[arg-type]
+        text, report = fleet_report(write_result(self.folder / str(number), items), **options)
         self.text = visible(text)
         protection: dict[str, Any] | None = report["protection"]
         return protection
