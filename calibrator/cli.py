@@ -72,7 +72,7 @@ for function, lines in (
     ),
     (params, ["calibrator params result V001 V002 --out params"]),
     (report, ["calibrator report result --out report.html"]),
-    (export, ["calibrator export result/params/V001.json --layout my_car.toml --format c99 --out c"]),
+    (export, ["calibrator export result/params/V001.json --layout my_car.toml --format c --out hv_calibration.c"]),
     (sign, ["calibrator sign result/params/*.json --key keys/alice.key --out signed"]),
     (revoke, ["calibrator revoke --vehicle V001 --number 1 --why repaired --key keys/alice.key --out V001.revoked"]),
     (simulate, ["calibrator simulate --layout dbc/hv_powertrain.toml --vehicles 40 --currents 3 --out fleet"]),

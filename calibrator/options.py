@@ -23,7 +23,9 @@ class Classifier(StrEnum):
 class ExportFormat(StrEnum):
     """Formats that parameters are taken to."""
 
+    C = "c"
+    HEX = "hex"
+    A2L = "a2l"
     DCM = "dcm"
     CDFX = "cdfx"
     CSV = "csv"
-    C99 = "c99"

@@ -137,8 +137,8 @@ def test_exports_tell_their_files_and_notices(
 ) -> None:
     params = tmp_path / "v1.json"
     write_parameters(parameters_for(database, battery=(0.05, 2.3)), params)
-    out = tmp_path / "c"
-    words = ["export", str(params), "--layout", str(LAYOUT), "--format", "c99", "--output", str(out), "--json"]
+    out = tmp_path / "hv_calibration.c"
+    words = ["export", str(params), "--layout", str(LAYOUT), "--format", "c", "--output", str(out), "--json"]
     assert run_app(app, "calibrator", words) == 0
     printed = capsys.readouterr()
     found = json.loads(printed.out)

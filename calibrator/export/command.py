@@ -1,6 +1,6 @@
-"""``calibrator export``: from parameter files to files of other formats, each written whole or not at all."""
+"""``calibrator export``: from parameter files to one file of another format, written whole or not at all."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -8,12 +8,11 @@ import msgspec
 import typer
 
 from calibrator.errors import ContradictionError, ExportError
-from calibrator.export.c99 import c99_files
-from calibrator.export.cdfx import cdfx_document
 from calibrator.export.checked import Checked, read_checked
+from calibrator.export.core import c_text, find_image, foreign_protection, image_bytes, intel_hex, s_records
 from calibrator.export.csv_table import csv_text
-from calibrator.export.dcm import dcm_text
-from calibrator.files.folders import require_possible_file, require_possible_folder
+from calibrator.export.tool_formats import a2l_text, cdfx_document, dcm_text
+from calibrator.files.folders import require_possible_file
 from calibrator.files.whole_files import made_folder, remove_abandoned, require_own_file, write_files
 from calibrator.options import ExportFormat
 from calibrator.terminal.options import JsonOption, LayoutOption
@@ -23,82 +22,76 @@ from ecu_node.database import node_database
 from ecu_node.errors import printable
 from ecu_node.program import say_error, write_output
 
-__all__ = ["export", "exported_files"]
+__all__ = ["export"]
+
+_S_RECORDS = (".s19", ".s28", ".s37", ".srec", ".mot")
 
 
 def export(
-    params: Annotated[list[Path], typer.Argument(help="Parameter file, signed or not; of several vehicles for csv.")],
+    params: Annotated[list[Path], typer.Argument(help="Parameter file; of several vehicles for csv.")],
     layout: LayoutOption,
     format_: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
-    output: Annotated[Path, typer.Option("--output", "--out", help="File to write; for c99 a folder.")],
+    output: Annotated[Path, typer.Option("--output", "--out", help="File to write; *.s19 is S-records for hex.")],
+    elf: Annotated[
+        Path | None, typer.Option("--elf", help="The control unit's linked program, for hex and a2l.")
+    ] = None,
     vehicle: Annotated[str | None, typer.Option("--vehicle", help="Refuse parameters of another vehicle.")] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace files that exist.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Take parameters to other tools, and to control units without Python.
 
-    dcm (DCM 2.0) and cdfx (ASAM CDF 2.0) are for calibration tools, csv is one row per branch, and c99 a header and a
-    source that correct as 'ecu-node run' does as a gateway. Parameters that the node would not apply are refused.
+    For the C core that comes with ecu_node: c is what is compiled with it, hex the calibration of one vehicle to be
+    flashed, a2l tells calibration tools where it stands. dcm (DCM 2.0) and cdfx (ASAM CDF 2.0) are for these tools,
+    csv is one row per branch. Parameters that the node would not apply are refused.
     """
+    if (elf is not None) != (format_ in {ExportFormat.HEX, ExportFormat.A2L}):
+        raise ContradictionError("--elf PROGRAM belongs to --format hex and a2l, which need it, and to no other")
     database = node_database(layout)
     reading = shown(params, "read parameters", len(params), "files") if len(params) > 1 else params
     tables = [read_checked(path, database, vehicle) for path in reading]
-    files = exported_files(tables, format_, output)
-    is_folder = format_ is ExportFormat.C99
-    _require_possible(files, output, is_folder=is_folder, replace=replace)
-    with made_folder(output if is_folder else output.parent):
-        remove_abandoned(files)
-        write_files(files)
-    notices = [text for checked in tables for text in checked.notices()]
+    content = _content(tables, format_, output, elf)
+    require_own_file(output)
+    if output.exists() and not replace and output.read_bytes() != content:
+        raise ExportError(f"{output}: exists; choose another --output, or replace it with --replace")
+    require_possible_file(output)
+    with made_folder(output.parent):
+        remove_abandoned([output])
+        write_files({output: content})
+    notices = []
+    if format_ is ExportFormat.C and (foreign := foreign_protection(database)):
+        notices.append(
+            f"the C core knows the E2E profiles P01 and P02: check {', '.join(foreign)} before hv_forward, and protect "
+            f"them anew after it"
+        )
     if json:
-        write_output(dumps({"format": format_.value, "files": list(map(str, files)), "notices": notices}))
+        write_output(dumps({"format": format_.value, "files": [str(output)], "notices": notices}))
         return
     for text in notices:
         say_error(f"notice: {text}")
-    write_output("\n".join(printable(str(path)) for path in files))
+    write_output(printable(str(output)))
 
 
-def exported_files(tables: Sequence[Checked], format_: ExportFormat, output: Path) -> dict[Path, bytes]:
-    """Make the files of one export.
-
-    Parameters
-    ----------
-    tables : sequence of Checked
-        Parameter files.
-    format_ : ExportFormat
-        What to make of them.
-    output : Path
-        File to write; the folder for C99.
-
-    Returns
-    -------
-    dict of Path to bytes
-        Contents by file.
-
-    Raises
-    ------
-    ContradictionError
-        If a format of one vehicle is given several, or a table the same parameters twice.
-    ExportError
-        If the parameters cannot be written in the format.
-    LayoutError, DatabaseError
-        If the node refuses layout or DBC as a gateway; C99 alone.
-    """
+def _content(tables: Sequence[Checked], format_: ExportFormat, output: Path, elf: Path | None) -> bytes:
     if format_ is ExportFormat.CSV:
         _require_different(tables)
-        return {output: csv_text(tables).encode()}
+        return csv_text(tables).encode()
     if len(tables) != 1:
         raise ContradictionError(
             f"{len(tables)} parameter files: {format_.value} holds one vehicle; call it for each, or use --format csv"
         )
     (checked,) = tables
-    match format_:
-        case ExportFormat.DCM:
-            return {output: dcm_text(checked).encode()}
-        case ExportFormat.CDFX:
-            return {output: cdfx_document(checked)}
-        case ExportFormat.C99:
-            return {output / name: text.encode() for name, text in c99_files(checked).items()}
+    if format_ is ExportFormat.CDFX:
+        return cdfx_document(checked)
+    if format_ is ExportFormat.DCM:
+        return dcm_text(checked).encode()
+    if elf is None:
+        return c_text(checked).encode()
+    image = find_image(elf)
+    if format_ is ExportFormat.A2L:
+        return a2l_text(checked.database, image).encode()
+    write = s_records if output.suffix.lower() in _S_RECORDS else intel_hex
+    return write(image.address, image_bytes(checked, image.order)).encode()
 
 
 def _require_different(tables: Sequence[Checked]) -> None:
@@ -110,15 +103,3 @@ def _require_different(tables: Sequence[Checked]) -> None:
                 f"{printable(checked.name)}: says the same as {printable(other.name)}, so its rows would stand in the "
                 f"table twice; give each parameter set once"
             )
-
-
-def _require_possible(files: Mapping[Path, bytes], output: Path, *, is_folder: bool, replace: bool) -> None:
-    """Refuse, before anything is written, files that hold something else or cannot be made."""
-    for path, content in files.items():
-        require_own_file(path)
-        if path.exists() and not replace and path.read_bytes() != content:
-            raise ExportError(f"{path}: exists; choose another --output, or replace it with --replace")
-    if is_folder:
-        require_possible_folder(output)
-    else:
-        require_possible_file(output)

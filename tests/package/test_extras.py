@@ -52,7 +52,7 @@ def test_calibrator_takes_a_fleet_from_logs_to_reports_and_exports(
     assert "<script>" in (tmp_path / "report.html").read_text()
     calibrator(venv, tmp_path, "report", result, "--vehicle", VEHICLE, "--out", "vehicle.html")
     parameters = result / "params" / f"{VEHICLE}.json"
-    for kind in ("dcm", "cdfx", "csv", "c99"):
+    for kind in ("dcm", "cdfx", "csv", "c"):
         calibrator(venv, tmp_path, "export", parameters, *layout, "--format", kind, "--out", f"out-{kind}")
     calibrator(venv, tmp_path, "layout", "init", car / "hv_powertrain.dbc", "--log", drive, "--out", "guessed.toml")
     assert json.loads(calibrator(venv, tmp_path, "kirchhoff", drive, *layout, "--plot", "x.png", "--json"))["instants"]

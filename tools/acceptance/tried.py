@@ -20,7 +20,7 @@ TESTED = {
     "bad input: one line, the rest goes on": ("test_user_mistakes", "calibrator.test_fleet_commands"),
     "fault table: a test per row": ("ecu_node.test_fault_table", "vcan.test_faults_on_vcan"),
     "parameter files that were tampered with, expired, replayed, of others: refused": ("trust",),
-    "DCM, CDFX, CSV, C99: read back, bit-identical": ("calibrator.export",),
+    "C core, A2L, DCM, CDFX, HEX: read back, flashed, bit-identical": ("calibrator.export",),
     "report: numbers equal results.parquet": ("calibrator.report",),
     "report in Chromium: no console error, filters, keyboard, contrast, no request": ("browser",),
     "documents: links, references, words": ("docs",),

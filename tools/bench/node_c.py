@@ -1,15 +1,13 @@
-"""A gateway in C that does with the bench's frames what the node does: check, correct, seal.
-
-The arithmetic is that of ``calibrator export --format c99``; CRC and counter of E2E profile 1 are beside it.
-"""
+"""A gateway in C that does with the bench's frames what the node does: the C core on SocketCAN."""
 
 import shutil
 import subprocess
 from pathlib import Path
 
+from bench.c_core import CORE
 from bench.node_vehicle import BenchVehicle
-from calibrator.export.c99 import c99_files
 from calibrator.export.checked import Checked
+from calibrator.export.core import c_text
 
 __all__ = ["compile_gateway"]
 
@@ -35,36 +33,17 @@ static int open_bus(const char *name)
     return bind(bus, (struct sockaddr *)&address, sizeof address) < 0 ? -1 : bus;
 }
 
-static uint8_t crc_of(const uint8_t *payload, size_t length) /* profile 1, both bytes of the data identifier */
-{
-    uint8_t bytes[10] = {HV_ID_Pair & 0xFF, HV_ID_Pair >> 8};
-    uint8_t crc = 0;
-    memcpy(bytes + 2, payload + 1, length - 1);
-    for (size_t k = 0; k < length + 1; k++) {
-        crc ^= bytes[k];
-        for (int bit = 0; bit < 8; bit++)
-            crc = (uint8_t)(crc & 0x80 ? crc << 1 ^ 0x1D : crc << 1);
-    }
-    return crc;
-}
-
 int main(int count, char **names)
 {
     int in = count == 3 ? open_bus(names[1]) : -1, out = in < 0 ? -1 : open_bus(names[2]);
-    int expected = -1;
     struct can_frame frame;
+    hv_state_t state;
     if (out < 0)
         return 1;
+    hv_start(&state);
     while (read(in, &frame, sizeof frame) == sizeof frame) {
-        if (frame.can_id == HV_ID_Pair && frame.can_dlc == 8) {
-            int counter = frame.data[1] & 15;
-            int step = (counter - expected + 15) % 15;
-            if (frame.data[0] != crc_of(frame.data, 8) || counter > 14 || (expected >= 0 && step > 2))
-                continue;
-            expected = (counter + 1) % 15;
-            if (hv_rewrite_Pair(frame.data, 8))
-                frame.data[0] = crc_of(frame.data, 8);
-        }
+        if (hv_forward(&hv_layout, &hv_calibration, &state, frame.can_id, frame.data, frame.can_dlc) == HV_HELD_BACK)
+            continue;
         while (write(out, &frame, sizeof frame) != sizeof frame)
             usleep(100);
     }
@@ -89,9 +68,8 @@ def compile_gateway(vehicle: BenchVehicle, folder: Path) -> Path:
         The program: ``gateway CHANNEL_IN CHANNEL_OUT``.
     """
     checked = Checked(name="params", digest="0" * 64, parameters=vehicle.parameters, database=vehicle.database)
-    for name, text in c99_files(checked).items():
-        (folder / name).write_text(text)
+    (folder / "hv_calibration.c").write_text(c_text(checked))
     (folder / "gateway.c").write_text(_MAIN)
-    sources = [folder / "gateway.c", folder / "hv_correction.c"]
-    subprocess.run([shutil.which("gcc") or "gcc", "-O2", *sources, "-o", folder / "gateway"], check=True)
+    sources = [folder / "gateway.c", folder / "hv_calibration.c", CORE / "hv_correction.c"]
+    subprocess.run([shutil.which("gcc") or "gcc", "-O2", f"-I{CORE}", *sources, "-o", folder / "gateway"], check=True)
     return folder / "gateway"

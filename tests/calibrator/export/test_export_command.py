@@ -1,28 +1,29 @@
-"""``calibrator export``: files written whole or not at all, and what is refused with one line."""
+"""``calibrator export``: one file, written whole or not at all, and what is refused with one line."""
 
 import csv
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 from msgspec.structs import replace
-from typer.testing import CliRunner, Result
 
-from calibrator.cli import app
 from calibrator.errors import ContradictionError, ExportError, FleetError
 from calibrator.export.checked import read_checked
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError, UserError
 from ecu_node.layout import file_digest
 from ecu_node.parameters import encode_parameters, write_parameters
-from tests.calibrator.export.exports import MakeDatabase, parameters_for
-from tests.ecu_node.vehicles import LAYOUT
+from tests.calibrator.export.exports import MakeDatabase, export, parameters_for, refused
+from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT
+from tests.trust.signing_steps import full_disk
 
-NAMES = {"dcm": ["v1.dcm"], "cdfx": ["v1.cdfx"], "csv": ["v1.csv"], "c99": ["hv_correction.c", "hv_correction.h"]}
+FORMATS = ("c", "dcm", "cdfx", "csv")
+"""Those that need no compiled program; the others write in the same way."""
 
 
 @pytest.fixture
@@ -33,48 +34,20 @@ def params(database: VehicleDatabase, tmp_path: Path) -> Path:
     return path
 
 
-def export(*arguments: object, layout: Path = LAYOUT) -> Result:
-    return CliRunner().invoke(app, ["export", *map(str, arguments), "--layout", str(layout)])
-
-
-def refused(*arguments: object, layout: Path = LAYOUT) -> UserError:
-    error = export(*arguments, layout=layout).exception
-    assert isinstance(error, UserError)
-    assert "\n" not in str(error)
-    return error
-
-
-@pytest.mark.parametrize("form", NAMES)
-def test_every_format_is_written_where_asked(form: str, params: Path, tmp_path: Path) -> None:
-    out = tmp_path / "new" / ("folder" if form == "c99" else f"v1.{form}")
-    run = export(params, "--format", form, "--output", out)
-    folder = out if form == "c99" else out.parent
-    assert (run.exit_code, run.stderr) == (0, "")
-    assert sorted(path.name for path in folder.iterdir()) == NAMES[form]
-    assert sorted(run.stdout.splitlines()) == sorted(str(folder / name) for name in NAMES[form])
-
-
-@pytest.mark.parametrize("form", NAMES)
-def test_files_that_exist_are_replaced_only_if_asked(form: str, params: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "out"
-    folder.mkdir()
-    there, other = folder / NAMES[form][-1], folder / "other.h"
-    there.write_text("mine")
-    other.write_text("mine")
-    arguments = (params, "--format", form, "--output", folder if form == "c99" else there)
+@pytest.mark.parametrize("form", FORMATS)
+def test_file_is_written_where_asked_and_replaced_only_if_asked(form: str, params: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new" / f"v1.{form}"
+    arguments = (params, "--format", form, "--output", out)
+    for _ in range(2):  # the same again is no error
+        run = export(*arguments)
+        assert (run.exit_code, run.stderr, run.stdout) == (0, "", f"{out}\n")
+    content = out.read_bytes()
+    out.write_text("mine")
     with pytest.raises(ExportError, match="exists; choose another --output, or replace it with --replace"):
         raise refused(*arguments)
-    assert [path.read_text() for path in sorted(folder.iterdir())] == ["mine", "mine"]
+    assert out.read_text() == "mine"
     assert export(*arguments, "--replace").exit_code == 0
-    assert there.read_text() != "mine"
-    assert other.read_text() == "mine"
-
-
-def test_a_folder_is_no_file_and_a_file_is_no_folder(params: Path, tmp_path: Path) -> None:
-    with pytest.raises(FleetError, match="is a folder; name a file in it"):
-        raise refused(params, "--format", "dcm", "--output", tmp_path)
-    with pytest.raises(FleetError, match=r"v1\.json is a file"):
-        raise refused(params, "--format", "c99", "--output", params)
+    assert (out.read_bytes(), len(list(out.parent.iterdir()))) == (content, 1)
 
 
 def test_several_vehicles_are_one_table(database: VehicleDatabase, params: Path, tmp_path: Path) -> None:
@@ -84,45 +57,43 @@ def test_several_vehicles_are_one_table(database: VehicleDatabase, params: Path,
         assert [(row["vehicle"], row["branch"]) for row in csv.DictReader(file)] == [("v1", "battery"), ("v2", "motor")]
 
 
-@pytest.mark.parametrize("form", ["dcm", "cdfx", "c99"])
-def test_several_vehicles_are_refused_where_one_belongs(form: str, params: Path, tmp_path: Path) -> None:
-    with pytest.raises(ContradictionError, match=f"2 parameter files: {form} holds one vehicle; .* --format csv"):
-        raise refused(params, params, "--format", form, "--output", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+def test_contradictions_of_the_command_line_are_refused(params: Path, tmp_path: Path) -> None:
+    out = ("--output", tmp_path / "out")
+    cases = [
+        ((params, params, "--format", "dcm"), "2 parameter files: dcm holds one vehicle; .* --format csv"),
+        ((params, params, "--format", "csv"), r"v1\.json: says the same as v1\.json, .* give each parameter set once"),
+        ((params, "--format", "hex"), "--elf PROGRAM belongs to --format hex and a2l, which need it"),
+        ((params, "--format", "csv", "--elf", params), "--elf PROGRAM belongs to --format hex and a2l"),
+    ]
+    for words, message in cases:
+        with pytest.raises(ContradictionError, match=message):
+            raise refused(*words, *out)
+    assert list(tmp_path.iterdir()) == [params]
 
 
-@pytest.mark.parametrize("form", NAMES)
-def test_parameters_of_another_vehicle_are_refused(form: str, params: Path, tmp_path: Path) -> None:
+def test_parameters_that_do_not_fit_are_refused(params: Path, tmp_path: Path, make_database: MakeDatabase) -> None:
+    more = ("--format", "c", "--output", tmp_path / "out")
     with pytest.raises(ParameterError, match=r"v1\.json: parameters are for vehicle 'v1', this is 'v7'"):
-        raise refused(params, "--format", form, "--output", tmp_path / "out", "--vehicle", "v7")
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("form", NAMES)
-def test_parameters_of_another_layout_are_refused(
-    form: str, params: Path, tmp_path: Path, make_database: MakeDatabase
-) -> None:
-    layout = make_database().layout.path
-    with pytest.raises(
-        ParameterError, match=r"parameters were made with layout hv_powertrain\.toml .*, this is .*small"
-    ):
-        raise refused(params, "--format", form, "--output", tmp_path / "out", layout=layout)
-
-
-def test_no_parameter_file_is_told(tmp_path: Path) -> None:
+        raise refused(params, *more, "--vehicle", "v7")
+    with pytest.raises(ParameterError, match=r"made with layout hv_powertrain\.toml .*, this is .*small"):
+        raise refused(params, *more, layout=make_database().layout.path)
     with pytest.raises(ParameterError, match=r"none\.json: no such parameter file"):
-        raise refused(tmp_path / "none.json", "--format", "dcm", "--output", tmp_path / "out")
-
-
-def test_a_key_that_stands_twice_is_told(params: Path, tmp_path: Path) -> None:
+        raise refused(tmp_path / "none.json", *more)
     params.write_text(params.read_text().replace('"offset_a":', '"offset_a": 1.0, "offset_a":', 1))
     with pytest.raises(ParameterError, match=r"offset_a.* twice"):
-        raise refused(params, "--format", "dcm", "--output", tmp_path / "out")
+        raise refused(params, *more)
+    assert not (tmp_path / "out").exists()
 
 
-def test_the_digest_is_of_what_was_read(
-    params: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_protection_that_the_core_does_not_know_is_told(make_database: MakeDatabase, tmp_path: Path) -> None:
+    layout = SMALL_LAYOUT + '\n[e2e]\nprofile = "P05"\noffset = 4\nmessages = ["Pair"]\n'
+    database = make_database(layout)
+    write_parameters(parameters_for(database, battery=(0.05, 2.3)), tmp_path / "v1.json")
+    run = export(tmp_path / "v1.json", "--format", "c", "--output", tmp_path / "v1.c", layout=database.layout.path)
+    assert run.stderr.startswith("notice: the C core knows the E2E profiles P01 and P02: check Pair before hv_forward")
+
+
+def test_digest_is_of_what_was_read(params: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not of a file that takes its place meanwhile."""
     digest, decode = file_digest(params), msgspec.json.decode
     other = encode_parameters(parameters_for(database, battery=(0.3, 0.0)), "other")
@@ -149,3 +120,21 @@ def test_names_that_are_no_text_are_written_escaped(database: VehicleDatabase, t
         check=False,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, f"{tmp_path}/o\\udcff.csv\n", "")
+
+
+def test_full_disk_names_the_file_and_leaves_nothing(params: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "folder" / "v1.c"
+    with full_disk(200):
+        error = refused(params, "--format", "c", "--output", out)
+    assert str(error) == f"{out}: cannot be written: File too large"
+    assert list(tmp_path.iterdir()) == [params]
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo, lambda path: path.symlink_to("target")])
+def test_what_is_no_file_is_not_replaced(make: Callable[[Path], object], params: Path, tmp_path: Path) -> None:
+    make(tmp_path / "out.csv")
+    before = (tmp_path / "out.csv").lstat()
+    error = refused(params, "--format", "csv", "--output", tmp_path / "out.csv", "--replace")
+    assert isinstance(error, FleetError | UserError)
+    assert str(error).startswith(f"{tmp_path}/out.csv: is ")
+    assert (tmp_path / "out.csv").lstat() == before

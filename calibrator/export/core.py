@@ -1,0 +1,402 @@
+"""Data of the C core (``ecu_node/c/hv_correction.h``): the layout that is compiled, the calibration that is flashed.
+
+The calibration holds the node's own integer plans, each multiplied so that all have 58 bits below one code: the same
+results, bit by bit, and one conversion for all gains. It is written as a C struct, or as its image at the address of
+``hv_calibration`` in a compiled program, in Intel HEX or Motorola S-records.
+"""
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from cantools.database.can import Message
+from elftools.common.exceptions import ELFError
+from elftools.elf.elffile import ELFFile
+from elftools.elf.sections import SymbolTableSection
+
+from calibrator.errors import ExportError
+from calibrator.export.checked import Checked
+from ecu_node.bus.guard import Mode, key_of, received, rewritten
+from ecu_node.bus.in_force import InForce, branch_signals
+from ecu_node.bus.wiring import wire
+from ecu_node.core.correction import SensorFault, correction_plan
+from ecu_node.core.signals import BitPlace, Codes, PlacedSignal, placed_signal, writable_range
+from ecu_node.database import VehicleDatabase
+from ecu_node.layout import Branch, ProfileP01, ProfileP02
+
+__all__ = [
+    "FRACTION_BITS",
+    "BranchValues",
+    "Image",
+    "branch_values",
+    "c_text",
+    "find_image",
+    "foreign_protection",
+    "image_bytes",
+    "intel_hex",
+    "s_records",
+    "scaled_plan",
+]
+
+FRACTION_BITS = 58
+"""SHIFT of the core."""
+_BRANCHES, _DATA_IDS = 16, 16
+_SYMBOL = "hv_calibration"
+_LEAST, _GREATEST = -(1 << 63), (1 << 63) - 1
+_WIDE = 1 << 127
+
+
+class BranchValues(NamedTuple):
+    """What is flashed of one branch, in the order of ``hv_values_t``; see there."""
+
+    gain: int
+    voltage_gain: int
+    bias: int
+    fraction: int
+    applied: int
+
+
+_PASSED = BranchValues(1 << FRACTION_BITS, 0, 0, 1 << (FRACTION_BITS - 1), 0)
+"""Of a branch that is passed through."""
+_VALUES = "qqqQQ"
+_BYTES = struct.calcsize(f"<QQ{_BRANCHES * _VALUES}")
+
+
+def branch_values(database: VehicleDatabase, branch: Branch, fault: SensorFault) -> BranchValues:
+    """What the core needs to correct a branch as the node does as a gateway.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        Layout and DBC.
+    branch : Branch
+        A branch of the layout.
+    fault : SensorFault
+        What is corrected.
+
+    Returns
+    -------
+    BranchValues
+        The node's integer plan, of the same results for every code.
+
+    Raises
+    ------
+    ExportError
+        If the core's integers are too small for them.
+    """
+    found, signals = scaled_plan(database, branch, fault), branch_signals(database, branch, Mode.GATEWAY)
+    codes = [signals.source.lowest, signals.source.highest] if fault.applied else []
+    voltages = (
+        [signals.voltage.lowest, signals.voltage.highest] if fault.applied and signals.voltage is not None else []
+    )
+    largest = abs(found.gain) * max(map(abs, codes), default=0) + ((abs(found.bias) + 1) << FRACTION_BITS)
+    largest += abs(found.voltage_gain) * max(map(abs, voltages), default=0)
+    if largest >= _WIDE or not all(_LEAST <= number <= _GREATEST for number in (*codes, *voltages, *found[:3])):
+        raise _too_large(branch, signals.source)
+    return found
+
+
+def scaled_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault) -> BranchValues:
+    """The same, though the numbers may be larger than the core's integers."""
+    if not fault.applied:
+        return _PASSED
+    signals = branch_signals(database, branch, Mode.GATEWAY)
+    plan = correction_plan(signals, fault)
+    up = FRACTION_BITS - plan.shift
+    if up < 0:
+        raise _too_large(branch, signals.source)
+    bias, fraction = divmod((plan.bias << up) + (1 << (FRACTION_BITS - 1)), 1 << FRACTION_BITS)
+    return BranchValues(plan.gain << up, plan.voltage_gain << up, bias, fraction, 1)
+
+
+def _too_large(branch: Branch, codes: Codes) -> ExportError:
+    return ExportError(
+        f"branch {branch.name}: signal {branch.source} has {codes.place.length} bits, and its correction does not fit "
+        f"into the C core, which has {FRACTION_BITS} bits below one code and gains below {1 << (63 - FRACTION_BITS)}; "
+        f"give the signal its true range in the DBC"
+    )
+
+
+def image_bytes(checked: Checked, order: Literal["little", "big"]) -> bytes:
+    """The calibration as it stands in the memory of a control unit.
+
+    Parameters
+    ----------
+    checked : Checked
+        The parameter file.
+    order : "little" or "big"
+        Byte order of the control unit.
+
+    Raises
+    ------
+    LayoutError, DatabaseError
+        If the node refuses layout or DBC as a gateway.
+    ExportError
+        As :func:`branch_values`.
+    """
+    values = [number for item in _all_values(checked) for number in item]
+    head = (_layout_digest(checked.database), checked.parameters.number)
+    mark = "<" if order == "little" else ">"
+    used = struct.pack(f"{mark}QQ{len(values) // len(_VALUES) * _VALUES}", *head, *values)
+    return used.ljust(_BYTES, b"\0")
+
+
+def _all_values(checked: Checked) -> list[BranchValues]:
+    """Of the branches of the layout, in its order."""
+    database = checked.database
+    wire(database, InForce(parameters=checked.parameters), start_s=0.0, mode=Mode.GATEWAY)
+    return [branch_values(database, branch, checked.fault(branch.name)) for branch in database.layout.branch]
+
+
+def _layout_digest(database: VehicleDatabase) -> int:
+    """What ties a calibration to its layout; 1 is the version of the core's structs."""
+    text = f"1 {database.layout.digest} {database.digest}"
+    return int.from_bytes(sha256(text.encode()).digest()[:8])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Image:
+    """Where the calibration stands in a compiled program."""
+
+    address: int
+    order: Literal["little", "big"]
+
+
+def find_image(elf: Path) -> Image:
+    """Find the calibration in a compiled program.
+
+    Parameters
+    ----------
+    elf : Path
+        ELF file with symbols, linked with the core and a calibration.
+
+    Returns
+    -------
+    Image
+        Address and byte order.
+
+    Raises
+    ------
+    ExportError
+        If it cannot be read, or has no calibration of this core.
+    """
+    try:
+        with elf.open("rb") as file:
+            program = ELFFile(file)
+            table = program.get_section_by_name(".symtab")
+            symbols = (table.get_symbol_by_name(_SYMBOL) or []) if isinstance(table, SymbolTableSection) else []
+            found = [(symbol["st_value"], symbol["st_size"]) for symbol in symbols if symbol["st_size"]]
+            order: Literal["little", "big"] = "little" if program.little_endian else "big"
+    except OSError as error:
+        raise ExportError(f"{elf}: cannot be read: {error.strerror}; name the linked program (ELF)") from None
+    except ELFError as error:
+        raise ExportError(f"{elf}: not an ELF file: {error}; name the linked program") from None
+    if len(found) != 1:
+        raise ExportError(
+            f"{elf}: has no symbol {_SYMBOL}; link the core with a calibration ('--format c'), and do not strip it"
+        )
+    ((address, size),) = found
+    if size != _BYTES:
+        raise ExportError(
+            f"{elf}: {_SYMBOL} has {size} bytes, and {_BYTES} are expected; compile it with the hv_correction.h of "
+            f"this version"
+        )
+    return Image(address=address, order=order)
+
+
+_RECORD_BYTES = 32
+
+
+def _chunks(address: int, data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Parts of the data that do not cross a boundary of 32 bytes, so none of 64 KiB either."""
+    if address + len(data) > 1 << 32:
+        raise ExportError(f"{_SYMBOL} stands at 0x{address:X}; HEX and S-records reach to 0xFFFFFFFF, link it below")
+    start = 0
+    while start < len(data):
+        end = start + _RECORD_BYTES - (address + start) % _RECORD_BYTES
+        yield address + start, data[start:end]
+        start = end
+
+
+def intel_hex(address: int, data: bytes) -> str:
+    """Data at an address as Intel HEX."""
+
+    def record(kind: int, at: int, content: bytes) -> str:
+        line = bytes([len(content)]) + at.to_bytes(2) + bytes([kind]) + content
+        return f":{line.hex()}{-sum(line) & 0xFF:02x}".upper()
+
+    lines, above = [], None
+    for at, content in _chunks(address, data):
+        if at >> 16 != above:
+            above = at >> 16
+            lines.append(record(4, 0, above.to_bytes(2)))
+        lines.append(record(0, at & 0xFFFF, content))
+    return "\n".join([*lines, record(1, 0, b""), ""])
+
+
+def s_records(address: int, data: bytes) -> str:
+    """Data at an address as Motorola S-records, of the smallest kind that reaches it: S19, S28 or S37."""
+    size = max(2, ((address + len(data)).bit_length() + 7) // 8)
+
+    def record(kind: int, at: int, content: bytes) -> str:
+        line = at.to_bytes(size if kind else 2) + content
+        line = bytes([len(line) + 1]) + line
+        return f"S{kind}{line.hex()}{~sum(line) & 0xFF:02x}".upper()
+
+    lines = [record(size - 1, *chunk) for chunk in _chunks(address, data)]
+    return "\n".join([record(0, 0, b"HV"), *lines, record(11 - size, 0, b""), ""])
+
+
+def foreign_protection(database: VehicleDatabase) -> list[str]:
+    """Names of the messages whose protection the core does not know."""
+    entries = {message.name: database.layout.protection(message.name) for message in received(database).values()}
+    return [name for name, entry in entries.items() if not isinstance(entry, ProfileP01 | ProfileP02 | None)]
+
+
+def c_text(checked: Checked) -> str:
+    """Layout and calibration as C, to be compiled with the core.
+
+    Parameters
+    ----------
+    checked : Checked
+        The parameter file.
+
+    Returns
+    -------
+    str
+        One source file, ASCII.
+
+    Raises
+    ------
+    LayoutError, DatabaseError, ExportError
+        As :func:`image_bytes`.
+    """
+    database = checked.database
+    values = _all_values(checked)
+    messages, carriers = received(database), rewritten(database)
+    numbers = {key: number for number, key in enumerate(messages)}
+    tables: list[str] = []
+    branches: list[str] = []
+
+    def number_of(signal: str) -> int:
+        return numbers[key_of(database.signal(signal)[0])]
+
+    for branch in database.layout.branch:
+        signals, name = branch_signals(database, branch, Mode.GATEWAY), f"current_{len(branches)}"
+        current, message, voltage = (
+            _Signal(database, branch.source, signals.source),
+            number_of(branch.source),
+            "0U, NULL",
+        )
+        tables += current.tables(name)
+        if branch.voltage is not None and signals.voltage is not None:
+            read, net = _Signal(database, branch.voltage, signals.voltage), f"voltage_{len(branches)}"
+            tables += [*read.tables(net), f"static const hv_signal_t {net} =", f"    {read.initialiser(net)};"]
+            voltage = f"{number_of(branch.voltage)}U, &{net}"
+        ends = ", ".join(_int(min(end, _GREATEST)) for end in writable_range(signals.target, branch.source))
+        branches.append(
+            f"    {{{message}U, {current.initialiser(name)},\n     {voltage}, {ends}}}, "
+            f"/* {_comment(branch.name)}: {_comment(branch.source)} */"
+        )
+    entries = [_message(database, message, key in carriers) for key, message in messages.items()]
+    unused = [BranchValues(0, 0, 0, 0, 0)] * (_BRANCHES - len(values))
+    names = [*database.layout.branch_names, *["not used"] * len(unused)]
+    rows = [
+        f"        {{{_int(item.gain)}, {_int(item.voltage_gain)}, {_int(item.bias)}, UINT64_C({item.fraction}), "
+        f"{item.applied}U}}, /* {_comment(name)} */"
+        for item, name in zip(values + unused, names, strict=True)
+    ]
+    digest, passes = f"UINT64_C(0x{_layout_digest(database):016X})", database.layout.on_bad_frame == "invalid"
+    return "\n".join(
+        [
+            "/* Written by 'calibrator export'; do not edit. Of hv_correction.h.",
+            *(f" * {key}: {_comment(value)}" for key, value in checked.provenance.items()),
+            " */",
+            '#include "hv_correction.h"',
+            "",
+            *tables,
+            "static const hv_message_t messages[] = {",
+            *entries,
+            "};",
+            "static const hv_branch_t branches[] = {",
+            *branches,
+            "};",
+            "const hv_layout_t hv_layout = {",
+            f"    {digest}, messages, {len(entries)}U, branches, {len(branches)}U, {_bool(passes)}",
+            "};",
+            "const hv_calibration_t hv_calibration = {",
+            f"    {digest}, UINT64_C({checked.parameters.number}), {{",
+            *rows,
+            "    }",
+            "};",
+            "",
+        ]
+    )
+
+
+class _Signal:
+    """A signal of the layout as C."""
+
+    def __init__(self, database: VehicleDatabase, name: str, codes: Codes) -> None:
+        self._placed: PlacedSignal = placed_signal(*database.signal(name))
+        self._codes = codes
+        self._named = sorted(code for code in codes.named if codes.lowest <= code <= min(codes.highest, _GREATEST))
+
+    def tables(self, name: str) -> Iterator[str]:
+        """Arrays that the initialiser refers to."""
+        if self._named:
+            yield f"static const int64_t {name}_named[] = {{{', '.join(map(_int, self._named))}}};"
+        for number, selector in enumerate(self._placed.above):
+            yield f"static const int64_t {name}_{number}[] = {{{', '.join(map(_int, sorted(selector.codes)))}}};"
+        if self._placed.above:
+            yield f"static const hv_selector_t {name}_selectors[] = {{"
+            for number, selector in enumerate(self._placed.above):
+                yield f"    {{{_place(selector.place)}, {name}_{number}, {len(selector.codes)}U}},"
+            yield "};"
+
+    def initialiser(self, name: str) -> str:
+        """Of a ``hv_signal_t``."""
+        above, named = len(self._placed.above), len(self._named)
+        return (
+            f"{{{_place(self._placed.place)}, {f'{name}_selectors' if above else 'NULL'}, {above}U, "
+            f"{_int(self._codes.lowest)}, {_int(min(self._codes.highest, _GREATEST))}, "
+            f"{f'{name}_named' if named else 'NULL'}, {named}U}}"
+        )
+
+
+def _message(database: VehicleDatabase, message: Message, has_branches: bool) -> str:
+    entry = database.layout.protection(message.name)
+    profile, offset, step, data_id = "HV_UNPROTECTED", 0, 0, [0]
+    if isinstance(entry, ProfileP01):
+        profile, offset, step = f"HV_P01_{entry.data_id_mode.upper()}", entry.offset, entry.max_delta_counter
+        data_id = [*entry.data_id.get(message.name, message.frame_id & 0xFFFF).to_bytes(2, "little")]
+    elif isinstance(entry, ProfileP02):
+        profile, step, data_id = "HV_P02", entry.max_delta_counter, entry.data_id_list[message.name]
+    key = key_of(message)
+    identifier = f"0x{key.identifier | (key.extended << 31):X}U"
+    numbers = ", ".join(f"{number}U" for number in data_id + [0] * (_DATA_IDS - len(data_id)))
+    start = f"    {{{identifier}, {profile}, {offset}U, {step}U, {_bool(has_branches)}, {{{numbers}}}}},"
+    return f"{start} /* {_comment(message.name)} */"
+
+
+def _place(place: BitPlace) -> str:
+    is_big = place.order == "big"
+    byte = place.end - 1 if is_big else place.first
+    return f"{{{byte}U, {place.shift}U, {place.length}U, {_bool(is_big)}, {_bool(place.signed)}}}"
+
+
+def _bool(value: bool) -> str:
+    return "true" if value else "false"
+
+
+def _int(number: int) -> str:
+    return "INT64_MIN" if number == _LEAST else f"INT64_C({number})"
+
+
+def _comment(text: str) -> str:
+    """A text that ends or begins no comment."""
+    return json.dumps(text)[1:-1].replace("*/", "*_/").replace("/*", "/_*")

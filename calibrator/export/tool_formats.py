@@ -1,0 +1,345 @@
+"""What calibration tools read: named numbers with unit and range, as DCM 2.0, ASAM CDF 2.0 (``.cdfx``) and A2L.
+
+``HV.BRANCH.gain`` and its like are what is flashed, as the A2L places it; ``HV.BRANCH.drift`` and ``.offset`` say the
+same in physical units, for people, and ``HV.BRANCH.found...`` what was found, corrected or not. Currents are positive
+into the junction.
+"""
+
+import itertools
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import NamedTuple
+
+from calibrator.errors import ExportError
+from calibrator.export.checked import Checked
+from calibrator.export.core import FRACTION_BITS, BranchValues, Image, branch_values, scaled_plan
+from ecu_node import __version__
+from ecu_node.core.correction import NO_FAULT, SensorFault
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import printable
+from ecu_node.layout import Branch
+
+__all__ = ["Characteristic", "a2l_text", "cdfx_document", "characteristics", "dcm_text"]
+
+_FUNCTION = "HV_current_correction"
+_FORBIDDEN = '"\\'
+"""DCM has no agreed way to write these in a text."""
+
+
+class _Field(NamedTuple):
+    """One of :class:`BranchValues`."""
+
+    text: str
+    unit: str
+    bits: int
+    """Below one."""
+    record_layout: str
+    compu_method: str
+
+
+_FIELDS = {
+    "gain": _Field("corrected code per measured code", "-", FRACTION_BITS, "HV.signed", "HV.fixed_point"),
+    "voltage_gain": _Field("corrected code per code of the voltage", "-", FRACTION_BITS, "HV.signed", "HV.fixed_point"),
+    "bias": _Field("added to the code, whole codes", "code", 0, "HV.signed", "HV.code"),
+    "fraction": _Field("added, less than one code", "code", FRACTION_BITS, "HV.unsigned", "HV.fixed_point_code"),
+    "applied": _Field("whether it is corrected", "-", 0, "HV.unsigned", "HV.truth"),
+}
+
+
+def _fields(branch: Branch) -> list[str]:
+    """Those that matter for a branch: a current has no voltage."""
+    return [name for name in _FIELDS if name != "voltage_gain" or branch.voltage is not None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Characteristic:
+    """One number or truth value.
+
+    Attributes
+    ----------
+    name : str
+        Unique; letters, digits, underscores and dots.
+    text : str
+        What it is, in one line of ASCII.
+    branch : str
+        Whose it is; empty for the vehicle.
+    unit : str
+        "-" for a pure number.
+    value : float, int or bool
+        In that unit.
+    """
+
+    name: str
+    text: str
+    branch: str = ""
+    unit: str = "-"
+    value: float | bool
+
+
+def characteristics(checked: Checked) -> list[Characteristic]:
+    """All characteristics of a parameter file, branch by branch.
+
+    Parameters
+    ----------
+    checked : Checked
+        The parameter file.
+
+    Returns
+    -------
+    list of Characteristic
+        First the vehicle's, then by branch, in the order of the layout.
+
+    Raises
+    ------
+    ExportError
+        If a number of the C core is not exact in floating point, in which tools hold it.
+    """
+    found = [
+        Characteristic(name="HV.parameter_set", text="number of the parameter set", value=checked.parameters.number)
+    ]
+    for branch in checked.database.layout.branch:
+        found += _flashed(checked, branch)
+        found += _for_people(checked, branch.name)
+    return found
+
+
+def _flashed(checked: Checked, branch: Branch) -> Iterator[Characteristic]:
+    values = branch_values(checked.database, branch, checked.fault(branch.name))
+    for field in _fields(branch):
+        number, (text, unit, bits, *_) = getattr(values, field), _FIELDS[field]
+        exact = Fraction(number, 1 << bits)
+        value: float | bool = bool(number) if field == "applied" else number if bits == 0 else float(exact)
+        if Fraction(value) != exact:
+            raise ExportError(
+                f"{checked.name}: branch {branch.name}: {field} has more digits than the floating-point numbers of "
+                f"calibration tools; flash it with --format hex"
+            )
+        name = f"HV.{branch.name}.{field}"
+        yield Characteristic(name=name, text=text, branch=branch.name, unit=unit, value=value)
+
+
+def _for_people(checked: Checked, branch: str) -> Iterator[Characteristic]:
+    fault, found = checked.fault(branch), checked.parameters.branches.get(branch)
+    rows: list[tuple[str, str, str, float | None]] = [
+        ("drift", "measured = (1 + drift) * true + offset", "-", fault.drift),
+        ("offset", "offset, positive into the junction", "A", fault.offset_a),
+    ]
+    if found is not None:
+        rows += [
+            ("found.drift", "drift that was found", "-", found.drift),
+            ("found.drift_sd", "its standard deviation", "-", found.drift_sd),
+            ("found.offset", "offset that was found", "A", found.offset_a),
+            ("found.offset_sd", "its standard deviation", "A", found.offset_sd_a),
+            ("found.delay", "how much later than the largest branch it is seen", "s", found.delay_s),
+        ]
+    for name, text, unit, value in rows:
+        if value is not None:
+            yield Characteristic(name=f"HV.{branch}.{name}", text=text, branch=branch, unit=unit, value=value)
+
+
+def _notes(checked: Checked) -> dict[str, str]:
+    """Texts about the whole file, such as the vehicle."""
+    texts = {key: value for key, value in checked.provenance.items() if key != "parameter_set"}
+    for key, value in texts.items():
+        if not value.isprintable() or any(letter in value for letter in _FORBIDDEN):
+            raise ExportError(
+                f"{checked.name}: {key} {value!r} has a quotation mark, a backslash or a control character, which "
+                f"calibration formats cannot hold; rename it, or export CSV"
+            )
+    return texts
+
+
+def dcm_text(checked: Checked) -> str:
+    """Write a parameter file as DCM 2.0, the text format of ETAS and Bosch ("Konservierung").
+
+    Numbers are FESTWERT, texts TEXTSTRING; all belong to one function, whose version is the number of the parameter
+    set. The order of the keywords is that of the grammar ``dcm/DCM_2_0_grammar.g4`` of antlr/grammars-v4.
+
+    Parameters
+    ----------
+    checked : Checked
+        The parameter file.
+
+    Returns
+    -------
+    str
+        The file, lines ended by LF; to be encoded as UTF-8.
+
+    Raises
+    ------
+    ExportError
+        If a text has a character, or a number digits, that the format cannot hold.
+    """
+    notes, number = _notes(checked), checked.parameters.number
+    blocks = [
+        '* encoding="utf-8"\n* Corrections of high-voltage current sensors: true = (measured - offset) / (1 + drift)',
+        "KONSERVIERUNG_FORMAT 2.0",
+        f'FUNKTIONEN\n  FKT {_FUNCTION} "{number}" "correction of high-voltage current sensors"\nEND',
+    ]
+    for key, value in notes.items():
+        blocks.append(f'TEXTSTRING HV.{key}\n  LANGNAME "{key}"\n  FUNKTION {_FUNCTION}\n  TEXT "{value}"\nEND')
+    for item in characteristics(checked):
+        value = str(int(item.value)) if isinstance(item.value, bool) else repr(item.value)
+        blocks.append(
+            f'FESTWERT {item.name}\n  LANGNAME "{item.branch or "vehicle"}: {item.text}"\n  FUNKTION {_FUNCTION}\n'
+            f'  EINHEIT_W "{item.unit}"\n  WERT {value}\nEND'
+        )
+    return "\n\n".join(blocks) + "\n"
+
+
+def cdfx_document(checked: Checked) -> bytes:
+    """Write a parameter file as ASAM CDF 2.0, calibration data as XML.
+
+    Numbers are of category VALUE, truth values BOOLEAN, texts ASCII. Each instance belongs to the feature of its branch
+    and has one entry of history that says where it comes from.
+
+    Parameters
+    ----------
+    checked : Checked
+        The parameter file.
+
+    Returns
+    -------
+    bytes
+        The XML document, UTF-8.
+
+    Raises
+    ------
+    ExportError
+        As :func:`dcm_text`.
+    """
+    notes, known, number = _notes(checked), checked.provenance, checked.parameters.number
+
+    def add(parent: ET.Element, path: str, text: str | None = None) -> ET.Element:
+        for tag in path.split("/"):
+            parent = ET.SubElement(parent, tag)
+        parent.text = text
+        return parent
+
+    root = ET.Element("MSRSW", {"CREATOR": "calibrator", "CREATOR-VERSION": __version__})
+    add(root, "SHORT-NAME", _FUNCTION)
+    add(root, "CATEGORY", "CDF20")
+    system = add(root, "SW-SYSTEMS/SW-SYSTEM")
+    add(system, "SHORT-NAME", printable(checked.database.layout.name))
+    tree = add(system, "SW-INSTANCE-SPEC/SW-INSTANCE-TREE")
+    add(tree, "SHORT-NAME", known["vehicle"])
+    add(tree, "CATEGORY", "NO_VCD")
+    origin = add(tree, "SW-INSTANCE-TREE-ORIGIN")
+    add(origin, "SYMBOLIC-FILE", printable(checked.database.layout.path.name))
+    add(origin, "DATA-FILE", printable(checked.name))
+    collections = add(tree, "SW-CS-COLLECTIONS")
+    for name in ("general", *(f"HV.{branch}" for branch in checked.database.layout.branch_names)):
+        collection = add(collections, "SW-CS-COLLECTION")
+        add(collection, "CATEGORY", "FEATURE")
+        add(collection, "SW-FEATURE-REF", name)
+        add(collection, "REVISION", str(number))
+
+    rows: list[tuple[str, str, str, str, str | None, str]] = [
+        (f"HV.{key}", key, "ASCII", "general", None, value) for key, value in notes.items()
+    ]
+    for item in characteristics(checked):
+        is_truth, feature = isinstance(item.value, bool), f"HV.{item.branch}" if item.branch else "general"
+        value, text = (
+            str(item.value).lower() if is_truth else repr(item.value),
+            f"{item.branch or 'vehicle'}: {item.text}",
+        )
+        rows.append((item.name, text, "BOOLEAN" if is_truth else "VALUE", feature, item.unit, value))
+    for name, text, category, feature, unit, value in rows:
+        instance = add(tree, "SW-INSTANCE")
+        add(instance, "SHORT-NAME", name)
+        add(instance, "LONG-NAME", text)
+        add(instance, "CATEGORY", category)
+        add(instance, "SW-FEATURE-REF", feature)
+        container = add(instance, "SW-VALUE-CONT")
+        if unit is not None:
+            add(container, "UNIT-DISPLAY-NAME", unit)
+        add(container, "SW-VALUES-PHYS/V" if category == "VALUE" else "SW-VALUES-PHYS/VT", value)
+        entry = add(instance, "SW-CS-HISTORY/CS-ENTRY")
+        history = {
+            "STATE": "calibrated",
+            "DATE": known["created"],
+            "CSUS": known["tool"],  # user, project, work package, test object, program, data
+            "CSPR": known["fleet"],
+            "CSWP": known["method"],
+            "CSTO": known["vehicle"],
+            "CSPI": known["layout_sha256"],
+            "CSDI": f"{number} {known['parameters_sha256']}",
+            "REMARK/P": f"verdict: {known['verdict']}",
+        }
+        for tag, content in history.items():
+            add(entry, tag, content)
+    ET.indent(root)
+    document: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
+    return document + b"\n"
+
+
+_A2L_HEAD = """\
+ASAP2_VERSION 1 71
+/begin PROJECT HV "correction of high-voltage current sensors"
+  /begin MODULE {function} "calibration of ecu_node/c/hv_correction.c"
+    /begin MOD_COMMON "" BYTE_ORDER {order} ALIGNMENT_INT64 8 /end MOD_COMMON
+    /begin COMPU_METHOD HV.fixed_point "fixed point, {bits} bits below one" RAT_FUNC "%21.18" "-"
+      COEFFS 0 {factor} 0 0 0 1
+    /end COMPU_METHOD
+    /begin COMPU_METHOD HV.fixed_point_code "the same in codes" RAT_FUNC "%21.18" "code"
+      COEFFS 0 {factor} 0 0 0 1
+    /end COMPU_METHOD
+    /begin COMPU_METHOD HV.code "whole codes of the signal" IDENTICAL "%20.0" "code" /end COMPU_METHOD
+    /begin COMPU_METHOD HV.number "a number" IDENTICAL "%20.0" "-" /end COMPU_METHOD
+    /begin COMPU_METHOD HV.truth "whether it is so" TAB_VERB "%1.0" "-" COMPU_TAB_REF HV.truths /end COMPU_METHOD
+    /begin COMPU_VTAB HV.truths "" TAB_VERB 2 0 "false" 1 "true" /end COMPU_VTAB
+    /begin RECORD_LAYOUT HV.signed FNC_VALUES 1 A_INT64 COLUMN_DIR DIRECT /end RECORD_LAYOUT
+    /begin RECORD_LAYOUT HV.unsigned FNC_VALUES 1 A_UINT64 COLUMN_DIR DIRECT /end RECORD_LAYOUT"""
+
+
+def a2l_text(database: VehicleDatabase, image: Image) -> str:
+    """Describe the calibration in a compiled program as A2L (ASAP2 1.7.1), the same for all vehicles of a layout.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        Layout and DBC.
+    image : Image
+        Where the calibration stands.
+
+    Returns
+    -------
+    str
+        The file, ASCII. Limits are those of all parameters that the layout allows.
+
+    Raises
+    ------
+    ExportError
+        If a signal is too wide for the core.
+    """
+    order = "MSB_LAST" if image.order == "little" else "MSB_FIRST"
+    lines = [_A2L_HEAD.format(function=_FUNCTION, order=order, bits=FRACTION_BITS, factor=1 << FRACTION_BITS)]
+
+    def add(name: str, text: str, place: int, field: str, limits: tuple[float, float]) -> None:
+        *_, record_layout, compu_method = _FIELDS.get(field, ("HV.unsigned", "HV.number"))
+        head = f'    /begin CHARACTERISTIC {name} "{text}" VALUE 0x{image.address + 8 * place:X} {record_layout} 0'
+        lines.append(f"{head} {compu_method} {limits[0]} {limits[1]} /end CHARACTERISTIC")
+
+    add("HV.parameter_set", "number of the parameter set", 1, "parameter_set", (0, (1 << 53) - 1))
+    for number, branch in enumerate(database.layout.branch):
+        extremes = _extremes(database, branch)
+        for field in _fields(branch):
+            text, _, bits, *_ = _FIELDS[field]
+            values, limits = [getattr(item, field) for item in extremes], (0.0, 1.0)
+            if field not in {"fraction", "applied"}:
+                slack = 1 << max(0, bits - 30)  # plans between the corners are rounded otherwise
+                ends = max(min(values) - slack, -(1 << 63)), min(max(values) + slack, (1 << 63) - 1)
+                limits = (ends[0] / (1 << bits), ends[1] / (1 << bits))
+            place = 2 + len(_FIELDS) * number + list(_FIELDS).index(field)
+            add(f"HV.{branch.name}.{field}", f"{branch.name}: {text}", place, field, limits)
+    return "\n".join([*lines, "  /end MODULE", "/end PROJECT", ""])
+
+
+def _extremes(database: VehicleDatabase, branch: Branch) -> list[BranchValues]:
+    """Values at the corners of what the layout allows, between which all others lie, and those that correct nothing."""
+    limits = database.layout.limits.drift, database.layout.offset_limit_a
+    corners = itertools.product(*((-limit, limit) for limit in limits))
+    faults = [NO_FAULT, *(SensorFault(drift=drift, offset_a=offset) for drift, offset in corners)]
+    return [scaled_plan(database, branch, fault) for fault in faults]

@@ -1,0 +1,173 @@
+"""DCM, CDFX and CSV as readers find them: values, units, provenance, and texts that a format cannot hold."""
+
+import csv
+import dataclasses
+import logging
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from dcmReader.dcm_reader import DcmReader
+from msgspec.structs import replace
+
+from calibrator.errors import ExportError
+from calibrator.export.checked import Checked
+from calibrator.export.csv_table import csv_text
+from calibrator.export.tool_formats import cdfx_document, dcm_text
+from ecu_node import __version__
+from ecu_node.database import VehicleDatabase
+from tests.calibrator.export.exports import checked_with, held_back, parameters_for
+
+ORDER = {
+    "MSRSW": ["SHORT-NAME", "CATEGORY", "SW-SYSTEMS"],
+    "SW-SYSTEMS": ["SW-SYSTEM"],
+    "SW-SYSTEM": ["SHORT-NAME", "SW-INSTANCE-SPEC"],
+    "SW-INSTANCE-SPEC": ["SW-INSTANCE-TREE"],
+    "SW-INSTANCE-TREE": ["SHORT-NAME", "CATEGORY", "SW-INSTANCE-TREE-ORIGIN", "SW-CS-COLLECTIONS", "SW-INSTANCE"],
+    "SW-INSTANCE-TREE-ORIGIN": ["SYMBOLIC-FILE", "DATA-FILE"],
+    "SW-CS-COLLECTIONS": ["SW-CS-COLLECTION"],
+    "SW-CS-COLLECTION": ["CATEGORY", "SW-FEATURE-REF", "REVISION"],
+    "SW-INSTANCE": ["SHORT-NAME", "LONG-NAME", "CATEGORY", "SW-FEATURE-REF", "SW-VALUE-CONT", "SW-CS-HISTORY"],
+    "SW-VALUE-CONT": ["UNIT-DISPLAY-NAME", "SW-VALUES-PHYS"],
+    "SW-VALUES-PHYS": ["VT", "V"],
+    "SW-CS-HISTORY": ["CS-ENTRY"],
+    "CS-ENTRY": ["STATE", "DATE", "CSUS", "CSPR", "CSWP", "CSTO", "CSPI", "CSDI", "REMARK"],
+    "REMARK": ["P"],
+}
+"""Children of each element that the export writes, in the order of ASAM's DTD ``cdf_v2.0.0.sl.dtd``."""
+VALUES = {
+    "HV.parameter_set": 300.0,
+    "HV.battery.gain": 1 / 1.05,
+    "HV.battery.applied": 1,
+    "HV.battery.drift": 0.05,
+    "HV.battery.offset": -1.23456789012345,
+    "HV.battery.found.drift": 0.05,
+    "HV.battery.found.offset": -1.23456789012345,
+    "HV.motor.gain": 1.0,
+    "HV.motor.bias": 0.0,
+    "HV.motor.fraction": 0.5,
+    "HV.motor.applied": 0,
+    "HV.motor.drift": 0.0,
+    "HV.motor.offset": 0.0,
+    "HV.motor.found.drift": 0.2,
+    "HV.motor.found.drift_sd": 0.01,
+    "HV.motor.found.offset": 7.0,
+    "HV.motor_rear.applied": 0,
+    "HV.motor_rear.drift": 0.0,
+}
+
+
+@pytest.fixture
+def checked(database: VehicleDatabase, tmp_path: Path) -> Checked:
+    """The battery is corrected, the motor held back, of the others nothing is known."""
+    return checked_with(
+        database, held_back(parameters_for(database, battery=(0.05, -1.23456789012345)), "motor"), tmp_path
+    )
+
+
+def renamed(checked: Checked, vehicle: str) -> Checked:
+    return dataclasses.replace(checked, parameters=replace(checked.parameters, vehicle=vehicle))
+
+
+def test_dcm_is_read_back(checked: Checked, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "v1.dcm").write_text(dcm_text(checked), encoding="utf-8")
+    reader = DcmReader()
+    with caplog.at_level(logging.WARNING):
+        reader.read(str(tmp_path / "v1.dcm"))
+    items = {item.name: item for item in reader.get_parameters()}
+    assert {name: items[name].value for name in VALUES} == pytest.approx(VALUES, abs=1e-12)
+    assert items["HV.battery.offset"].value == -1.23456789012345
+    assert [items[f"HV.battery.{name}"].unit for name in ("drift", "offset", "bias")] == ["-", "A", "code"]
+    (function,) = reader.get_functions()
+    assert (function.name, function.version) == ("HV_current_correction", "300")
+    passed_over = [record.getMessage().split("\n")[-1].split()[0] for record in caplog.records]
+    assert passed_over == ["TEXTSTRING", "LANGNAME", "FUNKTION", "TEXT", "END"] * (len(passed_over) // 5)
+
+
+def test_cdfx_is_read_back_in_the_order_of_the_dtd(checked: Checked) -> None:
+    document = ET.fromstring(cdfx_document(checked))
+    for element in document.iter():
+        tags, order = [child.tag for child in element], ORDER.get(element.tag, [])
+        assert tags == sorted(tags, key=order.index), element.tag
+        once = [tag for tag in tags if tag not in {"SW-INSTANCE", "SW-CS-COLLECTION"}]
+        assert len(once) == len(set(once)), element.tag
+    assert document.findtext("CATEGORY") == "CDF20"
+    assert document.attrib == {"CREATOR": "calibrator", "CREATOR-VERSION": __version__}
+    (tree,) = document.iter("SW-INSTANCE-TREE")
+    assert [tree.findtext(tag) for tag in ("SHORT-NAME", "CATEGORY", "*/DATA-FILE")] == ["v1", "NO_VCD", "v1.json"]
+    instances = {item.findtext("SHORT-NAME", ""): item for item in document.iter("SW-INSTANCE")}
+    words = {"true": "1", "false": "0"}
+    found = {
+        name: float(instances[name].findtext(".//V") or words[instances[name].findtext(".//VT", "")]) for name in VALUES
+    }
+    assert found == pytest.approx(VALUES, abs=1e-12)
+    assert instances["HV.battery.offset"].findtext(".//UNIT-DISPLAY-NAME") == "A"
+    declared = {item.findtext("SW-FEATURE-REF") for item in document.iter("SW-CS-COLLECTION")}
+    for item in instances.values():
+        entry = [item.findtext(f".//CS-ENTRY/{tag}") for tag in ("DATE", "CSUS", "CSTO", "CSDI")]
+        assert entry == ["2026-01-01T00:00:00Z", "test", "v1", f"300 {checked.digest}"]
+        assert item.findtext("SW-FEATURE-REF") in declared
+
+
+def test_texts_say_where_it_comes_from(checked: Checked) -> None:
+    checked = renamed(checked, "<Zoë & 1>")
+    wanted = {key: value for key, value in checked.provenance.items() if key != "parameter_set"}
+    form = r'^TEXTSTRING HV\.(\w+)\n  LANGNAME "[^"\n]*"\n  FUNKTION \w+\n  TEXT "([^"\n]*)"\nEND$'
+    assert dict(re.findall(form, dcm_text(checked), flags=re.MULTILINE)) == wanted
+    instances = ET.fromstring(cdfx_document(checked)).iter("SW-INSTANCE")
+    texts = {
+        item.findtext("LONG-NAME"): item.findtext(".//VT") for item in instances if item.findtext("CATEGORY") == "ASCII"
+    }
+    assert texts == wanted
+
+
+@pytest.mark.parametrize("write", [dcm_text, cdfx_document])
+@pytest.mark.parametrize("vehicle", ['a "b"', "a\\b", "a\nb", "a\x01"])
+def test_texts_that_tools_cannot_hold_are_refused(
+    write: Callable[[Checked], object], vehicle: str, checked: Checked
+) -> None:
+    with pytest.raises(ExportError, match=r"^v1\.json: vehicle '.*' has a quotation mark, a backslash or a control"):
+        write(renamed(checked, vehicle))
+
+
+@pytest.mark.parametrize("name", ["a\x01.json", "a\n.json", "a\udcff.json", "<a>&.json"])
+def test_file_of_any_name_gives_a_cdfx_that_can_be_read(name: str, checked: Checked) -> None:
+    document = ET.fromstring(cdfx_document(dataclasses.replace(checked, name=name)))
+    assert document.findtext(".//DATA-FILE") == name.encode("unicode_escape").decode()
+
+
+def rows(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(text.splitlines(keepends=True)))
+
+
+def test_csv_has_a_row_for_each_branch_of_each_vehicle(checked: Checked) -> None:
+    text = csv_text([checked, renamed(checked, 'b, "c"\nd')])
+    assert text.startswith(
+        "vehicle,parameter_set,branch,signal,signal_unit,drift,drift_sd,offset_a,offset_sd_a,applied,"
+    )
+    assert text.count("\r\n") == 5
+    battery, motor, *others = rows(text)
+    assert [battery[name] for name in ("branch", "signal", "signal_unit", "drift", "offset_a", "applied")] == [
+        *("battery", "HV_Battery.BatteryCurrent", "A", "0.05", "-1.23456789012345", "true"),
+    ]
+    assert [motor[name] for name in ("drift", "drift_sd", "offset_sd_a", "applied", "held_back")] == [
+        *("0.2", "0.01", "", "false", "harm limit"),
+    ]
+    assert [(row["vehicle"], row["branch"]) for row in others] == [
+        ('b, "c"\nd', "battery"),
+        ('b, "c"\nd', "motor"),
+    ]
+    assert {name: battery[name] for name in checked.provenance} == checked.provenance
+
+
+@pytest.mark.parametrize("vehicle", ["=1+1", "+cmd|' /C calc'!A0", "-x", "@SUM(A1)", "\t=1", "\r=1"])
+def test_name_that_a_spreadsheet_would_run_is_refused(vehicle: str, checked: Checked) -> None:
+    with pytest.raises(ExportError, match=r"^v1\.json: vehicle ['\"].*['\"] begins as a formula does"):
+        csv_text([renamed(checked, vehicle)])
+
+
+@pytest.mark.parametrize("vehicle", ["-12", "+1", "a=1", "Zoë-1"])
+def test_numbers_and_other_names_are_no_formulas(vehicle: str, checked: Checked) -> None:
+    assert rows(csv_text([renamed(checked, vehicle)]))[0]["vehicle"] == vehicle
