@@ -26,7 +26,6 @@ from ecu_node.trust.commands import add_trust_commands
 if TYPE_CHECKING:
     from ecu_node.database import VehicleDatabase
 
-__all__ = ["main", "template_text"]
 
 _Commands: TypeAlias = "argparse._SubParsersAction[CommandParser]"
 _VEHICLE_VARIABLE = "ECU_NODE_VEHICLE"

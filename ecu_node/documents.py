@@ -1,7 +1,6 @@
 """Files that a user names: read if they are regular and not too large, written whole, and what is wrong in them.
 
-msgspec decides whether a document has the structure that it should have; :func:`field_error` says why not in the words
-of the file's author.
+msgspec decides whether a document has the structure that it should have; :func:`field_error` says where it has not.
 """
 
 import codecs
@@ -10,26 +9,15 @@ import errno
 import hashlib
 import json
 import os
-import re
 import stat
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import msgspec
-
-__all__ = [
-    "UnsuitableFileError",
-    "field_error",
-    "json_error",
-    "read_user_file",
-    "repeated_key",
-    "text_digest",
-    "write_atomically",
-]
 
 
 class UnsuitableFileError(OSError):
@@ -78,6 +66,19 @@ def _require_regular(found: os.stat_result) -> None:
         raise UnsuitableFileError(errno.EINVAL, f"it is {kind}; a file is expected")
 
 
+FileSignature = tuple[int, int, int, int]
+"""Times of change, size and number of a file."""
+
+
+def signature(path: Path) -> FileSignature | None:
+    """Times of change, size and number of a file, which tell whether it was changed; None if there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_ctime_ns, found.st_size, found.st_ino
+
+
 def text_digest(content: bytes) -> str:
     """SHA-256 of a text, the same for LF and CRLF line ends."""
     return hashlib.sha256(content.replace(b"\r\n", b"\n")).hexdigest()
@@ -115,7 +116,7 @@ def field_error(error: Exception, document: Any, schema: Any) -> tuple[list[str]
     list of str
         Where: keys, and names or numbers of entries of lists, such as ``branch``, ``'heater'``, ``timeout_s``.
     str
-        What, such as ``a number is expected, found "x"``.
+        What: in msgspec's words, or which key is missing or unknown, and what was found.
     """
     return _problem(document, schema) or ([], str(error))
 
@@ -128,85 +129,60 @@ def _problem(value: Any, kind: Any) -> tuple[list[str], str] | None:
         why = str(error).partition(" - at `")[0]
     else:
         return None
-    kinds = list(_alternatives(kind))
-    tagged = [config for bare, _ in kinds if (config := getattr(bare, "__struct_config__", None)) and config.tag_field]
-    if tagged and isinstance(value, Mapping) and not any(_is_meant(value, bare) for bare, _ in kinds):
-        key, tags = tagged[0].tag_field, ", ".join(config.tag for config in tagged)
-        found = f"found {value[key]!r}" if key in value else "it is missing"
-        return [key], f"one of {tags} is expected, {found}"
-    for bare, _ in kinds:
-        for step, part, kind_of_part in _parts(value, bare):
+    is_table = isinstance(value, dict)
+    kinds, limits = _alternatives(kind)
+    structs = [one for one in kinds if is_table and isinstance(one, type) and issubclass(one, msgspec.Struct)]
+    if len(structs) > 1:  # told apart by the value of a key
+        key = str(structs[0].__struct_config__.tag_field)
+        by_tag = {str(one.__struct_config__.tag): one for one in structs}
+        if value.get(key) not in by_tag:
+            found = f"found {_shown(value[key])}" if key in value else "it is missing"
+            return [key], f"expected one of {', '.join(by_tag)}, {found}"
+        structs = [by_tag[value[key]]]
+    for one in structs or kinds:
+        for step, part, kind_of_part in _parts(value, one):
             if (inner := _problem(part, kind_of_part)) is not None:
                 return [step, *inner[0]], inner[1]
-    return [], _in_words(why, value, kinds)
+    for struct in structs:
+        tag, fields = struct.__struct_config__.tag_field, msgspec.structs.fields(struct)
+        known = [*([tag] if tag else []), *(field.encode_name for field in fields)]
+        if unknown := [key for key in value if key not in known]:
+            near = difflib.get_close_matches(unknown[0], known, n=1)
+            hint = f"did you mean '{near[0]}'? " if near else ""
+            return [], f"unknown key {unknown[0]!r}; {hint}allowed are {', '.join(known)}"
+        if missing := [field.encode_name for field in fields if field.required and field.encode_name not in value]:
+            return [], f"'{missing[0]}' is missing"
+    expected = why
+    if choices := [repr(choice) for one in kinds if get_origin(one) is Literal for choice in get_args(one)]:
+        expected = f"expected {' or '.join(choices)}"
+    elif isinstance(value, str) and (described := [meta.description for meta in limits if meta.pattern]):
+        expected = f"expected {described[0]}"
+    return [], f"{expected}, found {_shown(value)}"
 
 
-def _alternatives(kind: Any, limits: tuple[msgspec.Meta, ...] = ()) -> Iterator[tuple[Any, tuple[msgspec.Meta, ...]]]:
-    """What a value of some kind may be, each with its limits."""
+def _alternatives(kind: Any) -> tuple[list[Any], list[msgspec.Meta]]:
+    """What a value of some kind may be, and the limits of it."""
     if get_origin(kind) is Annotated:
-        yield from _alternatives(kind.__origin__, (*limits, *kind.__metadata__))
-    elif get_origin(kind) in {Union, UnionType}:
-        for one in get_args(kind):
-            yield from _alternatives(one, limits)
-    else:
-        yield kind, limits
+        kinds, limits = _alternatives(kind.__origin__)
+        return kinds, [*limits, *kind.__metadata__]
+    if get_origin(kind) in {Union, UnionType}:
+        each = [_alternatives(one) for one in get_args(kind)]
+        return [one for kinds, _ in each for one in kinds], [meta for _, limits in each for meta in limits]
+    return [kind], []
 
 
 def _parts(value: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
     """Parts of a table or list: what each is called, what it is, and of which kind it should be."""
     if get_origin(kind) is list and isinstance(value, list):
         for number, part in enumerate(value, start=1):
-            name = part.get("name") if isinstance(part, Mapping) else None
+            name = part.get("name") if isinstance(part, dict) else None
             yield repr(name) if isinstance(name, str) else f"entry number {number}", part, get_args(kind)[0]
-    elif get_origin(kind) is dict and isinstance(value, Mapping):
-        for key, part in value.items():
-            yield key, part, get_args(kind)[1]
-    elif _is_meant(value, kind):
+    elif isinstance(value, dict) and get_origin(kind) is dict:
+        yield from ((key, part, get_args(kind)[1]) for key, part in value.items())
+    elif isinstance(value, dict) and isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         for field in msgspec.structs.fields(kind):
             if field.encode_name in value:
                 yield field.encode_name, value[field.encode_name], field.type
-
-
-def _is_meant(value: Any, kind: Any) -> bool:
-    """Whether a value is a table that is to be this structure: it has its tag, if structures are told apart by one."""
-    if not (isinstance(kind, type) and issubclass(kind, msgspec.Struct) and isinstance(value, Mapping)):
-        return False
-    config = kind.__struct_config__
-    return config.tag_field is None or value.get(config.tag_field) == config.tag
-
-
-_WORDS = {
-    "object": "a table",
-    "array": "a list",
-    "str": "a text",
-    "float": "a number",
-    "int": "a whole number",
-    "bool": "true or false",
-}
-"""What msgspec calls the kinds of values, for authors of files."""
-
-
-def _in_words(why: str, value: Any, kinds: list[tuple[Any, tuple[msgspec.Meta, ...]]]) -> str:
-    """What msgspec says of a value, and what it does not say: names, choices and what a pattern means."""
-    if missing := re.fullmatch("Object missing required field `(.*)`", why):
-        return f"'{missing[1]}' is missing"
-    if unknown := re.fullmatch("Object contains unknown field `(.*)`", why, re.DOTALL):
-        (struct,) = (kind for kind, _ in kinds if _is_meant(value, kind))
-        tag = struct.__struct_config__.tag_field
-        known = [*([tag] if tag else []), *(field.encode_name for field in msgspec.structs.fields(struct))]
-        near = difflib.get_close_matches(unknown[1], known, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
-        return f"unknown key {unknown[1]!r}; {hint}allowed are {', '.join(known)}"
-    expected = why.removeprefix("Expected ").partition(", got")[0]
-    if choices := [repr(one) for kind, _ in kinds if get_origin(kind) is Literal for one in get_args(kind)]:
-        expected = " or ".join(choices)
-    elif " matching regex " in why:
-        expected = next(meta.description for _, limits in kinds for meta in limits if meta.pattern and meta.description)
-    else:
-        for name, words in _WORDS.items():
-            expected = re.sub(rf"\b{name}\b", words, expected)
-        expected = expected.replace("`", "").replace(" | ", " or ")
-    return f"{expected} is expected, found {_shown(value)}"
 
 
 _LONGEST_VALUE = 40
@@ -214,14 +190,10 @@ _LONGEST_VALUE = 40
 
 
 def _shown(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "a table"
-    if isinstance(value, list):
-        return f"a list of {len(value)}"
     text = json.dumps(value, default=str)
     if len(text) <= _LONGEST_VALUE:
         return text
-    return f"{text[:_LONGEST_VALUE]}..." + (f" ({len(value)} characters)" if isinstance(value, str) else "")
+    return f"{text[:_LONGEST_VALUE]}... ({len(text)} characters)"
 
 
 def json_error(error: Exception, content: bytes) -> str:

@@ -23,27 +23,6 @@ from ecu_node.errors import UserError, printable
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-__all__ = [
-    "DEBUG_HINT",
-    "FAILED",
-    "INTERNAL_ERROR",
-    "INTERRUPTED",
-    "CommandParser",
-    "drop_output",
-    "end_of",
-    "ending_at_interrupt",
-    "fitted",
-    "flush_output",
-    "load_python_can",
-    "run_program",
-    "say_error",
-    "split_debug",
-    "wrapped",
-    "write_output",
-    "write_result",
-    "write_text",
-]
-
 
 _MORE_INDENT = 4
 """Columns by which what follows of a line stands farther right than its beginning."""

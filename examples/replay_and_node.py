@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 from calibrator.cli import app
 from calibrator.recordings.frames import read_frames
-from ecu_node.bus.in_force import choose_parameters
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import choose_parameters, wire
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 

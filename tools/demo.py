@@ -30,11 +30,9 @@ from calibrator.recordings.live import play_frames
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import progress_bar
 from ecu_node.bus.adapters import open_bus
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.in_force import choose_parameters
 from ecu_node.bus.node import OverlayNode
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import Mode, choose_parameters, wire
 from ecu_node.database import read_database
 from ecu_node.errors import UserError
 from ecu_node.layout import read_layout

@@ -14,9 +14,7 @@ from calibrator.findings import Finding, worst_first
 from calibrator.kirchhoff.findings import Findings, error, hint, sum_findings, times, warning
 from calibrator.summaries.vehicle_summary import LEAST_DURATION_S
 from calibrator.terminal.text import counted, figure
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.in_force import InForce
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.errors import UserError
 
 __all__ = ["CHECKS", "findings_of", "readiness"]

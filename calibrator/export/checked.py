@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from ecu_node.bus.in_force import InForce, sensor_fault
+from ecu_node.bus.wiring import InForce, sensor_fault
 from ecu_node.core.correction import SensorFault
 from ecu_node.database import VehicleDatabase
 from ecu_node.documents import text_digest

@@ -20,9 +20,7 @@ from elftools.elf.sections import SymbolTableSection
 
 from calibrator.errors import ExportError
 from calibrator.export.checked import Checked
-from ecu_node.bus.guard import Mode, key_of, received, rewritten
-from ecu_node.bus.in_force import InForce, branch_signals
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, branch_signals, key_of, received, rewritten, wire
 from ecu_node.core.correction import SensorFault, correction_plan
 from ecu_node.core.signals import BitPlace, Codes, PlacedSignal, placed_signal, writable_range
 from ecu_node.database import VehicleDatabase

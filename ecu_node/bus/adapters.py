@@ -15,25 +15,9 @@ import can
 from can.typechecking import BitTimingDict, BitTimingFdDict, CanFilter
 from can.util import load_config
 
-from ecu_node.bus.guard import Mode, needs_fd, received, transmitted
+from ecu_node.bus.wiring import Mode, needs_fd, received, transmitted
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
-
-__all__ = [
-    "Settings",
-    "acknowledgement",
-    "bus_config",
-    "carries_fd",
-    "config_text",
-    "connect",
-    "error_text",
-    "is_interface",
-    "open_bus",
-    "receive_filters",
-    "require_fd",
-    "socketcan_socket",
-]
-
 
 _SPEED_SET_ELSEWHERE = frozenset({"serial", "socketcan", "socketcand", "udp_multicast", "virtual"})
 _WITHOUT_ADAPTER = frozenset({"udp_multicast", "virtual"})

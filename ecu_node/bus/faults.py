@@ -17,8 +17,6 @@ from ecu_node.core.status import Reason
 from ecu_node.documents import read_user_file, write_atomically
 from ecu_node.errors import UserError
 
-__all__ = ["Fault", "FaultMemory", "clear_faults", "faults_text", "read_faults"]
-
 _NAME = "faults.json"
 _MOST_FAULTS, _LARGEST_BYTES = 64, 1_000_000
 _LOOK_EVERY_S = 1.0

@@ -15,12 +15,9 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from typing import NamedTuple, Self
 
-from ecu_node.bus.guard import Mode, rewritten, transmitted
+from ecu_node.bus.wiring import Mode, rewritten, transmitted
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError, UserError
-
-__all__ = ["KernelRoutes", "complement", "kernel_routes"]
-
 
 _NEW, _DELETE, _GET = 24, 25, 26
 """RTM_NEWROUTE, RTM_DELROUTE, RTM_GETROUTE."""

@@ -10,19 +10,17 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Required, TypedDict, Unpack
 
 import can
 
-from ecu_node.bus.guard import Mode, rewritten, transmitted
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.telemetry import Latency
+from ecu_node.bus.wiring import Mode, rewritten, transmitted
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Counters
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
-
-__all__ = ["GatewayNode", "OverlayNode", "TimeOfDay", "steady_time_s"]
-
 
 _OLDEST_FRAME_S = 10.0
 """No frame waits for longer, unless the whole process pauses. [s]"""
@@ -62,30 +60,26 @@ class TimeOfDay:
     """
 
     def __init__(self, counters: Counters) -> None:
-        self._counters = counters
-        while (ahead_s := _ahead_s()) is None:
-            pass
-        self._ahead_s = ahead_s
-        self._set_s = float("-inf")
+        self._counters, self._set_s, self._ahead_s = counters, float("-inf"), float("nan")
+        while self._ahead_s != self._ahead_s:
+            self._read()
 
     def ahead_s(self) -> float:
         """By how much it is ahead now [s]; infinity while frames may be waiting that were stamped before it was set."""
-        now_s = time.monotonic()
-        ahead_s = _ahead_s()
-        if ahead_s is None:
-            ahead_s = self._ahead_s
-        if abs(ahead_s - self._ahead_s) > _LARGEST_JITTER_S:
+        before_s = self._ahead_s
+        now_s = self._read()
+        if abs(self._ahead_s - before_s) > _LARGEST_JITTER_S:
             self._set_s = now_s
             self._counters.clock_steps += 1
-        self._ahead_s = ahead_s
-        return ahead_s if now_s - self._set_s > _OLDEST_FRAME_S else float("inf")
+        return self._ahead_s if now_s - self._set_s > _OLDEST_FRAME_S else float("inf")
 
-
-def _ahead_s() -> float | None:
-    """By how much the time of day is ahead [s]; None if the process was held up between reading the two clocks."""
-    before_s = time.monotonic()
-    ahead_s = time.time() - before_s
-    return ahead_s if time.monotonic() - before_s < _LARGEST_JITTER_S else None
+    def _read(self) -> float:
+        """Read both clocks, unless the process was held up in between; the steady one. [s]"""
+        now_s = time.monotonic()
+        ahead_s = time.time() - now_s
+        if time.monotonic() - now_s < _LARGEST_JITTER_S:
+            self._ahead_s = ahead_s
+        return now_s
 
 
 _REMEMBERED = 256
@@ -150,6 +144,17 @@ class _Job:
         self.due_s = in_step_s if in_step_s > now_s else now_s + self.period_s
 
 
+class NodeSettings(TypedDict, total=False):
+    """What both kinds of nodes take by keyword."""
+
+    period_s: Required[float]
+    """Between status messages. [s]"""
+    on_tick: OnTick
+    """Called after each look at the junction."""
+    latency: Latency
+    """Where it is counted how long answers take."""
+
+
 class _Node:
     """What both nodes do: take frames as they come, and in between look, tell the status, and tick.
 
@@ -161,8 +166,8 @@ class _Node:
         Where the sensors are heard, and where the node answers and tells its status.
     own : iterable of tuple
         Identifiers that only this node may send there.
-    corrector, period_s, on_tick, latency :
-        As for :class:`OverlayNode`.
+    corrector : Corrector
+        The core.
     """
 
     def __init__(
@@ -173,8 +178,8 @@ class _Node:
         corrector: Corrector,
         *,
         period_s: float,
-        on_tick: OnTick,
-        latency: Latency | None,
+        on_tick: OnTick = lambda _, __: None,
+        latency: Latency | None = None,
     ) -> None:
         self._heard, self._told, self._own, self._corrector = heard, told, OwnFrames(own), corrector
         self._period_s, self._on_tick, self._latency = period_s, on_tick, latency or Latency()
@@ -285,26 +290,14 @@ class OverlayNode(_Node):
         The core.
     database : VehicleDatabase
         Layout and DBC.
-    period_s : float
-        Between status messages. [s]
-    on_tick : OnTick
-        Called after each look at the junction.
-    latency : Latency, optional
-        Where it is counted how long answers take.
+    **settings : NodeSettings
+        By keyword.
     """
 
     def __init__(
-        self,
-        bus: SteadyBus,
-        corrector: Corrector,
-        database: VehicleDatabase,
-        *,
-        period_s: float,
-        on_tick: OnTick = lambda _, __: None,
-        latency: Latency | None = None,
+        self, bus: SteadyBus, corrector: Corrector, database: VehicleDatabase, **settings: Unpack[NodeSettings]
     ) -> None:
-        own = transmitted(database, Mode.OVERLAY)
-        super().__init__(bus, bus, own, corrector, period_s=period_s, on_tick=on_tick, latency=latency)
+        super().__init__(bus, bus, transmitted(database, Mode.OVERLAY), corrector, **settings)
 
     def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
         """Correct until told to stop.
@@ -368,7 +361,7 @@ class GatewayNode(_Node):
         The bus on which the sensors are.
     vehicle : SteadyBus
         The bus on which the corrected values are needed; the status goes there too.
-    corrector, database, period_s, on_tick, latency :
+    corrector, database, **settings :
         As for :class:`~ecu_node.bus.node.OverlayNode`.
     routed : bool
         Whether the kernel carries all identifiers but those that only the gateway may send to the vehicle.
@@ -381,13 +374,11 @@ class GatewayNode(_Node):
         corrector: Corrector,
         database: VehicleDatabase,
         *,
-        period_s: float,
-        on_tick: OnTick = lambda _, __: None,
         routed: bool = False,
-        latency: Latency | None = None,
+        **settings: Unpack[NodeSettings],
     ) -> None:
         own = transmitted(database, Mode.GATEWAY)
-        super().__init__(sensors, vehicle, own, corrector, period_s=period_s, on_tick=on_tick, latency=latency)
+        super().__init__(sensors, vehicle, own, corrector, **settings)
         self._not_from_vehicle = OwnFrames([*own, *rewritten(database)], _REMEMBERED_COPIES)
         self._routed, self._back_s = routed, float("-inf")
         self._copies: deque[float] = deque(maxlen=_COPIES)

@@ -1,9 +1,14 @@
-"""``ecu-node run``: parameters, core, buses and service put together; ``ecu-node check``: what a run would apply."""
+"""``ecu-node run``: parameters, core, buses and service put together; ``ecu-node check``: what a run would apply.
+
+What else has something to do beside the frames, as the fault memory and the telemetry do, has a method ``look`` and
+stands in the list ``looks`` of :func:`run_node`: it is called every 20 ms, just after the junction was looked at. The
+samples of all branches then stand in ``corrector.watch``: ``instant_s`` and ``currents_a`` (measured and corrected).
+"""
 
 import argparse
 import gc
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -16,31 +21,93 @@ from cantools.database.can import Message
 
 from ecu_node.bus.adapters import acknowledgement, bus_config, carries_fd, config_text, open_bus, require_fd
 from ecu_node.bus.faults import FaultMemory
-from ecu_node.bus.guard import Mode, needs_fd, received, rewritten, transmitted
-from ecu_node.bus.in_force import (
+from ecu_node.bus.kernel_routes import kernel_routes
+from ecu_node.bus.node import GatewayNode, NodeSettings, OverlayNode
+from ecu_node.bus.service import Log, Requests, ServiceManager, be_real_time
+from ecu_node.bus.steady_bus import SteadyBus
+from ecu_node.bus.telemetry import Latency, Telemetry, serve_metrics
+from ecu_node.bus.wiring import (
     InForce,
-    ParameterFile,
-    ParameterSource,
+    Mode,
     branch_plan,
     choose_parameters,
-    not_published,
+    needs_fd,
+    put_in_force,
+    received,
+    rewritten,
     sensor_fault,
+    transmitted,
+    unpublished,
+    wire,
 )
-from ecu_node.bus.kernel_routes import kernel_routes
-from ecu_node.bus.node import GatewayNode, OverlayNode
-from ecu_node.bus.service import Log, Requests, ServiceManager, be_real_time, serve_metrics
-from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.telemetry import Latency, Telemetry
-from ecu_node.bus.wiring import wire
 from ecu_node.core.corrector import OF_ONE_DRIVE, Corrector
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase, node_database
+from ecu_node.documents import signature
 from ecu_node.errors import printable
 from ecu_node.layout import Branch
 from ecu_node.program import write_text
 
-__all__ = ["StateChanges", "check_report", "report_text", "run_node"]
+_LOOK_EVERY_S = 1.0
+"""Between looks whether the parameter file has changed. [s]"""
+
+
+class ParameterSource(Protocol):
+    """Where a running node has its parameters from."""
+
+    in_force: InForce
+    """What the node works with."""
+    why_not: str | None
+    """Why it passes measured values through; None if it has parameters."""
+
+    def look(self, corrector: Corrector, now_s: float, *, asked: bool = False) -> bool:
+        """See whether other parameters are to be in force from now on, and put them; to be called now and then."""
+
+
+class ParameterFile:
+    """Keeps the parameters of a running node up to date: new ones only if they fit, else the ones before stay.
+
+    Parameters
+    ----------
+    path : Path
+        Parameter file.
+    database : VehicleDatabase
+        Layout and DBC in use.
+    vehicle : str or None
+        Identity of the vehicle; None: not checked.
+    mode : Mode
+        Where corrected values go.
+    say : callable
+        Takes one line for the log.
+    """
+
+    def __init__(
+        self, path: Path, database: VehicleDatabase, vehicle: str | None, *, mode: Mode, say: Callable[[str], None]
+    ) -> None:
+        self._path, self._database, self._mode, self._say = path, database, mode, say
+        self._choose = partial(choose_parameters, path, database, vehicle)
+        self._seen, self._due_s = signature(path), float("-inf")
+        self.in_force, self.why_not = self._choose()
+
+    def look(self, corrector: Corrector, now_s: float, *, asked: bool = False) -> bool:
+        """Read the file again if it was changed, or somebody asked; whether new parameters are in force."""
+        if not asked and now_s < self._due_s:
+            return False
+        self._due_s = now_s + _LOOK_EVERY_S
+        before, self._seen = self._seen, signature(self._path)
+        if not asked and before == self._seen:
+            return False
+        in_force, why_not = self._choose()
+        if in_force.parameters is None:
+            corrector.counters.reload_failures += 1
+            self._say(f"new parameters are not used, those before stay in force: {why_not}")
+            return False
+        put_in_force(corrector, self._database, in_force, now_s, mode=self._mode)
+        self.in_force, self.why_not = in_force, None
+        corrector.counters.reloads += 1
+        self._say(f"parameter set {in_force.parameters.number} of vehicle {in_force.parameters.vehicle} is in force")
+        return True
 
 
 _WHY_LATCHED = {
@@ -79,6 +146,43 @@ class StateChanges:
         return "correcting again" if corrects_again else None
 
 
+class _Looks(Protocol):
+    """What has something to do now and then, beside the frames."""
+
+    def look(self, now_s: float) -> None:
+        """Do it if it is due."""
+
+
+@dataclass
+class _Tick:
+    """What is done beside the frames: watchdog, parameters, and a line in the log when the state changes."""
+
+    corrector: Corrector
+    buses: Sequence[SteadyBus]
+    source: ParameterSource
+    looks: Sequence[_Looks]
+    requests: Requests
+    manager: ServiceManager
+    say: Callable[[str], None]
+
+    def __post_init__(self) -> None:
+        self._changes = StateChanges(self.corrector)
+
+    def __call__(self, now_s: float, works: bool) -> None:
+        if works:
+            self.manager.alive(now_s)
+        for bus in self.buses:
+            bus.count_dropped()
+        if self.source.look(self.corrector, now_s, asked=self.requests.take_reload()):
+            self.manager.status(f"parameter set {self.corrector.parameter_set} is in force")
+        for each in self.looks:
+            each.look(now_s)
+        text = self._changes.news()
+        if text is not None:
+            self.say(text)
+            self.manager.status(text)
+
+
 _DEFAULT_PERIOD_S = 0.1
 _GARBAGE = 10_000
 """Objects that were made and not freed, after which garbage is looked for among them, in about a millisecond."""
@@ -108,8 +212,9 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:
     say, manager = Log().say, ServiceManager()
     if options.realtime:
         say(be_real_time())
-    mode = Mode.OVERLAY if options.gateway is None else Mode.GATEWAY
-    bus_settings = [bus] if options.gateway is None else [bus, {**bus, "channel": options.gateway}]
+    is_gateway = options.gateway is not None
+    mode = Mode.GATEWAY if is_gateway else Mode.OVERLAY
+    bus_settings = [bus, {**bus, "channel": options.gateway}] if is_gateway else [bus]
     database = node_database(options.layout)
     source = _source(options, database, mode, say)
     corrector = wire(database, source.in_force, time.monotonic(), mode=mode, shadow=options.shadow)
@@ -117,7 +222,7 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:
         write_text(_dry_run(bus_settings, database, mode))
         return 0
     routes = None
-    if options.gateway is not None and options.interface == "socketcan":
+    if is_gateway and options.interface == "socketcan":
         routes = kernel_routes((options.channel, options.gateway), database, fd=options.fd, say=say)
     routed, latency = routes is not None, Latency()
     with ExitStack() as closed_at_end:
@@ -131,42 +236,38 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:
         requests = Requests()
         if options.metrics_port is not None:
             serve_metrics(corrector, latency, options.metrics_port)
-        hidden = _unpublished(database, source.in_force, mode)
-        for text in _notes(options, source, hidden.values()):
+        hidden = unpublished(database, source.in_force, mode)
+        for text in (*_notes(options, source), *hidden.values()):
             say(text)
         applied = [branch.name for branch in corrector.branches if branch.fault.applied and branch.name not in hidden]
         correcting = f"correcting {', '.join(applied) or 'nothing'}"
-        to, shadow = f" to {options.gateway}" if options.gateway else "", ", shadow mode" if options.shadow else ""
-
-        def bus_states() -> dict[str, str]:
-            return {bus.channel: bus.state for bus in buses}
 
         def ready() -> None:
             if routes is not None:
                 routes.set()
+            to, shadow = f" to {options.gateway}" if is_gateway else "", ", shadow mode" if options.shadow else ""
             say(f"running on {options.interface} {options.channel}{to}{shadow}, {correcting}")
             manager.ready(correcting)
 
-        memory = FaultMemory(corrector, options.state, say, ThreadPoolExecutor(1, "faults")) if options.state else None
-        telemetry = (
-            Telemetry(options.telemetry, corrector, database.layout, latency, bus_states, say)
-            if options.telemetry
-            else None
-        )
-        looks = [part for part in (memory, telemetry, routes) if part is not None]
-        tick = _Tick(corrector, buses, source, looks, requests, manager, say)
+        looks: list[_Looks] = [] if routes is None else [routes]
+        if options.state is not None:
+            looks.append(FaultMemory(corrector, options.state, say, ThreadPoolExecutor(1, "faults")))
+        if options.telemetry is not None:
+            looks.append(Telemetry(options.telemetry, corrector, database.layout, latency, buses, say))
         closed_at_end.callback(lambda: say(f"ended: {corrector.counters.text()}"))
         closed_at_end.callback(manager.stopping)
         if routes is not None:
             closed_at_end.enter_context(routes)
-        period_s = database.layout.status.period_s if database.layout.status is not None else _DEFAULT_PERIOD_S
+        how: NodeSettings = {
+            "period_s": database.layout.status.period_s if database.layout.status is not None else _DEFAULT_PERIOD_S,
+            "on_tick": _Tick(corrector, buses, source, looks, requests, manager, say),
+            "latency": latency,
+        }
         node: OverlayNode | GatewayNode
-        if mode is Mode.OVERLAY:
-            node = OverlayNode(buses[0], corrector, database, period_s=period_s, on_tick=tick, latency=latency)
+        if is_gateway:
+            node = GatewayNode(buses[0], buses[1], corrector, database, routed=routed, **how)
         else:
-            node = GatewayNode(
-                buses[0], buses[1], corrector, database, period_s=period_s, on_tick=tick, routed=routed, latency=latency
-            )
+            node = OverlayNode(buses[0], corrector, database, **how)
         _freeze()
         node.run(requests.stop, ready)
     return 0
@@ -200,8 +301,8 @@ def _dry_run(buses: Sequence[Mapping[str, Any]], database: VehicleDatabase, mode
     ways = [(_names(received(database)), "nothing" if near["listen_only"] else written)]
     if mode is Mode.GATEWAY:
         corrected, others = _names(rewritten(database)), "all other frames of the other bus, as they are"
-        to_vehicle = f"{corrected}, corrected; {written}; {others}"
-        ways = [(f"all frames; corrects {corrected}", others), ("all frames", to_vehicle)]
+        ways = [(f"all frames; corrects {corrected}", others)]
+        ways.append(("all frames", f"{corrected}, corrected; {written}; {others}"))
     lines = []
     for bus, (reads, sends) in zip(buses, ways, strict=True):
         lines += [f"would open {config_text(bus_config(**bus))}", f"  reads {reads}", f"  sends {sends}"]
@@ -214,7 +315,7 @@ def _names(messages: Mapping[FrameKey, Message]) -> str:
     return ", ".join(f"{message.name} (0x{key.identifier:X})" for key, message in messages.items()) or "nothing"
 
 
-def _notes(options: argparse.Namespace, source: ParameterSource, unpublished: Iterable[str]) -> Iterator[str]:
+def _notes(options: argparse.Namespace, source: ParameterSource) -> Iterator[str]:
     """What to know of the parameters and the buses at the start."""
     if options.params is not None:
         yield "parameters are used that nobody signed (--unsigned)"
@@ -222,56 +323,11 @@ def _notes(options: argparse.Namespace, source: ParameterSource, unpublished: It
         yield f"passing measured values through: {source.why_not}"
     elif options.params is not None and options.vehicle is None:
         yield "the vehicle is not checked: give --vehicle or $ECU_NODE_VEHICLE"
-    yield from unpublished
     names = [options.channel, options.gateway] if options.gateway is not None and not options.fd else []
     if unseen := [name for name in names if carries_fd(options.interface, name)]:
         yield f"{' and '.join(unseen)}: set up for CAN FD, of which nothing is passed on without --fd"
     if options.listen_only:
         yield acknowledgement(options.interface, options.channel)
-
-
-def _unpublished(database: VehicleDatabase, in_force: InForce, mode: Mode) -> dict[str, str]:
-    """Branches with a fault that is not corrected, as no signal is there for it, and what to say of each."""
-    names = not_published(database, in_force) if mode is Mode.OVERLAY else []
-    why = "the parameters apply a fault to it, but the layout has no 'corrected' for it"
-    return {name: f"branch {name} is not published: {why}" for name in names}
-
-
-class _Looks(Protocol):
-    """What has something to do now and then, beside the frames."""
-
-    def look(self, now_s: float) -> None:
-        """Do it if it is due."""
-
-
-@dataclass
-class _Tick:
-    """What is done beside the frames: watchdog, parameters, and a line in the log when the state changes."""
-
-    corrector: Corrector
-    buses: Sequence[SteadyBus]
-    file: ParameterSource
-    looks: Sequence[_Looks]
-    requests: Requests
-    manager: ServiceManager
-    say: Callable[[str], None]
-
-    def __post_init__(self) -> None:
-        self._changes = StateChanges(self.corrector)
-
-    def __call__(self, now_s: float, works: bool) -> None:
-        if works:
-            self.manager.alive(now_s)
-        for bus in self.buses:
-            bus.count_dropped()
-        if self.file.look(self.corrector, now_s, asked=self.requests.take_reload()):
-            self.manager.status(f"parameter set {self.corrector.parameter_set} is in force")
-        for each in self.looks:
-            each.look(now_s)
-        text = self._changes.news()
-        if text is not None:
-            self.say(text)
-            self.manager.status(text)
 
 
 def check_report(params: Path, layout: Path, vehicle: str | None, *, is_gateway: bool = False) -> dict[str, Any]:
@@ -303,7 +359,7 @@ def check_report(params: Path, layout: Path, vehicle: str | None, *, is_gateway:
     database = node_database(layout)
     in_force, why_not = choose_parameters(params, database, vehicle)
     wire(database, in_force, start_s=0.0, mode=mode)
-    warnings = list(_unpublished(database, in_force, mode).values())
+    warnings = list(unpublished(database, in_force, mode).values())
     if names := needs_fd(database, mode):
         warnings.append(f"CAN FD messages ({', '.join(names)}): 'ecu-node run' needs --fd")
     parameters = in_force.parameters
@@ -320,16 +376,16 @@ def check_report(params: Path, layout: Path, vehicle: str | None, *, is_gateway:
 
 def _branch(database: VehicleDatabase, branch: Branch, in_force: InForce, mode: Mode) -> dict[str, Any]:
     said = in_force.parameters.branches.get(branch.name) if in_force.parameters is not None else None
-    facts: dict[str, Any] = {"drift": 0.0, "offset_a": 0.0, "apply": None}
-    if said is not None:
-        facts = {"drift": said.drift, "offset_a": said.offset_a, "apply": said.apply}
-    fault = sensor_fault(in_force, branch.name)
-    target = branch.corrected if mode is Mode.OVERLAY else branch.source
-    facts |= {"applied": fault.applied, "target": target, "plan": None}
-    if target is not None:
-        plan = branch_plan(database, branch, fault, mode)
-        facts["plan"] = {name: getattr(plan, name) for name in ("gain", "voltage_gain", "bias", "shift")}
-    return facts
+    fault, target = sensor_fault(in_force, branch.name), branch.corrected if mode is Mode.OVERLAY else branch.source
+    plan = branch_plan(database, branch, fault, mode) if target is not None else None
+    return {
+        "drift": said.drift if said is not None else 0.0,
+        "offset_a": said.offset_a if said is not None else 0.0,
+        "apply": said.apply if said is not None else None,
+        "applied": fault.applied,
+        "target": target,
+        "plan": plan and {name: getattr(plan, name) for name in ("gain", "voltage_gain", "bias", "shift")},
+    }
 
 
 def report_text(report: dict[str, Any]) -> str:
@@ -342,9 +398,9 @@ def report_text(report: dict[str, Any]) -> str:
     for name, branch in report["branches"].items():
         is_written = branch["target"] is not None
         mark = "not published" if not is_written else "corrected" if branch["applied"] else "passed through"
-        has_fault = branch["drift"] or branch["offset_a"]
-        held_back = ', "apply" is false' if has_fault and branch["apply"] is False else ""
-        lines.append(f"{name:<{width}}{branch['drift']:>+11.4%}{branch['offset_a']:>+11.3f} A  {mark}{held_back}")
+        if branch["apply"] is False and (branch["drift"] or branch["offset_a"]):
+            mark += ', "apply" is false'
+        lines.append(f"{name:<{width}}{branch['drift']:>+11.4%}{branch['offset_a']:>+11.3f} A  {mark}")
         lines += [f"  target {branch['target']}"] if is_written else []
         if is_written and branch["applied"]:
             plan = {key: value for key, value in branch["plan"].items() if value or key != "voltage_gain"}

@@ -1,4 +1,4 @@
-"""What a service needs of its surroundings: signals, the service manager, a log that does not flood, and metrics."""
+"""What a service needs of its surroundings: signals, the service manager, a log that does not flood, real time."""
 
 import ctypes
 import os
@@ -8,18 +8,11 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict
-from itertools import accumulate
 from types import FrameType
 
-from ecu_node.bus.telemetry import Latency
-from ecu_node.core.corrector import Corrector
-from ecu_node.errors import UserError, printable
-
-__all__ = ["Log", "Requests", "ServiceManager", "be_real_time", "serve_metrics"]
-
+from ecu_node.errors import printable
 
 _WHILE_S, _SAME_LINE_TIMES = 10.0, 3
 """The same line is written so many times in so long [s]: enough to see it come and go, and no flood."""
@@ -137,8 +130,6 @@ class ServiceManager:
             notify.sendto(text.encode(), self._address)
 
 
-_LATENCY_BITS = 21
-"""Buckets up to 2^20 us = 1 s."""
 _FIFO_PRIORITY = 50
 """That of the kernel's interrupt threads, which bring the frames; see sched(7)."""
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
@@ -174,61 +165,3 @@ def _lock_memory() -> None:
     resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     if ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
-
-
-def serve_metrics(corrector: Corrector, latency: Latency, port: int) -> None:
-    """Answer Prometheus in a thread of its own, on this machine's address only.
-
-    Parameters
-    ----------
-    corrector : Corrector
-        Whose counters and state are told.
-    latency : Latency
-        Of its answers.
-    port : int
-        TCP port.
-
-    Raises
-    ------
-    UserError
-        If prometheus-client is not installed, or the port cannot be had.
-    """
-    try:
-        from prometheus_client import CollectorRegistry, start_http_server  # noqa: PLC0415
-        from prometheus_client.core import (  # noqa: PLC0415
-            CounterMetricFamily,
-            GaugeMetricFamily,
-            HistogramMetricFamily,
-            Metric,
-        )
-    except ImportError:
-        raise UserError(
-            "--metrics-port needs prometheus-client; install it with pip install 'hv-current-correction[metrics]'"
-        ) from None
-
-    class Collector:
-        def collect(self) -> Iterator[Metric]:
-            for name, value in asdict(corrector.counters).items():
-                yield CounterMetricFamily(f"ecu_node_{name}", f"{name.replace('_', ' ')} since the start", value=value)
-            state, reason = corrector.told
-            yield GaugeMetricFamily("ecu_node_state", "state, as in the status message", value=int(state))
-            yield GaugeMetricFamily("ecu_node_reason", "reason, as in the status message", value=int(reason))
-            yield GaugeMetricFamily("ecu_node_parameter_set", "number in force", value=corrector.parameter_set)
-            counted = list(accumulate(latency.counts))
-            buckets = [(str(1e-6 * 2**bits), counted[bits]) for bits in range(_LATENCY_BITS)]
-            yield HistogramMetricFamily(
-                "ecu_node_latency_seconds",
-                "from when a frame came until its answer was sent",
-                buckets=[*buckets, ("+Inf", counted[-1])],
-            )
-            sums = corrector.watch.sums
-            if sums is not None:
-                yield GaugeMetricFamily("ecu_node_sum_measured_amperes", "Kirchhoff sum", value=sums.measured_a)
-                yield GaugeMetricFamily("ecu_node_sum_corrected_amperes", "Kirchhoff sum", value=sums.corrected_a)
-
-    registry = CollectorRegistry()
-    registry.register(Collector())
-    try:
-        start_http_server(port, addr="127.0.0.1", registry=registry)
-    except (OSError, OverflowError) as error:
-        raise UserError(f"port {port}: cannot answer there: {error}; give another --metrics-port") from None

@@ -23,9 +23,6 @@ from ecu_node.bus.adapters import error_text, is_interface, socketcan_socket
 from ecu_node.core.status import Counters
 from ecu_node.errors import BusError
 
-__all__ = ["MOST_AT_ONCE", "SocketCanLink", "SteadyBus", "is_of_frame", "means_gone"]
-
-
 _SEND_ATTEMPTS = 3
 _SEND_PAUSE_S = 0.001
 """A full send queue drains by some frames in this time. [s]"""

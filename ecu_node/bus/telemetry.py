@@ -1,4 +1,4 @@
-"""What the node tells beside the bus: how long its answers take, and a line of JSON per second."""
+"""What the node tells beside the bus: a line of JSON per second, metrics for Prometheus, and how long answers take."""
 
 import errno
 import os
@@ -6,8 +6,8 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from itertools import accumulate
 from pathlib import Path
@@ -15,12 +15,12 @@ from typing import Any
 
 import msgspec
 
+from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.core.branch import LiveBranch
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Quality
+from ecu_node.errors import UserError
 from ecu_node.layout import Layout
-
-__all__ = ["Latency", "Telemetry"]
 
 
 class Latency:
@@ -48,16 +48,24 @@ class Latency:
         """Count the frames that came since the last time, unless the bus did not take some of their answers."""
         waiting = self._waiting
         if waiting and not not_sent:
-            latency_s = time.monotonic() - waiting[0]
-            self.counts[int(latency_s * 1e6).bit_length()] += len(waiting)
-            self.largest_s = max(self.largest_s, latency_s)
+            self.add(time.monotonic() - waiting[0], len(waiting))
         waiting.clear()
+
+    def add(self, latency_s: float, frames: int = 1) -> None:
+        """Count frames of this latency. [s]"""
+        self.counts[int(max(latency_s, 0.0) * 1e6).bit_length()] += frames
+        self.largest_s = max(self.largest_s, latency_s)
 
     def at_most_s(self, share: float) -> float:
         """Latency that this share of the frames does not exceed, up to a factor of 2 more than it is. [s]"""
         wanted = share * sum(self.counts)
         bits = next(n for n, below in enumerate(accumulate(self.counts)) if below >= wanted)
         return min(1e-6 * 2.0**bits, self.largest_s)
+
+    def microseconds(self) -> dict[str, int]:
+        """Median, 99.9 % and largest. [us]"""
+        found_s = {"p50": self.at_most_s(0.5), "p99.9": self.at_most_s(0.999), "max": self.largest_s}
+        return {name: round(1e6 * value_s) for name, value_s in found_s.items()}
 
 
 _PERIOD_S = 1.0
@@ -77,8 +85,8 @@ class Telemetry:
         Names of the branches.
     latency : Latency
         Of the answers.
-    bus_states : callable
-        State of each bus, by its name.
+    buses : sequence of SteadyBus
+        Their states are told.
     say : callable
         Takes one line for the log, when lines begin to get lost and when they do no more.
     """
@@ -87,7 +95,7 @@ class Telemetry:
     corrector: Corrector
     layout: Layout
     latency: Latency
-    bus_states: Callable[[], dict[str, str]]
+    buses: Sequence[SteadyBus]
     say: Callable[[str], None]
 
     def __post_init__(self) -> None:
@@ -107,7 +115,7 @@ class Telemetry:
             self.corrector.counters.telemetry_lost += 1
 
     def _record(self, now_s: float) -> dict[str, Any]:
-        corrector, latency, sums = self.corrector, self.latency, self.corrector.watch.sums
+        corrector, sums = self.corrector, self.corrector.watch.sums
         state, reason = corrector.told
         return {
             "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -117,12 +125,8 @@ class Telemetry:
             "branches": {self._names[branch.name]: _branch(branch, now_s) for branch in corrector.branches},
             "sum_measured_a": None if sums is None else round(sums.measured_a, 3),
             "sum_corrected_a": None if sums is None else round(sums.corrected_a, 3),
-            "latency_us": {
-                "p50": round(1e6 * latency.at_most_s(0.5)),
-                "p99.9": round(1e6 * latency.at_most_s(0.999)),
-                "max": round(1e6 * latency.largest_s),
-            },
-            "buses": self.bus_states(),
+            "latency_us": self.latency.microseconds(),
+            "buses": {bus.channel: bus.state for bus in self.buses},
             "counters": corrector.counters,
         }
 
@@ -134,7 +138,7 @@ class Telemetry:
                 if isinstance(self.target, Path):
                     _append(self.target, line)
                 else:
-                    _send(self.target, line)
+                    _send(*self.target, line)
                 is_lost, news = False, "lines are written again"
             except OSError as error:
                 is_lost, news = True, f"{error.strerror}; lines are lost until that has changed"
@@ -145,11 +149,9 @@ class Telemetry:
 
 def _branch(branch: LiveBranch, now_s: float) -> dict[str, Any]:
     """Measured current and what is published of it, positive into the junction. [A]"""
-    is_old = branch.is_old(now_s)
-    currents_a = None if is_old else branch.currents_at(branch.time_s)
+    currents_a = None if branch.is_old(now_s) else branch.currents_at(branch.time_s)
     if currents_a is None:
-        _, quality = branch.published(now_s)
-        return {"measured_a": None, "corrected_a": None, "quality": quality.name}
+        return {"measured_a": None, "corrected_a": None, "quality": branch.published(now_s)[1].name}
     published_a = currents_a[branch.quality is Quality.CORRECTED]
     return {"measured_a": round(currents_a[0], 3), "corrected_a": round(published_a, 3), "quality": branch.quality.name}
 
@@ -166,8 +168,65 @@ def _append(path: Path, line: bytes) -> None:
         os.close(file)
 
 
-def _send(address: tuple[str, int], line: bytes) -> None:
-    host, port = address
+def _send(host: str, port: int, line: bytes) -> None:
     family, kind, protocol, _, found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
     with socket.socket(family, kind, protocol) as out:
         out.sendto(line, found)
+
+
+_LATENCY_BITS = 21
+"""Buckets up to 2^20 us = 1 s."""
+
+
+def serve_metrics(corrector: Corrector, latency: Latency, port: int) -> None:
+    """Answer Prometheus in a thread of its own, on this machine's address only.
+
+    Parameters
+    ----------
+    corrector : Corrector
+        Whose counters and state are told.
+    latency : Latency
+        Of its answers.
+    port : int
+        TCP port.
+
+    Raises
+    ------
+    UserError
+        If prometheus-client is not installed, or the port cannot be had.
+    """
+    try:
+        from prometheus_client import CollectorRegistry, core, start_http_server  # noqa: PLC0415
+    except ImportError:
+        raise UserError(
+            "--metrics-port needs prometheus-client; install it with pip install 'hv-current-correction[metrics]'"
+        ) from None
+
+    class Collector:
+        def collect(self) -> Iterator[core.Metric]:
+            for name, value in asdict(corrector.counters).items():
+                words = f"{name.replace('_', ' ')} since the start"
+                yield core.CounterMetricFamily(f"ecu_node_{name}", words, value=value)
+            state, reason = corrector.told
+            gauges: dict[str, tuple[str, float]] = {
+                "state": ("state, as in the status message", int(state)),
+                "reason": ("reason, as in the status message", int(reason)),
+                "parameter_set": ("number in force", corrector.parameter_set),
+            }
+            if (sums := corrector.watch.sums) is not None:
+                gauges["sum_measured_amperes"] = "Kirchhoff sum", sums.measured_a
+                gauges["sum_corrected_amperes"] = "Kirchhoff sum", sums.corrected_a
+            for name, (words, value) in gauges.items():
+                yield core.GaugeMetricFamily(f"ecu_node_{name}", words, value=value)
+            counted = list(accumulate(latency.counts))
+            buckets = [(str(1e-6 * 2**bits), counted[bits]) for bits in range(_LATENCY_BITS)]
+            words = "from when a frame came until its answer was sent"
+            buckets.append(("+Inf", counted[-1]))
+            yield core.HistogramMetricFamily("ecu_node_latency_seconds", words, buckets=buckets)
+
+    registry = CollectorRegistry()
+    registry.register(Collector())
+    try:
+        start_http_server(port, addr="127.0.0.1", registry=registry)
+    except (OSError, OverflowError) as error:
+        raise UserError(f"port {port}: cannot answer there: {error}; give another --metrics-port") from None

@@ -1,30 +1,31 @@
 """From layout, DBC and parameters to the node's core: everything is looked up once, at start.
 
-The structure depends on layout and DBC alone; the parameters are then put in force in it, see
-:mod:`ecu_node.bus.in_force`.
+Loop guard: no message that the layout reads may be sent on the same bus, else the node would correct its own output, or
+speak in the name of another control unit; and by the DBC all that is sent comes from one control unit, which sends
+nothing that is read. Each bit the node sends belongs to one signal only. A gateway sends the branches' messages on, on
+the other bus, and in its own name the status alone.
 """
 
 from collections import defaultdict
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
-from ecu_node.bus.guard import Mode, check_output, is_fd, key_of, received
-from ecu_node.bus.in_force import (
-    InForce,
-    branch_signals,
-    input_signal,
-    put_in_force,
-    require_branch_reach,
-    signal_codes,
-)
+from cantools.database.can import Message, Signal
+
 from ecu_node.core.branch import Auxiliary, LiveBranch
+from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault, Signals, correction_plan
 from ecu_node.core.corrector import Corrector, StatusFields
 from ecu_node.core.e2e import protection_of
 from ecu_node.core.frames import Reader, Source, Target, TargetField
-from ecu_node.core.junction import JunctionWatch
+from ecu_node.core.junction import ExpectedSum, JunctionWatch
 from ecu_node.core.signals import (
     AMPERE,
+    VOLT,
+    WATT,
     Codes,
     FrameKey,
     as_written,
@@ -37,11 +38,277 @@ from ecu_node.core.signals import (
     usual_unit,
     writable_range,
 )
-from ecu_node.core.status import Counters
+from ecu_node.core.status import Counters, Quality, Reason, State, UnfitError
 from ecu_node.database import VehicleDatabase
-from ecu_node.layout import SignalName, split_signal
+from ecu_node.errors import DatabaseError, LayoutError
+from ecu_node.layout import Branch, SignalName, split_signal
+from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
 
-__all__ = ["wire"]
+__all__ = ["InForce", "Mode", "branch_plan", "choose_parameters", "put_in_force", "sensor_fault", "wire"]
+
+PARAMETER_SETS = 256
+"""The status publishes the number of the parameter set modulo this."""
+_NOBODY = "Vector__XXX"
+"""How a DBC says that a message has no sender."""
+_CLASSIC_BYTES = 8
+
+
+class Mode(Enum):
+    """Where corrected values go."""
+
+    OVERLAY = "under identifiers of their own, on the same bus"
+    GATEWAY = "in place of the measured ones, on the other bus"
+
+
+def key_of(message: Message) -> FrameKey:
+    """Identifier of a message of the DBC."""
+    return FrameKey(message.frame_id, message.is_extended_frame)
+
+
+def is_fd(message: Message) -> bool:
+    """Whether only CAN FD can carry a message, or the DBC says that it does."""
+    return bool(message.is_fd) or message.length > _CLASSIC_BYTES
+
+
+def received(database: VehicleDatabase) -> dict[FrameKey, Message]:
+    """Messages that carry the branches and what else the node needs of the vehicle, by identifier."""
+    layout = database.layout
+    names = [name for branch in layout.branch for name in (branch.source, branch.voltage) if name is not None]
+    names += [item.signal for item in layout.input if item.name == layout.watch.input]
+    return {key_of(message): message for message, _ in map(database.signal, names)}
+
+
+def rewritten(database: VehicleDatabase) -> dict[FrameKey, Message]:
+    """Messages that a gateway rewrites, by identifier."""
+    pairs = (database.signal(branch.source) for branch in database.layout.branch)
+    return {key_of(message): message for message, _ in pairs}
+
+
+def transmitted(database: VehicleDatabase, mode: Mode) -> dict[FrameKey, Message]:
+    """Messages that the node sends in its own name, by identifier."""
+    messages = [item.message for item in _written(database, mode) if item.own]
+    return {key_of(message): message for message in messages}
+
+
+def needs_fd(database: VehicleDatabase, mode: Mode) -> list[str]:
+    """Names of the messages, received or sent, that need CAN FD."""
+    messages = {**received(database), **transmitted(database, mode)}
+    return [message.name for message in messages.values() if is_fd(message)]
+
+
+class _Written(NamedTuple):
+    """A signal that the node writes."""
+
+    message: Message
+    signal: Signal
+    purpose: str
+    largest: int
+    """The greatest code it must hold."""
+    own: bool = True
+    """Whether the whole message is the node's."""
+
+
+def _written(database: VehicleDatabase, mode: Mode) -> Iterator[_Written]:
+    """All signals that the node writes; a gateway writes the branches where it reads them."""
+    own = mode is Mode.OVERLAY
+    for branch in database.layout.branch:
+        for name, largest in (
+            ((branch.corrected, 0), (branch.quality, Quality.INVALID)) if own else ((branch.source, 0),)
+        ):
+            if name is not None:
+                yield _Written(*database.signal(name), f"branch {branch.name}", largest, own)
+    if database.layout.status is not None:
+        widths = {"state": max(State), "reason": Reason.ON_TRIAL, "alive_counter": 1}
+        widths["parameter_set"] = PARAMETER_SETS - 1
+        for key, name in database.layout.status.signals.items():
+            yield _Written(*database.signal(name), "status", widths.get(key, 0))
+
+
+def _check_output(database: VehicleDatabase, mode: Mode) -> None:
+    """Refuse a layout with which the node would disturb the bus or itself; raises as :func:`wire`."""
+    where, sent = database.layout.path, transmitted(database, mode)
+    if not sent and mode is Mode.OVERLAY:
+        raise LayoutError(
+            f"{where}: nothing to publish: neither a branch with a 'corrected' signal nor a [status]; add them to DBC "
+            f"and layout (the documentation's page 'Layout' has the lines), or be a gateway, which needs none: "
+            f"--gateway CHANNEL"
+        )
+    inputs = (database.signal(item.signal)[0] for item in database.layout.input)
+    read = {**received(database), **{key_of(message): message for message in inputs}}
+    if both := [message.name for key, message in sent.items() if key in read]:
+        raise LayoutError(
+            f"{where}: {', '.join(both)} would be both received and sent; corrected values and status need messages "
+            f"of their own"
+        )
+    others = {sender for message in read.values() for sender in message.senders} - {_NOBODY}
+    senders = {name: message.name for message in sent.values() for name in message.senders if name != _NOBODY}
+    if len(senders) > 1 or others & senders.keys():
+        found = ", ".join(f"{message} by {sender}" for sender, message in senders.items())
+        raise LayoutError(
+            f"{where}: {database.layout.dbc_path} has {found}; all corrected values and the status need to be sent by "
+            f"one control unit of their own, which sends no branch and no input"
+        )
+    taken: dict[FrameKey, int] = {}
+    for message, signal, purpose, largest, own in _written(database, mode):
+        place, what = bit_place(signal), f"{purpose}: signal {message.name}.{signal.name}"
+        if place.end > message.length:
+            raise DatabaseError(f"{what} ends in byte {place.end}, but the message has {message.length} bytes")
+        if own and signal.multiplexer_ids is not None:
+            raise DatabaseError(f"{what} is multiplexed; what the node sends in its own name must be in every frame")
+        if place.highest < largest:
+            raise DatabaseError(f"{what} holds at most {place.highest}; {largest} must fit, widen it in the DBC")
+        protection = protection_of(database, message)
+        used = taken.get(key_of(message), protection.header_mask if protection is not None else 0)
+        if used & place.mask and signal.multiplexer_ids is None:
+            raise LayoutError(
+                f"{where}: {purpose}: {message.name}.{signal.name} is written twice, or overlaps another signal that "
+                f"is written, or the E2E header"
+            )
+        taken[key_of(message)] = used | place.mask
+
+
+def signal_codes(
+    database: VehicleDatabase, name: SignalName, units: Mapping[str, float], what: str, no_value: tuple[int, ...] = ()
+) -> Codes:
+    """Codes of a signal in a base unit, with those that the layout itself says are no value.
+
+    Raises
+    ------
+    DatabaseError
+        If the signal cannot be read, see :func:`ecu_node.core.signals.read_codes`.
+    LayoutError
+        If the signal has no such codes.
+    """
+    codes = read_codes(database.signal(name)[1], units, f"{database.layout.path}: {what}")
+    place = codes.place
+    if impossible := [code for code in no_value if not place.lowest <= code <= place.highest]:
+        raise LayoutError(
+            f"{database.layout.path}: {what}: no_value: {name} has no code {', '.join(map(str, impossible))}; it has "
+            f"{place.lowest} to {place.highest}"
+        )
+    return replace(codes, named={**dict.fromkeys(no_value, "no value"), **codes.named})
+
+
+def branch_signals(database: VehicleDatabase, branch: Branch, mode: Mode) -> Signals:
+    """What a branch is read from and written to.
+
+    In a gateway every branch is written back where it was read; else where the layout says. Where nothing is published
+    the source itself is the target. Raises as :func:`signal_codes`.
+    """
+    what, units = f"branch {branch.name}", AMPERE if branch.signal is not None else WATT
+    source = signal_codes(database, branch.source, units, what, tuple(branch.no_value))
+    is_apart = mode is Mode.OVERLAY and branch.corrected is not None
+    return Signals(
+        source=source,
+        target=signal_codes(database, branch.corrected, units, what) if is_apart and branch.corrected else source,
+        sign=branch.sign,
+        voltage=signal_codes(database, branch.voltage, VOLT, what) if branch.voltage is not None else None,
+    )
+
+
+def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault, mode: Mode) -> IntegerPlan:
+    """Integer plan of one branch, from measured to written codes; raises as :func:`branch_signals`."""
+    return correction_plan(branch_signals(database, branch, mode), fault)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InForce:
+    """Parameters in force, or the reason why there are none and measured values are passed through."""
+
+    parameters: VehicleParameters | None
+    reason: Reason = Reason.NONE
+
+
+def choose_parameters(path: Path, database: VehicleDatabase, vehicle: str | None) -> tuple[InForce, str | None]:
+    """Read parameters, and decide whether they may be applied here.
+
+    Parameters
+    ----------
+    path : Path
+        Parameter file.
+    database : VehicleDatabase
+        Layout and DBC in use.
+    vehicle : str or None
+        Identity of the vehicle; None: not checked.
+
+    Returns
+    -------
+    InForce
+        The parameters, or the reason why measured values are passed through.
+    str or None
+        That reason in words, one line; None if the parameters fit.
+    """
+    try:
+        parameters = read_parameters(path)
+    except UnfitError as error:
+        return InForce(parameters=None, reason=error.reason), str(error)
+    try:
+        check_fit(parameters, database, vehicle)
+    except UnfitError as error:
+        return InForce(parameters=None, reason=error.reason), f"{path}: {error}"
+    return InForce(parameters=parameters), None
+
+
+def sensor_fault(in_force: InForce, branch: str) -> SensorFault:
+    """What is corrected on one branch; NO_FAULT where the parameters apply none."""
+    found = in_force.parameters.branches.get(branch) if in_force.parameters is not None else None
+    return SensorFault(drift=found.drift, offset_a=found.offset_a) if found is not None and found.apply else NO_FAULT
+
+
+def unpublished(database: VehicleDatabase, in_force: InForce, mode: Mode) -> dict[str, str]:
+    """Branches with a fault that is not corrected, as an overlay has no signal for it, and what to say of each."""
+    hidden = [branch.name for branch in database.layout.branch if mode is Mode.OVERLAY and branch.corrected is None]
+    why = "the parameters apply a fault to it, but the layout has no 'corrected' for it"
+    return {name: f"branch {name} is not published: {why}" for name in hidden if sensor_fault(in_force, name).applied}
+
+
+def put_in_force(
+    corrector: Corrector, database: VehicleDatabase, in_force: InForce, now_s: float, *, mode: Mode
+) -> None:
+    """Let a corrector work with these parameters from now on.
+
+    Parameters
+    ----------
+    corrector : Corrector
+        Built from the same layout and DBC.
+    database : VehicleDatabase
+        Layout and DBC.
+    in_force : InForce
+        Checked parameters, or why there are none.
+    now_s : float
+        Now; branches that the parameters name are waited for from here. [s]
+    mode : Mode
+        Where corrected values go, as when the corrector was built: what can be wrong with layout and DBC was said then.
+    """
+    parameters = in_force.parameters
+    found = parameters.branches if parameters is not None else {}
+    changes = []  # all plans before the first is put in force: either all or none
+    for branch in database.layout.branch:
+        fault, is_in_place = sensor_fault(in_force, branch.name), mode is Mode.GATEWAY or branch.corrected is None
+        plan = branch_plan(database, branch, fault, mode)
+        passing = AS_IT_IS if is_in_place else branch_plan(database, branch, NO_FAULT, mode)
+        changes.append((branch.name, fault, plan, passing))
+    for (name, fault, plan, passing), live in zip(changes, corrector.branches, strict=True):
+        live.put_in_force(
+            fault=fault,
+            plan=plan,
+            passing=passing,
+            delay_s=(found[name].delay_s if name in found else None) or 0.0,
+            expected_since_s=now_s if name in found else None,
+        )
+    if parameters is None:
+        corrector.put_in_force(reason=in_force.reason, parameter_set=0)
+        return
+    residual = parameters.junction_residual
+    measured_a, corrected_a = residual.about_expected()
+    expected = ExpectedSum(
+        expected_a=residual.expected_a,
+        predicted_worse_a=corrected_a - measured_a,
+        corrected_a=corrected_a,
+        sd_a=residual.corrected_sd_a,
+        sd_per_a=residual.corrected_sd_per_a,
+    )
+    corrector.put_in_force(reason=in_force.reason, parameter_set=parameters.number % PARAMETER_SETS, expected=expected)
 
 
 def wire(
@@ -74,11 +341,13 @@ def wire(
 
     Raises
     ------
-    LayoutError, DatabaseError
-        If the node cannot do its work with this layout and DBC, see :func:`ecu_node.bus.guard.check_output`.
+    LayoutError
+        If nothing is published, a message of a branch or an input would be sent, the DBC says that another control
+        unit sends it, or two signals are written in one place.
+    DatabaseError
+        If a signal cannot be read or written, or its values do not fit.
     """
-    check_output(database, mode)
-    require_branch_reach(database, mode)
+    _check_output(database, mode)
     layout, counters = database.layout, Counters()
     readers: dict[FrameKey, list[Reader]] = defaultdict(list)
 
@@ -89,7 +358,12 @@ def wire(
     branches: dict[str, LiveBranch] = {}
     auxiliaries: dict[SignalName, Auxiliary] = {}
     for branch in layout.branch:
-        signals = branch_signals(database, branch, Mode.GATEWAY)
+        signals = branch_signals(database, branch, mode)
+        if mode is Mode.GATEWAY or branch.corrected is not None:
+            largest, volts = as_written(layout.full_scale_a), signals.voltage
+            if volts is not None:
+                largest *= max(abs(volts.worth(code)) for code in (volts.lowest, volts.highest))
+            require_reach(signals.target, largest, f"{layout.path}: branch {branch.name}")
         if branch.voltage is not None and signals.voltage is not None and branch.voltage not in auxiliaries:
             timeout_s = max(item.timeout_s for item in layout.branch if item.voltage == branch.voltage)
             auxiliaries[branch.voltage] = Auxiliary(signals.voltage, timeout_s)
@@ -103,9 +377,20 @@ def wire(
             voltage=auxiliaries[branch.voltage] if branch.voltage is not None else None,
         )
         read(branch.source, branches[branch.name])
-    state = _state_input(database)
-    if state is not None:
-        read(state.name, state.live)
+    watch = JunctionWatch(
+        list(branches.values()),
+        window_s=layout.watch.window_s,
+        margin_a=layout.watch_margin_a,
+        full_scale_a=layout.full_scale_a,
+    )
+    for item in layout.input:  # the input that tells whether all currents of the junction are measured
+        if item.name == layout.watch.input:
+            _, signal = database.signal(item.signal)
+            codes = signal_codes(database, item.signal, {usual_unit(signal.unit or ""): 1.0}, "[watch] input")
+            state = Auxiliary(replace(codes, named={}), layout.max_age_s)  # a state's names are no lack of a value
+            valid = frozenset(int(exact_code(signal, value)) for value in layout.watch.valid)
+            watch.is_whole = partial(_has_code, state, valid)
+            read(item.signal, state)
     answers = _answers(database, branches) if mode is Mode.OVERLAY else {}
     corrector = Corrector(
         sources={
@@ -120,13 +405,7 @@ def wire(
         },
         branches=list(branches.values()),
         status_fields=_status_fields(database),
-        watch=JunctionWatch(
-            list(branches.values()),
-            window_s=layout.watch.window_s,
-            margin_a=layout.watch_margin_a,
-            full_scale_a=layout.full_scale_a,
-            is_whole=lambda now_s: state is None or state.live.code_at(now_s) in state.valid,
-        ),
+        watch=watch,
         counters=counters,
         shadow=shadow,
         sleep_s=layout.watch.sleep_s,
@@ -135,43 +414,24 @@ def wire(
     return corrector
 
 
-class _StateInput(NamedTuple):
-    """The input that tells whether all currents of the junction are measured."""
-
-    name: SignalName
-    live: Auxiliary
-    valid: frozenset[int]
-    """Its codes with which they are."""
-
-
-def _state_input(database: VehicleDatabase) -> _StateInput | None:
-    layout = database.layout
-    name = input_signal(database, layout.watch.input)
-    if name is None:
-        return None
-    _, signal = database.signal(name)
-    codes = signal_codes(database, name, {usual_unit(signal.unit or ""): 1.0}, "[watch] input")
-    every_code = replace(codes, named={})  # states have names, which are no lack of a value here
-    valid = frozenset(int(exact_code(signal, value)) for value in layout.watch.valid)
-    return _StateInput(name, Auxiliary(every_code, layout.max_age_s), valid)
+def _has_code(state: Auxiliary, valid: frozenset[int], now_s: float) -> bool:
+    return state.code_at(now_s) in valid
 
 
 def _answers(database: VehicleDatabase, branches: Mapping[str, LiveBranch]) -> dict[FrameKey, list[Target]]:
     """Corrected messages of an overlay node, by the incoming messages that they answer."""
     answers: dict[FrameKey, list[Target]] = defaultdict(list)
-    corrected = [(split_signal(branch.corrected)[0], branch) for branch in database.layout.branch if branch.corrected]
-    for name in dict.fromkeys(name for name, _ in corrected):
-        message, inside = database.message(name), [branch for other, branch in corrected if other == name]
-        fields = []
+    corrected: dict[str, list[Branch]] = defaultdict(list)
+    for branch in database.layout.branch:
+        if branch.corrected is not None:
+            corrected[split_signal(branch.corrected)[0]].append(branch)
+    for name, inside in corrected.items():
+        message, fields = database.message(name), []
         for branch in inside:
             codes = branch_signals(database, branch, Mode.OVERLAY).target
             not_available = not_available_code(codes, f"{database.layout.path}: branch {branch.name}")
             quality = bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None
-            fields.append(
-                TargetField(
-                    branch=branches[branch.name], place=codes.place, not_available=not_available, quality=quality
-                )
-            )
+            fields.append(TargetField(branches[branch.name], codes.place, not_available, quality))
         target = Target(
             key=key_of(message),
             length=message.length,
@@ -185,31 +445,24 @@ def _answers(database: VehicleDatabase, branches: Mapping[str, LiveBranch]) -> d
 
 
 def _status_fields(database: VehicleDatabase) -> StatusFields | None:
-    status = database.layout.status
+    status, where = database.layout.status, f"{database.layout.path}: status"
     if status is None:
         return None
-    message = database.message(status.message)
-    signals = {key: database.signal(name)[1] for key, name in status.signals.items()}
-    places = {key: bit_place(signal) for key, signal in signals.items()}
-
-    def current(key: str) -> tuple[Codes, int] | None:
-        if key not in signals:
-            return None
-        where = f"{database.layout.path}: status"
-        codes = read_codes(signals[key], AMPERE, where)
-        require_reach(codes, as_written(database.layout.full_scale_a), where)
-        lowest, highest = writable_range(codes, where)
-        return replace(codes, lowest=lowest, highest=highest), not_available_code(codes, where)
-
+    message, places, sums = database.message(status.message), {}, {}
+    for key, name in status.signals.items():
+        signal = database.signal(name)[1]
+        if key in {"sum_measured", "sum_corrected"}:
+            codes = read_codes(signal, AMPERE, where)
+            require_reach(codes, as_written(database.layout.full_scale_a), where)
+            lowest, highest = writable_range(codes, where)
+            sums[key] = replace(codes, lowest=lowest, highest=highest), not_available_code(codes, where)
+        else:
+            places[key] = bit_place(signal)
     return StatusFields(
         key=key_of(message),
         length=message.length,
         fd=is_fd(message),
         protection=protection_of(database, message),
-        state=places["state"],
-        reason=places["reason"],
-        parameter_set=places.get("parameter_set"),
-        alive_counter=places.get("alive_counter"),
-        sum_measured=current("sum_measured"),
-        sum_corrected=current("sum_corrected"),
+        places=places,
+        sums=sums,
     )

@@ -12,9 +12,6 @@ from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFaul
 from ecu_node.core.signals import Codes, PlacedSignal
 from ecu_node.core.status import Counters, Quality
 
-__all__ = ["REMEMBERED_FRAMES", "Auxiliary", "Frames", "LiveBranch", "Movement", "Past"]
-
-
 REMEMBERED_FRAMES = 1024
 """Frames of a message that are remembered: longer than branches lag each other."""
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from ecu_node.core.branch import LiveBranch
 from ecu_node.core.e2e import Protection
 from ecu_node.core.frames import Source
-from ecu_node.core.junction import NOTHING_EXPECTED, ExpectedSum, JunctionWatch
+from ecu_node.core.junction import ExpectedSum, JunctionWatch
 from ecu_node.core.signals import BitPlace, Codes, FrameKey, as_written
 from ecu_node.core.status import Counters, Reason, State
 
@@ -31,19 +31,16 @@ _IN_4_BITS = {
 
 @dataclass(frozen=True, kw_only=True)
 class StatusFields:
-    """The status message; fields that the layout leaves out are None."""
+    """The status message, with the fields that the layout has."""
 
     key: FrameKey
     length: int
     fd: bool
     protection: Protection | None
-    state: BitPlace
-    reason: BitPlace
-    parameter_set: BitPlace | None
-    alive_counter: BitPlace | None
-    sum_measured: tuple[Codes, int] | None
-    """Signal and its code for "no value"."""
-    sum_corrected: tuple[Codes, int] | None
+    places: Mapping[str, BitPlace]
+    """By their keys in the layout."""
+    sums: Mapping[str, tuple[Codes, int]]
+    """Signals of ``sum_measured`` and ``sum_corrected``, each with its code for "no value"."""
 
 
 class Corrector:
@@ -103,7 +100,7 @@ class Corrector:
         if status_fields is not None and status_fields.protection is not None:
             status_fields.protection.before_first(self._payload)
 
-    def put_in_force(self, *, reason: Reason, parameter_set: int, expected: ExpectedSum = NOTHING_EXPECTED) -> None:
+    def put_in_force(self, *, reason: Reason, parameter_set: int, expected: ExpectedSum | None = None) -> None:
         """Begin with what the branches were just given; what was latched is released.
 
         Parameters
@@ -112,11 +109,11 @@ class Corrector:
             NONE if there are parameters that fit.
         parameter_set : int
             Its number as it is published; 0 where there is none.
-        expected : ExpectedSum
+        expected : ExpectedSum, optional
             What they say of the junction's sum.
         """
         self.reason, self.parameter_set = reason, parameter_set
-        self.watch.restart(expected)
+        self.watch.restart(expected or ExpectedSum())
         self.latch(Reason.NONE)
         self.told = self.state()
 
@@ -168,19 +165,16 @@ class Corrector:
             return None
         payload = self._payload
         state, reason = self.state()
-        fields.state.put(payload, state)
-        fields.reason.put(payload, reason if reason <= fields.reason.highest else _IN_4_BITS[reason])
-        if fields.parameter_set is not None:
-            fields.parameter_set.put(payload, self.parameter_set)
-        if fields.alive_counter is not None:
-            fields.alive_counter.put(payload, self._alive % (fields.alive_counter.highest + 1))
+        if reason > fields.places["reason"].highest:
+            reason = _IN_4_BITS[reason]
+        values = {"state": state, "reason": reason, "parameter_set": self.parameter_set, "alive_counter": self._alive}
+        for key, place in fields.places.items():
+            place.put(payload, values[key] % (place.highest + 1))
         self._alive += 1
         sums = self.watch.sums
-        totals = (None, None) if sums is None else (sums.measured_a, sums.corrected_a)
-        for signal, total in zip((fields.sum_measured, fields.sum_corrected), totals, strict=True):
-            if signal is not None:
-                codes, missing = signal
-                codes.place.put(payload, missing if total is None else codes.nearest(as_written(total)))
+        for key, (codes, missing) in fields.sums.items():
+            total_a = None if sums is None else sums.measured_a if key == "sum_measured" else sums.corrected_a
+            codes.place.put(payload, missing if total_a is None else codes.nearest(as_written(total_a)))
         if fields.protection is not None:
             fields.protection.advance(payload)
         return fields, bytes(payload)

@@ -29,8 +29,6 @@ from ecu_node.layout import (
     ProfileP11,
 )
 
-__all__ = ["Check", "E2EState", "Protection", "Receiver", "protection_of"]
-
 
 class Check(IntEnum):
     """Outcome of checking one frame; up to LOST its content is new and intact."""

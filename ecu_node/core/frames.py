@@ -16,9 +16,6 @@ from ecu_node.core.e2e import Check, E2EState, Protection, Receiver
 from ecu_node.core.signals import BitPlace, FrameKey, Order, PlacedSignal
 from ecu_node.core.status import Counters, Quality
 
-__all__ = ["Reader", "Source", "Target", "TargetField"]
-
-
 _OK, _LAST_USABLE, _CORRUPT = Check.OK, Check.LOST, Check.CORRUPT  # looking up members of an enumeration is slow
 _INVALID, _from_bytes = E2EState.INVALID, int.from_bytes
 _BITS_PER_BYTE = 8
@@ -33,8 +30,7 @@ class Reader(NamedTuple):
     signal: PlacedSignal
 
 
-@dataclass(frozen=True, kw_only=True)
-class TargetField:
+class TargetField(NamedTuple):
     """Where one branch stands in a corrected message."""
 
     branch: LiveBranch

@@ -19,31 +19,6 @@ from cantools.database.utils import start_bit
 
 from ecu_node.errors import DatabaseError
 
-__all__ = [
-    "AMPERE",
-    "VOLT",
-    "WATT",
-    "BitPlace",
-    "Codes",
-    "FrameKey",
-    "Multiplexer",
-    "Order",
-    "PlacedSignal",
-    "as_written",
-    "bit_place",
-    "exact_code",
-    "factor_of",
-    "impossible_values",
-    "not_available_code",
-    "placed_signal",
-    "read_codes",
-    "require_reach",
-    "unit_factor",
-    "usual_unit",
-    "writable_range",
-]
-
-
 AMPERE: Mapping[str, float] = {"A": 1.0, "mA": 1e-3, "kA": 1e3}
 VOLT: Mapping[str, float] = {"V": 1.0, "mV": 1e-3, "kV": 1e3}
 WATT: Mapping[str, float] = {"W": 1.0, "kW": 1e3, "mW": 1e-3, "MW": 1e6}

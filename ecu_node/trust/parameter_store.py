@@ -6,11 +6,11 @@ from datetime import datetime
 from functools import partial
 from pathlib import Path
 
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.in_force import FileSignature, InForce, put_in_force, signature
+from ecu_node.bus.wiring import InForce, Mode, put_in_force
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Reason, TrustError, UnfitError
 from ecu_node.database import VehicleDatabase
+from ecu_node.documents import FileSignature, signature
 from ecu_node.errors import UserError
 from ecu_node.parameters import check_fit
 from ecu_node.trust.activation import conclude

@@ -17,7 +17,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from ecu_node.bus.in_force import InForce, sensor_fault
+from ecu_node.bus.wiring import InForce, sensor_fault
 from ecu_node.core.branch import LiveBranch
 from ecu_node.core.correction import NO_FAULT, SensorFault
 from ecu_node.core.junction import aligned_currents

@@ -7,8 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from ecu_node.bus.in_force import InForce
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, wire
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Quality
 from ecu_node.database import VehicleDatabase, read_database

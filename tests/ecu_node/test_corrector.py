@@ -8,9 +8,7 @@ import pytest
 from e2e.p01 import e2e_p01_check
 from msgspec.structs import replace
 
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.in_force import InForce, put_in_force
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, put_in_force, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.e2e import protection_of
 from ecu_node.core.signals import FrameKey

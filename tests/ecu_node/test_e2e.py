@@ -389,7 +389,7 @@ def test_a_corrupt_frame_leaves_the_counter_as_it_was(kind: str, protect: Callab
         ('profile = "P02"\nmessages = ["Room"]\ndata_id_list = {}', "data_id_list: Room has none"),
         (
             'profile = "P99"\nmessages = ["Room"]',
-            "one of P01, P02, P04, P05, P06, P07, P11, counter CRC8 is expected, found 'P99'",
+            "expected one of P01, P02, P04, P05, P06, P07, P11, counter CRC8, found",
         ),
     ],
 )
@@ -451,21 +451,21 @@ def test_messages_may_be_protected_in_different_ways(make_database: MakeDatabase
 WRONG = [
     (
         'profile = "P99"\nmessages = ["Room"]',
-        ", profile: one of P01, P02, P04, P05, P06, P07, P11, counter CRC8 is expected, found 'P99'",
+        ", profile: expected one of P01, P02, P04, P05, P06, P07, P11, counter CRC8, found",
     ),
     (
         'messages = ["Room"]',
-        ", profile: one of P01, P02, P04, P05, P06, P07, P11, counter CRC8 is expected, it is missing",
+        ", profile: expected one of P01, P02, P04, P05, P06, P07, P11, counter CRC8, it is missing",
     ),
     ('profile = "P01"', ": 'messages' is missing"),
-    ('profile = "P01"\nmessages = []', ", messages: a list of length >= 1 is expected, found a list of 0"),
+    ('profile = "P01"\nmessages = []', ", messages: Expected `array` of length >= 1, found []"),
     ('profile = "P01"\nmessages = ["Room", "Room"]', ", messages: Room is named twice"),
-    ('profile = "P01"\nmessages = [1]', ", messages, entry number 1: a text is expected, found 1"),
-    ('profile = "P01"\nmessages = ["Room"]\ndata_id = 3', ", data_id: a table is expected, found 3"),
+    ('profile = "P01"\nmessages = [1]', ", messages, entry number 1: Expected `str`, got `int`, found 1"),
+    ('profile = "P01"\nmessages = ["Room"]\ndata_id = 3', ", data_id: Expected `object`, got `int`, found 3"),
     ('profile = "P01"\nmessages = ["Room"]\ndata_id = { Hall = 3 }', ", data_id: Hall is not in 'messages'"),
     (
         'profile = "P02"\nmessages = ["Room"]\ndata_id_list = { Room = [1] }',
-        ", data_id_list, Room: a list of length >=",
+        ", data_id_list, Room: Expected `array` of length >= 16, found [1]",
     ),
     ('profile = "P02"\nmessages = ["Room"]\ndata_id_list = {}', ", data_id_list: Room has none"),
     (

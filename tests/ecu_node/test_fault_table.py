@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.in_force import InForce
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Counters

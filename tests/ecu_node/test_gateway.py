@@ -5,9 +5,7 @@ from collections.abc import Callable
 import pytest
 from e2e.p01 import e2e_p01_check
 
-from ecu_node.bus.guard import Mode, transmitted
-from ecu_node.bus.in_force import InForce
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, transmitted, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Reason, State

@@ -16,11 +16,9 @@ from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
 from ecu_node.bus.adapters import open_bus
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.in_force import InForce
 from ecu_node.bus.node import GatewayNode
 from ecu_node.bus.steady_bus import SocketCanLink, SteadyBus
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase

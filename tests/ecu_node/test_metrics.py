@@ -12,10 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.bus.in_force import InForce
-from ecu_node.bus.service import serve_metrics
-from ecu_node.bus.telemetry import Latency
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.telemetry import Latency, serve_metrics
+from ecu_node.bus.wiring import InForce, wire
 from ecu_node.cli import main
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Counters, Reason, State

@@ -15,11 +15,9 @@ from can.interfaces.virtual import VirtualBus
 from e2e.p01 import e2e_p01_check
 
 from ecu_node.bus.adapters import open_bus, receive_filters
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.in_force import InForce
 from ecu_node.bus.node import GatewayNode, OverlayNode, TimeOfDay
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.in_force import ParameterFile
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.run import ParameterFile
+from ecu_node.bus.wiring import Mode, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase

@@ -10,11 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.bus.guard import Mode, key_of
-from ecu_node.bus.in_force import ParameterFile
 from ecu_node.bus.run import _Tick
 from ecu_node.bus.service import Log, Requests, ServiceManager
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import Mode, ParameterFile, key_of, wire
 from ecu_node.database import VehicleDatabase
 from tests.ecu_node.vehicles import Frame, answers, protected
 

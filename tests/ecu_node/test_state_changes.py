@@ -4,10 +4,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from ecu_node.bus.guard import Mode, key_of
-from ecu_node.bus.in_force import InForce, put_in_force
 from ecu_node.bus.run import StateChanges
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, key_of, put_in_force, wire
 from ecu_node.core.status import Reason
 from ecu_node.database import VehicleDatabase
 from tests.ecu_node.vehicles import Frame, answers, parameters_for, protected

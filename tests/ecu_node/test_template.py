@@ -9,9 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.bus.guard import key_of
-from ecu_node.bus.in_force import InForce
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, key_of, wire
 from ecu_node.cli import main, template_text
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.in_force import InForce, branch_plan, passing_plan, sensor_fault
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, branch_plan, sensor_fault, wire
+from ecu_node.core.correction import AS_IT_IS
 from ecu_node.core.e2e import Check, Receiver, protection_of
 from ecu_node.core.signals import AMPERE, placed_signal, read_codes
 from ecu_node.core.status import Quality
@@ -95,7 +94,8 @@ class Plain:
             signal = database.signal(branch.source)[1]
             fault = sensor_fault(in_force, branch.name)
             corrects = fault.applied
-            plan = branch_plan(database, branch, fault, mode) if corrects else passing_plan(database, branch, mode)
+            is_in_place = mode is Mode.GATEWAY or branch.corrected is None
+            plan = AS_IT_IS if is_in_place and not corrects else branch_plan(database, branch, fault, mode)
             codes = read_codes(signal, AMPERE, branch.name)
             self.branches.append((branch, placed_signal(message, signal), codes, plan))
 

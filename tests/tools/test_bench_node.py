@@ -8,7 +8,7 @@ from bench.node import Sizes, measure
 from bench.node_plain import plain_job
 from bench.node_vehicle import NUMBERS, make_vehicle
 from bench.row import Row
-from ecu_node.bus.guard import Mode
+from ecu_node.bus.wiring import Mode
 
 TINY = Sizes(repeats=2, frames=600, latency_frames=50, load_frames=3000, process_frames=300, socketcan_frames=0)
 

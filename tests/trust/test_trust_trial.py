@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import Mode, wire
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase, read_database

@@ -25,9 +25,7 @@ from bench.true_parameters import true_parameters
 from calibrator.errors import ExportError
 from calibrator.export.checked import Checked
 from calibrator.export.core import c_text
-from ecu_node.bus.guard import Mode, received
-from ecu_node.bus.in_force import InForce, branch_signals
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, branch_signals, received, wire
 from ecu_node.core.correction import correction_plan
 from ecu_node.core.e2e import protection_of
 from ecu_node.core.signals import BitPlace, bit_place

@@ -8,7 +8,7 @@ from time import perf_counter
 from bench.node_plain import plain_job
 from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle
 from bench.row import Row
-from ecu_node.bus.guard import Mode
+from ecu_node.bus.wiring import Mode
 
 __all__ = ["rows"]
 

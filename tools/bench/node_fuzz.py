@@ -19,11 +19,9 @@ import can
 
 from bench.node_fuzz_oracle import FuzzFrame, Oracle
 from bench.node_fuzz_vehicles import FuzzMessage, FuzzVehicle, draw_vehicle
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.in_force import InForce
 from ecu_node.bus.node import GatewayNode, OverlayNode
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.core.status import Counters
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters

@@ -13,7 +13,7 @@ from cantools.database.can import Message
 
 from bench.node_fuzz_protection import CheckState
 from bench.node_fuzz_vehicles import FuzzBranch, FuzzMessage, FuzzSignal, FuzzVehicle, zero_code
-from ecu_node.bus.guard import Mode
+from ecu_node.bus.wiring import Mode
 from ecu_node.core.status import Quality
 from ecu_node.database import VehicleDatabase
 

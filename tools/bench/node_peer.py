@@ -40,7 +40,7 @@ def _plain(receiving: "can.BusABC", sending: "can.BusABC") -> None:
 
     from bench.node_plain import plain_job  # noqa: PLC0415  # the bare loop does without
     from bench.node_vehicle import IDENTIFIER, make_vehicle  # noqa: PLC0415
-    from ecu_node.bus.guard import Mode  # noqa: PLC0415
+    from ecu_node.bus.wiring import Mode  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
         job = plain_job(make_vehicle(Path(folder), numbered=True), Mode.GATEWAY)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bench.node_vehicle import FAULTS, BenchVehicle
-from ecu_node.bus.guard import Mode
+from ecu_node.bus.wiring import Mode
 from ecu_node.core.e2e import Check, Protection, Receiver, protection_of
 from ecu_node.core.status import Quality
 

@@ -13,7 +13,7 @@ from typing import cast
 from bench.node_child import Seen
 from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle
 from bench.row import Row
-from ecu_node.bus.guard import Mode
+from ecu_node.bus.wiring import Mode
 from ecu_node.parameters import write_parameters
 
 __all__ = ["command_line", "rows", "watched"]

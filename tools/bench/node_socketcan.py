@@ -31,8 +31,8 @@ from bench.node_plain import plain_job
 from bench.node_process import command_line
 from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle
 from bench.row import Row
-from ecu_node.bus.guard import Mode
 from ecu_node.bus.steady_bus import SocketCanLink
+from ecu_node.bus.wiring import Mode
 from ecu_node.parameters import write_parameters
 
 __all__ = ["rows"]

@@ -9,9 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.true_parameters import true_parameters
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.in_force import InForce
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.e2e import protection_of
 from ecu_node.database import VehicleDatabase, read_database

@@ -22,9 +22,9 @@ from bench.node_plain import plain_job
 from bench.node_vehicle import IDENTIFIER, NUMBERS, OUT_IDENTIFIER, BenchVehicle, make_vehicle
 from bench.row import Row
 from ecu_node.bus.adapters import open_bus
-from ecu_node.bus.guard import Mode
 from ecu_node.bus.node import GatewayNode, OverlayNode
 from ecu_node.bus.steady_bus import SteadyBus
+from ecu_node.bus.wiring import Mode
 from ecu_node.core.status import Counters
 
 __all__ = ["BUS_LOAD_HZ", "load_rows", "rows"]

@@ -10,8 +10,7 @@ from calibrator.artificial.vehicle import Vehicle, vehicle_currents, vehicle_fra
 from calibrator.drive import Array
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.recordings.canlog import FrameSeries
-from ecu_node.bus.guard import Mode, key_of
-from ecu_node.bus.in_force import branch_signals
+from ecu_node.bus.wiring import Mode, branch_signals, key_of
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.signals import Codes, FrameKey
 from ecu_node.database import VehicleDatabase

@@ -10,9 +10,7 @@ from msgspec.structs import replace
 
 from chain.fleet import ChainFleet
 from chain.node_drive import BranchTrace, NodeDrive, drive_through
-from ecu_node.bus.guard import Mode
-from ecu_node.bus.in_force import InForce, sensor_fault
-from ecu_node.bus.wiring import wire
+from ecu_node.bus.wiring import InForce, Mode, sensor_fault, wire
 from ecu_node.core.status import State
 from ecu_node.errors import UserError
 from ecu_node.parameters import BranchParameters, VehicleParameters
