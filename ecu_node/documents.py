@@ -126,7 +126,7 @@ def _problem(value: Any, kind: Any) -> tuple[list[str], str] | None:
     try:
         msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
-        why = str(error).partition(" - at `")[0]
+        why = str(error).partition(" - at `")[0].replace("`", "")
     else:
         return None
     is_table = isinstance(value, dict)
@@ -193,7 +193,7 @@ def _shown(value: Any) -> str:
     text = json.dumps(value, default=str)
     if len(text) <= _LONGEST_VALUE:
         return text
-    return f"{text[:_LONGEST_VALUE]}... ({len(text)} characters)"
+    return f"{text[:_LONGEST_VALUE]}... ({len(value) if isinstance(value, str) else len(text)} characters)"
 
 
 def json_error(error: Exception, content: bytes) -> str:

@@ -458,14 +458,14 @@ WRONG = [
         ", profile: expected one of P01, P02, P04, P05, P06, P07, P11, counter CRC8, it is missing",
     ),
     ('profile = "P01"', ": 'messages' is missing"),
-    ('profile = "P01"\nmessages = []', ", messages: Expected `array` of length >= 1, found []"),
+    ('profile = "P01"\nmessages = []', ", messages: Expected array of length >= 1, found []"),
     ('profile = "P01"\nmessages = ["Room", "Room"]', ", messages: Room is named twice"),
-    ('profile = "P01"\nmessages = [1]', ", messages, entry number 1: Expected `str`, got `int`, found 1"),
-    ('profile = "P01"\nmessages = ["Room"]\ndata_id = 3', ", data_id: Expected `object`, got `int`, found 3"),
+    ('profile = "P01"\nmessages = [1]', ", messages, entry number 1: Expected str, got int, found 1"),
+    ('profile = "P01"\nmessages = ["Room"]\ndata_id = 3', ", data_id: Expected object, got int, found 3"),
     ('profile = "P01"\nmessages = ["Room"]\ndata_id = { Hall = 3 }', ", data_id: Hall is not in 'messages'"),
     (
         'profile = "P02"\nmessages = ["Room"]\ndata_id_list = { Room = [1] }',
-        ", data_id_list, Room: Expected `array` of length >= 16, found [1]",
+        ", data_id_list, Room: Expected array of length >= 16, found [1]",
     ),
     ('profile = "P02"\nmessages = ["Room"]\ndata_id_list = {}', ", data_id_list: Room has none"),
     (

@@ -74,7 +74,7 @@ BATTERY = 'name = "battery", sign = 1, signal = "Pair.Battery"'
             r"'Message.Signal' as in the DBC is expected, found \"Battery\"",
         ),
         ("sign = 1", "sign = 1, timout_s = 1", "'battery': unknown key 'timout_s'; did you mean 'timeout_s'"),
-        ("sign = 1", 'sign = 1, timeout_s = "x"', "'battery', timeout_s: Expected `float`, got `str`, found \"x\""),
+        ("sign = 1", 'sign = 1, timeout_s = "x"', "'battery', timeout_s: Expected float, got str, found \"x\""),
         ('name = "battery"', 'name = "motor"', "motor is named twice"),
         (BATTERY, BATTERY + ', power = "Heater.Power"', "branch battery: give either 'signal'"),
         (', voltage = "Net.Voltage"', "", "branch heater: give either 'signal'"),
