@@ -38,7 +38,7 @@ class Bus:
         self.database, self.monitor = database, BusMonitor(database, start_s)
         self.counters: dict[str, int] = {}
 
-    def send(self, message: str, time_s: float, *, step: int = 1, spoilt: bool = False, **values: float) -> None:
+    def send(self, message: str, time_s: float, *, step: int = 1, spoilt: bool = False, **values: Any) -> None:
         counter = self.counters[message] = (self.counters.get(message, -1) + step) % 15
         data = bytearray(protected(self.database, message, counter, **values))
         data[7] ^= spoilt
@@ -46,9 +46,10 @@ class Bus:
 
     def send_pair(self, name: str, time_s: float, measured_a: float, corrected_a: float | None, quality: int) -> None:
         """A measured frame and its answer, in the direction of the signal."""
-        self.send(f"HV_{name}", time_s, **{f"{name}Current": measured_a})
+        measured: dict[str, Any] = {f"{name}Current": measured_a}
+        self.send(f"HV_{name}", time_s, **measured)
         if corrected_a is not None:
-            values = {f"{name}CurrentCorrected": corrected_a, f"{name}CurrentQuality": quality}
+            values: dict[str, Any] = {f"{name}CurrentCorrected": corrected_a, f"{name}CurrentQuality": quality}
             self.send(f"HV_{name}Corrected", time_s + 0.001, **values)
 
     def battery(self, time_s: float, measured_a: float, corrected_a: float | None = None, quality: int = 2) -> None:
@@ -171,7 +172,7 @@ def test_sum_needs_a_fresh_value_of_every_branch_seen_and_its_answer(bus: Bus) -
     assert bus.sums(0.002) == (None, None)
     bus.battery(0.01, 100.0, 90.0)
     bus.motor(0.01, 80.0)
-    assert bus.sums(0.02) == (pytest.approx(20.0), None)
+    assert bus.monitor.look(0.02)["sums"] == {"measured_a": pytest.approx(20.0), "corrected_a": None}
     assert [each["name"] for each in bus.monitor.look(0.02)["branches"] if each["is_seen"]] == ["battery", "motor"]
     bus.battery(0.3, 100.0, 90.0)
     assert bus.sums(0.31) == (None, None)
@@ -222,8 +223,8 @@ def test_rates_are_those_of_the_last_seconds(bus: Bus, looks_hz: int) -> None:
     assert [rates[5.0], rates[6.0], rates[10.0]] == pytest.approx([50.0, 75.0, 100.0])
 
 
-def status(bus: Bus, time_s: float, **values: float) -> None:
-    bus.send("HV_CorrectionStatus", time_s, **{"JunctionSumMeasured": -12.3, "JunctionSumCorrected": 0.4, **values})
+def status(bus: Bus, time_s: float, **values: Any) -> None:
+    bus.send("HV_CorrectionStatus", time_s, **({"JunctionSumMeasured": -12.3, "JunctionSumCorrected": 0.4} | values))
 
 
 def test_status_is_read_as_the_node_wrote_it(bus: Bus) -> None:

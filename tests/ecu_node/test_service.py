@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.bus.run import _Tick
+from ecu_node.bus.run import ParameterFile, _Tick
 from ecu_node.bus.service import Log, Requests, ServiceManager
-from ecu_node.bus.wiring import Mode, ParameterFile, key_of, wire
+from ecu_node.bus.wiring import Mode, key_of, wire
 from ecu_node.database import VehicleDatabase
 from tests.ecu_node.vehicles import Frame, answers, protected
 
@@ -107,7 +107,7 @@ def test_a_node_that_does_not_do_its_work_does_not_feed_the_watchdog(
     tick = _Tick(
         corrector=corrector,
         buses=[],
-        file=file,
+        source=file,
         looks=[],
         requests=requests,
         manager=ServiceManager(),
@@ -129,7 +129,7 @@ def test_what_changes_is_said_in_the_log_and_to_the_manager(
     tick = _Tick(
         corrector=corrector,
         buses=[],
-        file=file,
+        source=file,
         looks=[],
         requests=requests,
         manager=ServiceManager(),
