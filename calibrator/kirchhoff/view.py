@@ -28,6 +28,8 @@ _Panels = list[tuple[str, list[tuple[str, str, str]]]]
 """Diagrams from top to bottom: title, and name, column and colour of each line; the band belongs to the last one."""
 SLIP = 0.5
 """Magnitude of a gain error beyond which it is no sensor's but a slip of sign or unit. [1]"""
+LEAST_SHARE = 0.005
+"""Of how the sum varies: less stands as 0 % and explains nothing. [1]"""
 MOST_DRAWN = 50_000
 """Instants: more make a page of tens of megabytes, and no line that could be seen. [1]"""
 
@@ -55,7 +57,7 @@ def kirchhoff_text(comparison: Comparison, notices: Sequence[str]) -> str:
             shares = (f"{name} {_percent(getattr(residual, name))}" for name in ("constant", "gains", "delays", "rest"))
             lines.append(f"of the sum {stage} (mean square): {', '.join(shares)} ({figure(residual.rest_a, 2)} A)")
     last = list(comparison.residual.values())[-1]
-    if last is not None and last.alone:
+    if last is not None and any(own.gain_share > LEAST_SHARE for own in last.alone.values()):
         rows = [
             (name, f"{100.0 * own.gain_error:+.1f} %" if abs(own.gain_error) <= SLIP else "-", _percent(own.gain_share))
             for name, own in last.alone.items()

@@ -5,11 +5,13 @@ import json
 import math
 import os
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from calibrator.errors import LogError, ProposalError
 from calibrator.proposal.branches import (
@@ -293,47 +295,34 @@ def layout_text(proposal: Proposal, out: Path | None) -> str:
     """
     inputs = _inputs(proposal)
     derived = derive(inputs)
-    lines = _head(proposal, inputs, derived, out)
-    messages = {v.candidate.message.name: v.candidate.message for v in proposal.branches if v.candidate.message}
-    checked = [name for name, m in messages.items() if any(CHECKS & set(words_of(s.name)) for s in m.signals)]
-    if checked:
-        lines += _folded(f"confirm: {', '.join(checked)} seem to be protected end to end: say how in [e2e]")
-    for verdict in proposal.branches:
-        lines += ["", *_branch(proposal, verdict)]
-    for name, item in inputs.items():
-        lines += ["", "[[input]]", f"name = {_text(name)}"]
-        lines += _guess(item.about, f"signal = {_text(item.name)}")
-    for name, formula in derived.items():
-        lines += ["", "[[derived]]", f"name = {_text(name)}", f"formula = {_text(formula)}"]
-    return "\n".join(lines) + "\n"
-
-
-def _head(
-    proposal: Proposal, inputs: Mapping[str, Candidate], derived: Mapping[str, str], out: Path | None
-) -> list[str]:
-    scale_a, reason = _full_scale(proposal)
-    lines = [
-        *_folded(
-            f"Guessed by 'calibrator layout init' from {proposal.files}. Confirm or correct what is marked so; then "
-            f"'calibrator doctor' compares it with a recording. What the keys mean: docs/layout.md"
-        ),
-        "schema = 1",
-        f"name = {_text(proposal.name)}",
-    ]
-    if proposal.database is not None:
-        folder = out.absolute().parent if out is not None else Path.cwd()
-        lines.append(f"dbc = {_text(os.path.relpath(proposal.database.absolute(), folder))}")
-    lines += _guess(reason, f"full_scale_a = {scale_a:g}")
+    scale_a, scale_reason = _full_scale(proposal)
     used = [v.candidate for v in proposal.branches] + [*inputs.values()]
-    if wrong := [item.name for item in used if item.wrong == "range"]:
-        lines += _guess("the recording goes beyond the ranges of the database", f"wrong_ranges = {json.dumps(wrong)}")
-    if "sensor_temperature" in inputs:
-        lines += _guess("it is that of the current sensors", 'temperature = "sensor_temperature"')
-    if not derived:
-        return [*lines, "# model_inputs = [...]   # nothing found to drive a model: a fleet needs [[input]]s"]
-    lines.append("# Which inputs below drive the model of one vehicle, and that of the fleet.")
-    lines += _names("model_inputs", [name for name in derived if not name.startswith(FOR_FLEETS)])
-    return lines + _names("fleet_inputs", [*derived])
+    messages = {v.candidate.message.name: v.candidate.message for v in proposal.branches if v.candidate.message}
+    folder = out.absolute().parent if out is not None else Path.cwd()
+    environment = Environment(
+        loader=PackageLoader("calibrator.proposal", ""),
+        autoescape=False,  # noqa: S701 (a text, no page)
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {"remark": _remark, "entries": _entries, "toml": partial(json.dumps, ensure_ascii=False)}
+    text: str = environment.get_template("layout.toml.jinja").render(
+        proposal=proposal,
+        dbc=proposal.database and os.path.relpath(proposal.database.absolute(), folder),
+        scale_a=scale_a,
+        scale_reason=scale_reason,
+        inputs=inputs,
+        derived=derived,
+        model_inputs=[name for name in derived if not name.startswith(FOR_FLEETS)],
+        wrong_ranges=[item.name for item in used if item.wrong == "range"],
+        checked=[name for name, m in messages.items() if any(CHECKS & set(words_of(s.name)) for s in m.signals)],
+        taken=TAKEN,
+        uncertainty=COMPUTED,
+        timeout_s=_timeout_s,
+    )
+    return text
 
 
 def _full_scale(proposal: Proposal) -> tuple[float, str]:
@@ -351,28 +340,9 @@ def _full_scale(proposal: Proposal) -> tuple[float, str]:
     return TYPICAL_A, "typical of a car; nothing tells it"
 
 
-def _names(key: str, names: list[str]) -> list[str]:
-    entries = textwrap.wrap(" ".join(f'"{name}",' for name in names), _WIDTH - 4, break_long_words=False)
-    return [f"{key} = [", *(f"    {line}" for line in entries), "]"]
-
-
-def _branch(proposal: Proposal, verdict: Verdict) -> list[str]:
-    item = verdict.candidate
-    lines = ["[[branch]]", f"name = {_text(verdict.branch)}"]
-    reason = ", ".join(dict.fromkeys(part for part in (item.about, verdict.why) if part))
-    key = "formula" if item.formula else "signal" if item.quantity == "current" else "power"
-    lines += _guess(reason, f"{key} = {_text(item.formula or item.name)}")
-    if item.formula:
-        lines.append(f"uncertainty = {COMPUTED:g}")
-    if item.quantity == "power":
-        assert proposal.voltage is not None
-        lines.append(f"voltage = {_text(proposal.voltage.name)}")
-    others = [v for v in proposal.verdicts if not v.branch and v.place == verdict.place and v.score >= TAKEN]
-    for other in others:
-        lines += _folded(f"or: {_text(other.candidate.name)} ({other.candidate.about})")
-    lines += _guess(verdict.sign_reason, f"sign = {verdict.sign}")
-    lines.append(f"timeout_s = {_timeout_s(item):g}")
-    return lines
+def _entries(names: Iterable[str]) -> list[str]:
+    """Names in lines that a terminal holds."""
+    return textwrap.wrap(" ".join(f'"{name}",' for name in names), _WIDTH - 4, break_long_words=False)
 
 
 def _timeout_s(item: Candidate) -> float:
@@ -386,18 +356,9 @@ def _timeout_s(item: Candidate) -> float:
     return max(round(math.ceil(wanted_s / TIMEOUT_STEP_S - 1e-9) * TIMEOUT_STEP_S, 3), LEAST_TIMEOUT_S)
 
 
-def _guess(reason: str, line: str) -> list[str]:
-    """A key that was guessed, under the reason for it."""
-    return [*_folded(f"confirm: {reason}"), line]
-
-
-def _folded(text: str) -> list[str]:
+def _remark(text: str) -> str:
     """A remark; texts of a database are kept from breaking it."""
-    plain = printable(" ".join(text.split()))
-    return textwrap.wrap(
-        plain, _WIDTH, initial_indent="# ", subsequent_indent="#   ", break_long_words=False, break_on_hyphens=False
+    wrapper = textwrap.TextWrapper(
+        _WIDTH, initial_indent="# ", subsequent_indent="#   ", break_long_words=False, break_on_hyphens=False
     )
-
-
-def _text(value: str) -> str:
-    return json.dumps(value, ensure_ascii=False)
+    return wrapper.fill(printable(" ".join(text.split())))

@@ -340,14 +340,15 @@ def _table(path: Path, frame: pd.DataFrame, units: dict[str, str], found: str) -
         name = next(iter(frame.columns.difference(names, sort=False)), "")
         shown = f"; '{name}' begins with {str(frame[name].iloc[0])!r}" if name else ""
         raise LogError(f"{path}: no column of numbers beside the time{shown}")
+    coarse = _coarse(order.time_s, columns)
     return Table(
         path=path,
-        time_s=order.time_s,
+        time_s=_spread(order.time_s) if coarse else order.time_s,
         columns=columns,
         units={name: unit for name, unit in units.items() if name in columns},
         bad=bad,
         texts=texts,
-        found=f"{found}{about}{_coarse(order.time_s, columns)}",
+        found=f"{found}{about}{coarse}",
         disordered=order.disordered,
         clock_steps=order.clock_steps,
         without_time=int(np.sum(~known)) + frame.attrs.get("left out", 0),
@@ -358,7 +359,20 @@ def _coarse(time_s: Array, columns: Mapping[str, Array]) -> str:
     """What to say where rows have more values of one column than different times; else nothing."""
     kept = [time_s[np.isfinite(value)] for value in columns.values()]
     share = max(len(times) / max(len(np.unique(times)), 1) for times in kept)
-    return f"; {share:.3g} rows share each time: write its fractions of a second" if share > MOST_SHARING else ""
+    what = f"; {share:.3g} rows share each time: write its fractions of a second"
+    return f"{what}; until then they count as evenly spread" if share > MOST_SHARING else ""
+
+
+def _spread(time_s: Array) -> Array:
+    """Times of rows that share each with others, as if these came evenly until the next; the first ones end with it."""
+    stamps, first, count = np.unique(time_s, return_index=True, return_counts=True)
+    if len(stamps) < 2:
+        return time_s
+    usual_s = float(np.median(np.diff(stamps)) / np.median(count))
+    length_s = np.minimum(np.append(np.diff(stamps), np.inf), count * usual_s)
+    start_s = stamps + np.append(max(stamps[1] - stamps[0] - count[0] * usual_s, 0.0), np.zeros(len(stamps) - 1))
+    place = np.arange(len(time_s)) - np.repeat(first, count)
+    return np.asarray(np.repeat(start_s, count) + place * np.repeat(length_s / count, count))
 
 
 def _numbers(column: "pd.Series[float]") -> tuple[Array, Mask]:

@@ -4,7 +4,6 @@ import re
 import shlex
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 
 from calibrator.drive import Array, Channel, Drive
 from ecu_node.database import VehicleDatabase
-from ecu_node.program import wrapped
 from tests.calibrator.command_here import calibrator
 from tests.calibrator.doctor.artificial_logs import (
     channel,
@@ -76,11 +74,6 @@ def test_text_names_the_next_commands_in_people_s_figures(log: Path, layout: Pat
     assert all(len(line) <= 80 for line in table.splitlines()[1:]), table
 
 
-def test_terminal_of_80_columns_gets_all_words(log: Path, tmp_path: Path) -> None:
-    text = calibrator("doctor", "--layout", write_layout(tmp_path, inverted=("motor",)), "--log", log).stdout
-    assert wrapped(text, 80).split() == text.split()
-
-
 @pytest.mark.parametrize(("declared_a", "told"), [(2.5, False), (1.5, False), (0.5, True)])
 def test_declared_load_is_not_told_again(declared_a: float, told: bool, log: Path, layout: Path) -> None:
     with layout.open("a") as file:
@@ -108,7 +101,7 @@ def at_rest(
     return write_log(folder, replace(drive, branches=branches, inputs=inputs), database)
 
 
-@pytest.mark.parametrize(("noise_a", "offset_a"), [(0.0, 0.0), (0.02, 0.0), (0.3, 0.0), (0.7, 0.0), (0.3, 2.0)])
+@pytest.mark.parametrize(("noise_a", "offset_a"), [(0.0, 0.0), (0.7, 0.0), (0.3, 2.0)])
 def test_car_at_rest_has_no_error_and_stands_still(
     noise_a: float, offset_a: float, tmp_path: Path, layout: Path, database: VehicleDatabase
 ) -> None:
@@ -128,20 +121,6 @@ def test_currents_that_stand_still_while_the_car_drives_are_not_called_rest(
     told = examined(layout, at_rest(database, tmp_path, noise_a=0.02, speed=50.0))
     assert told.findings("stands still") == []
     assert [item.subject for item in told.findings("full scale")] == ["all branches"]
-
-
-@pytest.mark.parametrize(("seconds", "severity", "text"), [
-    (12.0, "warning", "signs, units and gains cannot be told"), (40.0, "hint", "are short"),
-])  # fmt: skip
-def test_short_log_is_called_short(
-    seconds: float, severity: str, text: str, tmp_path: Path, layout: Path, database: VehicleDatabase
-) -> None:
-    told = examined(layout, write_log(tmp_path, cut(true_drive(), seconds), database))
-    assert told.errors == []
-    (short,) = told.findings("too short")
-    assert (short.severity, text in short.text) == (severity, True)
-    assert short.number == pytest.approx(seconds, abs=0.5)
-    assert "calibrate --trusted" in told.report["ready"]
 
 
 @pytest.mark.parametrize(("seconds", "inverted"), [(120.0, ()), (12.0, ()), (3.0, ()), (120.0, ("motor",))])
@@ -236,18 +215,6 @@ def told_of(folder: Path, currents_a: Array) -> list[tuple[str, str]]:
     branches = "".join(f'[[branch]]\nname = "{name}"\nsignal = "{name}"\nsign = 1\n' for name in names)
     (folder / "table.toml").write_text(f'schema = 1\nname = "table"\nfull_scale_a = 150\n{branches}')
     return examined(folder / "table.toml", folder / "table.csv").errors
-
-
-def test_currents_of_a_table_that_cancel_are_left_as_they_are(tmp_path: Path) -> None:
-    assert told_of(tmp_path, TRUE) == []
-
-
-@pytest.mark.parametrize(("branch", "factor"), list(product(range(3), (-1.0, 1e3, 1e-3))))
-def test_one_wrong_branch_of_a_table_is_found(branch: int, factor: float, tmp_path: Path) -> None:
-    wrong = TRUE.copy()
-    wrong[:, branch] *= factor
-    name = ("battery", "motor", "heater")[branch]
-    assert told_of(tmp_path, wrong) == [("sign" if factor < 0.0 else "unit", name)]
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 2.0])
@@ -447,7 +414,11 @@ def test_short_log_is_called_so_by_kirchhoff(
 ) -> None:
     log = write_log(tmp_path, cut(true_drive(), seconds), database)
     told = examined(layout, log)
+    assert told.errors == []
     (short,) = told.findings("too short")
+    assert (short.severity, short.number) == ("hint" if seconds == 40.0 else "warning", pytest.approx(seconds, abs=0.5))
+    assert "need 120 s together, and these have" in told.report["not_ready"]["calibrate"] or seconds == 3.0
+    assert ("calibrate --trusted" in told.report["ready"]) is (seconds > 5.0)
     shown = calibrator("kirchhoff", log, "--layout", layout).stdout
     assert short.text in " ".join(shown.split())
     assert "stand still" not in shown

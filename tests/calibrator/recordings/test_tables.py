@@ -152,6 +152,8 @@ def test_times_without_their_fractions_are_said(tmp_path: Path) -> None:
     csv(frame(time=TIME_S.astype(int)))(tmp_path / "x.csv")
     told = " ".join(before(tmp_path / "x.csv", "--branches", BRANCHES)["notices"])
     assert "10 rows share each time: write its fractions of a second" in told
+    time_s = read_table(tmp_path / "x.csv").time_s
+    assert time_s - time_s[0] == pytest.approx(TIME_S - TIME_S[0], abs=0.051)
     sparse(tmp_path / "sparse.csv")
     assert "share" not in " ".join(before(tmp_path / "sparse.csv", "--branches", BRANCHES)["notices"])
 
