@@ -423,7 +423,7 @@ def test_short_log_is_called_so_by_kirchhoff(
     assert short.text in " ".join(shown.split())
     assert "stand still" not in shown
     assert told.findings("stands still") == []
-    assert ("gain error" in shown) is (seconds == 40.0)
+    assert ("of the sum before" in shown) is (seconds == 40.0)
 
 
 def test_branch_that_the_log_lacks_keeps_the_others_ready(
