@@ -18,7 +18,7 @@ from calibrator.recordings.command import replay
 from calibrator.report.command import report
 from calibrator.signing.command import keys, revoke, sign
 from calibrator.sources.command import import_
-from calibrator.summaries.command import summarise
+from calibrator.summaries.command import store_app, summarise
 from calibrator.terminal.command_line import command_app, example, run_app
 from ecu_node import __version__
 
@@ -26,7 +26,7 @@ __all__ = ["app", "main"]
 
 ORDER = {
     "Commands to look at a recording": ("layout", "doctor", "kirchhoff", "replay"),
-    "Commands to calibrate": ("import", "summarise", "calibrate", "params", "report", "export"),
+    "Commands to calibrate": ("import", "summarise", "store", "calibrate", "params", "report", "export"),
     "Commands to sign parameters": ("keys", "sign", "revoke"),
     "Commands for research": ("simulate", "identify", "score", "experiment"),
 }
@@ -51,6 +51,7 @@ app = command_app(
     epilog=example("calibrator kirchhoff table.csv --branches battery=Ibat,-motor=Imot"),
 )
 app.add_typer(layout_commands, name="layout", epilog=example("calibrator layout init my_car.dbc --out my_car.toml"))
+app.add_typer(store_app, name="store", epilog=example("calibrator store info summaries"))
 app.add_typer(keys, name="keys", epilog=example("calibrator keys new alice --out keys"))
 for function, lines in (
     (doctor, ["calibrator doctor --layout my_car.toml --log drive.blf"]),

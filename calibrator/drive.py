@@ -6,7 +6,6 @@ in place and are labelled, so that what was left out can always be counted.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -67,10 +66,24 @@ class Drive:
         return float(max(c.time_s[-1] for c in channels) - min(c.time_s[0] for c in channels))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class DriveFile:
-    """One file that holds a drive, a log or a file of a store, and whose it is; nothing of it has been read."""
+    """One file that holds a drive, a log or a file of a store, and whose it is; nothing of it has been read.
+
+    Attributes
+    ----------
+    vehicle, name : str
+        Whose, and which drive.
+    place : str
+        Path of the file, in an archive perhaps, or its URL.
+    size : int
+        0 in an archive. [byte]
+    version : str
+        Changes when the file changes.
+    """
 
     vehicle: str
     name: str
-    path: Path
+    place: str
+    size: int = 0
+    version: str = ""

@@ -1,8 +1,30 @@
 """Errors of the off-board side; see :mod:`ecu_node.errors` for what they have in common."""
 
+import traceback
+from pathlib import Path
+
 from ecu_node.errors import UserError
 
-__all__ = ["ContradictionError", "DriveError", "ExportError", "FleetError", "LogError", "ProposalError", "SigningError"]
+__all__ = [
+    "INTERNAL_ERROR",
+    "ContradictionError",
+    "DriveError",
+    "ExportError",
+    "FleetError",
+    "LogError",
+    "ProposalError",
+    "SigningError",
+    "internal_error",
+]
+
+INTERNAL_ERROR = "internal error: "
+"""How the reason of a vehicle begins that a fault of the program left out."""
+
+
+def internal_error(error: Exception) -> str:
+    """Reason of a vehicle that a fault of the program itself left out."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{INTERNAL_ERROR}{type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno}); report it"
 
 
 class LogError(UserError):

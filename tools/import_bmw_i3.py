@@ -31,8 +31,7 @@ import numpy as np
 import typer
 
 from calibrator.drive import Array, Channel, Drive, Mask
-from calibrator.drives.plain_names import require_plain_name
-from calibrator.drives.store import has_drive, write_drive
+from calibrator.drives.store import has_drive, require_plain_name, write_drive
 from calibrator.errors import DriveError, LogError
 from calibrator.files.folders import require_possible_folder
 from calibrator.recordings.canlog import write_drive_log

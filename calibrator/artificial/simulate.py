@@ -2,9 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-
-from joblib import delayed
 
 from calibrator.artificial.ground_truth import GroundTruth, choose_branches, with_branches
 from calibrator.artificial.random_fleet import draw_faults
@@ -13,7 +12,7 @@ from calibrator.artificial.vehicle import Vehicle, draw_disturbances, write_vehi
 from calibrator.drives.fleet_id import write_fleet_ids
 from calibrator.files.folders import whole_folder
 from calibrator.fleet_truth import TRUTH_FILE, FleetTruth, VehicleTruth, with_fleet_id, write_truth
-from calibrator.processes.computing import in_processes
+from calibrator.processes.run_many import Workers, run_many
 from calibrator.random_streams import Purpose, random_stream
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
@@ -100,13 +99,8 @@ def simulate_fleet(
     branches = choose_branches(layout, trips.branches, plan.currents)
     vehicles = draw_vehicles(plan, layout, branches)
     with whole_folder(out) as folder:
-        tasks = (
-            delayed(_write)(
-                folder=folder, database=database, vehicle=vehicle, trips=trips, number=number, seed=plan.seed
-            )
-            for number, vehicle in enumerate(vehicles)
-        )
-        written = in_processes(tasks, workers=workers)
+        write = partial(_write, folder=folder, database=database, trips=trips, seed=plan.seed)
+        written = run_many(write, enumerate(vehicles), Workers(processes=workers))
         truths: dict[str, VehicleTruth] = {}
         for vehicle, truth in zip(vehicles, written, strict=True):
             truths[vehicle.name] = truth
@@ -150,8 +144,9 @@ def draw_vehicles(plan: FleetPlan, layout: Layout, branches: tuple[str, ...]) ->
 
 
 def _write(
-    *, folder: Path, database: VehicleDatabase, vehicle: Vehicle, trips: TripSource, number: int, seed: int
+    numbered: tuple[int, Vehicle], *, folder: Path, database: VehicleDatabase, trips: TripSource, seed: int
 ) -> VehicleTruth:
+    number, vehicle = numbered
     return write_vehicle(
         folder,
         database,

@@ -8,30 +8,28 @@ from collections.abc import Collection
 from pathlib import Path
 
 from calibrator.errors import FleetError
-from ecu_node.documents import write_atomically
+from calibrator.files.storage import StorageError, open_storage
 
 __all__ = ["read_fleet_ids", "require_same_fleet", "write_fleet_ids"]
 
 FILE = "fleet.id"
 
 
-def write_fleet_ids(folder: Path, fleet_ids: Collection[str]) -> None:
+def write_fleet_ids(folder: str | Path, fleet_ids: Collection[str]) -> None:
     """Note the fleets that the drives of a folder come from."""
-    write_atomically(folder / FILE, "".join(f"{item}\n" for item in sorted(fleet_ids)).encode("ascii"))
+    open_storage(folder).write(FILE, "".join(f"{item}\n" for item in sorted(fleet_ids)).encode("ascii"))
 
 
-def read_fleet_ids(folder: Path) -> frozenset[str]:
-    """Fleets that the drives of a folder come from; empty if nothing is noted."""
-    path = folder / FILE
+def read_fleet_ids(folder: str | Path) -> frozenset[str]:
+    """Fleets that the drives of a folder, path or URL, come from; empty if nothing is noted."""
+    storage = open_storage(folder)
     try:
-        return frozenset(path.read_text(encoding="ascii").split())
-    except FileNotFoundError:
-        return frozenset()
-    except (OSError, UnicodeDecodeError):
-        raise FleetError(f"{path}: cannot be read; remove it, or simulate the fleet again") from None
+        return frozenset((storage.read_if_there(FILE) or b"").decode("ascii").split())
+    except (StorageError, UnicodeDecodeError):
+        raise FleetError(f"{storage.url}/{FILE}: cannot be read; remove it, or simulate the fleet again") from None
 
 
-def require_same_fleet(fleet_ids: Collection[str], truth_id: str, *, drives: Path, truth: Path) -> None:
+def require_same_fleet(fleet_ids: Collection[str], truth_id: str, *, drives: str | Path, truth: Path) -> None:
     """Refuse a truth that is not that of the drives.
 
     Parameters
@@ -40,7 +38,7 @@ def require_same_fleet(fleet_ids: Collection[str], truth_id: str, *, drives: Pat
         Fleets that the drives come from; empty if unknown, which passes.
     truth_id : str
         Fleet of the truth.
-    drives, truth : Path
+    drives, truth : str or Path
         Where both are, for the message.
 
     Raises

@@ -1,141 +1,247 @@
-"""Drives on disk: ``STORE/drives/VEHICLE/DRIVE.parquet``."""
+"""Drives as files: ``STORE/drives/VEHICLE/DRIVE.parquet``, one row per channel.
 
-from collections.abc import Callable, Iterator
+Columns: ``name``, ``kind`` (branch or input), ``time_s`` and ``value`` (lists of float64), ``good`` (list of bool). The
+file's metadata carries schema version, vehicle, drive, and name and digests of layout and DBC, because branch names and
+signs mean something only together with these. A store is a folder or a place in object storage.
+"""
+
+import hashlib
+import io
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from calibrator.drive import Drive, DriveFile
-from calibrator.drives.drive_file import encode_drive, read_drive_file, require_made_with
-from calibrator.drives.plain_names import require_plain_name
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from calibrator.drive import Channel, Drive, DriveFile
 from calibrator.errors import DriveError
-from ecu_node.documents import write_atomically
+from calibrator.files.storage import Storage, StorageError, open_storage
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout
 
-__all__ = ["has_drive", "iterate_drives", "list_drives", "write_drive"]
+__all__ = [
+    "DRIVES_FOLDER",
+    "has_drive",
+    "is_drive_file",
+    "is_plain_name",
+    "iterate_drives",
+    "list_drives",
+    "read_drive_file",
+    "recording_digest",
+    "require_plain_name",
+    "write_drive",
+]
 
-_FOLDER = "drives"
+DRIVES_FOLDER = "drives"
+SCHEMA_VERSION = 1
+_METADATA = b"calibrator.drive"
+_SCHEMA = pa.schema(
+    [
+        pa.field("name", pa.string(), nullable=False),
+        pa.field("kind", pa.string(), nullable=False),
+        pa.field("time_s", pa.list_(pa.float64()), nullable=False),
+        pa.field("value", pa.list_(pa.float64()), nullable=False),
+        pa.field("good", pa.list_(pa.bool_()), nullable=False),
+    ]
+)
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+@ -]{0,63}")
+"""Also a file name on every system, and short enough for the parameter file."""
 
 
-def write_drive(store: Path, drive: Drive, layout: Layout) -> Path:
+def is_plain_name(name: str) -> bool:
+    """Whether a vehicle or drive may have this name, see :func:`require_plain_name`."""
+    return _PLAIN_NAME.fullmatch(name) is not None and not name.endswith((" ", "."))
+
+
+def require_plain_name(name: str, what: str) -> None:
+    """Refuse the name of a vehicle or drive that cannot be a file name on every system.
+
+    Raises
+    ------
+    DriveError
+        If the name is empty, longer than 64 characters, has other characters than A to Z, a to z, 0 to 9, ``_ . + @ -``
+        and blanks, does not start with a letter, a digit or ``_``, or ends with a dot or a blank. `what` is named so,
+        and is the start of the message.
+    """
+    if not is_plain_name(name):
+        raise DriveError(
+            f"{what} {name[:80]!r} cannot be used; expected 1 to 64 letters A to Z, digits, blanks or _ . + @ -, "
+            f"not starting with a dash, dot, +, @ or blank, not ending with a dot or blank; rename it"
+        )
+
+
+def write_drive(store: str | Path, drive: Drive, layout: Layout) -> str:
     """Write one drive into a store, whole or not at all; an older drive of the same name is replaced.
 
     Parameters
     ----------
-    store : Path
-        Folder of the store; made if needed.
-    drive : Drive
-        The drive.
-    layout : Layout
-        The layout it was made with.
+    store : str or Path
+        Path or URL of the store; made if needed.
+    drive, layout : Drive, Layout
+        The drive, and the layout it was made with.
 
     Returns
     -------
-    Path
-        The file written.
+    str
+        Path or URL of the file.
 
     Raises
     ------
     DriveError
-        If vehicle or drive has a name that is no file name, or the folder cannot be written.
+        If vehicle or drive has a name that is no file name, or the file cannot be written.
     """
     require_plain_name(drive.vehicle, "vehicle")
     require_plain_name(drive.name, f"vehicle {drive.vehicle}: drive")
-    path = _path(store, drive.vehicle, drive.name)
-    content = encode_drive(drive, layout)
+    rows = [
+        {"name": name, "kind": kind, "time_s": channel.time_s, "value": channel.value, "good": channel.good}
+        for kind, channels in (("branch", drive.branches), ("input", drive.inputs))
+        for name, channel in channels.items()
+    ]
+    about = {
+        "schema_version": SCHEMA_VERSION,
+        "vehicle": drive.vehicle,
+        "drive": drive.name,
+        "layout": layout.name,
+        "layout_sha256": layout.digest,
+        "dbc_sha256": layout.dbc_digest,
+    }
+    table = pa.Table.from_pylist(rows, schema=_SCHEMA).replace_schema_metadata({_METADATA: json.dumps(about)})
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer, compression="zstd", use_dictionary=False)
+    folder = _folder(store, drive.vehicle)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, content)
-    except OSError as error:
-        raise DriveError(f"{path}: cannot write the drive: {error.strerror}; choose another folder") from None
-    return path
+        folder.write(f"{drive.name}.parquet", buffer.getvalue())
+    except StorageError as error:
+        raise DriveError(f"{error}; choose another folder") from None
+    return f"{folder.url}/{drive.name}.parquet"
 
 
-def has_drive(store: Path, vehicle: str, name: str, layout: Layout) -> bool:
-    """Whether a store has a drive already.
-
-    Parameters
-    ----------
-    store : Path
-        Folder of the store; there need not be one.
-    vehicle, name : str
-        Whose drive, and which.
-    layout : Layout
-        The layout it must have been made with.
-
-    Returns
-    -------
-    bool
-        True if it is there and was made with this layout and DBC.
-
-    Raises
-    ------
-    DriveError
-        If it is there, but is damaged or was made with another layout or DBC.
-    """
-    path = _path(store, vehicle, name)
-    if not path.exists():
-        return False
-    require_made_with(path, layout)
+def has_drive(store: str | Path, vehicle: str, name: str, layout: Layout) -> bool:
+    """Whether a store has a drive already; DriveError if it is damaged or was made with another layout or DBC."""
+    folder = _folder(store, vehicle)
+    place = f"{folder.url}/{name}.parquet"
+    with _reading(place), folder.opened(f"{name}.parquet") as file:
+        if file is None:
+            return False
+        _check_identity(_about(pq.read_schema(file)), place, layout)
     return True
 
 
 def list_drives(store: Path) -> list[DriveFile]:
-    """List the drives of a store, sorted by vehicle and name.
-
-    Parameters
-    ----------
-    store : Path
-        Folder of the store.
-
-    Returns
-    -------
-    list of DriveFile
-        What is there; nothing is opened.
-
-    Raises
-    ------
-    DriveError
-        If the folder is no store.
-    """
-    folder = store / _FOLDER
+    """List the drives of a store of this machine, by vehicle and name; DriveError if the folder is none."""
+    folder = store / DRIVES_FOLDER
     if not folder.is_dir():
-        raise DriveError(f"{store}: not a drive store: no folder '{_FOLDER}' in it; make one with 'calibrator import'")
+        raise DriveError(
+            f"{store}: not a drive store: no folder '{DRIVES_FOLDER}' in it; make one with 'calibrator import'"
+        )
     paths = sorted(folder.glob("*/[!.]*.parquet"), key=lambda path: (path.parent.name, path.stem))
-    return [DriveFile(vehicle=path.parent.name, name=path.stem, path=path) for path in paths]
+    return [DriveFile(vehicle=path.parent.name, name=path.stem, place=str(path)) for path in paths]
 
 
 def iterate_drives(
     store: Path, layout: Layout, *, on_error: Callable[[UserError], None] | None = None
 ) -> Iterator[Drive]:
-    """Read the drives of a store one after the other.
+    """Read the drives of a store of this machine, made with this layout, in the order of :func:`list_drives`.
 
-    Parameters
-    ----------
-    store : Path
-        Folder of the store.
-    layout : Layout
-        The layout it must have been made with.
-    on_error : callable, optional
-        Called with the error of a file that cannot be used, which is then left out; by default it is raised.
-
-    Yields
-    ------
-    Drive
-        In the order of :func:`list_drives`.
-
-    Raises
-    ------
-    DriveError
-        If the folder is no store; also as :func:`.read_drive_file` if `on_error` is not given.
+    ``on_error`` is called with the error of a file that cannot be used, which is then left out; by default the error is
+    raised.
     """
     for entry in list_drives(store):
         try:
-            yield read_drive_file(entry.path, layout)
+            yield read_drive_file(Path(entry.place), layout)
         except UserError as error:
             if on_error is None:
                 raise
             on_error(error)
 
 
-def _path(store: Path, vehicle: str, name: str) -> Path:
-    return store / _FOLDER / vehicle / f"{name}.parquet"
+def is_drive_file(path: Path) -> bool:
+    """Whether a file is one of a store: Parquet, but no table of somebody else's. A damaged one counts."""
+    if path.suffix != ".parquet":
+        return False
+    try:
+        return _METADATA in (pq.read_schema(path).metadata or {})
+    except NotADirectoryError:  # in an archive, where no store is
+        return False
+    except (OSError, pa.ArrowException):
+        return True
+
+
+def read_drive_file(path: Path, layout: Layout) -> Drive:
+    """Read one drive of a store; DriveError if it is cut, no drive, or was made with another layout or DBC."""
+    with _reading(str(path)):
+        table = pq.read_table(io.BytesIO(path.read_bytes()), use_threads=False)
+        about = _about(table.schema)
+        _check_identity(about, str(path), layout)
+        channels: dict[str, dict[str, Channel]] = {"branch": {}, "input": {}}
+        for row in range(table.num_rows):
+            time_s, value, good = (_values(table, column, row) for column in ("time_s", "value", "good"))
+            if not len(time_s) == len(value) == len(good):
+                raise ValueError("a channel has columns of different lengths")
+            channel = Channel(
+                time_s=time_s.astype(np.float64), value=value.astype(np.float64), good=good.astype(np.bool_)
+            )
+            channels[table.column("kind")[row].as_py()][table.column("name")[row].as_py()] = channel
+        vehicle, name = str(about["vehicle"]), str(about["drive"])
+    return Drive(vehicle=vehicle, name=name, branches=channels["branch"], inputs=channels["input"])
+
+
+def recording_digest(drive: Drive) -> str:
+    """Digest of what a drive holds, whatever it is called: no two recordings have the same, as noise differs."""
+    digest = hashlib.blake2b(digest_size=16)
+    for channels in (drive.branches, drive.inputs):
+        for name, channel in channels.items():
+            digest.update(f"{name} {len(channel.time_s)} ".encode())
+            for values in (channel.time_s, channel.value, channel.good):
+                digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+def _folder(store: str | Path, vehicle: str) -> Storage:
+    return open_storage(store).folder(DRIVES_FOLDER).folder(vehicle)
+
+
+@contextmanager
+def _reading(place: str) -> Iterator[None]:
+    """What a damaged file makes pyarrow raise becomes a DriveError."""
+    try:
+        yield
+    except OSError as error:
+        raise DriveError(
+            f"{place}: cannot read the drive: {error.strerror or 'damaged'}; remove it and import it again"
+        ) from None
+    except (pa.ArrowException, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DriveError(
+            f"{place}: not a drive: {str(error).splitlines()[0][:120]}; remove it and import it again"
+        ) from None
+
+
+def _about(schema: pa.Schema) -> dict[str, Any]:
+    about: dict[str, Any] = json.loads((schema.metadata or {})[_METADATA])
+    return about
+
+
+def _check_identity(about: Mapping[str, object], place: str, layout: Layout) -> None:
+    if about["schema_version"] != SCHEMA_VERSION:
+        raise DriveError(
+            f"{place}: schema version {about['schema_version']!r}, expected {SCHEMA_VERSION}; import the logs again"
+        )
+    if about["layout_sha256"] != layout.digest:
+        raise DriveError(
+            f"{place}: made with layout {about['layout']} ({str(about['layout_sha256'])[:12]}), this is {layout.path} "
+            f"({layout.digest[:12]}); import the logs again with this layout"
+        )
+    if about.get("dbc_sha256") != layout.dbc_digest:
+        raise DriveError(f"{place}: made with another DBC than {layout.dbc_path}; import the logs again with this DBC")
+
+
+def _values(table: pa.Table, column: str, row: int) -> "np.ndarray[tuple[int], np.dtype[np.generic]]":
+    values: np.ndarray[tuple[int], np.dtype[np.generic]] = table.column(column)[row].values.to_numpy(
+        zero_copy_only=False
+    )
+    return values

@@ -1,7 +1,6 @@
 """``calibrator calibrate``, ``params`` and ``identify``: parameter files of a fleet or junction, and a filter bank."""
 
 import math
-import re
 import shlex
 from contextlib import suppress
 from pathlib import Path
@@ -13,8 +12,8 @@ from calibrator.files.folders import require_possible_file, require_possible_fol
 from calibrator.files.layout_files import vehicle_database
 from calibrator.options import Classifier, Method
 from calibrator.processes.interrupts import importing
-from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.terminal.options import (
+    TIME_LIMIT_S,
     BankOption,
     BranchesOption,
     FleetArgument,
@@ -22,6 +21,7 @@ from calibrator.terminal.options import (
     JsonOption,
     LayoutOption,
     MagnitudeOption,
+    SchedulerOption,
     SeedOption,
     SparsityOption,
     SymmetricOption,
@@ -55,25 +55,11 @@ OWN_OPTIONS = {
     Method.PUBLISHED: ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity", "seed"),
 }
 """What only one method heeds."""
-SCHEDULER = re.compile(r"(tcp|tls)://([^\s/?#@:\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})")
-MAX_PORT = 65_535
 SHORTEST_POLE_S, LONGEST_POLE_S = 0.01, 600.0
 """Time constants of low-passes: from below the time base of any layout to ten minutes. [s]"""
 POLES_HELP = f"Low-passes to use: time constants with commas, each {SHORTEST_POLE_S:g} to {LONGEST_POLE_S:g} [s]."
 MOST_NAMED = 5
 """Internal errors that are named one by one."""
-
-
-def _scheduler(value: str | None) -> str | None:
-    if value is None:
-        return None
-    found = SCHEDULER.fullmatch(value)
-    if found is None or not 1 <= int(found["port"]) <= MAX_PORT:
-        raise typer.BadParameter(
-            f"{value!r}: expected the address of a Dask scheduler, tcp://HOST:PORT or tls://HOST:PORT, port 1 to "
-            f"{MAX_PORT}"
-        )
-    return value
 
 
 def calibrate(
@@ -145,15 +131,7 @@ def calibrate(
     ] = None,
     seed: SeedOption = 0,
     workers: WorkersOption = 2,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            "--scheduler",
-            metavar="URL",
-            callback=_scheduler,
-            help="Dask scheduler, tcp://HOST:PORT, instead of processes.",
-        ),
-    ] = None,
+    scheduler: SchedulerOption = None,
     since: Annotated[
         Path | None,
         typer.Option("--since", help="Earlier result: vehicles without new drives keep its parameters (posterior)."),
@@ -171,7 +149,7 @@ def calibrate(
         from calibrator.estimator.results import internal_errors
         from calibrator.estimator.run import calibrate_fleet
         from calibrator.estimator.settings import CalibrationSettings
-        from calibrator.processes.computing import Workers
+        from calibrator.processes.run_many import Workers
 
     _require_truth_where_used(classifier, truth, method)
     for other, names in OWN_OPTIONS.items():
@@ -191,7 +169,7 @@ def calibrate(
         meter=meter,
         expected_faults=expected_faults,
         classifier=classifier,
-        truth=_truth_of(Path(fleet), truth) if truth is not None else None,
+        truth=_truth_of(fleet, truth) if truth is not None else None,
         sparsity=sparsity,
         magnitude=magnitude,
         symmetric=symmetric,
@@ -288,7 +266,7 @@ def _require_truth_where_used(classifier: Classifier, truth: Path | None, method
     )
 
 
-def _truth_of(fleet: Path, path: Path) -> "FleetTruth":
+def _truth_of(fleet: str, path: Path) -> "FleetTruth":
     """The truth, if it is that of the fleet's vehicles."""
     from calibrator.drives.fleet_id import require_same_fleet
     from calibrator.fleet_truth import faults_of, read_truth
@@ -332,11 +310,16 @@ def identify(
         require_possible_file(out)
     with importing():
         from calibrator.estimator.fleet_identification import identify_fleet
+        from calibrator.processes.run_many import Workers
         from calibrator.summaries.filter_bank import read_bank
 
     given = None if bank is None else read_bank(bank)
     report = identify_fleet(
-        fleet, vehicle_database(layout), bank=given, time_constants_s=time_constants_s, workers=workers
+        fleet,
+        vehicle_database(layout),
+        bank=given,
+        time_constants_s=time_constants_s,
+        workers=Workers(processes=workers),
     )
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

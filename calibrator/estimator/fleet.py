@@ -564,7 +564,7 @@ class FleetCalibrator(_Calibrator):
             If the fleet as a whole cannot be calibrated, or a parameter makes no sense.
         """
         from calibrator.estimator.run import calibrate_fleet
-        from calibrator.processes.computing import Workers
+        from calibrator.processes.run_many import Workers
         from calibrator.terminal.progress import no_progress
 
         _require(isinstance(fleet, Fleet), "fleet", fleet, "Fleet.from_frames(...) or Fleet.from_folder(...)")
@@ -675,7 +675,7 @@ class JunctionCalibrator(_Calibrator):
 
         from calibrator.estimator.frames import store_frames
         from calibrator.estimator.run import calibrate_fleet
-        from calibrator.processes.computing import Workers
+        from calibrator.processes.run_many import Workers
         from calibrator.terminal.progress import no_progress
 
         if not isinstance(junction, Junction):

@@ -23,9 +23,8 @@ from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
 from calibrator.estimator.state_space import pooled_poles, snr_from_power, solve_scaled
-from calibrator.sources.copies import without_copies
-from calibrator.sources.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment
-from calibrator.sources.vehicles import read_each, read_vehicles
+from calibrator.processes.run_many import Workers
+from calibrator.sources.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment, read_vehicles
 from calibrator.summaries.filter_bank import FilterBank, Poles, low_pass_bank, low_passes
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summariser import Summariser
@@ -236,13 +235,18 @@ class IdentificationReport:
 
 
 def identify_fleet(
-    path: Path, database: VehicleDatabase, *, bank: FilterBank | None, time_constants_s: Sequence[float], workers: int
+    path: str | Path,
+    database: VehicleDatabase,
+    *,
+    bank: FilterBank | None,
+    time_constants_s: Sequence[float],
+    workers: Workers,
 ) -> IdentificationReport:
     """Choose the filter bank of a fleet, or take one that is given, and judge it by every vehicle.
 
     Parameters
     ----------
-    path : Path
+    path : str or Path
         The fleet, see :func:`calibrator.sources.fleet_source.find_fleet`.
     database : VehicleDatabase
         DBC and layout.
@@ -250,8 +254,8 @@ def identify_fleet(
         A bank that is given.
     time_constants_s : sequence of float
         Those of low-passes that are given; empty: chosen from some vehicles of the fleet, if no bank is given. [s]
-    workers : int
-        Number of processes.
+    workers : Workers
+        Where the drives are read.
 
     Returns
     -------
@@ -263,7 +267,7 @@ def identify_fleet(
     UserError
         If no vehicle can be used, or the bank is not of the fleet's inputs.
     """
-    fleet, period_s = without_copies(find_fleet(path)), database.layout.period_s
+    fleet, period_s = find_fleet(path), database.layout.period_s
     equipment = probe_equipment(fleet, database, None)
     if bank is None and time_constants_s:
         bank = low_pass_bank(equipment.fleet_inputs, time_constants_s, period_s=period_s)
@@ -281,18 +285,19 @@ def identify_fleet(
     named = {
         one.vehicle: dict(zip(equipment.branches, of, strict=True)) for one, of in zip(vehicles, snr_db, strict=True)
     }
-    notices = (*fleet.notices, *equipment.notices)
+    notices = equipment.notices
     return IdentificationReport(
         bank=bank, branches=equipment.branches, snr_db=named, left_out=left_out, notices=notices
     )
 
 
-def _chosen_bank(fleet: FleetSource, equipment: Equipment, database: VehicleDatabase, *, workers: int) -> FilterBank:
+def _chosen_bank(
+    fleet: FleetSource, equipment: Equipment, database: VehicleDatabase, *, workers: Workers
+) -> FilterBank:
     """Bank chosen from vehicles that are spread evenly over the fleet."""
     names = list(fleet.vehicles)
     some = [names[j] for j in np.unique(np.linspace(0, len(names) - 1, POOLED_VEHICLES).round().astype(int))]
-    readers = dict.fromkeys(some, read_samples)
-    read, errors = read_each(readers, fleet, equipment, database, workers=workers, label="read some drives")
-    if not read:
-        raise DriveError(f"none of {len(some)} vehicles can be read to choose a filter bank; {errors[some[0]]}")
-    return choose_filter_bank(list(read.values()), period_s=database.layout.period_s)
+    read, _ = read_vehicles(
+        read_samples, fleet, equipment, database, workers=workers, names=some, label="read some drives"
+    )
+    return choose_filter_bank(read, period_s=database.layout.period_s)

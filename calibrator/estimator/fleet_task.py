@@ -12,6 +12,7 @@ from typing import cast
 import numpy as np
 
 from calibrator.drives.delays import BranchDelays
+from calibrator.errors import internal_error
 from calibrator.estimator.fleet_estimate import (
     CONFIDENT,
     SUSPECTED,
@@ -21,7 +22,6 @@ from calibrator.estimator.fleet_estimate import (
     learn_fleet,
 )
 from calibrator.estimator.readings import CONTRADICTION, BenchTable, Readings, merge_readings, trust_notices
-from calibrator.estimator.results import internal_error
 from calibrator.estimator.rows import VehicleEvidence
 from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.estimator.vehicle_report import deciding_evidence, faults_of, impossible

@@ -13,8 +13,7 @@ import pandas as pd
 
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.align import TIME_RESOLUTION_S, base_inputs, choose_inputs
-from calibrator.drives.plain_names import require_plain_name
-from calibrator.drives.store import write_drive
+from calibrator.drives.store import require_plain_name, write_drive
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.settings import FEWEST_VEHICLES
 from calibrator.files.storage import open_storage

@@ -45,9 +45,9 @@ from calibrator.estimator.results import ChunkResult, encode_chunk
 from calibrator.estimator.settings import CalibrationSettings
 from calibrator.estimator.vehicle_report import sensor_text
 from calibrator.files.parameter_files import RunIdentity
+from calibrator.processes.run_many import Workers
 from calibrator.score import TOLERANCE
-from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive
-from calibrator.sources.vehicles import read_vehicles
+from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, read_vehicles
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
 from calibrator.summaries.summariser import summarise
 from calibrator.summaries.vehicle_summary import VehicleSummary, most_moving_first, require_possible
@@ -714,7 +714,7 @@ def calibrate_junctions(
     identity: RunIdentity,
     settings: CalibrationSettings,
     *,
-    workers: int,
+    workers: Workers,
 ) -> tuple[ChunkResult, dict[str, object], tuple[str, ...]]:
     """Calibrate each vehicle by itself; with a meter all together, as they are recordings of one car.
 
@@ -730,8 +730,8 @@ def calibrate_junctions(
         For the parameter files.
     settings : CalibrationSettings
         How; its trusted names are branches.
-    workers : int
-        Number of processes.
+    workers : Workers
+        Where the drives are read.
 
     Returns
     -------
@@ -809,7 +809,7 @@ def _summaries(
     database: VehicleDatabase,
     limit_s: float,
     *,
-    workers: int,
+    workers: Workers,
 ) -> tuple[list[VehicleSummary], dict[str, str]]:
     """Summaries of the vehicles that can be used, and why the others cannot."""
     if not drives:

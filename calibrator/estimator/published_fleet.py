@@ -23,10 +23,10 @@ from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.estimator.state_space import StateSpaceModel, bridged, identify, simulation_snr_db
 from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.fleet_truth import faults_of
+from calibrator.processes.run_many import Workers
 from calibrator.published.calibration import ExpectedFaults, calibrate_published
 from calibrator.published.recovery import Recovery
-from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive
-from calibrator.sources.vehicles import read_vehicles
+from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, read_vehicles
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import counted, few
 from ecu_node.database import VehicleDatabase
@@ -200,7 +200,7 @@ def _identify_excited(inputs: Array, currents: Array, valid: Mask) -> StateSpace
 
 
 def calibrate_fleet_published(
-    fleet: FleetSource, equipment: Equipment, identity: RunIdentity, settings: CalibrationSettings, *, workers: int
+    fleet: FleetSource, equipment: Equipment, identity: RunIdentity, settings: CalibrationSettings, *, workers: Workers
 ) -> tuple[ChunkResult, dict[str, object], tuple[str, ...]]:
     """Calibrate a fleet as published.
 
@@ -212,8 +212,8 @@ def calibrate_fleet_published(
         For the parameter files.
     settings : CalibrationSettings
         How.
-    workers : int
-        Number of processes.
+    workers : Workers
+        Where the drives are read.
 
     Returns
     -------

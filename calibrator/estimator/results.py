@@ -8,7 +8,6 @@ a million files is of no use.
 
 import io
 import shutil
-import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -22,9 +21,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from calibrator.drive import Array, Mask
-from calibrator.errors import FleetError
+from calibrator.errors import INTERNAL_ERROR, FleetError
 from calibrator.estimator.rows import VehicleEvidence
-from calibrator.summaries.buckets import bucket_of
+from calibrator.summaries.identity import bucket_of
 from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
 from ecu_node.documents import write_atomically
 from ecu_node.errors import ParameterError
@@ -40,7 +39,6 @@ __all__ = [
     "Written",
     "deployed_rms_a",
     "encode_chunk",
-    "internal_error",
     "internal_errors",
     "join_rows",
     "left_out_of",
@@ -65,8 +63,6 @@ CONFIDENT = 0.95
 PARTS, FILES, ROWS = "parameters", "params", "results.parquet"
 LEFT_OUT = "left out"
 """Stands for the verdict of a vehicle, or of a file of unclear vehicle, that has no parameters."""
-INTERNAL_ERROR = "internal error: "
-"""Begins the reason of a vehicle that an error of the program itself left out."""
 REMEDY = "name a folder that 'calibrator calibrate --out' wrote"
 Rows = list[dict[str, Any]]
 
@@ -350,12 +346,6 @@ def left_out_of(result: Path) -> dict[str, str]:
     """Vehicles of ``results.parquet`` that have no parameters, and why."""
     found = pq.read_table(result / ROWS, columns=["vehicle", "branch", "reason"], use_threads=False)
     return {row["vehicle"]: row["reason"] for row in found.filter(pc.field("branch").is_null()).to_pylist()}
-
-
-def internal_error(error: Exception) -> str:
-    """Reason of a vehicle that an error of the program itself left out."""
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{INTERNAL_ERROR}{type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno}); report it"
 
 
 def internal_errors(result: Path) -> dict[str, str]:

@@ -20,7 +20,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calibrator.drive import Drive
-from calibrator.errors import ContradictionError, DriveError, FleetError
+from calibrator.drives.store import DRIVES_FOLDER
+from calibrator.errors import ContradictionError, DriveError, FleetError, internal_error
 from calibrator.estimator.fleet_estimate import FleetEstimate
 from calibrator.estimator.fleet_task import Calibrated, FleetTask, learn_task
 from calibrator.estimator.readings import (
@@ -37,7 +38,6 @@ from calibrator.estimator.results import (
     ChunkResult,
     RunRecord,
     encode_chunk,
-    internal_error,
     join_rows,
     left_out_of,
     part_file,
@@ -54,22 +54,19 @@ from calibrator.files.folders import require_new_folder
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.files.storage import Storage, open_storage
 from calibrator.options import Method
-from calibrator.processes.computing import Workers
-from calibrator.sources.copies import without_copies
+from calibrator.processes.run_many import Workers, run_many
 from calibrator.sources.fleet_source import (
     LOGS_FOLDER,
-    STORE_FOLDER,
     Equipment,
     FleetSource,
     find_fleet,
     load_drive,
     probe_equipment,
 )
-from calibrator.summaries.add_drives import add_drives
 from calibrator.summaries.identity import StoreIdentity, read_identity, store_identity
-from calibrator.summaries.open_store import open_store
 from calibrator.summaries.record import Outline, Record, drives_digest, joined_records
-from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.store import SummaryStore, open_store
+from calibrator.summaries.summarise_fleet import add_drives
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.terminal.progress import numbered_passes, progress_bar
 from calibrator.terminal.text import few, few_reasons
@@ -147,7 +144,7 @@ def calibrate_fleet(
     storage = open_storage(place)
     identity = require_fleet(storage, place, database)
     if identity is None:
-        fleet = _find_drives(Path(storage.url))
+        fleet = find_fleet(storage.url)
         alone = _stands_alone(fleet, settings, database.layout, since)
         if alone:
             _require_alone(settings, since)
@@ -173,15 +170,12 @@ def require_fleet(storage: Storage, place: str | Path, database: VehicleDatabase
         return None
     if storage.is_local and not path.is_dir():
         raise FleetError(f"{place}: no such folder, store of drives or store of summaries")
-    identity = read_identity(storage, database)
-    if identity is None and not storage.is_local:
-        raise FleetError(f"{storage.url}: no store of summaries there; make one with 'calibrator summarise --out'")
-    return identity
+    return read_identity(storage, database)
 
 
 def _require_summaries_enough(storage: Storage, settings: CalibrationSettings) -> None:
     """Refuse drives beside summaries, as nobody can tell which are meant, and options that need the drives."""
-    drives = [name for name in (STORE_FOLDER, LOGS_FOLDER) if storage.is_local and (Path(storage.url) / name).is_dir()]
+    drives = [name for name in (DRIVES_FOLDER, LOGS_FOLDER) if storage.is_local and (Path(storage.url) / name).is_dir()]
     if drives:
         raise FleetError(
             f"{storage.url}: holds drives ({few(drives)}) and summaries (summaries.json); move one of them elsewhere, "
@@ -190,13 +184,6 @@ def _require_summaries_enough(storage: Storage, settings: CalibrationSettings) -
     needs = {"--method published": settings.method is Method.PUBLISHED, "--branches": settings.branches is not None}
     for option in (option for option, wanted in needs.items() if wanted):
         raise FleetError(f"{storage.url}: a store of summaries, and {option} needs the drives; give the drive store")
-
-
-def _find_drives(path: Path) -> FleetSource:
-    fleet = without_copies(find_fleet(path))
-    if not fleet.vehicles:
-        raise FleetError(f"{path}: no drive that is one vehicle's alone{few_reasons(fleet.left_out)}")
-    return fleet
 
 
 def _stands_alone(fleet: FleetSource, settings: CalibrationSettings, layout: Layout, since: Path | None) -> bool:
@@ -225,7 +212,7 @@ def _require_alone(settings: CalibrationSettings, since: Path | None) -> None:
 
 def _require_vehicles(fleet: FleetSource, settings: CalibrationSettings) -> None:
     """Refuse names of vehicles that there are not, and too few to learn from."""
-    path = fleet.path
+    path = fleet.place
     for names, what in ((settings.hold_out, "hold out"), (settings.trusted, "trust")):
         if unknown := sorted(names - fleet.vehicles.keys()):
             reasons = few_reasons({name: fleet.left_out[name] for name in unknown if name in fleet.left_out})
@@ -265,7 +252,9 @@ def take_census(store: SummaryStore, workers: Workers, asked: Collection[str] = 
     """Look at every bucket of a store; UserError if one cannot be read, or there is no vehicle."""
     buckets, usable, reasons, known, seen = store.buckets(), dict[int, int](), dict[str, str](), dict[str, Outline](), 0
     with progress_bar("look at vehicles", len(buckets), "chunks") as progress:
-        for done, (bucket, outlines) in enumerate(zip(buckets, workers.map(store.outlines, buckets), strict=True), 1):
+        for done, (bucket, outlines) in enumerate(
+            zip(buckets, run_many(store.outlines, buckets, workers), strict=True), 1
+        ):
             seen += len(outlines)
             problems = {item.vehicle: item.problem for item in outlines if item.problem}
             usable[bucket] = len(outlines) - len(problems)
@@ -333,7 +322,7 @@ class _Run:
         about = self._about(fleet, equipment)
         identity = self._identity(about, None)
         chunk, details, notices = calibrate_fleet_published(
-            fleet, equipment, identity, self.settings, workers=self.workers.processes
+            fleet, equipment, identity, self.settings, workers=self.workers
         )
         self.unfinished.put(0, chunk)
         return self._result(about, identity, {}, details=details, notices=notices)
@@ -366,7 +355,7 @@ class _Run:
         about = self._about(fleet, equipment)
         identity = self._identity(about, None)
         chunk, details, notices = calibrate_junctions(
-            fleet, drives, equipment.branches, identity, self.settings, workers=self.workers.processes
+            fleet, drives, equipment.branches, identity, self.settings, workers=self.workers
         )
         self.unfinished.put(0, chunk)
         return self._result(about, identity, {}, details=details, notices=notices)
@@ -376,7 +365,7 @@ class _Run:
         store, limit_s, everyone = self._own_store(fleet), self.settings.time_limit_s, self.since is None
         if everyone:  # a slip in the table is reported before the drives are read
             self._check(self._bench_table(store), fleet.vehicles, fleet.left_out)
-        add_drives(store, fleet, self.database, workers=self.workers.processes, time_limit_s=limit_s, exactly=everyone)
+        add_drives(store, fleet, self.database, workers=self.workers, time_limit_s=limit_s, exactly=everyone)
         return self.summaries(store, self._about(fleet, store.identity.equipment), fleet.left_out)
 
     def _own_store(self, fleet: FleetSource) -> SummaryStore:
@@ -406,9 +395,9 @@ class _Run:
 
     def _about(self, fleet: FleetSource, equipment: Equipment) -> StoreIdentity:
         """What a result says of a fleet of drives."""
-        name, vehicles = fleet.path.resolve().name, len(fleet.vehicles)
+        name, vehicles = fleet.name, len(fleet.vehicles)
         about = store_identity(equipment, self.database, vehicles=vehicles, fleet=name, fleet_ids=fleet.fleet_ids)
-        return msgspec.structs.replace(about, notices=(*fleet.notices, *equipment.notices))
+        return msgspec.structs.replace(about, notices=equipment.notices)
 
     def summaries(self, store: SummaryStore, about: StoreIdentity, left_out: Mapping[str, str]) -> CalibrationReport:
         """Calibrate every vehicle of a store; summaries that were read by this run become part of its result."""
@@ -434,7 +423,7 @@ class _Run:
         seen = census.size - sum(census.usable[bucket] for bucket in todo)
         with progress_bar("calibrate", census.size, "vehicles", begun=seen) as progress:
             progress(seen)
-            for bucket, chunk in zip(todo, self.workers.map(calibrate, todo), strict=True):
+            for bucket, chunk in zip(todo, run_many(calibrate, todo, self.workers), strict=True):
                 self.unfinished.put(bucket, chunk)
                 seen += census.usable[bucket]
                 progress(seen)

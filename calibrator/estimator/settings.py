@@ -8,7 +8,7 @@ from typing import Any
 from calibrator.errors import ContradictionError, FleetError
 from calibrator.fleet_truth import FleetTruth
 from calibrator.options import Classifier, Method
-from calibrator.processes.reading import TIME_LIMIT_S
+from calibrator.terminal.options import TIME_LIMIT_S
 from calibrator.terminal.text import counted, few, few_reasons
 from ecu_node.documents import text_digest
 from ecu_node.layout import UnmeasuredLoad, file_digest

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from joblib import delayed
 
 from calibrator.errors import FleetError
 from calibrator.experiments.methods import Estimate, Method
@@ -12,7 +11,7 @@ from calibrator.experiments.outcome import Outcome, confidence_bins, figures_of,
 from calibrator.experiments.result import Row
 from calibrator.experiments.trial import Trial
 from calibrator.faults import Faults
-from calibrator.processes.computing import in_processes
+from calibrator.processes.run_many import Workers, run_many
 from calibrator.terminal.progress import shown
 
 __all__ = ["Effort", "PaperFigures", "Setting", "require_estimate", "run_settings"]
@@ -98,13 +97,9 @@ def run_settings(
     """
     _require_distinct_names(methods)
     seeds = range(effort.seed, effort.seed + effort.repetitions)
-    tasks = (
-        delayed(_run_trial)(setting.make_trial, setting.methods or methods, seed)
-        for setting in settings
-        for seed in seeds
-    )
+    tasks = ((setting.make_trial, setting.methods or methods, seed) for setting in settings for seed in seeds)
     total = len(settings) * len(seeds)
-    judged = iter(shown(in_processes(tasks, workers=effort.jobs), label, total, "trials"))
+    judged = iter(shown(run_many(_run_trial, tasks, Workers(processes=effort.jobs)), label, total, "trials"))
     rows = []
     for setting in settings:
         trials = [next(judged) for _ in seeds]
@@ -115,7 +110,8 @@ def run_settings(
     return tuple(rows)
 
 
-def _run_trial(make_trial: Callable[[int], Trial], methods: Sequence[Method], seed: int) -> list[Outcome]:
+def _run_trial(task: tuple[Callable[[int], Trial], Sequence[Method], int]) -> list[Outcome]:
+    make_trial, methods, seed = task
     trial = make_trial(seed)
     estimates = (require_estimate(method.name, method.estimate(trial), trial.truth) for method in methods)
     return [judge(estimate, trial) for estimate in estimates]

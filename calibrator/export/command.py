@@ -12,8 +12,13 @@ from calibrator.export.checked import Checked, read_checked
 from calibrator.export.core import c_text, find_image, foreign_protection, image_bytes, intel_hex, s_records
 from calibrator.export.csv_table import csv_text
 from calibrator.export.tool_formats import a2l_text, cdfx_document, dcm_text
-from calibrator.files.folders import require_possible_file
-from calibrator.files.whole_files import made_folder, remove_abandoned, require_own_file, write_files
+from calibrator.files.folders import (
+    made_folder,
+    remove_abandoned,
+    require_own_file,
+    require_possible_file,
+    write_files,
+)
 from calibrator.options import ExportFormat
 from calibrator.terminal.options import JsonOption, LayoutOption
 from calibrator.terminal.progress import shown

@@ -1,14 +1,19 @@
 """Files of a local folder or of object storage (a URL that fsspec knows), each written whole or not at all."""
 
 import errno
+import fcntl
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from ecu_node.documents import write_atomically
 from ecu_node.errors import UserError
 
-__all__ = ["DISK_FULL", "Storage", "StorageError", "open_storage"]
+__all__ = ["DISK_FULL", "Entry", "Storage", "StorageError", "is_url", "local_copy", "open_storage", "walk"]
 
 OBJECT_STORAGE = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "memory"})
 """Kinds of storage in which a file appears only when it is complete, and which need no folders."""
@@ -17,6 +22,25 @@ DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 class StorageError(UserError):
     """A folder or object storage cannot be read or written."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A file as its folder lists it.
+
+    Attributes
+    ----------
+    name : str
+        Without its folder.
+    size : int
+        [byte]
+    version : str
+        Changes when the file changes: size, and time of the last change or what the storage has instead.
+    """
+
+    name: str
+    size: int
+    version: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +58,7 @@ class Storage:
     @property
     def is_local(self) -> bool:
         """Whether it is a folder of this machine."""
-        return "://" not in self.url
+        return not is_url(self.url)
 
     @property
     def lasts(self) -> bool:
@@ -45,68 +69,92 @@ class Storage:
         """Return a folder in this one; it is made when something is written."""
         return Storage(url=f"{self.url.rstrip('/')}/{name}")
 
-    def names(self) -> list[str]:
-        """Return the names of the files in it, sorted; none if there is no such folder. Hidden ones do not count."""
-        return sorted(self._list())
+    def contents(self, prefix: str = "") -> tuple[list[str], list[Entry]]:
+        """Return the names of its folders, and its files, both sorted; none if there is no such folder.
 
-    def _list(self) -> dict[str, dict[str, Any]]:
-        """What the storage tells of each file, by name."""
+        Hidden ones do not count, nor do names that begin otherwise than with ``prefix``.
+        """
+        if self.is_local:
+            return self._list_local(prefix)
         filesystem, root = self._filesystem()
         try:
-            filesystem.invalidate_cache(root)  # others write there as well
-            found = filesystem.ls(root, detail=True)
+            if prefix and self.url.startswith(("s3", "gs", "gcs")):  # one request, however many others there are
+                found = list(filesystem.find(root, prefix=prefix, maxdepth=1, detail=True).values())
+            else:
+                found = filesystem.ls(root, detail=True)
         except (FileNotFoundError, NotADirectoryError):
-            return {}
+            return [], []
         except Exception as error:  # noqa: BLE001 (each kind of storage has its own)
             raise self._failed("", "read", error) from None
-        named = {str(about["name"]).rstrip("/").rpartition("/")[2]: about for about in found}
-        return {name: about for name, about in named.items() if not name.startswith(".")}
+        folders, files = list[str](), list[Entry]()
+        for about in found:
+            name = str(about["name"]).rstrip("/").rpartition("/")[2]
+            if name.startswith(".") or not name.startswith(prefix) or str(about["name"]).rstrip("/") == root:
+                continue
+            if about["type"] == "directory":
+                folders.append(name)
+            else:
+                marks = [about[key] for key in ("mtime", "ETag", "etag", "LastModified", "created") if key in about]
+                version = "-".join(map(str, [about["size"], *marks[:1]]))
+                files.append(Entry(name, int(about["size"] or 0), version))
+        return sorted(folders), sorted(files, key=lambda entry: entry.name)
 
-    def versions(self) -> dict[str, str]:
-        """What tells whether a file was changed, by name: size, and time of change or tag where the storage has one."""
-        marks = ("size", "mtime", "LastModified", "ETag", "etag", "created")
-        return {
-            name: "-".join(str(about[mark]) for mark in marks if mark in about) for name, about in self._list().items()
-        }
+    def _list_local(self, prefix: str) -> tuple[list[str], list[Entry]]:
+        folders, files = list[str](), list[Entry]()
+        try:
+            with os.scandir(self.url) as items:
+                for item in items:
+                    if item.name.startswith(".") or not item.name.startswith(prefix):
+                        continue
+                    if item.is_dir(follow_symlinks=False):
+                        folders.append(item.name)
+                    elif item.is_file():
+                        status = item.stat()
+                        version = f"{status.st_size}-{status.st_mtime_ns}"
+                        files.append(Entry(item.name, status.st_size, version))
+        except (FileNotFoundError, NotADirectoryError):
+            return [], []
+        except OSError as error:
+            raise self._failed("", "read", error) from None
+        return sorted(folders), sorted(files, key=lambda entry: entry.name)
+
+    def names(self, prefix: str = "") -> list[str]:
+        """Return the names of its files and folders that begin so, sorted."""
+        folders, files = self.contents(prefix)
+        return sorted([*folders, *(entry.name for entry in files)])
 
     def read(self, name: str) -> bytes:
-        """Return the content of a file.
-
-        Raises
-        ------
-        StorageError
-            If it is not there or cannot be read.
-        """
+        """Return the content of a file; StorageError if it is not there or cannot be read."""
         content = self.read_if_there(name)
         if content is None:
             raise StorageError(f"{self.url}/{name}: no such file")
         return content
 
     def read_if_there(self, name: str) -> bytes | None:
-        """Return the content of a file; None if there is none of that name.
-
-        Raises
-        ------
-        StorageError
-            If it cannot be read.
-        """
+        """Return the content of a file, None if there is none; StorageError if it cannot be read."""
         filesystem, root = self._filesystem()
         try:
             content: bytes = filesystem.cat_file(f"{root}/{name}")
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return None
         except Exception as error:  # noqa: BLE001
             raise self._failed(name, "read", error) from None
         return content
 
-    def write(self, name: str, content: bytes) -> None:
-        """Write a file, whole or not at all; one of that name is replaced.
+    @contextmanager
+    def opened(self, name: str) -> Iterator[BinaryIO | None]:
+        """Open a file of which only parts are read; None if there is none."""
+        filesystem, root = self._filesystem()
+        try:
+            file = filesystem.open(f"{root}/{name}", "rb")
+        except FileNotFoundError:
+            yield None
+            return
+        with file:
+            yield file
 
-        Raises
-        ------
-        StorageError
-            If it cannot be written.
-        """
+    def write(self, name: str, content: bytes) -> None:
+        """Write a file, whole or not at all; one of that name is replaced. StorageError if it cannot be written."""
         try:
             if self.is_local:
                 Path(self.url).mkdir(parents=True, exist_ok=True)
@@ -122,12 +170,41 @@ class Storage:
         except Exception as error:  # noqa: BLE001
             raise self._failed(name, "write", error) from None
 
+    def remove(self, name: str) -> None:
+        """Remove a file, if it is there."""
+        filesystem, root = self._filesystem()
+        try:
+            filesystem.rm_file(f"{root}/{name}")
+        except FileNotFoundError:
+            pass
+        except Exception as error:  # noqa: BLE001
+            raise self._failed(name, "remove", error) from None
+
+    @contextmanager
+    def locked(self, *, wait: bool = True) -> Iterator[None]:
+        """While no other process of this machine does the same; other storage than folders has no locks.
+
+        Raises
+        ------
+        BlockingIOError
+            If another one does, and this is not to wait for it.
+        """
+        if not self.is_local:
+            yield
+            return
+        handle = os.open(self.url, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            yield
+        finally:
+            os.close(handle)
+
     def _filesystem(self) -> tuple[Any, str]:
         """What fsspec reads and writes the storage with, and the folder's name there."""
         from fsspec.core import url_to_fs  # noqa: PLC0415 (takes time, and not every command needs it)
 
         try:
-            filesystem, root = url_to_fs(self.url)
+            filesystem, root = url_to_fs(self.url, **({} if self.is_local else {"use_listings_cache": False}))
         except (ImportError, ValueError) as error:
             first_line = str(error).partition("\n")[0]
             raise StorageError(f"{self.url}: no way to reach this kind of storage: {first_line}") from None
@@ -138,6 +215,11 @@ class Storage:
         remedy = "; make room, and run the same command again to go on, or choose another place"
         full = getattr(error, "errno", None) in DISK_FULL
         return StorageError(f"{self.url}{name and '/'}{name}: cannot {what} it: {reason}{remedy if full else ''}")
+
+
+def is_url(place: str) -> bool:
+    """Whether a place is in object storage or on another machine."""
+    return "://" in place
 
 
 def open_storage(place: str | Path) -> Storage:
@@ -153,4 +235,37 @@ def open_storage(place: str | Path) -> Storage:
         raise StorageError(
             f"{str(place)!r}: names no place; give the path of a folder or a URL such as s3://BUCKET/NAME"
         )
-    return Storage(url=text if "://" in text else str(Path(text).absolute()))
+    return Storage(url=text if is_url(text) else str(Path(text).absolute()))
+
+
+def walk(storage: Storage) -> Iterator[tuple[Storage, list[Entry]]]:
+    """Folders that hold files, at any depth, each listed at its turn: the files of no two are in memory at once."""
+    folders, files = storage.contents()
+    if files:
+        yield storage, files
+    for name in folders:
+        yield from walk(storage.folder(name))
+
+
+@contextmanager
+def local_copy(url: str) -> Iterator[Path]:
+    """A file as one of this machine: itself, or a copy that is gone after the block.
+
+    Errors of the user that name the copy come out with the URL that the user knows.
+    """
+    if not is_url(url):
+        yield Path(url)
+        return
+    folder, _, name = url.rpartition("/")
+    storage = Storage(url=folder)
+    with tempfile.TemporaryDirectory(prefix="copy-") as temporary:
+        copy = Path(temporary) / name
+        filesystem, root = storage._filesystem()
+        try:
+            filesystem.get_file(f"{root}/{name}", str(copy))
+        except Exception as error:  # noqa: BLE001
+            raise storage._failed(name, "read", error) from None
+        try:
+            yield copy
+        except UserError as error:
+            raise type(error)(str(error).replace(str(copy), url)) from None

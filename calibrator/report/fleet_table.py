@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.results import SCHEMA, RunRecord, deployed_rms_a, part_file, read_part, read_run
-from calibrator.summaries.buckets import bucket_of
+from calibrator.summaries.identity import bucket_of
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import few_reasons
 from ecu_node.parameters import Explanation, Finding

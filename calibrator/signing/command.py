@@ -10,8 +10,13 @@ from typing import Annotated
 import typer
 
 from calibrator.errors import ContradictionError, SigningError
-from calibrator.files.folders import require_possible_folder
-from calibrator.files.whole_files import made_folder, remove_abandoned, require_own_file, write_files
+from calibrator.files.folders import (
+    made_folder,
+    remove_abandoned,
+    require_own_file,
+    require_possible_folder,
+    write_files,
+)
 from calibrator.signing.key_files import PASSPHRASE_VARIABLE, new_key, read_public_key, read_signer
 from calibrator.signing.numbers import require_near_number, signing_time, time_text
 from calibrator.signing.orders import Order

@@ -1,4 +1,4 @@
-"""CAN logs of one or many vehicles into a drive store. One bad log never stops the others."""
+"""Logs of one or many vehicles become drives of a store. One bad log never stops the others."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -9,14 +9,14 @@ from pathlib import Path
 from calibrator.drive import DriveFile
 from calibrator.drives.fleet_id import read_fleet_ids, write_fleet_ids
 from calibrator.drives.store import has_drive, write_drive
-from calibrator.processes.messages import Unread
-from calibrator.processes.reading import TIME_LIMIT_S, read_in_processes
+from calibrator.files.storage import Storage, local_copy, open_storage
+from calibrator.processes.run_many import Failed, Workers, try_many
 from calibrator.recordings.readers import read_recording
-from calibrator.sources.logs import find_logs
+from calibrator.sources.fleet_source import MEGABYTE, find_logs
+from calibrator.terminal.options import TIME_LIMIT_S
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import Notice, dumps, left_out_text, merged_notices, table
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import UserError
 
 __all__ = ["ImportReport", "ImportedDrive", "import_logs"]
 
@@ -62,20 +62,25 @@ class ImportReport:
 
 
 def import_logs(
-    logs: Sequence[Path], database: VehicleDatabase, store: Path, *, workers: int, limit_s: float = TIME_LIMIT_S
+    logs: Sequence[str | Path],
+    database: VehicleDatabase,
+    store: str | Path,
+    *,
+    workers: Workers,
+    limit_s: float = TIME_LIMIT_S,
 ) -> ImportReport:
     """Read logs and add their drives to a store.
 
     Parameters
     ----------
-    logs : sequence of Path
-        Log files, or folders to search; see :mod:`calibrator.sources.logs` for which vehicle a log belongs to.
+    logs : sequence of str or Path
+        Log files, or folders to search, see :mod:`calibrator.sources.fleet_source`; paths or URLs.
     database : VehicleDatabase
         DBC and layout.
-    store : Path
-        Folder of the store; made if there is none.
-    workers : int
-        Number of processes.
+    store : str or Path
+        Path or URL of the store; made if there is none.
+    workers : Workers
+        Where the logs are read.
     limit_s : float
         Longest time for one log; one that takes longer is left out. [s]
 
@@ -85,45 +90,50 @@ def import_logs(
         What was written, what was there already, and what was left out and why.
     """
     found = find_logs(logs)
-    left_out = {f"problem {k + 1}": str(problem) for k, problem in enumerate(found.problems)}
-    drives: list[ImportedDrive] = []
-    already_there: list[str] = []
-    read = partial(_import_one, database=database, store=store)
-    reading = read_in_processes(read, found.logs, workers=workers, limit_s=limit_s)
-    with progress_bar("import", len(found.logs), "logs") as progress, closing(reading) as runs:
-        for done, (log, outcome) in enumerate(zip(found.logs, runs, strict=True), start=1):
+    left_out, drives, already_there = dict(found.left_out), list[ImportedDrive](), list[str]()
+    read = partial(_import_one, database=database, store=open_storage(store).url)
+    entries = (log for vehicle in found.vehicles for log in found.vehicles[vehicle])
+    outcomes, done = try_many(read, entries, workers, limit_s=limit_s), 0.0
+    total = max(round(sum(found.sizes.values()) / MEGABYTE), 1)
+    with progress_bar("import", total, "MB") as progress, closing(outcomes):
+        for log, outcome in outcomes:
             if isinstance(outcome, ImportedDrive):
                 drives.append(outcome)
-            elif outcome is None:
-                already_there.append(f"{log.vehicle}/{log.name}")
-            elif isinstance(outcome, Unread):
-                left_out[f"{log.vehicle}/{log.name}"] = f"{log.path}: {outcome.reason}"
+            elif isinstance(outcome, Failed):
+                named = log.place in outcome.reason
+                left_out[f"{log.vehicle}/{log.name}"] = outcome.reason if named else f"{log.place}: {outcome.reason}"
             else:
-                left_out[f"{log.vehicle}/{log.name}"] = outcome
+                already_there.append(f"{log.vehicle}/{log.name}")
+            done += log.size / MEGABYTE
             progress(done)
     if drives:
-        _note_fleets(store, found.logs)
+        _note_fleets(open_storage(store), logs)
     return ImportReport(store=str(store), drives=tuple(drives), already_there=tuple(already_there), left_out=left_out)
 
 
-def _note_fleets(store: Path, logs: Sequence[DriveFile]) -> None:
-    """Carry over which artificial fleets the logs are of."""
-    folders = {log.path.resolve().parent.parent for log in logs}
-    fleet_ids = read_fleet_ids(store).union(*(read_fleet_ids(folder) for folder in folders if folder.is_dir()))
+def _note_fleets(store: Storage, logs: Sequence[str | Path]) -> None:
+    """Carry over which artificial fleets the logs are of, as noted beside the folders of their vehicles."""
+    places = [open_storage(log).url.rstrip("/") for log in logs]
+    beside = {folder for place in places for folder in (place, f"{place}/logs", *_above(place, 2))}
+    fleet_ids = read_fleet_ids(store.url).union(*map(read_fleet_ids, beside))
     if fleet_ids:
-        write_fleet_ids(store, fleet_ids)
+        write_fleet_ids(store.url, fleet_ids)
 
 
-def _import_one(log: DriveFile, database: VehicleDatabase, store: Path) -> ImportedDrive | str | None:
-    """Import one log; the text of the error if it cannot be used; None if it was imported before."""
-    try:
-        if has_drive(store, log.vehicle, log.name, database.layout):
-            return None
-        recording = read_recording(log.path, database, vehicle=log.vehicle, name=log.name)
-        write_drive(store, recording.drive, database.layout)
-    except UserError as error:
-        return str(error)
+def _above(place: str, levels: int) -> list[str]:
+    """Folders above a place."""
+    parts = place.split("/")
+    return ["/".join(parts[:-level]) for level in range(1, levels + 1) if len(parts) > level + 1]
+
+
+def _import_one(log: DriveFile, database: VehicleDatabase, store: str) -> ImportedDrive | None:
+    """Import one log; None if it was imported before."""
+    if has_drive(store, log.vehicle, log.name, database.layout):
+        return None
+    with local_copy(log.place) as path:
+        recording = read_recording(path, database, vehicle=log.vehicle, name=log.name)
     drive = recording.drive
+    write_drive(store, drive, database.layout)
     return ImportedDrive(
         vehicle=drive.vehicle,
         name=drive.name,

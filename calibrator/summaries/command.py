@@ -1,4 +1,4 @@
-"""``calibrator summarise``: drives become summaries."""
+"""``calibrator summarise``: drives become summaries; ``calibrator store``: what a store of them holds."""
 
 from typing import Annotated
 
@@ -6,37 +6,24 @@ import typer
 
 from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
-from calibrator.processes.reading import TIME_LIMIT_S
 from calibrator.terminal.options import (
+    TIME_LIMIT_S,
     BankOption,
     BranchesOption,
     FleetArgument,
     JsonOption,
     LayoutOption,
+    SchedulerOption,
     StoreOption,
     TimeLimitOption,
     WorkersOption,
 )
-from calibrator.terminal.text import print_report
+from calibrator.terminal.text import end_if_internal, print_report
 
-__all__ = ["summarise"]
+__all__ = ["store_app", "summarise"]
 
-MAX_PARTS = 1024
-
-
-def _part(value: str) -> str:
-    number, slash, count = value.partition("/")
-    if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count) <= MAX_PARTS):
-        raise typer.BadParameter(f"{value}: expected I/N with 1 <= I <= N <= {MAX_PARTS}, such as 3/8")
-    return value
-
-
-PartOption = Annotated[
-    str,
-    typer.Option(
-        "--part", metavar="I/N", callback=_part, help="Part I of N of the vehicles, where N machines share the work."
-    ),
-]
+StoreArgument = Annotated[str, typer.Argument(help="Store of summaries, path or URL.")]
+store_app = typer.Typer(no_args_is_help=True, help="Look at a store of summaries, check it, and tidy it up.")
 
 
 def summarise(
@@ -45,13 +32,14 @@ def summarise(
     out: StoreOption,
     branches: BranchesOption = None,
     bank: BankOption = None,
-    part: PartOption = "1/1",
     workers: WorkersOption = 2,
+    scheduler: SchedulerOption = None,
     time_limit: TimeLimitOption = TIME_LIMIT_S,
     json: JsonOption = False,
 ) -> None:
     """Reduce drives to what the calibration needs of them: second moments, a few kilobytes per vehicle."""
     with importing():
+        from calibrator.processes.run_many import Workers
         from calibrator.summaries.filter_bank import read_bank
         from calibrator.summaries.summarise_fleet import summarise_fleet
 
@@ -61,14 +49,38 @@ def summarise(
         out,
         branches=tuple(branches.split(",")) if branches else None,
         bank=read_bank(bank) if bank is not None else None,
-        workers=workers,
+        workers=Workers(processes=workers, scheduler=scheduler),
         time_limit_s=time_limit,
-        part=numbered_part(part),
     )
     print_report(report, json=json)
+    end_if_internal(report.left_out)
 
 
-def numbered_part(value: str) -> tuple[int, int]:
-    """Number and count of ``I/N``."""
-    number, _, count = value.partition("/")
-    return int(number), int(count)
+@store_app.command()
+def info(store: StoreArgument, json: JsonOption = False) -> None:
+    """Tell how many vehicles, drives and hours a store holds, of what, and how large it is."""
+    with importing():
+        from calibrator.summaries.store_report import look_at_store
+
+    print_report(look_at_store(store), json=json)
+
+
+@store_app.command()
+def check(store: StoreArgument, json: JsonOption = False) -> None:
+    """Read all of a store; exit code 1 if something in it is damaged, or counts twice."""
+    with importing():
+        from calibrator.summaries.store_report import look_at_store
+
+    report = look_at_store(store, whole=True)
+    print_report(report, json=json)
+    if report.faults:
+        raise typer.Exit(1)
+
+
+@store_app.command()
+def compact(store: StoreArgument) -> None:
+    """Put the files of each bucket together, and remove damaged records, whose drives are then summarised again."""
+    with importing():
+        from calibrator.summaries.store_report import compact_store
+
+    typer.echo(compact_store(store))

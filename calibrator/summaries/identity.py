@@ -1,5 +1,7 @@
 """What a store of summaries is of: summaries add up only if branches, inputs, filters and time base are the same."""
 
+import hashlib
+
 import msgspec
 
 from calibrator.errors import DriveError, FleetError
@@ -10,12 +12,13 @@ from calibrator.summaries.moments import BLOCK_S
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
-__all__ = ["SCHEMA_VERSION", "StoreIdentity", "read_identity", "store_identity", "write_identity"]
+__all__ = ["SCHEMA_VERSION", "StoreIdentity", "bucket_of", "read_identity", "store_identity", "write_identity"]
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 FILE = "summaries.json"
 FEWEST_BUCKETS, MOST_BUCKETS = 16, 32_768
 """Of a store: few vehicles are lost with one that is not finished, and a folder can still be listed."""
+_HASH_BYTES = 8
 VEHICLES_PER_BUCKET = 256
 """Aimed at: a few megabytes, read in a fraction of a second."""
 
@@ -79,6 +82,12 @@ def _short(value: object) -> str:
     text = ", ".join(value) if isinstance(value, tuple) else str(value)
     text = value.identity if isinstance(value, FilterBank) else text
     return text[:60]
+
+
+def bucket_of(vehicle: str, buckets: int) -> int:
+    """Bucket of a vehicle, from 0 to ``buckets - 1``: the same on every machine, whatever other vehicles there are."""
+    digest = hashlib.blake2b(vehicle.encode(), digest_size=_HASH_BYTES).digest()
+    return int.from_bytes(digest, "big") % buckets
 
 
 def store_identity(

@@ -6,16 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
-from calibrator.drives.plain_names import require_plain_name
+from calibrator.drives.store import require_plain_name
 from calibrator.errors import DriveError
-from calibrator.recordings.log_files import file_on_disk
 from calibrator.summaries.vehicle_summary import LEAST_DURATION_S, VehicleSummary
 from calibrator.summaries.zero_current import ZeroCurrent, weighted_mean
 from calibrator.terminal.text import counted
@@ -24,13 +22,13 @@ __all__ = [
     "IMPOSSIBLE",
     "MOST_MOMENT",
     "MOST_VARIANCE_A2",
+    "Known",
     "Outline",
     "Record",
     "drives_digest",
     "joined_records",
     "name_problem",
     "outline_of",
-    "source_version",
     "stored_problem",
 ]
 
@@ -51,7 +49,9 @@ class Record:
     drives : tuple of str
         Names of the drives.
     sources : tuple of str
-        Which version of each drive's file was read, see :func:`source_version`.
+        Which version of each drive's file was read, see :class:`.DriveFile`.
+    digests : tuple of str
+        What each drive holds, see :func:`.recording_digest`; none of drives that could not be read.
     found : VehicleSummary or None
         What they tell; None if they cannot be used.
     problem : str
@@ -66,6 +66,18 @@ class Record:
     found: VehicleSummary | None
     problem: str = ""
     damaged: bool = False
+    digests: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """Which drives a record is of; attributes as of :class:`Record`."""
+
+    vehicle: str
+    drives: tuple[str, ...]
+    sources: tuple[str, ...]
+    digests: tuple[str, ...]
+    problem: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,15 +105,6 @@ def drives_digest(records: Sequence[Record]) -> str:
         pair for record in records if record.found for pair in zip(record.drives, record.sources, strict=True)
     )
     return hashlib.blake2b(repr(known).encode(), digest_size=16).hexdigest()
-
-
-def source_version(path: Path) -> str:
-    """Size and time of the last change of a drive's file; empty if there is no such file."""
-    try:
-        status = file_on_disk(path).stat()
-    except OSError:
-        return ""
-    return f"{status.st_size}-{status.st_mtime_ns}"
 
 
 def name_problem(vehicle: str) -> str:

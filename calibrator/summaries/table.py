@@ -1,4 +1,4 @@
-"""Records as Parquet: one row, and one row group, per record, so that one vehicle can be read without the others.
+"""Records as Parquet, one row each.
 
 Moments are symmetric, so their upper triangles are stored, row by row, one block after the other. A record has at most
 :data:`MOST_BLOCKS` blocks: of longer drives neighbouring blocks are added, so a vehicle's size on disk and in memory
@@ -21,12 +21,20 @@ from calibrator.errors import FleetError
 from calibrator.summaries.fit_sums import LEVEL_EDGES_A, FitSums
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.moments import DriveSummary
-from calibrator.summaries.record import Outline, Record, name_problem, outline_of, stored_problem
+from calibrator.summaries.record import Known, Outline, Record, name_problem, outline_of, stored_problem
 from calibrator.summaries.row_checks import row_problem
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.summaries.zero_current import ZeroCurrent
 
-__all__ = ["FIT_COLUMNS", "MOST_BLOCKS", "SCHEMA", "decode_outlines", "decode_records", "encode_records"]
+__all__ = [
+    "FIT_COLUMNS",
+    "MOST_BLOCKS",
+    "SCHEMA",
+    "decode_known",
+    "decode_outlines",
+    "decode_records",
+    "encode_records",
+]
 
 MOST_BLOCKS = 256
 """Of a record: two hours and more; their spread is known to a tenth. [1]"""
@@ -40,6 +48,7 @@ SCHEMA = pa.schema(
         pa.field("vehicle", pa.string(), nullable=False),
         pa.field("drives", _NAMES, nullable=False),
         pa.field("sources", _NAMES, nullable=False),
+        pa.field("digests", _NAMES),
         pa.field("problem", pa.string()),
         pa.field("duration_s", pa.float64(), metadata={"unit": "s"}),
         pa.field("moments", _FLOATS, metadata={"shape": "(B, p (p + 1) / 2), p: filtered inputs, branches [A], 1"}),
@@ -60,99 +69,80 @@ SCHEMA = pa.schema(
 
 
 def encode_records(records: Sequence[Record], identity: StoreIdentity) -> bytes:
-    """Write records as a Parquet file.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        With the inputs and branches of the store.
-    identity : StoreIdentity
-        Of the store.
-
-    Returns
-    -------
-    bytes
-        The file.
-    """
-    rows = [_row(record, identity) for record in records]
+    """Write records, which have the inputs and branches of the store, as a Parquet file."""
     buffer = io.BytesIO()
-    table = pa.Table.from_pylist(rows, schema=SCHEMA)
-    pq.write_table(
-        table,
-        buffer,
-        row_group_size=1,
-        compression="snappy",
-        use_dictionary=False,
-        write_statistics=["vehicle"],
-    )
+    table = pa.Table.from_pylist([_row(record, identity) for record in records], schema=SCHEMA)
+    pq.write_table(table, buffer, compression="snappy", use_dictionary=False, write_statistics=["vehicle"])
     return buffer.getvalue()
 
 
-def decode_records(content: bytes, identity: StoreIdentity, where: str) -> list[Record]:
-    """Read records from a Parquet file.
+def decode_records(contents: Sequence[bytes], identity: StoreIdentity, where: str) -> list[Record]:
+    """Read records from Parquet files.
 
     Parameters
     ----------
-    content : bytes
-        The file.
+    contents : sequence of bytes
+        The files.
     identity : StoreIdentity
-        Of its store.
+        Of their store.
     where : str
-        Of the file, for messages.
+        Of the files, for messages.
 
     Returns
     -------
     list of Record
-        In the order of the file. One whose numbers make no sense, or are too few or too many, is damaged.
+        In the order of the files. One whose numbers make no sense, or are too few or too many, is damaged.
 
     Raises
     ------
     FleetError
-        If the file is cut or no such file.
+        If a file is cut or no such file.
     """
-    return list(_records(_table(content, where), identity))
+    return list(_records(_table(contents, where), identity))
 
 
-def decode_outlines(content: bytes, where: str) -> list[Outline]:
-    """Read what there is of each vehicle, without its moments.
-
-    Parameters
-    ----------
-    content : bytes
-        A file of :func:`encode_records`.
-    where : str
-        Of the file, for messages.
-
-    Returns
-    -------
-    list of Outline
-        One per vehicle, in the order of the file.
-
-    Raises
-    ------
-    FleetError
-        If the file is cut or no such file.
-    """
+def decode_outlines(contents: Sequence[bytes], where: str) -> list[Outline]:
+    """Read what there is of each vehicle, one per vehicle, without its moments; as :func:`decode_records`."""
     rows: dict[str, list[dict[str, Any]]] = {}
-    for row in _table(content, where, ["vehicle", "drives", "problem", "duration_s"]).to_pylist():
+    for row in _table(contents, where, ["vehicle", "drives", "problem", "duration_s"]).to_pylist():
         rows.setdefault(row["vehicle"] or "", []).append(row)
     return [outline_of(name, group) for name, group in rows.items()]
 
 
-def _table(content: bytes, where: str, columns: list[str] | None = None) -> pa.Table:
-    """Some columns of a file; without the detour over data sets, which takes twice as long for many row groups."""
-    try:
-        file = pq.ParquetFile(pa.BufferReader(content), pre_buffer=False)
-        fits = file.schema_arrow.equals(SCHEMA)
-        table = file.read(columns=columns, use_threads=False) if fits else None
-        if table is not None:
-            table.validate(full=True)
-    except (pa.ArrowException, OSError):
-        table, fits = None, True
-    if table is None:
-        reason = "it is cut, or no Parquet file" if fits else "its columns are not those of summaries"
+def decode_known(contents: Sequence[bytes], where: str) -> list[Known]:
+    """Read which drives the records are of, without their moments; as :func:`decode_records`."""
+    found = []
+    for row in _table(contents, where, ["vehicle", "drives", "sources", "digests", "problem"]).to_pylist():
+        drives, sources = _drives(row)
+        digests = tuple(text or "" for text in row["digests"] or ())
+        problem = row["problem"]
+        found.append(
+            Known(
+                vehicle=row["vehicle"] or "",
+                drives=drives,
+                sources=sources,
+                digests=digests,
+                problem="" if problem is None else stored_problem(problem),
+            )
+        )
+    return found
+
+
+def _table(contents: Sequence[bytes], where: str, columns: list[str] | None = None) -> pa.Table:
+    """Some columns of files, without the detour over data sets."""
+    tables = [SCHEMA.empty_table() if columns is None else SCHEMA.empty_table().select(columns)]
+    for content in contents:
+        reason = "its columns are not those of summaries"
+        try:
+            file = pq.ParquetFile(pa.BufferReader(content), pre_buffer=False)
+            if file.schema_arrow.equals(SCHEMA):
+                tables.append(file.read(columns=columns, use_threads=False))
+                tables[-1].validate(full=True)
+                continue
+        except (pa.ArrowException, OSError):
+            reason = "it is cut, or no Parquet file"
         raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again")
-    return table
+    return pa.concat_tables(tables)
 
 
 def _row(record: Record, identity: StoreIdentity) -> dict[str, Any]:
@@ -160,6 +150,7 @@ def _row(record: Record, identity: StoreIdentity) -> dict[str, Any]:
         "vehicle": record.vehicle,
         "drives": list(record.drives),
         "sources": list(record.sources),
+        "digests": list(record.digests),
     }
     if record.found is None:
         return {**row, "problem": record.problem}
@@ -199,7 +190,8 @@ def _records(table: pa.Table, identity: StoreIdentity) -> Iterable[Record]:
     for row, summary in zip(rows, _summaries(table, identity), strict=True):
         name = row["vehicle"] or ""
         drives, sources = _drives(row)
-        record = Record(vehicle=name, drives=drives, sources=sources, found=None)
+        digests = tuple(text or "" for text in row["digests"] or ())
+        record = Record(vehicle=name, drives=drives, sources=sources, found=None, digests=digests)
         if row["problem"] is not None:
             yield replace(record, problem=stored_problem(row["problem"]))
         elif problem := name_problem(name) or row_problem(row, summary, identity.branches):

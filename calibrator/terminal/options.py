@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 __all__ = [
+    "TIME_LIMIT_S",
     "BankOption",
     "BranchesOption",
     "DbcOption",
@@ -20,6 +21,7 @@ __all__ = [
     "JsonOption",
     "LayoutOption",
     "MagnitudeOption",
+    "SchedulerOption",
     "SeedOption",
     "SparsityOption",
     "StoreOption",
@@ -37,6 +39,10 @@ MAX_SEED = 2**32 - 1
 MAX_WORKERS = 256
 FAR = 1e9
 """Upper bounds from here on tell nobody anything, and do not stand in the help."""
+TIME_LIMIT_S = 600.0
+"""A day's log is read in seconds; what takes so long never ends, or would hold up a fleet. [s]"""
+SCHEDULER = re.compile(r"(tcp|tls)://([^\s/?#@:\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})")
+MAX_PORT = 65_535
 MAX_TIME_LIMIT_S = 86_400.0
 """A day. [s]"""
 
@@ -100,19 +106,27 @@ def _magnitude(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
+def _scheduler(value: str | None) -> str | None:
+    if value is None:
+        return None
+    found = SCHEDULER.fullmatch(value)
+    if found is None or not 1 <= int(found["port"]) <= MAX_PORT:
+        raise typer.BadParameter(
+            f"{value!r}: expected the address of a Dask scheduler, tcp://HOST:PORT or tls://HOST:PORT, port 1 to "
+            f"{MAX_PORT}"
+        )
+    return value
+
+
 def _named(value: str) -> str:
     if not value.strip():
         raise typer.BadParameter("an empty name; give the path of a folder, '.' for this one")
     return value
 
 
-def _named_path(value: str) -> Path:
-    return Path(_named(value))
-
-
 FleetArgument = Annotated[
-    Path,
-    typer.Argument(parser=_named_path, help="Drive store, or folder with a folder of logs per vehicle."),
+    str,
+    typer.Argument(callback=_named, help="Drive store, or folder with a folder of logs per vehicle; path or URL."),
 ]
 FleetOrSummariesArgument = Annotated[
     str,
@@ -133,6 +147,15 @@ WorkersOption = Annotated[int, whole_option("--workers", 1, MAX_WORKERS, "Number
 TimeLimitOption = Annotated[
     float,
     number_option("--time-limit", 1, MAX_TIME_LIMIT_S, "Longest time to read one log, or one vehicle of a fleet [s]"),
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        callback=_scheduler,
+        help="Dask scheduler, tcp://HOST:PORT, instead of processes.",
+    ),
 ]
 SeedOption = Annotated[int, whole_option("--seed", 0, MAX_SEED, "Seed of everything random")]
 BranchesOption = Annotated[

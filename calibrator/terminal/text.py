@@ -6,13 +6,16 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import msgspec
+import typer
 
-from ecu_node.program import write_output, write_text
+from calibrator.errors import INTERNAL_ERROR as INTERNAL
+from ecu_node.program import INTERNAL_ERROR, say_error, write_output, write_text
 
 __all__ = [
     "Notice",
     "counted",
     "dumps",
+    "end_if_internal",
     "few",
     "few_reasons",
     "figure",
@@ -96,6 +99,15 @@ def reasons_text(title: str, reasons: Mapping[str, str], most: int = 10) -> str:
 def left_out_text(left_out: Mapping[str, str]) -> str:
     """One line per reason why things were left out; empty if nothing was."""
     return "\n".join(["left out:", *(f"  {line}" for line in told_once(left_out.items()))]) if left_out else ""
+
+
+def end_if_internal(left_out: Mapping[str, str]) -> None:
+    """End a command with the exit code of internal errors if these are among the reasons; the first few are named."""
+    failed = {name: why.removeprefix(INTERNAL) for name, why in left_out.items() if why.startswith(INTERNAL)}
+    if failed:
+        lines = "; ".join(told_once(failed.items())[:MOST_REASONS])
+        say_error(f"calibrator: internal error in {counted(len(failed), 'vehicle')}, which are left out: {lines}")
+        raise typer.Exit(INTERNAL_ERROR)
 
 
 def few(names: Sequence[str]) -> str:

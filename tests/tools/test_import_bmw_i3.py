@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.drives.drive_file import read_drive_file
-from calibrator.drives.store import list_drives
+from calibrator.drives.store import list_drives, read_drive_file
 from calibrator.errors import DriveError, LogError
 from calibrator.recordings.readers import read_drive
 from calibrator.recordings.tables import read_table
@@ -180,7 +179,7 @@ def test_the_log_holds_what_the_drive_holds(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert json.loads(done.stdout)["drives"]["A"]["duration_s"] == pytest.approx(59.9)
     database = read_database(read_layout(LAYOUT))
-    drive = read_drive_file(list_drives(tmp_path / "store")[0].path, database.layout)
+    drive = read_drive_file(Path(list_drives(tmp_path / "store")[0].place), database.layout)
     read = read_drive(tmp_path / "logs" / "A" / "A.log.gz", database, vehicle="A", name="A")
     assert set(read.inputs) == set(drive.inputs)
     for name, channel in drive.branches.items():
@@ -231,14 +230,14 @@ def test_trips_that_are_there_stay_as_they_are_and_only_missing_logs_are_written
     path = write_csv(tmp_path / "A.csv", columns())
     store, logs = tmp_path / "store", tmp_path / "logs"
     assert run(path, "--layout", LAYOUT, "--out", store).returncode == 0
-    before = list_drives(store)[0].path.read_bytes()
+    before = Path(list_drives(store)[0].place).read_bytes()
     write_csv(path, columns() | {"speed": np.full(SAMPLES, 50.0)})
     again = run(path, "--layout", LAYOUT, "--out", store)
     assert again.returncode == 0
     assert "0 trips imported, 0.0 h; 1 already there; 0 left out" in again.stdout
     assert run(path, "--layout", LAYOUT, "--out", store, "--logs", logs).returncode == 0
     assert (logs / "A" / "A.log.gz").is_file()
-    assert list_drives(store)[0].path.read_bytes() == before
+    assert Path(list_drives(store)[0].place).read_bytes() == before
 
 
 @pytest.mark.parametrize("option", ["--out", "--logs"])

@@ -18,7 +18,7 @@ from calibrator.experiments.recorded_fleet import builtin_fleet
 from calibrator.experiments.recorded_trial import RecordedCase, record_vehicles
 from calibrator.faults import Faults
 from calibrator.files.storage import open_storage
-from calibrator.processes.computing import Workers
+from calibrator.processes.run_many import Workers, run_many
 from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.moments import DriveSummary
@@ -75,7 +75,7 @@ def make_store(
     write = partial(_write, store=store, trips=trips, sparsity=sparsity, full_scale_a=database.layout.full_scale_a)
     with progress_bar("write summaries", vehicles, "vehicles") as progress:
         done = 0
-        for count in Workers(processes=workers).map(write, by_bucket.items()):
+        for count in run_many(write, by_bucket.items(), Workers(processes=workers)):
             done += count
             progress(done)
     return store
@@ -120,7 +120,7 @@ def _write(
         name: [_record(name, trips[int(name[1:]) % TRIPS], faults.take(j), store.identity.branches)]
         for j, name in enumerate(names)
     }
-    store.write(number, records)
+    store.append(number, records)
     return len(names)
 
 

@@ -2,16 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-
-from joblib import delayed
 
 from calibrator.artificial.ground_truth import GroundTruth, choose_branches
 from calibrator.artificial.simulate import FleetPlan, draw_vehicles, trip_of
 from calibrator.artificial.trips import TripPurpose, TripSource
 from calibrator.artificial.vehicle import Vehicle, vehicle_drive
 from calibrator.drives.store import write_drive
-from calibrator.processes.computing import in_processes
+from calibrator.processes.run_many import Workers, run_many
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.terminal.progress import shown
 from ecu_node.database import VehicleDatabase
@@ -51,7 +50,7 @@ class ChainFleet:
     def write_drives(self, store: Path, *, workers: int) -> None:
         """Write the drives to learn from into a store."""
         count = len(self.vehicles)
-        written = in_processes((delayed(self.write_drive)(store, number) for number in range(count)), workers=workers)
+        written = run_many(partial(self.write_drive, store), range(count), Workers(processes=workers))
         for _ in shown(written, "drive, to learn from", count, "vehicles"):
             pass
 

@@ -4,11 +4,10 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from joblib import delayed
-
-from calibrator.processes.computing import in_processes
+from calibrator.processes.run_many import Workers, run_many
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps, table
 from chain.fleet import ChainFleet
@@ -121,11 +120,8 @@ def drive_chain(fleet: ChainFleet, folder: Path, *, workers: int) -> ChainScore:
     _sign(folder, [path for path in files if path.exists()])
     keys = read_canonical((folder / "keys.json").read_bytes().rstrip(), KeySet, "keys.json", KEY_SET)
     calibrated = [number for number, path in enumerate(files) if path.exists()]
-    tasks = (
-        delayed(_drive)(fleet, number, folder, keys, calibrated[(place + 1) % len(calibrated)])
-        for place, number in enumerate(calibrated)
-    )
-    driven = in_processes(tasks, workers=workers)
+    tasks = ((number, calibrated[(place + 1) % len(calibrated)]) for place, number in enumerate(calibrated))
+    driven = run_many(partial(_drive, fleet, folder, keys), tasks, Workers(processes=workers))
     return ChainScore(list(shown(driven, "drive, corrected", len(calibrated), "vehicles")))
 
 
@@ -139,7 +135,8 @@ def _sign(folder: Path, files: Sequence[Path]) -> None:
     _run("calibrator", "sign", *files, *private, "--out", folder / "signed")
 
 
-def _drive(fleet: ChainFleet, number: int, folder: Path, keys: KeySet, other: int) -> VehicleOutcome:
+def _drive(fleet: ChainFleet, folder: Path, keys: KeySet, task: tuple[int, int]) -> VehicleOutcome:
+    number, other = task
     name = fleet.vehicles[number].name
     params = folder / "result" / "params"
     file = SignedFile(

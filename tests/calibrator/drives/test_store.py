@@ -8,8 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from calibrator.drive import Channel, Drive
-from calibrator.drives.drive_file import read_drive_file
-from calibrator.drives.store import iterate_drives, list_drives, write_drive
+from calibrator.drives.store import iterate_drives, list_drives, read_drive_file, write_drive
 from calibrator.errors import DriveError
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
@@ -31,7 +30,7 @@ def some_drive(vehicle: str = "V1", name: str = "monday") -> Drive:
 
 def test_a_drive_comes_back_to_the_bit(tmp_path: Path, layout: Layout) -> None:
     drive = some_drive()
-    read = read_drive_file(write_drive(tmp_path, drive, layout), layout)
+    read = read_drive_file(Path(write_drive(tmp_path, drive, layout)), layout)
     assert (read.vehicle, read.name) == ("V1", "monday")
     assert list(read.branches) == ["battery", "motor"]
     for one, other in zip(
@@ -54,7 +53,7 @@ def test_drives_are_listed_and_read_in_order(tmp_path: Path, layout: Layout) -> 
 
 def test_writing_again_replaces_the_drive_and_leaves_nothing_behind(tmp_path: Path, layout: Layout) -> None:
     write_drive(tmp_path, some_drive(), layout)
-    path = write_drive(tmp_path, some_drive(), layout)
+    path = Path(write_drive(tmp_path, some_drive(), layout))
     assert list(path.parent.iterdir()) == [path]
 
 
@@ -67,7 +66,7 @@ def test_a_name_that_is_no_file_name_is_refused(tmp_path: Path, layout: Layout, 
 
 
 def test_a_store_made_with_another_layout_is_refused(tmp_path: Path, layout: Layout) -> None:
-    path = write_drive(tmp_path, some_drive(), layout)
+    path = Path(write_drive(tmp_path, some_drive(), layout))
     other = msgspec.structs.replace(layout, digest="0" * 64)
     with pytest.raises(DriveError, match=r"monday\.parquet: made with layout hv_powertrain .*000000.*import the logs"):
         read_drive_file(path, other)
@@ -75,7 +74,7 @@ def test_a_store_made_with_another_layout_is_refused(tmp_path: Path, layout: Lay
 
 @pytest.mark.parametrize("size", [0, 3, 100, -10])
 def test_a_cut_file_is_refused(tmp_path: Path, layout: Layout, size: int) -> None:
-    path = write_drive(tmp_path, some_drive(), layout)
+    path = Path(write_drive(tmp_path, some_drive(), layout))
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(DriveError, match=r"monday\.parquet: (not a drive|cannot read the drive): .*import it again"):
         read_drive_file(path, layout)
@@ -89,7 +88,7 @@ def test_another_parquet_file_is_refused(tmp_path: Path, layout: Layout) -> None
 
 
 def test_another_schema_version_is_refused(tmp_path: Path, layout: Layout) -> None:
-    path = write_drive(tmp_path, some_drive(), layout)
+    path = Path(write_drive(tmp_path, some_drive(), layout))
     table = pq.read_table(path)
     about = json.loads(table.schema.metadata[b"calibrator.drive"]) | {"schema_version": 99}
     pq.write_table(table.replace_schema_metadata({b"calibrator.drive": json.dumps(about)}), path)
@@ -98,7 +97,7 @@ def test_another_schema_version_is_refused(tmp_path: Path, layout: Layout) -> No
 
 
 def test_columns_of_different_lengths_are_refused(tmp_path: Path, layout: Layout) -> None:
-    path = write_drive(tmp_path, some_drive(), layout)
+    path = Path(write_drive(tmp_path, some_drive(), layout))
     table = pq.read_table(path)
     short = pa.array([[1.0]] * table.num_rows, pa.list_(pa.float64()))
     pq.write_table(table.set_column(3, "value", short), path)
@@ -107,7 +106,7 @@ def test_columns_of_different_lengths_are_refused(tmp_path: Path, layout: Layout
 
 
 def test_one_bad_file_does_not_stop_the_others(tmp_path: Path, layout: Layout) -> None:
-    write_drive(tmp_path, some_drive("V1"), layout).write_bytes(b"")
+    Path(write_drive(tmp_path, some_drive("V1"), layout)).write_bytes(b"")
     write_drive(tmp_path, some_drive("V2"), layout)
     errors: list[UserError] = []
     assert [drive.vehicle for drive in iterate_drives(tmp_path, layout, on_error=errors.append)] == ["V2"]
@@ -123,7 +122,7 @@ def test_a_folder_that_is_no_store_is_refused(tmp_path: Path) -> None:
 
 def test_a_store_that_cannot_be_written_is_named(tmp_path: Path, layout: Layout) -> None:
     (tmp_path / "store").write_text("a file")
-    with pytest.raises(DriveError, match="cannot write the drive"):
+    with pytest.raises(DriveError, match=r"cannot write it: .*; choose another folder"):
         write_drive(tmp_path / "store", some_drive(), layout)
 
 
@@ -133,7 +132,7 @@ def test_a_drive_decoded_with_another_dbc_is_refused(tmp_path: Path) -> None:
     layout_file.write_bytes((original / layout_file.name).read_bytes())
     dbc.write_bytes((original / dbc.name).read_bytes())
     layout = read_layout(layout_file)
-    path = write_drive(tmp_path / "store", Drive(vehicle="V", name="d", branches={}, inputs={}), layout)
+    path = Path(write_drive(tmp_path / "store", Drive(vehicle="V", name="d", branches={}, inputs={}), layout))
     dbc.write_text(dbc.read_text().replace("(0.02,0)", "(0.04,0)"))
     with pytest.raises(DriveError, match=r"made with another DBC than .*hv_powertrain\.dbc; import the logs again"):
         read_drive_file(path, layout)

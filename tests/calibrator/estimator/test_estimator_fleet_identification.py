@@ -59,7 +59,7 @@ def drive(
 
 def model_of(database: VehicleDatabase, store: Path, *drives: Drive) -> VehicleModel:
     entries = [
-        DriveFile(vehicle=item.vehicle, name=item.name, path=write_drive(store, item, database.layout))
+        DriveFile(vehicle=item.vehicle, name=item.name, place=write_drive(store, item, database.layout))
         for item in drives
     ]
     return read_vehicle_model(entries, EQUIPMENT, database)

@@ -25,7 +25,7 @@ from calibrator.estimator.results import (
 from calibrator.estimator.rows import VehicleEvidence
 from calibrator.report.fleet_table import read_fleet_table
 from calibrator.report.overview import overview_of
-from calibrator.summaries.buckets import bucket_of
+from calibrator.summaries.identity import bucket_of
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters, decode_parameters, read_parameters
 from tests.calibrator.conftest import run_command

@@ -30,7 +30,7 @@ from calibrator.faults import Faults
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.files.storage import open_storage
 from calibrator.options import Method
-from calibrator.processes.computing import Workers
+from calibrator.processes.run_many import Workers
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary

@@ -1,11 +1,6 @@
 import gzip
 import json
-import multiprocessing
-import os
 import re
-import signal
-import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -13,6 +8,7 @@ import pytest
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
 from calibrator.drives.fleet_id import read_fleet_ids
+from calibrator.processes.run_many import Workers
 from calibrator.sources.import_logs import ImportReport, import_logs
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
@@ -30,7 +26,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def imported(logs: list[Path], store: Path, database: VehicleDatabase) -> ImportReport:
-    return import_logs(logs, database, store, workers=1)
+    return import_logs(logs, database, store, workers=Workers())
 
 
 def test_what_is_there_is_named_and_what_is_new_is_added(
@@ -92,31 +88,11 @@ def write_endless_log(path: Path) -> None:
     path.write_bytes(gzip.compress(b"\n" * (1 << 24)) * 2000)
 
 
-def kill_first_reader(others: set[int | None]) -> None:
-    """Kill the first worker that was not there before."""
-    while not (new := {child.pid for child in multiprocessing.active_children()} - others):
-        time.sleep(0.01)
-    os.kill(new.pop() or 0, signal.SIGKILL)
-
-
 def test_a_log_that_takes_too_long_costs_itself_only(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
     endless = tmp_path / "logs" / "V000" / "endless.log.gz"
     write_endless_log(endless)
     logs = [endless, fleet / "logs"]
-    report = import_logs(logs, database, tmp_path / "store", workers=1, limit_s=5.0)
+    report = import_logs(logs, database, tmp_path / "store", workers=Workers(), limit_s=5.0)
     assert [drive.vehicle for drive in report.drives] == ["V001", "V002"]
     assert list(report.left_out) == ["V000/endless"]
     assert report.left_out["V000/endless"].startswith(f"{endless}: reading took more than 5 s and was ended; ")
-
-
-def test_a_log_whose_reader_is_killed_costs_itself_only(fleet: Path, tmp_path: Path, database: VehicleDatabase) -> None:
-    endless = tmp_path / "logs" / "V000" / "endless.log.gz"
-    write_endless_log(endless)
-    others = {child.pid for child in multiprocessing.active_children()}
-    killer = threading.Thread(target=kill_first_reader, args=[others])
-    killer.start()
-    report = imported([endless, fleet / "logs"], tmp_path / "store", database)
-    killer.join()
-    assert [drive.vehicle for drive in report.drives] == ["V001", "V002"]
-    reason = f"{endless}: the process that read it was killed by SIGKILL; "
-    assert report.left_out["V000/endless"].startswith(reason)

@@ -1,6 +1,12 @@
+"""Which log belongs to which vehicle; nothing is opened."""
+
 from pathlib import Path
 
-from calibrator.sources.logs import find_logs
+from calibrator.sources.fleet_source import FleetSource, find_logs
+
+
+def drives(found: FleetSource) -> list[tuple[str, str]]:
+    return [(log.vehicle, log.name) for logs in found.vehicles.values() for log in logs]
 
 
 def make(*paths: Path) -> None:
@@ -12,63 +18,62 @@ def make(*paths: Path) -> None:
 def test_the_folder_names_the_vehicle_and_the_file_the_drive(tmp_path: Path) -> None:
     make(tmp_path / "logs" / "V1" / "monday.log.gz", tmp_path / "logs" / "V2" / "a.b.blf", tmp_path / "truth.json")
     found = find_logs([tmp_path])
-    assert [(log.vehicle, log.name) for log in found.logs] == [("V1", "monday"), ("V2", "a.b")]
-    assert not found.problems
+    assert drives(found) == [("V1", "monday"), ("V2", "a.b")]
+    assert not found.left_out
 
 
 def test_a_log_beside_the_folders_of_vehicles_is_left_out_and_named(tmp_path: Path) -> None:
     make(tmp_path / "V1" / "a.log", tmp_path / "V2" / "a.log", tmp_path / "copy of a.log")
     found = find_logs([tmp_path])
-    assert [log.vehicle for log in found.logs] == ["V1", "V2"]
-    (problem,) = found.problems
-    assert str(problem).startswith(f"{tmp_path / 'copy of a.log'}: lies beside folders with logs; move it")
+    assert list(found.vehicles) == ["V1", "V2"]
+    (problem,) = found.left_out.values()
+    assert problem.startswith(f"{tmp_path / 'copy of a.log'}: lies beside folders with logs; move it")
 
 
 def test_a_log_that_is_named_itself_is_of_its_folder_whatever_lies_beside_it(tmp_path: Path) -> None:
     make(tmp_path / "V1" / "a.log", tmp_path / "V1" / "old" / "b.log")
     found = find_logs([tmp_path / "V1", tmp_path / "V1" / "a.log"])
-    assert [(log.vehicle, log.name) for log in found.logs] == [("V1", "a"), ("old", "b")]
-    assert not found.problems
-    assert len(find_logs([tmp_path / "V1"]).problems) == 1
+    assert drives(found) == [("V1", "a"), ("old", "b")]
+    assert not found.left_out
+    assert len(find_logs([tmp_path / "V1"]).left_out) == 1
 
 
 def test_a_file_named_twice_is_read_once(tmp_path: Path) -> None:
     make(tmp_path / "V1" / "a.log")
     found = find_logs([tmp_path / "V1", tmp_path / "V1" / "a.log", tmp_path])
-    assert len(found.logs) == 1
-    assert not found.problems
+    assert len(drives(found)) == 1
+    assert not found.left_out
 
 
 def test_two_vehicles_with_one_name_are_left_out_and_the_rest_goes_on(tmp_path: Path) -> None:
     make(tmp_path / "x" / "V1" / "a.log", tmp_path / "y" / "V1" / "b.log", tmp_path / "y" / "V2" / "a.log")
     found = find_logs([tmp_path])
-    assert [log.vehicle for log in found.logs] == ["V2"]
-    (problem,) = found.problems
-    assert str(problem).startswith(f"two vehicles with one name: V1 is in {tmp_path / 'x' / 'V1'} and in")
+    assert list(found.vehicles) == ["V2"]
+    (problem,) = found.left_out.values()
+    assert problem.startswith(f"two vehicles with one name: V1 is in {tmp_path / 'x' / 'V1'} and in")
 
 
 def test_two_files_of_one_drive_are_left_out_and_named(tmp_path: Path) -> None:
     make(tmp_path / "V1" / "a.log", tmp_path / "V1" / "a.blf", tmp_path / "V1" / "b.log")
     found = find_logs([tmp_path])
-    assert [log.name for log in found.logs] == ["b"]
-    (problem,) = found.problems
-    assert "vehicle V1: drive a is in" in str(problem)
-    assert "a.blf and" in str(problem)
+    assert drives(found) == [("V1", "b")]
+    (problem,) = found.left_out.values()
+    assert "vehicle V1: drive a is in" in problem
+    assert "a.blf and" in problem
 
 
 def test_an_argument_that_does_not_exist_or_has_no_logs_is_a_problem(tmp_path: Path) -> None:
     make(tmp_path / "V1" / "a.log")
     (tmp_path / "empty").mkdir()
     found = find_logs([tmp_path / "nothing", tmp_path / "empty", tmp_path / "V1"])
-    assert len(found.logs) == 1
-    assert ["no such file or folder" in str(p) or "no logs in it" in str(p) for p in found.problems] == [
-        True,
-        True,
-    ]
+    assert len(drives(found)) == 1
+    missing, empty = found.left_out.values()
+    assert "nothing: no such file or folder" in missing
+    assert "empty: no logs in it" in empty
 
 
 def test_a_folder_name_that_cannot_name_a_vehicle_is_a_problem(tmp_path: Path) -> None:
     make(tmp_path / "V*1" / "a.log")
     found = find_logs([tmp_path])
-    assert not found.logs
-    assert "'V*1' cannot be used" in str(found.problems[0])
+    assert not found.vehicles
+    assert "'V*1' cannot be used" in found.left_out["problem 1"]

@@ -16,11 +16,11 @@ import pytest
 
 from calibrator.errors import DriveError, FleetError
 from calibrator.files.storage import Storage, StorageError, open_storage
-from calibrator.summaries.buckets import bucket_of
-from calibrator.summaries.identity import SCHEMA_VERSION, read_identity, write_identity
+from calibrator.summaries.identity import SCHEMA_VERSION, bucket_of, read_identity, write_identity
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import Record, joined_records
 from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.store_report import compact_store, look_at_store
 from calibrator.summaries.table import FIT_COLUMNS, MOST_BLOCKS, SCHEMA
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.estimator.simulated_drives import Conditions, no_faults, summaries_of
@@ -70,10 +70,28 @@ def test_any_tool_can_read_it(store: SummaryStore) -> None:
     assert seconds == pytest.approx(VEHICLES * 1800.0)
 
 
-def test_each_vehicle_has_a_row_group_of_its_own(store: SummaryStore) -> None:
-    for path in Path(store.url).glob("buckets/*.parquet"):
-        about = pq.read_metadata(path)
-        assert about.num_row_groups == about.num_rows
+def test_added_records_are_files_of_their_own_until_they_are_put_together(
+    tmp_path: Path, database: VehicleDatabase
+) -> None:
+    store = small_store(tmp_path / "store", database, random_faults(4))
+    bucket = store.bucket_of("V001")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "store" / "buckets").iterdir()}
+    store.append(bucket, {"V001": [record_of("V001", summary_of(600), ("d2",))]})
+    for name, content in before.items():
+        assert (tmp_path / "store" / "buckets" / name).read_bytes() == content
+    assert [record.drives for record in store.read(bucket)["V001"]] == [("d1",), ("d2",)]
+    old = store.files(bucket)[0]
+    kept = {name: (tmp_path / "store" / "buckets" / name).read_bytes() for name in old}
+    assert look_at_store(store.url).drives == 5
+    assert compact_store(store.url).endswith("1 bucket written anew, 0 damaged records removed")
+    (whole,), rest = store.files(bucket)
+    assert rest == []
+    for name, content in kept.items():  # as if the run had been killed before it removed them
+        (tmp_path / "store" / "buckets" / name).write_bytes(content)
+    assert store.files(bucket) == ([whole], old)
+    assert [record.drives for record in store.read(bucket)["V001"]] == [("d1",), ("d2",)]
+    report = look_at_store(store.url, whole=True)
+    assert (report.vehicles, report.drives, sorted(report.faults)) == (4, 5, old)
 
 
 def test_the_bucket_of_a_vehicle_depends_on_its_name_alone() -> None:
@@ -132,18 +150,18 @@ def test_a_damaged_bucket_is_named(tmp_path: Path, database: VehicleDatabase, da
     path = next((tmp_path / "buckets").iterdir())
     path.write_bytes(damage)
     with pytest.raises(FleetError, match=rf"{path.name}: damaged file of summaries: .*; remove it and summarise again"):
-        store.read(int(path.stem))
+        store.read(int(path.name[:5]))
     with pytest.raises(FleetError, match="damaged file of summaries"):
-        store.outlines(int(path.stem))
+        store.outlines(int(path.name[:5]))
 
 
 def spoil(store: SummaryStore, bucket: int, changes: Mapping[str, Any]) -> str:
     """Change columns of the first vehicle of a bucket, as another tool would; its name."""
-    path = Path(store.url) / "buckets" / f"{bucket:05d}.parquet"
+    path = Path(store.url) / "buckets" / store.files(bucket)[0][0]
     rows = pq.read_table(path).to_pylist()
     name = str(rows[0]["vehicle"])
     rows[0] |= changes
-    pq.write_table(pa.Table.from_pylist(rows, schema=SCHEMA), path, row_group_size=1)
+    pq.write_table(pa.Table.from_pylist(rows, schema=SCHEMA), path)
     return name
 
 
@@ -225,31 +243,31 @@ def test_a_problem_is_told_in_one_line(own_store: SummaryStore) -> None:
 def test_a_bucket_that_is_the_copy_of_another_is_refused(own_store: SummaryStore) -> None:
     first, second = own_store.buckets()[:2]
     folder = Path(own_store.url) / "buckets"
-    shutil.copy(folder / f"{first:05d}.parquet", folder / f"{second:05d}.parquet")
-    for read in (own_store.read, own_store.outlines):
-        with pytest.raises(FleetError, match=rf"{second:05d}\.parquet: vehicle V\d+ belongs into {first:05d}\.parquet"):
+    shutil.copy(folder / own_store.files(first)[0][0], folder / own_store.files(second)[0][0])
+    for read in (own_store.read, own_store.outlines, own_store.known):
+        with pytest.raises(FleetError, match=rf"{second:05d}-0.*: vehicle V\d+ belongs into bucket {first:05d}"):
             read(second)
 
 
-@pytest.mark.parametrize("name", ["99999.parquet", "00016.parquet", "3.parquet", "00003 (copy).parquet"])
+@pytest.mark.parametrize(
+    "name", ["99999-00000.parquet", "00016-00000.parquet", "3.parquet", "00003-00000 (copy).parquet"]
+)
 def test_a_file_that_is_no_bucket_of_the_store_is_refused(own_store: SummaryStore, name: str) -> None:
     folder = Path(own_store.url) / "buckets"
     shutil.copy(next(folder.iterdir()), folder / name)
-    with pytest.raises(FleetError, match=rf"{re.escape(name)}: no bucket of this store, whose buckets are 00000"):
+    with pytest.raises(FleetError, match=rf"{re.escape(name)}: no file of this store, whose buckets are 00000"):
         own_store.buckets()
 
 
 def test_a_bucket_that_is_not_there_is_empty(store: SummaryStore) -> None:
-    assert store.read(999) == {}
-    with pytest.raises(StorageError, match=r"00999\.parquet: no such file"):
-        store.outlines(999)
+    assert (store.read(999), store.known(999), store.outlines(999)) == ({}, {}, [])
 
 
 def test_object_storage_holds_the_same(database: VehicleDatabase) -> None:
     store = small_store(Storage(url="memory://fleet/one"), database, random_faults(4))
     assert len(all_records(store)) == 4
     assert read_identity(open_storage("memory://fleet/one"), database) == store.identity
-    assert set(store.versions()) == {f"{bucket:05d}.parquet" for bucket in store.buckets()}
+    assert set(store.versions()) == {store.files(bucket)[0][0] for bucket in store.buckets()}
 
 
 def test_no_place_is_refused() -> None:
@@ -266,16 +284,6 @@ def test_a_full_disk_is_told_with_what_to_do(tmp_path: Path, monkeypatch: pytest
     expected = rf"^{tmp_path}/x: cannot write it: No space left on device; make room, and run the same command again"
     with pytest.raises(StorageError, match=expected):
         open_storage(tmp_path).write("x", b"")
-
-
-def test_object_storage_is_looked_at_anew_and_gets_no_new_bucket_by_a_slip(monkeypatch: pytest.MonkeyPatch) -> None:
-    storage, calls = open_storage("memory://fleet/two"), []
-    kind = type(storage._filesystem()[0])
-    monkeypatch.setattr(kind, "invalidate_cache", lambda *_: calls.append("looked"))
-    monkeypatch.setattr(kind, "makedirs", lambda *_, **__: calls.append("made"))
-    storage.write("x", b"1")
-    assert storage.names() == ["x"]
-    assert calls == ["looked"]
 
 
 def test_storage_of_an_unknown_kind_is_refused_in_one_line() -> None:

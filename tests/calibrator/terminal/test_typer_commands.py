@@ -1,19 +1,15 @@
 """What command lines made with typer share."""
 
-import os
 import re
-import signal
 from typing import Annotated
 
 import pytest
 import typer
-from joblib import delayed
 
 from calibrator.cli import ORDER
 from calibrator.cli import app as calibrator_app
 from calibrator.errors import ContradictionError, FleetError
-from calibrator.processes.computing import in_processes
-from calibrator.processes.reading import read_in_processes
+from calibrator.processes.run_many import Workers, run_many
 from calibrator.terminal.command_line import command_app, run_app, run_tool
 from ecu_node.program import write_output
 
@@ -129,27 +125,14 @@ def test_ctrl_c_ends_a_tool_with_one_line(monkeypatch: pytest.MonkeyPatch, capsy
 
 
 @app.command()
-def work(where: str) -> None:
+def work() -> None:
     """Fail in a worker process."""
-    if where == "joblib":
-        list(in_processes((delayed(int)(text) for text in ("1", "one")), workers=2))
-    else:
-        list(read_in_processes(int, ["1", "one"], workers=1))
+    list(run_many(int, ["1", "one"], Workers(processes=2)))
 
 
-@pytest.mark.parametrize("where", ["joblib", "reading"])
-def test_a_fault_in_a_worker_process_is_one_line_too(where: str, capfd: pytest.CaptureFixture[str]) -> None:
-    assert run_app(app, "prog", ["work", where]) == 70
+def test_a_fault_in_a_worker_process_is_one_line_too(capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_app(app, "prog", ["work"]) == 70
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith("prog: internal error: ValueError: invalid literal for int() with base 10: 'one'")
-    assert run_app(app, "prog", ["work", where, "--debug"]) == 70
+    assert run_app(app, "prog", ["work", "--debug"]) == 70
     assert "Traceback (most recent call last)" in capfd.readouterr().err
-
-
-def die(_: int) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def test_a_worker_that_is_killed_is_told_in_words() -> None:
-    with pytest.raises(FleetError, match="a worker process was killed, as by a lack of memory; run the same command"):
-        list(in_processes((delayed(die)(number) for number in range(2)), workers=2))

@@ -1,5 +1,8 @@
 """Drives into a store: each is read once, changes are noticed, bad ones are tried again."""
 
+import shutil
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -10,13 +13,14 @@ from calibrator.drive import Channel, Drive
 from calibrator.drives.store import write_drive
 from calibrator.errors import FleetError
 from calibrator.files.storage import open_storage
+from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import Equipment, find_fleet
-from calibrator.summaries.add_drives import Added, add_drives
-from calibrator.summaries.open_store import open_store
 from calibrator.summaries.record import joined_records
-from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.store import SummaryStore, open_store
+from calibrator.summaries.summarise_fleet import Added, add_drives
 from ecu_node.database import VehicleDatabase
 
+LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
 EQUIPMENT = Equipment(branches=("battery", "motor"), inputs=("speed",), fleet_inputs=("speed",), notices=())
 
 
@@ -35,12 +39,10 @@ def write(store: Path, vehicle: str, name: str, database: VehicleDatabase, *, sc
     )
 
 
-def add(
-    drives: Path, out: Path, database: VehicleDatabase, *, exactly: bool = False, part: tuple[int, int] = (1, 1)
-) -> tuple[Added, SummaryStore]:
+def add(drives: Path, out: Path, database: VehicleDatabase, *, exactly: bool = False) -> tuple[Added, SummaryStore]:
     fleet = find_fleet(drives)
     store = open_store(open_storage(out), EQUIPMENT, database, fleet)
-    return add_drives(store, fleet, database, workers=1, exactly=exactly, part=part), store
+    return add_drives(store, fleet, database, workers=Workers(), exactly=exactly), store
 
 
 def drives_in(store: SummaryStore) -> dict[str, list[tuple[str, ...]]]:
@@ -63,6 +65,8 @@ def test_each_drive_is_read_once(tmp_path: Path, database: VehicleDatabase) -> N
     more, store = add(drives, out, database)
     assert (more.vehicles, more.drives) == (1, 1)
     assert drives_in(store) == {"V1": [("a",)], "V2": [("a",), ("b",)]}
+    bucket = store.bucket_of("V2")
+    assert store.files(bucket) == ([f"{bucket:05d}-00000.parquet", f"{bucket:05d}-00001.parquet"], [])
 
 
 def test_two_drives_added_one_after_the_other_are_as_both_at_once(tmp_path: Path, database: VehicleDatabase) -> None:
@@ -141,7 +145,7 @@ def test_drives_that_change_while_they_are_read_stay_with_their_vehicle(
 
     toucher = threading.Thread(target=touch)
     toucher.start()
-    add_drives(store, fleet, database, workers=1)
+    add_drives(store, fleet, database, workers=Workers())
     stop.set()
     toucher.join()
     found = {
@@ -176,14 +180,58 @@ def test_drives_of_other_branches_cannot_be_added(tmp_path: Path, database: Vehi
         open_store(open_storage(out), other, database, find_fleet(drives))
 
 
-def test_parts_of_the_work_add_up(tmp_path: Path, database: VehicleDatabase) -> None:
+def copy(drives: Path, source: str, target: str) -> None:
+    path = drives / "drives" / f"{target}.parquet"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(drives / "drives" / f"{source}.parquet", path)
+
+
+def test_recording_of_two_vehicles_counts_for_neither(tmp_path: Path, database: VehicleDatabase) -> None:
+    drives, out = tmp_path / "drives", tmp_path / "summaries"
+    for vehicle in ("V1", "V2", "V3"):
+        write(drives, vehicle, "a", database)
+    _, store = add(drives, out, database)
+    copy(drives, "V1/a", "V2/b")
+    for _ in range(2):  # the second run finds nothing else
+        added, store = add(drives, out, database)
+        reasons = {name: text.partition(";")[0] for name, text in added.problems.items()}
+        assert reasons == {"V1": "same recording as V2", "V2": "same recording as V1"}
+        usable = {
+            (record.vehicle, *record.drives)
+            for bucket in store.buckets()
+            for records in store.read(bucket).values()
+            for record in records
+            if record.found
+        }
+        assert usable == {("V2", "a"), ("V3", "a")}
+    (drives / "drives" / "V2" / "b.parquet").unlink()
+    added, store = add(drives, out, database, exactly=True)
+    assert (added.problems, drives_in(store)) == ({}, {name: [("a",)] for name in ("V1", "V2", "V3")})
+
+
+def test_recording_that_a_vehicle_has_twice_counts_once(tmp_path: Path, database: VehicleDatabase) -> None:
     drives = tmp_path / "drives"
-    for number in range(6):
-        write(drives, f"V{number}", "a", database)
-    added = [add(drives, tmp_path / "parts", database, part=(number, 3))[0].vehicles for number in (1, 2, 3)]
-    assert sum(added) == 6
-    assert max(added) < 6
-    _, whole = add(drives, tmp_path / "whole", database)
-    assert drives_in(SummaryStore(storage=open_storage(tmp_path / "parts"), identity=whole.identity)) == drives_in(
-        whole
+    write(drives, "V1", "a", database)
+    copy(drives, "V1/a", "V1/b")
+    added, store = add(drives, tmp_path / "at once", database)
+    assert added.notices == ["vehicle V1: drives a, b hold the same recording, which counts once"]
+    (record,) = store.read(store.bucket_of("V1"))["V1"]
+    assert joined_records([record]).summary.duration_s < 301.0
+    copy(drives, "V1/a", "V1/c")
+    _, store = add(drives, tmp_path / "at once", database)
+    assert joined_records(store.read(store.bucket_of("V1"))["V1"]).summary.duration_s < 301.0
+
+
+def test_a_fault_of_the_program_is_not_one_of_the_drives(
+    tmp_path: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path / "drives", "V1", "a", database)
+    path = tmp_path / "sitecustomize.py"  # a bug in a process that reads
+    path.write_text("import numpy\nnumpy.ascontiguousarray = lambda *_, **__: 1 // 0\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    line = [sys.executable, "-m", "calibrator", "summarise", str(tmp_path / "drives"), "--layout", str(LAYOUT)]
+    done = subprocess.run(
+        [*line, "--out", str(tmp_path / "out")], capture_output=True, text=True, check=False, timeout=300
     )
+    assert done.returncode == 70
+    assert "internal error in 1 vehicle, which are left out: V1: ZeroDivisionError" in done.stderr

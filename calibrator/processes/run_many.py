@@ -1,0 +1,434 @@
+"""One function over many items: in this process, in processes of this machine, or on a Dask cluster.
+
+Results come in the order of the items and do not depend on where they were computed; a few items per worker are in
+flight, so memory does not grow with their number. A worker that dies costs its item a second attempt; an item that
+kills its process twice, or takes longer than it may, is lost and the others go on.
+
+Every worker process has a pool of one of its own (pebble): processes that share pipes and locks, as those of one pool
+do, can take each other along when one is killed.
+"""
+
+import logging
+import multiprocessing
+import os
+import pickle
+import resource
+import signal
+import sys
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from importlib.util import find_spec
+from itertools import islice
+from multiprocessing import forkserver, resource_tracker
+from multiprocessing.context import ForkServerContext, ForkServerProcess
+from queue import Empty, LifoQueue
+from types import ModuleType
+from typing import Any, TypeVar
+
+from pebble import ProcessExpired, ProcessPool
+from threadpoolctl import threadpool_limits
+
+from calibrator.errors import FleetError, internal_error
+from calibrator.terminal.options import TIME_LIMIT_S
+from ecu_node.errors import UserError
+from ecu_node.program import load_python_can
+
+__all__ = ["Failed", "Workers", "run_many", "try_many"]
+
+AHEAD_PER_WORKER = 4
+"""Items in flight: others go on while one takes long, and few results wait in memory. [1]"""
+CONNECT_S, RETURN_S = 10.0, 60.0
+"""Within which a scheduler must answer at first; within which it and a worker must be there after it was lost. [s]"""
+MEMORY_SHARE, LEAST_MEMORY_BYTES = 0.8, 1 << 30
+"""Of the machine's memory for all processes that read; each may use this much at least. [1], [byte]"""
+PRELOADED = ["numba", "numpy", "pyarrow.parquet", "threadpoolctl"]
+"""Slow to import, so imported once, for all processes. Not this package: the fork server may find another copy."""
+REMEDY = "remove the file if it is damaged, cut it if it is long"
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workers:
+    """Where a run computes.
+
+    Attributes
+    ----------
+    processes : int
+        Number of processes on this machine.
+    scheduler : str or None
+        Address of a Dask scheduler, ``tcp://host:port``, whose workers are used instead. FleetError if Dask is missing.
+    """
+
+    processes: int = 1
+    scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.scheduler is not None and find_spec("distributed") is None:
+            raise FleetError("--scheduler needs Dask: pip install 'hv-current-correction[cluster]'")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failed:
+    """An item without a result.
+
+    Attributes
+    ----------
+    reason : str
+        What happened, and what to do, one line; a fault of the program begins with :data:`.INTERNAL_ERROR`.
+    """
+
+    reason: str
+
+
+def run_many(
+    function: Callable[[_Item], _Result], items: Iterable[_Item], workers: Workers
+) -> Generator[_Result, None, None]:
+    """Apply a function to each item; whatever it raises is raised here, at the turn of its item.
+
+    Parameters
+    ----------
+    function : callable
+        Of module level, or a partial of such a function, as it goes to other processes.
+    items : iterable
+        Taken as they are needed.
+    workers : Workers
+        Where; one process on this machine is this one.
+
+    Yields
+    ------
+    object
+        What the function returns, in the order of the items.
+
+    Raises
+    ------
+    FleetError
+        If an item killed its process twice, or the cluster cannot be reached.
+    """
+    if workers.scheduler is None and workers.processes == 1:
+        with threadpool_limits(1):  # as everywhere: sums depend on the number of threads
+            yield from map(function, items)
+        return
+    with closing(_outcomes(function, items, workers, limit_s=None)) as outcomes:
+        for _, outcome in outcomes:
+            if isinstance(outcome, Failed):
+                raise FleetError(f"{outcome.reason}; run the same command again")
+            yield outcome
+
+
+def try_many(
+    function: Callable[[_Item], _Result], items: Iterable[_Item], workers: Workers, *, limit_s: float = TIME_LIMIT_S
+) -> "Generator[tuple[_Item, _Result | Failed], None, None]":
+    """Apply a function to each item, never in this process, as items are files of strangers.
+
+    Parameters
+    ----------
+    function, items, workers
+        As for :func:`run_many`.
+    limit_s : float
+        Longest time for one item. [s]
+
+    Yields
+    ------
+    item : object
+        In their order.
+    outcome : object or Failed
+        What the function returns of it, or why it does not: an error of the data, time or memory above the limits, or
+        a fault of the program. The others go on.
+    """
+    yield from _outcomes(partial(_attempt, function), items, workers, limit_s=limit_s)
+
+
+def _attempt(function: Callable[[_Item], _Result], item: _Item) -> "_Result | Failed":
+    try:
+        return function(item)
+    except UserError as error:
+        return Failed(reason=str(error))
+    except MemoryError:
+        return Failed(reason=f"not enough memory to read it; {REMEDY}, or use fewer --workers")
+    except Exception as error:  # noqa: BLE001 (a fault of the program is reported with its item, and the others go on)
+        return Failed(reason=internal_error(error))
+
+
+def _outcomes(
+    function: Callable[[Any], Any], items: Iterable[Any], workers: Workers, *, limit_s: float | None
+) -> Generator[tuple[Any, Any], None, None]:
+    job = _Job(function=pickle.dumps(function), limit_s=limit_s)
+    if workers.scheduler is not None:
+        yield from _on_cluster(workers.scheduler, job, items)
+        return
+    processes = _Processes(_memory_bytes() // workers.processes)
+    waiting, futures = iter(items), deque[tuple[Any, Future[Any]]]()
+    with ThreadPoolExecutor(workers.processes) as threads:
+        try:
+            while True:
+                more = islice(waiting, AHEAD_PER_WORKER * workers.processes - len(futures))
+                futures.extend((item, threads.submit(processes.run, job, item)) for item in more)
+                if not futures:
+                    return
+                item, future = futures.popleft()
+                yield item, future.result()
+        finally:
+            threads.shutdown(wait=False, cancel_futures=True)
+            processes.end()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Job:
+    """A pickled function, and the longest time for one item; None: any time, and data that can be trusted. [s]"""
+
+    function: bytes
+    limit_s: float | None
+
+
+class _Processes:
+    """Processes that run one item each, as many as are asked for at a time; they may use so much memory each."""
+
+    def __init__(self, memory_bytes: int) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="calibrator-", ignore_cleanup_errors=True)
+        self._memory_bytes = max(memory_bytes, LEAST_MEMORY_BYTES)
+        self._idle: LifoQueue[_Process] = LifoQueue()
+        self._all: list[_Process] = []
+        resource_tracker.ensure_running()  # its start, else within the next one, would let SIGINT through
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which all that it forks inherit
+        try:
+            forkserver.set_forkserver_preload(PRELOADED)
+            forkserver.ensure_running()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+    def run(self, job: _Job, item: Any) -> Any:
+        """What the function returns of an item, or why it was lost."""
+        try:
+            process = self._idle.get_nowait()
+        except Empty:
+            process = _Process(self._folder.name, self._memory_bytes)
+            self._all.append(process)
+        try:
+            return process.run(job, item)
+        finally:
+            self._idle.put(process)
+
+    def end(self) -> None:
+        """Kill them all, and remove what they left."""
+        for process in self._all:
+            process.stop()
+        for process in self._all:
+            process.join()
+        self._folder.cleanup()
+
+
+class _Process:
+    """One process, replaced when it dies or takes too long."""
+
+    def __init__(self, folder: str, memory_bytes: int) -> None:
+        self._folder, self._memory_bytes = folder, memory_bytes
+        self._pool: Any = None
+        self._job: _Job | None = None
+        self._future: Any = None
+        self._stopped = False
+
+    def run(self, job: _Job, item: Any) -> Any:
+        how = ""
+        for _ in range(2):
+            pool = self._pool_for(job)
+            try:
+                self._future = pool.schedule(_call, (item,), timeout=job.limit_s)
+                if self._stopped:
+                    self._future.cancel()
+                return self._future.result()
+            except TimeoutError:
+                if job.limit_s is None:  # one that the function raised
+                    raise
+                self.join()
+                why = f"reading took more than {job.limit_s:g} s and was ended; {REMEDY}, or allow more with"
+                return Failed(reason=f"{why} --time-limit")
+            except ProcessExpired as error:
+                killed = error.exitcode < 0
+                how = f"was killed by {signal.Signals(-error.exitcode).name}" if killed else f"ended ({error.exitcode})"
+            except BrokenProcessPool:
+                how = "was killed"
+            self.join()
+        if job.limit_s is None:
+            return Failed(reason=f"a worker process {how}, and another one again, as by a lack of memory")
+        return Failed(reason=f"the process that read it {how}; {REMEDY}, or use fewer --workers if memory ran out")
+
+    def _pool_for(self, job: _Job) -> Any:
+        if self._stopped:
+            raise CancelledError
+        if self._pool is None or not self._pool.active or self._job != job:
+            self.join()
+            memory_bytes = None if job.limit_s is None else self._memory_bytes
+            arguments = (dict(os.environ), self._folder, memory_bytes, job.function)
+            self._pool = ProcessPool(max_workers=1, initializer=_begin, initargs=arguments, context=_Context())
+            self._job = job
+        return self._pool
+
+    def stop(self) -> None:
+        """Let no more items be run; who waits for one gets CancelledError."""
+        self._stopped = True
+        if self._future is not None:
+            self._future.cancel()
+        if self._pool is not None:
+            self._pool.stop()
+
+    def join(self) -> None:
+        """Kill the process."""
+        if self._pool is not None:
+            self._pool.stop()
+            self._pool.join()
+            self._pool = None
+
+
+class _ForkedProcess(ForkServerProcess):
+    """Starts without running the user's script once more."""
+
+    starting = threading.Lock()
+
+    def start(self) -> None:
+        with self.starting:
+            main = sys.modules["__main__"]
+            sys.modules["__main__"] = ModuleType("__main__")
+            try:
+                super().start()
+            finally:
+                sys.modules["__main__"] = main
+
+
+class _Context(ForkServerContext):
+    Process = _ForkedProcess
+
+
+_pickled_function = b""
+
+
+def _begin(environment: dict[str, str], folder: str, memory_bytes: int | None, function: bytes) -> None:
+    """What a process does first; an exception here would be a process that is replaced for ever."""
+    global _pickled_function  # noqa: PLW0603 (the process runs this function alone)
+    _pickled_function = function
+    os.environ.clear()
+    os.environ.update(environment)
+    tempfile.tempdir = folder
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    load_python_can()  # before the modules of readers are imported, with which they would take seconds
+    _one_thread()
+    with suppress(Exception):  # what it imports is not to count as time of an item; errors come with the first one
+        _loaded(function)
+    if memory_bytes is not None:
+        resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, resource.RLIM_INFINITY))
+
+
+def _call(item: Any) -> Any:
+    return _loaded(_pickled_function)(item)
+
+
+@lru_cache(maxsize=2)
+def _loaded(function: bytes) -> Callable[[Any], Any]:
+    loaded: Callable[[Any], Any] = pickle.loads(function)  # noqa: S301 (of the parent)
+    return loaded
+
+
+@lru_cache
+def _one_thread() -> threadpool_limits:
+    """Limit this process for good: processes share the cores, and sums depend on the number of threads."""
+    return threadpool_limits(1)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _on_cluster(address: str, job: _Job, items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
+    from distributed import KilledWorker  # noqa: PLC0415 (an extra)
+
+    waiting, flight = iter(items), deque[tuple[Any, Any]]()
+    with _silenced():
+        client = _connect(address, CONNECT_S)
+        try:
+            while True:
+                try:
+                    ahead = AHEAD_PER_WORKER * max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
+                    for item in islice(waiting, max(ahead - len(flight), 0)):
+                        flight.append((item, None))
+                    flight = deque((i, f or client.submit(_on_worker, job, i, pure=False)) for i, f in flight)
+                    if not flight:
+                        return
+                    outcome = flight[0][1].result()
+                except KilledWorker:
+                    outcome = Failed(reason=f"{address}: it killed its workers one after the other, as by memory")
+                except (CancelledError, OSError) as error:
+                    if client.status == "running" and not isinstance(error, CancelledError):
+                        raise
+                    client.close(timeout=1)
+                    client = _connect(address, RETURN_S, lost=True)
+                    flight = deque((item, None) for item, _ in flight)
+                    continue
+                yield flight.popleft()[0], outcome
+        finally:
+            client.close(timeout=1)
+
+
+def _connect(address: str, patience_s: float, *, lost: bool = False) -> Any:
+    from distributed import Client  # noqa: PLC0415
+
+    again = "; the same command, run again, goes on where it stopped"
+    try:
+        client = Client(address, timeout=patience_s, set_as_default=False)
+    except (OSError, ValueError) as error:
+        reason = str(error).partition("\n")[0]
+        if lost:
+            raise FleetError(f"{address}: the scheduler is gone; start it and its workers again{again}") from None
+        raise FleetError(f"{address}: no Dask scheduler answers: {reason}; start one with 'dask scheduler'") from None
+    try:
+        client.wait_for_workers(1, timeout=RETURN_S)
+    except TimeoutError:
+        client.close()
+        raise FleetError(
+            f"{address}: the scheduler has no worker; start some with 'dask worker'{again if lost else ''}"
+        ) from None
+    return client
+
+
+def _on_worker(job: _Job, item: Any) -> Any:
+    """What a worker of a cluster does; files of strangers are read by a process of its own, which it can kill."""
+    if job.limit_s is not None:
+        return _own_processes().run(job, item)
+    _one_thread()
+    return _loaded(job.function)(item)
+
+
+@lru_cache
+def _own_processes() -> _Processes:
+    from distributed import get_worker  # noqa: PLC0415
+
+    multiprocessing.current_process().daemon = False  # or it could not start processes
+    return _Processes(get_worker().memory_manager.memory_limit or _memory_bytes())
+
+
+def _memory_bytes() -> int:
+    return int(MEMORY_SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Loggers that print tracebacks of what is told in one line here say nothing within the block."""
+    names = ("distributed", "distributed.client", "tornado.application", "asyncio")
+    levels = {logger: logger.level for logger in map(logging.getLogger, names)}
+    for logger in levels:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for logger, level in levels.items():
+            logger.setLevel(level)

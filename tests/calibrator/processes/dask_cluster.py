@@ -1,0 +1,54 @@
+"""A Dask cluster for tests: a scheduler and two workers, processes of this machine that talk over TCP."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+
+ROOT = Path(__file__).parents[3]
+
+
+class DaskCluster:
+    """Start the cluster; a context manager that kills it. ``environment`` is added to that of the processes."""
+
+    def __init__(self, folder: Path, environment: Mapping[str, str] | None = None) -> None:
+        path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+        self._environment = {**os.environ, "OMP_NUM_THREADS": "1", **(environment or {}), "PYTHONPATH": path}
+        self._folder, self._stack = folder, ExitStack()
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.address = f"tcp://127.0.0.1:{self.port}"
+
+    def __enter__(self) -> "DaskCluster":
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def start(self) -> None:
+        """Start scheduler and workers, the first time or once more on the same port."""
+        options = ["--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard", "--no-jupyter"]
+        self.scheduler = self._run("scheduler", *options)
+        until = time.monotonic() + 60.0
+        while time.monotonic() < until:
+            with socket.socket() as attempt:
+                if attempt.connect_ex(("127.0.0.1", self.port)) == 0:
+                    break
+            time.sleep(0.05)
+        self.workers = [
+            self._run("worker", self.address, "--nthreads", "1", "--no-nanny", "--no-dashboard") for _ in range(2)
+        ]
+
+    def _run(self, *arguments: str) -> "subprocess.Popen[bytes]":
+        command = [sys.executable, "-m", f"distributed.cli.dask_{arguments[0]}", *arguments[1:]]
+        log = self._stack.enter_context((self._folder / f"{arguments[0]}.log").open("ab"))
+        process = subprocess.Popen(command, stdout=log, stderr=log, env=self._environment, cwd=self._folder)
+        self._stack.callback(process.wait)
+        self._stack.callback(process.kill)
+        return process

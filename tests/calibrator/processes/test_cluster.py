@@ -1,0 +1,155 @@
+"""The same on a Dask cluster with two workers: results, lost workers, a scheduler that is restarted, object storage."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from calibrator.artificial.simulate import FleetPlan, simulate_fleet
+from calibrator.artificial.trips import BuiltinTrips
+from calibrator.errors import FleetError
+from calibrator.files.storage import Storage, open_storage, walk
+from calibrator.processes import run_many as module
+from calibrator.processes.run_many import Failed, Workers, run_many, try_many
+from calibrator.summaries.identity import read_identity
+from calibrator.summaries.store import SummaryStore
+from ecu_node.database import VehicleDatabase
+from tests.calibrator.processes.dask_cluster import DaskCluster
+from tests.calibrator.processes.test_run_many import LIMIT_S, dying_once, hostile
+
+pytest.importorskip("distributed")
+LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
+PLAN = FleetPlan(vehicles=6, currents=2, sparsity=80.0, magnitude=(0.05, 0.25))
+
+
+def gated(number: int, folder: Path) -> int:
+    """Wait from the third item on until a file is there."""
+    while number >= 2 and not (folder / "go").exists():
+        time.sleep(0.02)
+    return number
+
+
+def test_lost_workers_and_hostile_items_cost_themselves_only(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "endless")
+    with DaskCluster(tmp_path) as cluster:
+        where = Workers(scheduler=cluster.address)
+        read = partial(hostile, endless=tmp_path / "endless")
+        first, *failed, last = (outcome for _, outcome in try_many(read, range(8), where, limit_s=LIMIT_S))
+        assert (first, last) == (0, 7)
+        causes = ["reading took more than 4 s", "the process that read it was killed", "the process that read it ended",
+                  "not enough memory", "too short", "internal error: ZeroDivisionError"]  # fmt: skip
+        for outcome, cause in zip(failed, causes, strict=True):
+            assert isinstance(outcome, Failed)
+            assert outcome.reason.startswith(cause)
+        assert all(worker.poll() is None for worker in cluster.workers)
+        assert list(run_many(partial(dying_once, folder=tmp_path), range(9), where)) == list(range(9))
+        assert sorted(worker.poll() is None for worker in cluster.workers) == [False, True]  # it killed one
+
+
+def test_run_goes_on_after_the_scheduler_was_restarted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with DaskCluster(tmp_path) as cluster:
+        results = run_many(partial(gated, folder=tmp_path), range(20), Workers(scheduler=cluster.address))
+        assert [next(results), next(results)] == [0, 1]
+        for process in (cluster.scheduler, *cluster.workers):
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+        cluster.start()
+        (tmp_path / "go").touch()
+        assert list(results) == list(range(2, 20))
+        (tmp_path / "go").unlink()
+        results = run_many(partial(gated, folder=tmp_path), range(20), Workers(scheduler=cluster.address))
+        next(results)
+        monkeypatch.setattr(module, "RETURN_S", 1.0)
+        cluster.scheduler.kill()
+        with pytest.raises(FleetError, match=r"the scheduler is gone; start it .* goes on where it stopped"):
+            list(results)
+
+
+@pytest.fixture(scope="module")
+def s3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """Environment in which S3 is a server of this machine, with a bucket."""
+    server_module = pytest.importorskip("moto.server")
+    boto3 = pytest.importorskip("boto3")
+    server = server_module.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    environment = {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        "AWS_ACCESS_KEY_ID": "testing",
+        "AWS_SECRET_ACCESS_KEY": "testing",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "SOURCE_DATE_EPOCH": "1700000000",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        boto3.client("s3").create_bucket(Bucket="fleet")
+        yield environment
+    server.stop()
+
+
+def command(*arguments: object) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "calibrator", *map(str, arguments)]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def summaries(place: str, database: VehicleDatabase) -> dict[str, list[object]]:
+    """What a store holds, without the versions of files, which storages count in their own ways."""
+    identity = read_identity(open_storage(place), database)
+    assert identity is not None
+    store = SummaryStore(storage=open_storage(place), identity=identity)
+    return {
+        name: [(r.drives, r.digests, r.found and r.found.summary.moments.tobytes(), r.problem) for r in records]
+        for bucket in store.buckets()
+        for name, records in store.read(bucket).items()
+    }
+
+
+def drives(place: str) -> dict[str, bytes]:
+    return {
+        f"{folder.url.rpartition('/')[2]}/{file.name}": folder.read(file.name)
+        for folder, files in walk(open_storage(place))
+        for file in files
+    }
+
+
+def test_logs_and_stores_in_object_storage_give_the_same_from_cluster_workers(
+    tmp_path: Path, database: VehicleDatabase, s3: dict[str, str]
+) -> None:
+    simulate_fleet(PLAN, BuiltinTrips(seed=0, duration_s=200.0, unseen_s=20.0), database, tmp_path / "fleet", workers=1)
+    logs = tmp_path / "fleet" / "logs"
+    for folder, files in walk(open_storage(logs)):
+        for file in files:
+            target = Storage(url=f"s3://fleet/logs/{folder.url.rpartition('/')[2]}")
+            target.write(file.name, folder.read(file.name))
+    layout = ("--layout", LAYOUT)
+    with DaskCluster(tmp_path, s3) as cluster:
+        there = ("--scheduler", cluster.address)
+        command("import", logs, *layout, "--out", tmp_path / "drives", "--workers", 2)
+        command("import", "s3://fleet/logs", *layout, "--out", "s3://fleet/drives", *there)
+        assert drives("s3://fleet/drives/drives") == drives(str(tmp_path / "drives" / "drives"))
+        command("summarise", logs, *layout, "--out", tmp_path / "one", "--workers", 1)
+        command("summarise", logs, *layout, "--out", tmp_path / "two", "--workers", 2)
+        command("summarise", logs, *layout, "--out", tmp_path / "dask", *there)
+        reading = ("summarise", "s3://fleet/logs", *layout, "--out", "s3://fleet/s", "--json")
+        report = json.loads(command(*reading, *there).stdout)
+        assert (report["vehicles"], report["drives"], report["left_out"]) == (6, 6, {})
+        again = json.loads(command(*reading).stdout)
+        assert again["drives"] == 0
+        expected = summaries(str(tmp_path / "one"), database)
+        for place in (str(tmp_path / "two"), str(tmp_path / "dask"), "s3://fleet/s"):
+            assert summaries(place, database) == expected
+        command("calibrate", tmp_path / "one", *layout, "--out", tmp_path / "here", "--workers", 1)
+        command("calibrate", "s3://fleet/s", *layout, "--out", tmp_path / "there", *there)
+        for path in sorted((tmp_path / "here" / "params").iterdir()):
+            assert (tmp_path / "there" / "params" / path.name).read_bytes() == path.read_bytes()
+    assert "6 vehicles" in command("store", "info", "s3://fleet/s").stdout

@@ -1,0 +1,191 @@
+"""One function over many items, wherever it runs: order, bounded memory, limits, lost workers, Ctrl-C."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import partial
+from multiprocessing.context import ForkServerProcess
+from pathlib import Path
+
+import pytest
+
+from calibrator.errors import DriveError, FleetError
+from calibrator.processes.run_many import AHEAD_PER_WORKER, Failed, Workers, run_many, try_many
+
+ONE, TWO = Workers(), Workers(processes=2)
+LIMIT_S = 4.0
+
+
+def doubled(number: int) -> int:
+    return 2 * number
+
+
+def slower_when_first(number: int) -> int:
+    time.sleep(0.2 if number == 0 else 0.0)
+    return number
+
+
+def hostile(number: int, endless: Path) -> int:
+    if number == 1:
+        endless.read_text()
+    if number == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if number == 3:
+        os._exit(7)
+    if number == 4:
+        return len(bytearray(1 << 60))
+    if number == 5:
+        raise DriveError("too short")
+    if number == 6:
+        return 1 // 0
+    os.kill(os.getpid(), signal.SIGINT)  # of no effect: Ctrl-C is the parent's
+    return number
+
+
+def refused(number: int) -> int:
+    if number > 1:
+        raise ValueError(f"number {number}")
+    return number
+
+
+def dying_once(number: int, folder: Path) -> int:
+    mark = folder / str(number)
+    if number == 2 and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def waiting(number: int, folder: Path) -> int:
+    tempfile.mkstemp()
+    (folder / "new").write_text(str(os.getpid()))
+    (folder / "new").rename(folder / "note")
+    time.sleep(1000 if number else 0)
+    return number
+
+
+def children() -> list[multiprocessing.process.BaseProcess]:
+    return [child for child in multiprocessing.active_children() if isinstance(child, ForkServerProcess)]
+
+
+def is_running(pid: int) -> bool:
+    """Whether there is such a process that has not ended; one that has may wait to be asked how."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    for _ in range(1000):
+        if condition():
+            return
+        time.sleep(0.05)
+    raise AssertionError("it did not come about")
+
+
+@pytest.mark.parametrize("workers", [ONE, TWO])
+def test_results_come_in_the_order_of_the_items(workers: Workers) -> None:
+    assert list(run_many(slower_when_first, range(12), workers)) == list(range(12))
+    assert list(try_many(slower_when_first, range(12), workers)) == [(number, number) for number in range(12)]
+    assert list(try_many(doubled, [], workers)) == []
+
+
+def test_few_items_are_in_flight() -> None:
+    taken: list[int] = []
+
+    def items() -> Iterator[int]:
+        for number in range(1000):
+            taken.append(number)
+            yield number
+
+    with closing(try_many(doubled, items(), TWO)) as results:
+        for number in range(20):
+            assert next(results) == (number, 2 * number)
+            assert len(taken) <= number + 1 + AHEAD_PER_WORKER * 2
+        assert children()
+    assert not children()
+
+
+def test_hostile_items_cost_themselves_only(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "endless")
+    handler, mask = signal.getsignal(signal.SIGINT), signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    read = partial(hostile, endless=tmp_path / "endless")
+    first, *failed, last = (outcome for _, outcome in try_many(read, range(8), TWO, limit_s=LIMIT_S))
+    assert (first, last) == (0, 7)
+    reasons = [outcome.reason for outcome in failed if isinstance(outcome, Failed)]
+    assert reasons[0].startswith("reading took more than 4 s and was ended; remove the file if it is damaged, cut it")
+    assert reasons[1].startswith("the process that read it was killed by SIGKILL; remove the file if it is damaged")
+    assert reasons[2].startswith("the process that read it ended (7); ")
+    assert reasons[3].startswith("not enough memory to read it; ")
+    assert reasons[4] == "too short"
+    assert reasons[5].startswith("internal error: ZeroDivisionError: ")
+    assert (signal.getsignal(signal.SIGINT), signal.pthread_sigmask(signal.SIG_BLOCK, [])) == (handler, mask)
+
+
+def test_worker_killed_once_costs_a_second_attempt(tmp_path: Path) -> None:
+    assert list(run_many(partial(dying_once, folder=tmp_path), range(5), TWO)) == list(range(5))
+
+
+def test_workers_killed_at_rest_cost_nothing() -> None:
+    with closing(run_many(doubled, iter(range(40)), TWO)) as results:
+        assert next(results) == 0
+        time.sleep(0.5)
+        for child in children():
+            os.kill(child.pid or 0, signal.SIGKILL)
+        assert list(results) == [2 * number for number in range(1, 40)]
+
+
+def killing_itself(_: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_item_that_kills_its_workers_ends_the_run_in_words() -> None:
+    with pytest.raises(FleetError, match="a worker process was killed by SIGKILL, and another one again"):
+        list(run_many(killing_itself, range(2), TWO))
+
+
+@pytest.mark.parametrize("workers", [ONE, TWO])
+def test_errors_are_raised_at_the_turn_of_their_item(workers: Workers) -> None:
+    with closing(run_many(refused, range(5), workers)) as results:
+        assert [next(results) for _ in range(2)] == [0, 1]
+        with pytest.raises(ValueError, match="number 2"):
+            next(results)
+    assert not children()
+
+
+PARENT = """
+import sys, tempfile
+from functools import partial
+from pathlib import Path
+tempfile.tempdir = sys.argv[2]
+from calibrator.processes.run_many import Workers, try_many
+from tests.calibrator.processes.test_run_many import waiting
+print(list(try_many(partial(waiting, folder=Path(sys.argv[1])), range(9), Workers(processes=2))))
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_nothing_is_left_of_a_parent_that_ends(tmp_path: Path, how: signal.Signals) -> None:
+    script, temporary = tmp_path / "parent.py", tmp_path / "temporary"
+    script.write_text(PARENT)  # without a guard: workers must not run it once more
+    temporary.mkdir()
+    path = os.pathsep.join([str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, str(script), str(tmp_path), str(temporary)]
+    environment = {**os.environ, "PYTHONPATH": path}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, start_new_session=True) as parent:
+        wait_until((tmp_path / "note").exists)
+        time.sleep(0.5)
+        os.killpg(parent.pid, how)
+        assert parent.stderr is not None
+        errors = parent.stderr.read().decode()
+    wait_until(lambda: not is_running(int((tmp_path / "note").read_text())))
+    if how is signal.SIGINT:
+        assert errors.count("Traceback") == errors.count("KeyboardInterrupt") == 1
+        assert list(temporary.iterdir()) == []
