@@ -129,8 +129,9 @@ def test_logs_and_stores_in_object_storage_give_the_same_from_cluster_workers(
     logs = tmp_path / "fleet" / "logs"
     for folder, files in walk(open_storage(logs)):
         for file in files:
-            target = Storage(url=f"s3://fleet/logs/{folder.url.rpartition('/')[2]}")
-            target.write(file.name, folder.read(file.name))
+            Storage(url=f"s3://fleet/{folder.url.removeprefix(f'{logs.parent}/')}").write(
+                file.name, folder.read(file.name)
+            )
     layout = ("--layout", LAYOUT)
     with DaskCluster(tmp_path, s3) as cluster:
         there = ("--scheduler", cluster.address)
