@@ -377,7 +377,7 @@ def read_vehicles(
     found, left_out, done = list[_Vehicle](), dict(fleet.left_out), 0.0
     sizes = [fleet.sizes.get(name, 0) / MEGABYTE for name in chosen]
     outcomes = try_many(read_one, (fleet.vehicles[name] for name in chosen), workers, limit_s=limit_s)
-    with progress_bar(label, max(round(sum(sizes)), 1), "MB") as progress, closing(outcomes):
+    with progress_bar(label, int(sum(sizes)) + 1, "MB") as progress, closing(outcomes):
         for name, size, (_, outcome) in zip(chosen, sizes, outcomes, strict=True):
             if isinstance(outcome, Failed):
                 left_out[name] = outcome.reason
@@ -385,6 +385,7 @@ def read_vehicles(
                 found.append(outcome)
             done += size
             progress(done)
+        progress(int(sum(sizes)) + 1)
     if not found:
         reason = next((left_out[name] for name in chosen if name in left_out), next(iter(left_out.values()), ""))
         raise FleetError(f"{fleet.place}: no vehicle has enough usable data; the first says: {reason}")

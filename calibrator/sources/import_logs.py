@@ -94,7 +94,7 @@ def import_logs(
     read = partial(_import_one, database=database, store=open_storage(store).url)
     entries = (log for vehicle in found.vehicles for log in found.vehicles[vehicle])
     outcomes, done = try_many(read, entries, workers, limit_s=limit_s), 0.0
-    total = max(round(sum(found.sizes.values()) / MEGABYTE), 1)
+    total = int(sum(found.sizes.values()) / MEGABYTE) + 1
     with progress_bar("import", total, "MB") as progress, closing(outcomes):
         for log, outcome in outcomes:
             if isinstance(outcome, ImportedDrive):
@@ -106,6 +106,7 @@ def import_logs(
                 already_there.append(f"{log.vehicle}/{log.name}")
             done += log.size / MEGABYTE
             progress(done)
+        progress(total)
     if drives:
         _note_fleets(open_storage(store), logs)
     return ImportReport(store=str(store), drives=tuple(drives), already_there=tuple(already_there), left_out=left_out)

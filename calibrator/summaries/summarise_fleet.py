@@ -166,7 +166,7 @@ def add_drives(
     outcomes = try_many(
         partial(_read_record, store=store.identity, database=database), entries, workers, limit_s=time_limit_s
     )
-    total = max(round(sum(fleet.sizes.values()) / MEGABYTE), 1)
+    total = int(sum(fleet.sizes.values()) / MEGABYTE) + 1
     with progress_bar("summarise drives", total, "MB") as progress, closing(outcomes):
         for (drives, _), outcome in outcomes:
             while not waiting[0].versions:
