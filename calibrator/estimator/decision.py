@@ -13,7 +13,7 @@ with alpha = (1 + d) / (1 + d_hat) - 1 and beta = (o - o_hat) / (1 + d_hat); its
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, sqrt
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +26,15 @@ from calibrator.estimator.posterior import Draws
 from calibrator.estimator.rows import EvidenceRows, parameter_places
 from calibrator.score import TOLERANCE
 
-__all__ = ["Explained", "Points", "RowsEstimate", "best_estimate", "estimate_rows", "harm_probability", "points_of"]
+__all__ = [
+    "Explained",
+    "Points",
+    "RowsEstimate",
+    "best_estimate",
+    "estimate_rows",
+    "harm_probability",
+    "posterior_points",
+]
 
 NEGLIGIBLE = 1e-8
 """Weight of a draw below which it is left out. [1]"""
@@ -92,52 +100,36 @@ class Points(NamedTuple):
     fit: NDArray[np.int64]
 
 
-def points_of(laws: Sequence[Explained], vehicle: int) -> Points:
-    """Posterior of one vehicle over all laws that explain its fleet."""
-    faults, weight, number = [], [], []
+def posterior_points(laws: Sequence[Explained]) -> list[Points]:
+    """Posterior of each vehicle over all laws that explain its fleet."""
+    faults, weight, number, vehicle = [], [], [], []
     for i, law in enumerate(laws):
-        K = law.draws.values.shape[3] // 3
-        size = int(np.count_nonzero(law.weight[vehicle] > NEGLIGIBLE))
-        some, w, which = np.empty((size, 2 * K)), np.empty(size), np.empty(size, np.int64)
-        _collect(law.draws, law.weight[vehicle], law.group_centre, vehicle, some, w, which)
-        faults.append(some)
-        weight.append(w * law.probability)
-        number.append(which * len(laws) + i)
-    kinds, explanation = np.unique(np.concatenate(number), return_inverse=True)
-    groups = np.array([law.weight.shape[3] for law in laws])
-    of_law = kinds % len(laws)
-    return Points(
-        np.concatenate(faults), np.concatenate(weight), explanation, of_law, kinds // len(laws) // groups[of_law]
-    )
-
-
-@compiled_with_notice
-def _collect(
-    draws: Draws, weight: Array, group_centre: Array, j: int, faults: Array, w: Array, which: NDArray[np.int64]
-) -> None:
-    _, M, G = weight.shape
-    K, n = faults.shape[1] // 2, 0
-    for q in range(draws.fits.number[j]):
-        for m in range(M):
-            for g in range(G):
-                if weight[q, m, g] <= NEGLIGIBLE:
-                    continue
-                x = draws.values[j, q, m]
-                for k in range(K):
-                    gain = exp(x[1 + k] + draws.shared[K + k])
-                    offset = x[2 * K + k] * gain
-                    if k == draws.feed and g > 0:
-                        if draws.shared[2 * K] and offset == 0.0:
-                            offset = group_centre[g - 1]
-                        elif not draws.shared[2 * K] and offset != 0.0:
-                            offset -= group_centre[g - 1] * gain
-                    if x[2 * K + k] != 0.0 or abs(offset + draws.shared[k]) > SAME:
-                        offset += draws.shared[k]
-                    else:
-                        offset = 0.0  # what the group and all sensors share cancel
-                    faults[n, k], faults[n, K + k] = gain - 1.0, offset
-                w[n], which[n] = weight[q, m, g], q * G + g
-                n += 1
+        shared, feed, K = law.draws.shared, law.draws.feed, law.draws.values.shape[3] // 3
+        j, q, m, g = np.nonzero(law.weight > NEGLIGIBLE)
+        x = law.draws.values[j, q, m]
+        gain = np.exp(x[:, 1 : K + 1] + shared[K : 2 * K])
+        offset = x[:, 2 * K : 3 * K] * gain
+        # An offset that a group shares belongs to the sensor; a load that it shares does not, and is taken out.
+        alone, of_group = offset[:, feed] == 0.0, np.append(0.0, law.group_centre)[g]
+        if shared[-1]:
+            offset[:, feed] += np.where(alone, of_group, 0.0)
+        else:
+            offset[:, feed] -= np.where(alone, 0.0, of_group * gain[:, feed])
+        total = offset + shared[:K]
+        cancel = (x[:, 2 * K : 3 * K] == 0.0) & (np.abs(total) <= SAME)  # what a group and all sensors share
+        faults.append(np.hstack([gain - 1.0, np.where(cancel, 0.0, total)]))
+        weight.append(law.weight[j, q, m, g] * law.probability)
+        number.append((q * law.weight.shape[3] + g) * len(laws) + i)
+        vehicle.append(j)
+    order = np.argsort(np.concatenate(vehicle), kind="stable")
+    ends = np.cumsum(np.bincount(np.concatenate(vehicle), minlength=len(laws[0].weight)))[:-1]
+    parts = [np.split(np.concatenate(each)[order], ends) for each in (faults, weight, number)]
+    groups, found = np.array([law.weight.shape[3] for law in laws]), []
+    for some, w, which in zip(*parts, strict=True):
+        kinds, explanation = np.unique(which, return_inverse=True)
+        of_law = kinds % len(laws)
+        found.append(Points(some, w, explanation, of_law, kinds // len(laws) // groups[of_law]))
+    return found
 
 
 def best_estimate(points: Points, smallest: Array) -> tuple[Array, float]:
@@ -332,9 +324,8 @@ def estimate_rows(
         explained.append(Explained(law.probability, draws, weigh_law(draws, law), law.prior.group_centre))
     smallest = np.array([laws[0].prior.gain.smallest, laws[0].prior.offset.smallest])
     estimate, sd, confidence, harm = np.zeros((N, 2 * K)), np.zeros((N, 2 * K)), np.zeros(N), np.zeros((N, K))
-    fault, hardware, points, supports = np.zeros((N, K)), np.zeros(N), [], []
-    for j in range(N):
-        found = points_of(explained, j)
+    fault, hardware, points, supports = np.zeros((N, K)), np.zeros(N), posterior_points(explained), []
+    for j, found in enumerate(points):
         estimate[j], confidence[j] = best_estimate(found, smallest)
         drift, offset = estimate[j, :K], estimate[j, K:]
         own = (mean[j] - offset) / (1.0 + drift)
@@ -345,7 +336,6 @@ def estimate_rows(
         sd[j] = _central_sd(found, estimate[j])
         faulty = found.faults != 0.0
         fault[j] = np.minimum(found.weight @ (faulty[:, :K] | faulty[:, K:]), 1.0)
-        points.append(found)
         supports.append(_supports(explained, found, j))
         hardware[j] = sum(share for share, values in supports[j] if values[:2].any())
     first = np.array([_nearest(each, estimate[j]) for j, each in enumerate(supports)])

@@ -17,11 +17,11 @@ The 5K rows, with the names of :class:`calibrator.estimator.rows.RowPlaces`; bra
 
 Offsets and loads are in fractions of full scale. A support is the set of parameters that are not zero. Every support is
 fitted by Gauss-Newton steps on the evidence rows (M11), under a wide Gaussian prior (M12); the prior that is meant
-comes in later (:mod:`calibrator.estimator.posterior`). The loops are compiled by numba: tuples of arrays go in, arrays
-are filled, and rows and parameters go by these numbers.
+comes in later (:mod:`calibrator.estimator.posterior`). A vehicle has some ten thousand residuals to evaluate in a
+millisecond, so the loops are compiled by numba; in them rows and parameters go by these numbers.
 """
 
-from math import exp, expm1, log, sqrt
+from math import exp, expm1, log
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +49,8 @@ LOWEST, HIGHEST, STEP = -2.5, 1.2, 0.5
 """Range of a parameter, and the longest step of one iteration: gains from 0.08 to 3.3. [1]"""
 MOST_STEPS, LAST_STEP = 7, 1e-7
 """Gauss-Newton steps, and the size of a step that is the last one: far below what any row shows. [1]"""
+DIFFERENCE = 1e-6
+"""Step by which residuals are differentiated: rounding and curvature leave 1e-9 of a derivative. [1]"""
 
 
 class Evidence(NamedTuple):
@@ -66,8 +68,8 @@ class Evidence(NamedTuple):
         What all sensors of a branch share: offsets, in fractions of full scale, which the centre holds, and logarithms
         of gains; last 1 if what a group of vehicles shares is an offset of the feeding sensor, 0 if it is a load. An
         offset does not grow with the current: seen through a gain error it is another one, and a load is not (M16).
-    precision, precision_relative : ndarray of shape (N, 5K, 5K) and (N, 3K - 1, 3K - 1)
-        Inverse covariance of all rows, and of the relative rows alone.
+    precision, precision_relative : ndarray of shape (N, 5K, 5K)
+        Inverse covariance of all rows, and of the relative rows alone; zero for the others.
     log_scale : ndarray of shape (N,)
         Logarithm of the probability density of the rows of a vehicle that are all at the centre.
     feed : int
@@ -119,14 +121,15 @@ def evidence_of(values: Array, covariance: Array, means: Array, *, centre: Array
     """Evidence with the inverses of its covariance (N, 5K, 5K); the other parameters as in :class:`Evidence`."""
     rows = values.shape[1]
     relative = row_places(rows // 5).relative
-    precision = np.linalg.inv(covariance)
+    precision, of_relative = np.linalg.inv(covariance), np.zeros_like(covariance)
+    of_relative[:, relative, relative] = np.linalg.inv(covariance[:, relative, relative])
     return Evidence(
         values=np.ascontiguousarray(values),
         means=np.ascontiguousarray(means),
         centre=centre,
         shared=shared,
         precision=precision,
-        precision_relative=np.linalg.inv(covariance[:, relative, relative]),
+        precision_relative=of_relative,
         log_scale=0.5 * (np.linalg.slogdet(precision)[1] - rows * np.log(2.0 * np.pi)),
         feed=feed,
     )
@@ -218,247 +221,127 @@ def residual(theta: Array, evidence: Evidence, j: int, e: Array) -> None:
     e[c + feed] -= load
 
 
-@inner
-def _design(theta: Array, evidence: Evidence, j: int, e: Array, A: Array) -> None:
-    """Fill A with minus the derivative of :func:`residual` by the parameters, at a residual e."""
-    y, means, shared, feed = evidence.values[j], evidence.means[j], evidence.shared, evidence.feed
-    K = len(y) // 5
-    c = 3 * K - 1
-    A[:] = 0.0
-    A[c + K, 1] = y[c + K] * exp(-theta[1] - shared[K])
-    for k in range(K):
-        A[k, 0] = A[k, 1 + k] = A[2 * K - 1 + k, 1 + k] = 1.0
-        unit = exp(-theta[1 + k] - shared[K + k])
-        turn = exp(theta[0]) * exp(min(e[k], MOST_TURN))
-        A[c + k, 0] = means[0, k] * (exp(theta[0]) - 1.0)
-        A[c + k, 1 + k] = (y[c + k] - shared[k]) * unit + means[0, k] * (turn - 1.0)
-        A[c + K, 1 + k] -= shared[k] * unit
-        A[c + K + 1 + k, 1 + k] = y[c + K + 1 + k] * unit
-        A[c + k, 2 * K + k] = A[c + K, 2 * K + k] = A[c + K + 1 + k, 2 * K + k] = 1.0
-        if k < K - 1:
-            A[c + k, K + 1 + k] = 1.0
-            A[c + K - 1, K + 1 + k] = -1.0
-        if k:
-            row = K + k - 1
-            A[row, 1], A[row, 1 + k] = 1.0, -1.0
-            A[c + K, 1] -= means[1, k] * (unit * exp(min(e[row], MOST_TURN)) - exp(-y[k]))
-            A[c + K, 1 + k] -= means[1, k] * (exp(-y[k]) - unit)
-    scale = exp(-theta[1 + feed] - shared[K + feed]) if shared[2 * K] else 1.0
-    A[c + feed, 3 * K] = A[c + K, 3 * K] = scale
-    if shared[2 * K]:
-        A[c + feed, 1 + feed] -= theta[3 * K] * scale
-        A[c + K, 1 + feed] -= theta[3 * K] * scale
-
-
-@inner
-def _normal_equations(
-    precision: Array, A: Array, e: Array, theta: Array, chosen: Integers, n: int, H: Array, g: Array, work: Array
-) -> float:
-    """H = A' precision A + 1 / sd^2 and g = A' precision e - theta / sd^2 of n chosen columns; returns chi2."""
-    rows = len(e)
-    chi2 = 0.0
-    for r in range(rows):
-        total = 0.0
-        for s in range(rows):
-            total += precision[r, s] * e[s]
-        work[0, r] = total
-        chi2 += total * e[r]
-    for i in range(n):
-        p = chosen[i]
-        for r in range(rows):
-            total = 0.0
-            for s in range(rows):
-                total += precision[r, s] * A[s, p]
-            work[1, r] = total
-        for j in range(i + 1):
-            total = 0.0
-            for r in range(rows):
-                total += work[1, r] * A[r, chosen[j]]
-            H[i, j] = total
-        H[i, i] += WIDE_SD**-2
-        total = 0.0
-        for r in range(rows):
-            total += A[r, p] * work[0, r]
-        g[i] = total - theta[p] / WIDE_SD**2
-    return float(chi2)
-
-
-@inner
-def _append(H: Array, g: Array, order: Integers, n: int, L: Array, w: Array) -> float:
-    """Add row order[n] of H to the Cholesky factor L; returns half the square of the new component of L^-1 g."""
-    i = order[n]
-    for a in range(n + 1):
-        j = order[a]
-        total = H[i, j] if i >= j else H[j, i]
-        for b in range(a):
-            total -= L[n, b] * L[a, b]
-        L[n, a] = total / L[a, a] if a < n else sqrt(max(total, 1e-300))
-    total = g[i]
-    for b in range(n):
-        total -= L[n, b] * w[b]
-    w[n] = total / L[n, n]
-    return float(0.5 * w[n] ** 2)
-
-
-@inner
-def _solve(H: Array, g: Array, order: Integers, n: int, L: Array, w: Array) -> None:
-    """Fill w with the solution of H w = g, and L with the Cholesky factor of H; order becomes 0 .. n - 1."""
-    for a in range(n):
-        order[a] = a
-        _append(H, g, order, a, L, w)
-    for a in range(n - 1, -1, -1):
-        for b in range(a + 1, n):
-            w[a] -= L[b, a] * w[b]
-        w[a] /= L[a, a]
-
-
 @compiled_with_notice
 def _fit_all(evidence: Evidence, log_prior: Array, log_load: float, fits: Fits) -> None:
-    P = fits.theta.shape[2]
-    scores: Array = np.empty(1 << 14)
-    codes: Integers = np.empty(1 << 14, np.int64)
     for j in range(len(evidence.values)):
-        found, scores, codes = _score(evidence, j, log_prior, log_load, scores, codes)
-        kept = np.flatnonzero(scores[:found] > scores[:found].max() - MARGIN)
+        scores, codes = _rough_weights(evidence, j, log_prior, log_load)
+        kept = np.flatnonzero(scores > scores.max() - MARGIN)
         kept = kept[np.argsort(-scores[kept])][: fits.theta.shape[1]]
         fits.number[j] = len(kept)
         for q in range(len(kept)):
-            for p in range(P):
+            for p in range(fits.theta.shape[2]):
                 fits.support[j, q, p] = (codes[kept[q]] >> p) & 1
             fits.log_evidence[j, q], fits.chi2[j, q] = _refine(
-                evidence, j, fits.support[j, q], fits.theta[j, q], fits.root[j, q]
+                evidence, j, np.flatnonzero(fits.support[j, q]), fits.theta[j, q], fits.root[j, q]
             )
             fits.log_evidence[j, q] += evidence.log_scale[j]
 
 
 @inner
-def _score(
-    evidence: Evidence, j: int, log_prior: Array, log_load: float, scores: Array, codes: Integers
-) -> tuple[int, Array, Integers]:
-    """Rough log weights of the supports that may matter: constants linear about the gains that the relative rows tell.
-
-    Constant parameters are added one at a time to a Cholesky factor, depth first, so that a support costs one row of
-    it; a branch of the search ends where even all constant parameters together could not make it matter.
-    """
-    K, feed, most = evidence.values.shape[1] // 5, evidence.feed, MOST_PARAMETERS
-    P, R, first = 3 * K + 1, 3 * K - 1, K + 1
-    e, A, theta = np.zeros(5 * K), np.zeros((5 * K, P)), np.zeros(P)
-    H, g, work = np.zeros((P, P)), np.zeros(P), np.zeros((2, 5 * K))
-    L, w, chosen, order = np.zeros((P, P)), np.zeros(P), np.zeros(P, np.int64), np.zeros(P, np.int64)
-    gain, logdet = np.zeros(P + 1), np.zeros(P + 1)
-    hardware, sensor, load = np.zeros(P + 1, np.int64), np.zeros(P + 1, np.int64), np.zeros(P + 1, np.int64)
-    best, found, log_wide = -np.inf, 0, log(WIDE_SD)
-    for mask in range(1 << (K + 1)):
-        n = 0
-        for i in range(K + 1):
-            if (mask >> i) & 1:
-                chosen[n] = i
-                n += 1
-        if n > most:
-            continue
-        theta[:] = 0.0
-        residual(theta, evidence, j, e)
-        _design(theta, evidence, j, e, A)
-        _normal_equations(evidence.precision_relative[j], A[:R], e[:R], theta, chosen, n, H, g, work)
-        _solve(H, g, order, n, L, w)
-        for a in range(n):
-            theta[chosen[a]] = min(max(w[a], LOWEST), HIGHEST)
-        residual(theta, evidence, j, e)
-        _design(theta, evidence, j, e, A)
-        for i in range(first, P):
-            chosen[n + i - first] = i
-        columns = n + P - first
-        start = -0.5 * _normal_equations(evidence.precision[j], A, e, theta, chosen, columns, H, g, work)
-        for a in range(n):
-            start -= 0.5 * (theta[chosen[a]] / WIDE_SD) ** 2
-        gain[0] = logdet[0] = 0.0
-        for a in range(columns):  # all constant parameters together
-            order[a] = a
-            gain[a + 1] = gain[a] + _append(H, g, order, a, L, w)
-            if a < n:
-                logdet[a + 1] = logdet[a] + log(L[a, a])
-        everything = gain[columns]
-        hardware[0] = mask & 1
-        sensor[0] = n - hardware[0]
-        load[0] = 0
-        depth, following = 0, n
-        evaluate = True
-        while True:
-            if evaluate:
-                m = n + depth
-                score = start + gain[m] - logdet[m] - m * log_wide + log_prior[hardware[depth], sensor[depth]]
-                score += log_load * load[depth]
-                if found == len(scores):
-                    scores = np.append(scores, np.empty(found))
-                    codes = np.append(codes, np.empty(found, np.int64))
-                code = mask
-                for a in range(depth):
-                    code |= 1 << chosen[order[n + a]]
-                scores[found], codes[found] = score, code
-                found += 1
-                best = max(best, score)
-                if score + everything - gain[m] < best - MARGIN - 3.0:
-                    following = columns  # no descent from here
-            evaluate = False
-            if following < columns and n + depth < most:
-                p = chosen[following]
-                if p == 3 * K and _holds(order, n, depth, chosen, 2 * K + feed):
-                    following += 1  # an offset of the feeding sensor and a load look the same
-                    continue
-                order[n + depth] = following
-                m = n + depth
-                gain[m + 1] = gain[m] + _append(H, g, order, m, L, w)
-                logdet[m + 1] = logdet[m] + log(L[m, m])
-                hardware[depth + 1] = hardware[depth] + (p < 2 * K)
-                sensor[depth + 1] = sensor[depth] + (2 * K <= p < 3 * K)
-                load[depth + 1] = load[depth] + (p == 3 * K)
-                depth += 1
-                following += 1
-                evaluate = True
-            else:
-                if depth == 0:
-                    break
-                depth -= 1
-                following = order[n + depth] + 1
-    return found, scores, codes
-
-
-@inner
-def _holds(order: Integers, n: int, depth: int, chosen: Integers, parameter: int) -> bool:
-    for a in range(depth):
-        if chosen[order[n + a]] == parameter:
-            return True
-    return False
-
-
-@inner
-def _refine(evidence: Evidence, j: int, support: Mask, theta: Array, root: Array) -> tuple[float, float]:
-    """Gauss-Newton on all rows; fills theta and root, returns log evidence and chi2."""
-    K = evidence.values.shape[1] // 5
-    P = 3 * K + 1
-    e, A = np.zeros(5 * K), np.zeros((5 * K, P))
-    H, g, work = np.zeros((P, P)), np.zeros(P), np.zeros((2, 5 * K))
-    L, w, chosen, order = np.zeros((P, P)), np.zeros(P), np.flatnonzero(support), np.arange(P)
-    n, chi2 = len(chosen), 0.0
-    theta[:] = 0.0
-    root[:] = 0.0
-    for _ in range(MOST_STEPS):
-        residual(theta, evidence, j, e)
-        if n:
-            _design(theta, evidence, j, e, A)
-        chi2 = _normal_equations(evidence.precision[j], A, e, theta, chosen, n, H, g, work)
-        _solve(H, g, order, n, L, w)
-        if n == 0 or np.abs(w[:n]).max() < LAST_STEP:
-            break
-        for a in range(n):
-            p = chosen[a]
-            theta[p] = min(max(theta[p] + min(max(w[a], -STEP), STEP), LOWEST), HIGHEST)
-    value = -0.5 * chi2
+def _normal_equations(
+    evidence: Evidence, j: int, theta: Array, chosen: Integers, precision: Array
+) -> tuple[Array, Array, float]:
+    """H and g of the Gauss-Newton step H step = g of the chosen parameters at theta, prior included; and chi2 there."""
+    n, e = len(chosen), np.empty(evidence.values.shape[1])
+    A = np.empty((n, len(e)))  # minus the derivatives, a row per parameter
+    residual(theta, evidence, j, e)
     for a in range(n):
+        before = theta[chosen[a]]
+        theta[chosen[a]] = before + DIFFERENCE
+        residual(theta, evidence, j, A[a])
+        theta[chosen[a]] = before
+        A[a] = (e - A[a]) / DIFFERENCE
+    weighted, H, g = A @ precision, np.empty((n, n)), np.empty(n)
+    for a in range(n):
+        for b in range(a + 1):
+            H[a, b] = H[b, a] = (weighted[a] * A[b]).sum()
+        H[a, a] += WIDE_SD**-2
+        g[a] = (weighted[a] * e).sum() - theta[chosen[a]] / WIDE_SD**2
+    return H, g, float(e @ (precision @ e))
+
+
+@inner
+def _without(H: Array, g: Array, i: int) -> tuple[Array, Array]:
+    """Normal equations of the parameters after number i once that one is fitted (Schur complement)."""
+    rest, right = H[i + 1 :, i + 1 :].copy(), g[i + 1 :].copy()
+    for a in range(len(right)):
+        share = H[i, i + 1 + a] / H[i, i]
+        right[a] -= share * g[i]
+        for b in range(len(right)):
+            rest[a, b] -= share * H[i, i + 1 + b]
+    return rest, right
+
+
+@inner
+def _rough_weights(evidence: Evidence, j: int, log_prior: Array, log_load: float) -> tuple[Array, Integers]:
+    """Rough log weights of the supports that may matter, and the supports as bits.
+
+    For each set of gains, which the relative rows tell, the constants are linear: one after the other is eliminated
+    from the normal equations, depth first. A branch of the search ends where even all constants together could not
+    make it matter.
+    """
+    K, log_wide = evidence.values.shape[1] // 5, log(WIDE_SD)
+    P, feeding_offset = 3 * K + 1, 2 * K + evidence.feed
+    best, scores, codes = -np.inf, [0.0 for _ in range(0)], [0 for _ in range(0)]
+    of_gains, of_relative, _ = _normal_equations(
+        evidence, j, np.zeros(P), np.arange(K + 1), evidence.precision_relative[j]
+    )
+    for mask in range(1 << (K + 1)):
+        gains = np.array([p for p in range(K + 1) if (mask >> p) & 1], np.int64)
+        n, theta = len(gains), np.zeros(P)
+        if n > MOST_PARAMETERS:
+            continue
+        if n:
+            fitted = np.linalg.solve(of_gains[gains][:, gains], of_relative[gains])
+            theta[gains] = np.minimum(np.maximum(fitted, LOWEST), HIGHEST)
+        columns = np.concatenate((gains, np.arange(K + 1, P)))
+        H, g, chi2 = _normal_equations(evidence, j, theta, columns, evidence.precision[j])
+        weight = -0.5 * chi2 - 0.5 * ((theta / WIDE_SD) ** 2).sum()
+        for _ in range(n):
+            weight += 0.5 * g[0] ** 2 / H[0, 0] - 0.5 * log(H[0, 0]) - log_wide
+            H, g = _without(H, g, 0)
+        possible = 0.5 * (g * np.linalg.solve(H, g)).sum()  # by all constants together
+        hardware = mask & 1
+        sensor = n - hardware
+        scores.append(weight + log_prior[hardware, sensor])
+        codes.append(mask)
+        best = max(best, scores[-1])
+        stack = [(K + 1, n, hardware, sensor, 0, mask, weight, possible, H, g)]
+        while stack:
+            first, size, hardware, sensor, load, code, weight, possible, H, g = stack.pop()
+            for p in range(first, P if size < MOST_PARAMETERS else first):
+                if p == 3 * K and (code >> feeding_offset) & 1:
+                    continue  # a load and an offset of the feeding sensor look the same
+                i, h, s, loads = p - first, hardware + (p < 2 * K), sensor + (2 * K <= p < 3 * K), load + (p == 3 * K)
+                gain = 0.5 * g[i] ** 2 / H[i, i]
+                value = weight + gain - 0.5 * log(H[i, i]) - log_wide
+                scores.append(value + log_prior[h, s] + log_load * loads)
+                codes.append(code | (1 << p))
+                best = max(best, scores[-1])
+                if scores[-1] + possible - gain > best - MARGIN - 3.0:
+                    rest, right = _without(H, g, i)
+                    stack.append((p + 1, size + 1, h, s, loads, codes[-1], value, possible - gain, rest, right))
+    return np.array(scores), np.array(codes)
+
+
+@inner
+def _refine(evidence: Evidence, j: int, chosen: Integers, theta: Array, root: Array) -> tuple[float, float]:
+    """Gauss-Newton on all rows; fills theta and root, returns log evidence and chi2."""
+    for _ in range(MOST_STEPS):
+        H, g, chi2 = _normal_equations(evidence, j, theta, chosen, evidence.precision[j])
+        if not len(chosen):
+            return -0.5 * chi2, chi2
+        step = np.linalg.solve(H, g)
+        if np.abs(step).max() < LAST_STEP:
+            break
+        theta[chosen] = np.minimum(
+            np.maximum(theta[chosen] + np.minimum(np.maximum(step, -STEP), STEP), LOWEST), HIGHEST
+        )
+    L = np.linalg.cholesky(H)
+    inverse = np.linalg.inv(L)  # its transpose is a root of the covariance
+    value = -0.5 * chi2
+    for a in range(len(chosen)):
         value -= 0.5 * (theta[chosen[a]] / WIDE_SD) ** 2 + log(WIDE_SD) + log(L[a, a])
-        for b in range(a, -1, -1):  # rows of L^-1, whose transpose is the root of the covariance
-            total = 1.0 if a == b else 0.0
-            for i in range(b, a):
-                total -= L[a, i] * root[chosen[b], chosen[i]]
-            root[chosen[b], chosen[a]] = total / L[a, a]
+        for b in range(a + 1):
+            root[chosen[b], chosen[a]] = inverse[a, b]
     return value, chi2

@@ -93,12 +93,21 @@ def _is_number(given: Any, low: float, high: float, kind: Any = Real) -> bool:
 
 def _names(given: Any, what: str, *, sets: bool = False) -> tuple[str, ...]:
     """Names of anything like a list, numbers as strings; a set has no order, so it does for some arguments only."""
+    no_list = (str, bytes, Mapping) if sets else (str, bytes, Mapping, set, frozenset)
     names: list[Any] = [None]
     with suppress(TypeError):
-        names = names if isinstance(given, (str, bytes, Mapping, *(() if sets else (set, frozenset)))) else [*given]
+        names = names if isinstance(given, no_list) else [*given]
     named = (not isinstance(name, bool) and isinstance(name, (str, Integral)) and str(name).strip() for name in names)
     _require(all(named), what, given, "a list of names, such as ['one', 'other']")
     return tuple(map(str, names))
+
+
+def _with_sd(given: Any, what: str, least: float = -1e6) -> tuple[float, float]:
+    """A value with its standard deviation."""
+    good = isinstance(given, Sequence) and len(given) == 2 and _is_number(given[0], least, 1e6)
+    above = " from 0" if least == 0.0 else ""
+    _require(good and _is_number(given[1], 0.0, 1e6), what, given, f"a value{above} with its standard deviation")
+    return float(given[0]), float(given[1])
 
 
 def _in_python(text: str) -> str:
@@ -390,6 +399,48 @@ class _Calibrator:
         )
         return f"{type(self).__name__}({', '.join(changed)})"
 
+    def _settings(self, *, alone: bool) -> "CalibrationSettings":
+        """Parameters of the constructor as the command takes them; FleetError if one makes no sense."""
+        from calibrator.estimator.settings import CalibrationSettings
+        from ecu_node.layout import UnmeasuredLoad
+
+        given = self.get_params()
+        for name in sorted(given.keys() & {"harm_limit", "expected_faults"}):
+            good = _is_number(given[name], 0, 1) or (given[name] is None and name == "expected_faults")
+            _require(good, name, given[name], "a number from 0 to 1")
+        for name in sorted(given.keys() & {"trusted", "hold_out"}):
+            names = [given[name]] if isinstance(given[name], str) else () if given[name] is None else given[name]
+            given[name] = frozenset(_names(names, name, sets=True))
+        readings = given["readings"]
+        if hasattr(readings, "to_csv"):
+            given["readings"] = str(readings.to_csv(index=False))
+        elif readings is not None:
+            given["readings"] = _path(readings, "readings", "a DataFrame or the path of a CSV table")
+            _require(given["readings"].is_file(), "readings", readings, "a file that exists")
+        if alone:
+            meter, charge_ah = given["meter"], given["charge_ah"] or {}
+            _require(meter is None or isinstance(meter, str), "meter", meter, "the name of a branch")
+            _require(isinstance(charge_ah, Mapping), "charge_ah", charge_ah, "charges by branch")
+            given["charge_ah"] = {str(name): _with_sd(pair, "charge_ah") for name, pair in charge_ah.items()}
+            if given["load"] is not None:
+                mean_a, sd_a = _with_sd(given["load"], "load", least=0.0)
+                given["load"] = UnmeasuredLoad(mean_a=mean_a, sd_a=sd_a)
+        used = CalibrationSettings.__dataclass_fields__.keys() & given.keys()
+        return CalibrationSettings(alone=alone, **{name: given[name] for name in used})
+
+    def _calibrate(
+        self, place: str | Path, database: "VehicleDatabase", *, alone: bool, has_layout: bool, **workers: Any
+    ) -> None:
+        """Calibrate as the command does, and take over what stands in the result folder."""
+        from calibrator.estimator.run import calibrate_fleet
+        from calibrator.processes.run_many import Workers
+
+        with TemporaryDirectory(prefix="calibrator-") as folder:
+            out = Path(folder) / "result"
+            settings = self._settings(alone=alone)
+            report = calibrate_fleet(place, database, out, settings, workers=Workers(**workers))
+            self._keep(out, report, has_layout=has_layout)
+
     def _keep(self, out: Path, report: "CalibrationReport", *, has_layout: bool) -> None:
         """Take over what stands in a result folder."""
         import pandas as pd
@@ -469,18 +520,8 @@ class _Calibrator:
             warnings.warn(NO_NODE_FILES, stacklevel=2)
         return Path(folder)
 
-    def _readings(self) -> Path | str | None:
-        """Path of the bench readings, or their text if they are a data frame."""
-        readings: Any = self.get_params()["readings"]
-        if hasattr(readings, "to_csv"):
-            return str(readings.to_csv(index=False))
-        if readings is None:
-            return None
-        path = _path(readings, "readings", "a DataFrame or the path of a CSV table")
-        _require(path.is_file(), "readings", readings, "a file that exists")
-        return path
 
-
+@dataclass(kw_only=True, repr=False, eq=False)
 class FleetCalibrator(_Calibrator):
     """Learns from a fleet of identical vehicles what each one's current sensors do wrong.
 
@@ -522,26 +563,14 @@ class FleetCalibrator(_Calibrator):
     FleetCalibrator(harm_limit=0.01)
     """
 
-    def __init__(
-        self,
-        *,
-        harm_limit: float = 0.001,
-        trusted: Collection[str] = (),
-        readings: "str | Path | pd.DataFrame | None" = None,
-        hold_out: Collection[str] = (),
-        expected_faults: float | None = None,
-        workers: int = 2,
-        scheduler: str | None = None,
-        verbose: bool = False,
-    ) -> None:
-        self.harm_limit = harm_limit
-        self.trusted = trusted
-        self.readings = readings
-        self.hold_out = hold_out
-        self.expected_faults = expected_faults
-        self.workers = workers
-        self.scheduler = scheduler
-        self.verbose = verbose
+    harm_limit: float = 0.001
+    trusted: Collection[str] = ()
+    readings: "str | Path | pd.DataFrame | None" = None
+    hold_out: Collection[str] = ()
+    expected_faults: float | None = None
+    workers: int = 2
+    scheduler: str | None = None
+    verbose: bool = False
 
     def fit(self, fleet: Fleet, y: None = None) -> "FleetCalibrator":  # noqa: ARG002 (scikit-learn's signature)
         """Learn from a fleet, and estimate the sensor faults of every vehicle.
@@ -563,42 +592,19 @@ class FleetCalibrator(_Calibrator):
         UserError
             If the fleet as a whole cannot be calibrated, or a parameter makes no sense.
         """
-        from calibrator.estimator.run import calibrate_fleet
-        from calibrator.processes.run_many import Workers
         from calibrator.terminal.progress import no_progress
 
         _require(isinstance(fleet, Fleet), "fleet", fleet, "Fleet.from_frames(...) or Fleet.from_folder(...)")
-        progress = nullcontext() if self.verbose else no_progress()
-        with TemporaryDirectory(prefix="calibrator-") as folder, progress, _errors_in_python():
-            settings, out = self._settings(), Path(folder) / "result"
-            # frames are so few that another process takes longer to start than they take here
-            workers = Workers(processes=1 if fleet.in_memory else self.workers, scheduler=self.scheduler)
-            report = calibrate_fleet(fleet.place, fleet.database, out, settings, workers=workers)
-            self._keep(out, report, has_layout=fleet.has_layout)
-        return self
-
-    def _settings(self) -> "CalibrationSettings":
-        """Parameters of the constructor as the command takes them; FleetError if one makes no sense."""
-        from calibrator.estimator.settings import CalibrationSettings
-
-        faults = 0.0 if self.expected_faults is None else self.expected_faults
-        _require(_is_number(self.harm_limit, 0, 1), "harm_limit", self.harm_limit, "a number from 0 to 1")
-        _require(_is_number(faults, 0, 1), "expected_faults", faults, "a number from 0 to 1")
         _require(_is_number(self.workers, 1, 256, Integral), "workers", self.workers, "a whole number from 1 to 256")
         _require(isinstance(self.scheduler, str | None), "scheduler", self.scheduler, "the address of a Dask scheduler")
-        trusted, hold_out = (
-            frozenset(_names([given] if isinstance(given, str) else () if given is None else given, name, sets=True))
-            for name, given in (("trusted", self.trusted), ("hold_out", self.hold_out))
-        )
-        return CalibrationSettings(
-            harm_limit=self.harm_limit,
-            readings=self._readings(),
-            expected_faults=self.expected_faults,
-            trusted=trusted,
-            hold_out=hold_out,
-        )
+        # frames are so few that another process takes longer to start than they take here
+        workers: dict[str, Any] = {"processes": 1 if fleet.in_memory else self.workers, "scheduler": self.scheduler}
+        with nullcontext() if self.verbose else no_progress(), _errors_in_python():
+            self._calibrate(fleet.place, fleet.database, alone=False, has_layout=fleet.has_layout, **workers)
+        return self
 
 
+@dataclass(kw_only=True, repr=False, eq=False)
 class JunctionCalibrator(_Calibrator):
     """Learns from recordings of one junction, and what is known of it, what its current sensors do wrong.
 
@@ -631,22 +637,12 @@ class JunctionCalibrator(_Calibrator):
     JunctionCalibrator(trusted=['battery'])
     """
 
-    def __init__(
-        self,
-        *,
-        trusted: Collection[str] = (),
-        readings: "str | Path | pd.DataFrame | None" = None,
-        load: tuple[float, float] | None = None,
-        charge_ah: Mapping[str, tuple[float, float]] | None = None,
-        meter: str | None = None,
-        harm_limit: float = 0.001,
-    ) -> None:
-        self.trusted = trusted
-        self.readings = readings
-        self.load = load
-        self.charge_ah = charge_ah
-        self.meter = meter
-        self.harm_limit = harm_limit
+    trusted: Collection[str] = ()
+    readings: "str | Path | pd.DataFrame | None" = None
+    load: tuple[float, float] | None = None
+    charge_ah: Mapping[str, tuple[float, float]] | None = None
+    meter: str | None = None
+    harm_limit: float = 0.001
 
     def fit(self, recordings: "Recordings", junction: Junction | str | Path, y: None = None) -> "JunctionCalibrator":  # noqa: ARG002 (scikit-learn's signature)
         """Estimate the sensor faults of one junction, or of several, each by itself.
@@ -674,52 +670,21 @@ class JunctionCalibrator(_Calibrator):
         import pandas as pd
 
         from calibrator.estimator.frames import store_frames
-        from calibrator.estimator.run import calibrate_fleet
-        from calibrator.processes.run_many import Workers
         from calibrator.terminal.progress import no_progress
 
         if not isinstance(junction, Junction):
             junction = Junction.from_layout(_path(junction, "junction", "a Junction, or the path of a layout (TOML)"))
         with TemporaryDirectory(prefix="calibrator-") as folder, no_progress(), _errors_in_python():
-            place, out = Path(folder) / "recordings", Path(folder) / "result"
-            settings = self._settings()
             if isinstance(recordings, (str, os.PathLike)):
                 _require(junction.database is not None, "junction", junction, "a layout, as the recordings are on disk")
                 place, database = Path(recordings), junction.as_database((), 0.1)
             else:
                 several = isinstance(recordings, Mapping) and not isinstance(recordings, pd.DataFrame)
                 named: Any = recordings if several else {"vehicle": recordings}
+                place = Path(folder) / "recordings"
                 database = store_frames(place, named, junction)
-            report = calibrate_fleet(place, database, out, settings, workers=Workers(processes=1))
-            self._keep(out, report, has_layout=junction.layout is not None)
+            self._calibrate(place, database, alone=True, has_layout=junction.layout is not None, processes=1)
         return self
-
-    def _settings(self) -> "CalibrationSettings":
-        from calibrator.estimator.settings import CalibrationSettings
-        from ecu_node.layout import UnmeasuredLoad
-
-        def pair(given: Any, name: str, least: float = -1e6) -> tuple[float, float]:
-            good = isinstance(given, Sequence) and len(given) == 2 and _is_number(given[0], least, 1e6)
-            above = " from 0" if least == 0.0 else ""
-            _require(
-                good and _is_number(given[1], 0.0, 1e6), name, given, f"a value{above} with its standard deviation"
-            )
-            return float(given[0]), float(given[1])
-
-        _require(_is_number(self.harm_limit, 0, 1), "harm_limit", self.harm_limit, "a number from 0 to 1")
-        _require(self.meter is None or isinstance(self.meter, str), "meter", self.meter, "the name of a branch")
-        _require(isinstance(self.charge_ah or {}, Mapping), "charge_ah", self.charge_ah, "charges by branch")
-        load = None if self.load is None else pair(self.load, "load", 0.0)
-        names = [self.trusted] if isinstance(self.trusted, str) else () if self.trusted is None else self.trusted
-        return CalibrationSettings(
-            alone=True,
-            harm_limit=self.harm_limit,
-            readings=self._readings(),
-            trusted=frozenset(_names(names, "trusted", sets=True)),
-            load=None if load is None else UnmeasuredLoad(mean_a=load[0], sd_a=load[1]),
-            charge_ah={str(name): pair(given, "charge_ah") for name, given in (self.charge_ah or {}).items()},
-            meter=self.meter,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

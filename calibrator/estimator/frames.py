@@ -64,18 +64,11 @@ def summarise_frames(
         If the frames are no recordings of such a fleet.
     """
     vehicles = _vehicles(frames)
-    labelled = [
-        (f"vehicle {vehicle}, frame {number}", frame)
-        for vehicle, drives in vehicles.items()
-        for number, frame in enumerate(drives, start=1)
-    ]
+    labelled = _labelled(vehicles)
     chosen = _chosen_inputs(labelled, junction, inputs)
-    times = {where: _seconds(frame, where) for where, frame in labelled}
-    database = junction.as_database(chosen, _period_s(times, junction))
-    columns = (*junction.branches, *sorted(base_inputs(database.layout, chosen)))
-    drives = _drives(vehicles, times, junction.branches, columns)
+    columns = (*junction.branches, *sorted(base_inputs(junction.layout, chosen) if junction.layout else chosen))
+    drives, database = _drives(vehicles, junction, columns, inputs=chosen)
     _require_amperes(drives, junction)
-
     equipment = Equipment(branches=tuple(junction.branches), inputs=chosen, fleet_inputs=chosen, notices=())
     identity = store_identity(equipment, database, vehicles=len(drives), fleet="frames", fleet_ids=frozenset())
     store = SummaryStore(storage=open_storage(folder), identity=identity)
@@ -108,28 +101,31 @@ def store_frames(folder: Path, frames: Mapping[str, Any], junction: "Junction") 
         If the frames are no recordings of this junction.
     """
     vehicles = _vehicles(frames, fewest=1)
-    labelled = [
-        (f"vehicle {vehicle}, frame {number}", frame)
-        for vehicle, drives in vehicles.items()
-        for number, frame in enumerate(drives, start=1)
-    ]
-    for where, frame in labelled:
+    labelled = _labelled(vehicles)
+    for where, frame in labelled.items():
         try:
-            require_columns(frame, list(junction.branches), where)
+            require_columns(frame, junction.branches, where)
         except DriveError as error:
             raise DriveError(
                 f"{error}; rename its columns, positive into the junction, or name those in Junction(branches=...)"
             ) from None
-    times = {where: _seconds(frame, where) for where, frame in labelled}
-    database = junction.as_database((), _period_s(times, junction))
-    contactor = database.layout.contactor
-    there = contactor is not None and all(contactor.input in frame.columns for _, frame in labelled)
+    contactor = None if junction.layout is None else junction.layout.contactor
+    there = contactor is not None and all(contactor.input in frame.columns for frame in labelled.values())
     columns = (*junction.branches, *([contactor.input] if contactor is not None and there else []))
-    drives = _drives(vehicles, times, junction.branches, columns)
+    drives, database = _drives(vehicles, junction, columns)
     _require_amperes(drives, junction, alone=True)
     for drive in (drive for mine in drives.values() for drive in mine):
         write_drive(folder, drive, database.layout)
     return database
+
+
+def _labelled(vehicles: Mapping[str, Sequence[pd.DataFrame]]) -> dict[str, pd.DataFrame]:
+    """All frames by what messages call them."""
+    return {
+        f"vehicle {vehicle}, frame {number}": frame
+        for vehicle, drives in vehicles.items()
+        for number, frame in enumerate(drives, start=1)
+    }
 
 
 def _vehicles(frames: Mapping[str, Any], *, fewest: int = 2) -> dict[str, list[pd.DataFrame]]:
@@ -156,40 +152,38 @@ def _vehicles(frames: Mapping[str, Any], *, fewest: int = 2) -> dict[str, list[p
 
 
 def _chosen_inputs(
-    labelled: Sequence[tuple[str, pd.DataFrame]], junction: "Junction", inputs: Sequence[str] | None
+    labelled: Mapping[str, pd.DataFrame], junction: "Junction", inputs: Sequence[str] | None
 ) -> tuple[str, ...]:
     """Names of the inputs; every frame has the columns that it takes."""
-    branches = list(junction.branches)
-    for where, frame in labelled:
+    branches, layout = list(junction.branches), junction.layout
+    for where, frame in labelled.items():
         require_columns(frame, branches, where)
-    both = sorted(set(inputs or ()) & set(branches))
-    if both:
+    if both := sorted(set(inputs or ()) & set(branches)):
         raise FleetError(f"inputs {few(both)}: a branch of the junction cannot be an input of its model")
-    if junction.layout is not None:
-        common = set.intersection(*(set(frame.columns) for _, frame in labelled))
-        known = {item.name for item in junction.layout.input} | {item.name for item in junction.layout.derived}
-        unknown = sorted(set(inputs or ()) - known)
-        if unknown:
+    first = next(iter(labelled))
+    if layout is not None:
+        known = {item.name for item in layout.input} | {item.name for item in layout.derived}
+        if unknown := sorted(set(inputs or ()) - known):
             raise FleetError(f"inputs {few(unknown)}: not in the layout; it has {few(sorted(known))}")
-        fleet_inputs = junction.layout.fleet_inputs or junction.layout.model_inputs
-        chosen = tuple(inputs) if inputs is not None else choose_inputs(junction.layout, common, names=fleet_inputs)[0]
-        needed = [*branches, *sorted(base_inputs(junction.layout, chosen))]
+        common = set.intersection(*(set(frame.columns) for frame in labelled.values()))
+        usual = choose_inputs(layout, common, names=layout.fleet_inputs or layout.model_inputs)[0]
     else:
-        (first, frame), *others = labelled
-        chosen = tuple(name for name in frame.columns if name not in branches) if inputs is None else tuple(inputs)
-        needed = [*branches, *chosen]
-        for where, other in others if inputs is None else ():
-            if more := sorted(set(other.columns) - set(needed)):
-                raise FleetError(
-                    f"{where}: column {few(more)}, which {first} has not; all vehicles need the same columns, or name "
-                    f"those to use with inputs=[...]"
-                )
+        usual = tuple(name for name in labelled[first].columns if name not in branches)
+    chosen = usual if inputs is None else tuple(inputs)
+    needed = [*branches, *(chosen if layout is None else sorted(base_inputs(layout, chosen)))]
+    for where, frame in labelled.items():
+        more = sorted(set(frame.columns) - set(needed))
+        if more and layout is None and inputs is None:
+            raise FleetError(
+                f"{where}: column {few(more)}, which {first} has not; all vehicles need the same columns, or name "
+                f"those to use with inputs=[...]"
+            )
     if not chosen or len(set(chosen)) < len(chosen):
         raise FleetError(
             f"inputs {few(chosen) or 'none'}: expected one or more different columns that the currents depend on, such "
             f"as speed, torque, or the demands of heater and air conditioning"
         )
-    for where, frame in labelled:
+    for where, frame in labelled.items():
         require_columns(frame, needed, where)
     return chosen
 
@@ -258,11 +252,6 @@ def _period_s(times: Mapping[str, Array], junction: "Junction") -> float:
     return max(round(usual_s, 6), FINEST_PERIOD_S) if layout is None else layout.period_s
 
 
-def _without_pauses(time_s: Array) -> Array:
-    """Instants with longer gaps cut to that of logs whose clock was set, as time bases go through them. [s]"""
-    return np.asarray(time_s - np.append(0.0, np.cumsum(np.maximum(np.diff(time_s) - CLOCK_GAP_S, 0.0))))
-
-
 def column_values(frame: pd.DataFrame, name: str, where: str) -> Array:
     """Values of a column as floating-point numbers, NaN where there is none; DriveError if it has no numbers."""
     column = frame[name]
@@ -278,39 +267,34 @@ def column_values(frame: pd.DataFrame, name: str, where: str) -> Array:
 
 def _drives(
     vehicles: Mapping[str, Sequence[pd.DataFrame]],
-    times: Mapping[str, Array],
-    branches: Sequence[str],
+    junction: "Junction",
     columns: Sequence[str],
-) -> dict[str, list[Drive]]:
-    """Drives by vehicle; a frame that two vehicles have, or one has twice, is refused."""
-    found: dict[str, list[Drive]] = {}
+    inputs: Sequence[str] = (),
+) -> tuple[dict[str, list[Drive]], VehicleDatabase]:
+    """Drives by vehicle, and their layout; a frame that two vehicles have, or one has twice, is refused."""
+    times = {where: _seconds(frame, where) for where, frame in _labelled(vehicles).items()}
+    database = junction.as_database(inputs, _period_s(times, junction))
+    found: dict[str, list[Drive]] = {vehicle: [] for vehicle in vehicles}
     seen: dict[bytes, str] = {}
     for vehicle, frames in vehicles.items():
-        found[vehicle] = []
         for number, frame in enumerate(frames, start=1):
             where = f"vehicle {vehicle}, frame {number}"
-            time_s = _without_pauses(times[where])
-            channels = {name: _channel(time_s, column_values(frame, name, where), name, where) for name in columns}
+            # longer pauses are cut to those of logs whose clock was set, as time bases go through them
+            pauses_s = np.maximum(np.diff(times[where]) - CLOCK_GAP_S, 0.0)
+            time_s, channels = times[where] - np.append(0.0, np.cumsum(pauses_s)), dict[str, Channel]()
+            for name in columns:
+                value = column_values(frame, name, where)
+                if not (good := np.isfinite(value)).any():
+                    raise DriveError(f"{where}: column {name} has no number at all; leave the frame or the column out")
+                channels[name] = Channel(time_s=time_s, value=value, good=good)
             content = b"".join(part.tobytes() for item in channels.values() for part in (item.time_s, item.value))
             digest = hashlib.blake2b(content).digest()
             if digest in seen:
                 raise FleetError(f"{where}: the same as {seen[digest]}; give each recording once")
             seen[digest] = where
-            drive = Drive(
-                vehicle=vehicle,
-                name=f"frame {number}",
-                branches={name: channels[name] for name in branches},
-                inputs={name: item for name, item in channels.items() if name not in branches},
-            )
-            found[vehicle].append(drive)
-    return found
-
-
-def _channel(time_s: Array, value: Array, name: str, where: str) -> Channel:
-    good = np.isfinite(value)
-    if not good.any():
-        raise DriveError(f"{where}: column {name} has no number at all; leave the frame or the column out")
-    return Channel(time_s=time_s, value=value, good=good)
+            of_branches = {name: channels.pop(name) for name in junction.branches}
+            found[vehicle].append(Drive(vehicle=vehicle, name=f"frame {number}", branches=of_branches, inputs=channels))
+    return found, database
 
 
 def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: "Junction", *, alone: bool = False) -> None:
@@ -327,10 +311,9 @@ def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: "Junction"
                     f"the vehicle out, or the branch if the junction has none"
                 )
     small = largest < LEAST_OF_SCALE * scale_a
-    strange = small & small.all(axis=1, keepdims=True)
+    strange = small & (small.all(axis=1, keepdims=True) | (np.median(largest, axis=0) > OTHER_UNIT * largest))
     if not alone:
         strange |= small & small.all(axis=0)
-    strange |= small & (np.median(largest, axis=0) > OTHER_UNIT * largest)
     strange |= largest > MOST_OF_SCALE * scale_a
     if strange.any():
         j, k = (int(place[0]) for place in np.nonzero(strange))

@@ -93,23 +93,17 @@ def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: N
     for j in range(N):
         for q in range(fits.number[j]):
             theta, root, chosen = fits.theta[j, q], fits.root[j, q], np.flatnonzero(fits.support[j, q])
-            n, widest = len(chosen), 0.0
-            for a in range(n):
-                variance = 0.0
-                for b in range(a, n):
-                    variance += root[chosen[a], chosen[b]] ** 2
-                widest = max(widest, variance)
+            widest = (root**2).sum(axis=1).max()
             for m in range(M):
                 x = values[j, q, m]
                 weight = fits.log_evidence[j, q]  # of the rows under the wide Gaussian ...
                 fitted = fits.chi2[j, q]
-                for a in range(n):
-                    total = theta[chosen[a]]
-                    for b in range(a, n):
-                        total += root[chosen[a], chosen[b]] * normal[m, chosen[b]]
-                    x[chosen[a]] = total
-                    weight += 0.5 * (total / WIDE_SD) ** 2 + log(WIDE_SD) + LOG_ROOT_TAU  # ... whose density goes
-                    fitted += (theta[chosen[a]] ** 2 - total**2) / WIDE_SD**2 + normal[m, chosen[a]] ** 2
+                for p in chosen:
+                    x[p] = theta[p]
+                    for i in chosen:
+                        x[p] += root[p, i] * normal[m, i]
+                    weight += 0.5 * (x[p] / WIDE_SD) ** 2 + log(WIDE_SD) + LOG_ROOT_TAU  # ... whose density goes
+                    fitted += (theta[p] ** 2 - x[p] ** 2) / WIDE_SD**2 + normal[m, p] ** 2
                 for k in range(K):  # known is the offset, not what a doubtful gain makes of it in true currents
                     turn = x[1 + k] - theta[1 + k]
                     if turn != 0.0 and fits.support[j, q, 2 * K + k]:
@@ -124,18 +118,14 @@ def _draw(fits: Fits, evidence: Evidence, normal: Array, values: Array, place: N
                             total += evidence.precision[j, r, s] * e[s]
                         exact += 2.0 * e[r] * total
                     weight += 0.5 * (fitted - exact)
-                for a in range(n):
-                    p = chosen[a]
-                    if p <= K:  # d = e^x - 1, of either sign
-                        size = abs(expm1(x[p]))
-                        weight += x[p] - log(2.0)
+                for p in chosen:
+                    size, log_unit = abs(x[p]), 0.0
+                    if p <= K:  # d = e^x - 1
+                        size, log_unit = abs(expm1(x[p])), x[p]
                     elif 2 * K <= p < 3 * K:  # o = (1 + d) omega
-                        gain = x[p - 2 * K + 1] + evidence.shared[p - K]
-                        size = abs(x[p]) * exp(gain)
-                        weight += gain - log(2.0)
-                    else:
-                        size = abs(x[p])
-                        weight -= log(2.0) if p < 3 * K else 0.0
+                        log_unit = x[p - 2 * K + 1] + evidence.shared[p - K]
+                        size *= exp(log_unit)
+                    weight += log_unit - (log(2.0) if p < 3 * K else 0.0)  # faults are of either sign
                     place[j, q, m, p] = _place(size)
                 base[j, q, m] = weight
 

@@ -142,13 +142,6 @@ def test_finding_does_not_depend_on_the_order_of_the_branches() -> None:
     assert (second.cause, second.branch, second.text) == (first.cause, first.branch, first.text)
 
 
-def test_vehicle_is_checked_by_itself() -> None:
-    summaries = a_fleet(2, CAUSES["step"])
-    usual = learn_usual_misfits(summaries, read_out(2), full_scale_a=FULL_SCALE_A)
-    alone = check_fit(summaries[BAD : BAD + 1], read_out(2), usual, full_scale_a=FULL_SCALE_A, branches=BRANCHES[:2])
-    assert [each.cause for each in alone[0]] == ["step"]
-
-
 def test_summaries_without_fit_sums_have_no_findings() -> None:
     summaries = a_fleet(2, CAUSES["step"])
     plain = [replace(summary, fit=None) for summary in summaries]

@@ -5,18 +5,17 @@ import pytest
 
 from calibrator.drive import Array
 from calibrator.estimator.decision import (
-    RESOLUTION,
     Explained,
     Points,
     best_estimate,
     harm_probability,
-    points_of,
+    posterior_points,
 )
 from calibrator.estimator.explanations import fit_explanations
 from calibrator.estimator.posterior import draw_explanations, weigh
 from calibrator.estimator.prior import Prior, Slab, first_prior
 from calibrator.faults import Faults
-from calibrator.score import correction_error_rms, recovered
+from calibrator.score import recovered
 from tests.calibrator.estimator.simulated_drives import no_faults
 from tests.calibrator.estimator.simulated_rows import plain_evidence, random_faults, rows_of
 
@@ -45,25 +44,6 @@ def as_faults(values: Array) -> Faults:
     return Faults(hardware_drift=none[:, 0], hardware_offset_a=none, drift=values[:, :K], offset_a=values[:, K:])
 
 
-def plain_harm(found: Points, estimate: Array, mean: Array, square: Array) -> Array:
-    """Share of the points for which the corrected current is farther from the true one on any of the drives."""
-    worse = np.zeros((len(found.faults), K), bool)
-    for i, i2 in zip(mean, square, strict=True):
-        with_it, without = (
-            correction_error_rms(
-                true_drift=found.faults[:, :K],
-                true_offset_a=found.faults[:, K:],
-                drift=values[:K],
-                offset_a=values[K:],
-                mean_a=i,
-                mean_square_a2=i2,
-            )
-            for values in (estimate, np.zeros(2 * K))
-        )
-        worse |= with_it > without
-    return np.asarray(found.weight @ worse)
-
-
 @pytest.mark.parametrize("sd", [1e-4, 0.001, 0.005, 0.01, 0.03])
 def test_confidence_is_the_probability_to_be_recovered(sd: float) -> None:
     found = points(TWO_EXPLANATIONS, sd=sd)
@@ -76,12 +56,6 @@ def test_confidence_is_the_probability_to_be_recovered(sd: float) -> None:
     )
     assert confidence == pytest.approx(found.weight @ near, abs=1e-9)
     assert confidence <= 0.7 + 1e-9
-
-
-def test_sharp_explanations_give_their_own_weight() -> None:
-    estimate, confidence = best_estimate(points(TWO_EXPLANATIONS, sd=1e-6), LEAST)
-    np.testing.assert_allclose(estimate, TWO_EXPLANATIONS[0][1], atol=1e-5)
-    assert confidence == pytest.approx(0.7)
 
 
 def test_explanations_within_tolerance_of_each_other_count_together() -> None:
@@ -115,19 +89,6 @@ def test_order_of_the_branches_and_the_sign_of_all_faults_do_not_matter() -> Non
     assert mirrored[1] == pytest.approx(confidence)
 
 
-def test_what_is_below_every_resolution_is_no_fault() -> None:
-    estimate, _ = best_estimate(points([(1.0, [0.9 * RESOLUTION, 0.1, -0.9 * RESOLUTION, 0.0])]), LEAST)
-    np.testing.assert_allclose(estimate, [0.0, 0.1, 0.0, 0.0], atol=1e-12)
-
-
-@pytest.mark.parametrize("sd", [0.001, 0.05, 0.1])
-@pytest.mark.parametrize("chosen", [0, 1])
-def test_harm_is_the_probability_that_correction_makes_a_branch_worse(sd: float, chosen: int) -> None:
-    found, estimate = points(TWO_EXPLANATIONS, sd=sd), np.array(TWO_EXPLANATIONS[chosen][1])
-    harm = harm_probability(found, estimate, MEAN, SQUARE)
-    np.testing.assert_allclose(harm, plain_harm(found, estimate, MEAN, SQUARE), atol=1e-9)
-
-
 def test_harm_is_that_of_simulated_currents() -> None:
     """(25) on drawn true currents, against the moments of (M19)."""
     rng = np.random.default_rng(1)
@@ -154,12 +115,6 @@ def test_harm_on_any_drive_counts_once_and_a_branch_without_a_correction_has_non
     assert both[1] == 0.0
 
 
-def test_right_correction_is_harmless_and_a_wrong_one_is_not() -> None:
-    found = points([(1.0, [0.12, 0.0, 0.0, 0.1])], sd=0.002)
-    assert not harm_probability(found, np.array([0.12, 0.0, 0.0, 0.1]), MEAN, SQUARE).any()
-    np.testing.assert_allclose(harm_probability(found, np.array([-0.12, 0.0, 0.0, -0.1]), MEAN, SQUARE), 1.0)
-
-
 def explained(truth: Faults, prior: Prior, *, shared: Array | None = None, load: Array | float = 0.0) -> Explained:
     """One law's draws of a fleet."""
     shared = np.zeros(2 * K + 1) if shared is None else shared
@@ -178,22 +133,6 @@ def group_prior() -> Prior:
     return Prior(counts=counts, gain=slab, offset=slab, group_share=share, group_centre=centre, group_sd=sd)
 
 
-def test_points_are_a_posterior_whose_mean_is_that_of_the_draws() -> None:
-    truth = random_faults(2, vehicles=6, branches=K)
-    law = explained(truth, first_prior(K))
-    for j in range(6):
-        found = points_of([law], j)
-        assert found.weight.sum() == pytest.approx(1.0, abs=1e-4)
-        x, w = law.draws.values[j], law.weight[j].sum(axis=2)
-        np.testing.assert_allclose(
-            found.weight @ found.faults[:, :K], np.einsum("qm,qmk->k", w, np.expm1(x[..., 1:3])), atol=1e-5
-        )
-        offset = np.exp(x[..., 1:3]) * x[..., 4:6]
-        np.testing.assert_allclose(found.weight @ found.faults[:, K:], np.einsum("qm,qmk->k", w, offset), atol=1e-5)
-        assert (found.law == 0).all()
-        assert (found.fit[found.explanation] < law.draws.fits.number[j]).all()
-
-
 def test_laws_are_averaged_by_their_probabilities() -> None:
     truth = random_faults(3, vehicles=2, branches=K)
     shared = np.array([0.0, 0.01, 0.0, 0.02, 0.0])
@@ -201,7 +140,7 @@ def test_laws_are_averaged_by_their_probabilities() -> None:
         explained(truth, first_prior(K))._replace(probability=0.7),
         explained(truth, first_prior(K), shared=shared)._replace(probability=0.3),
     ]
-    both, single = points_of(laws, 0), [points_of([law._replace(probability=1.0)], 0) for law in laws]
+    both, single = posterior_points(laws)[0], [posterior_points([law._replace(probability=1.0)])[0] for law in laws]
     mean = 0.7 * single[0].weight @ single[0].faults + 0.3 * single[1].weight @ single[1].faults
     np.testing.assert_allclose(both.weight @ both.faults, mean, atol=1e-12)
     assert np.bincount(both.law, np.bincount(both.explanation, both.weight)) == pytest.approx([0.7, 0.3], abs=1e-4)
@@ -211,7 +150,7 @@ def test_what_the_sensors_share_is_part_of_every_fault() -> None:
     shared = np.array([0.0, 0.02, 0.03, 0.0, 0.0])
     sound = no_faults(1, K)
     sound.drift[0, 0], sound.offset_a[0, 1] = np.expm1(0.03), 0.02
-    estimate, confidence = best_estimate(points_of([explained(sound, first_prior(K), shared=shared)], 0), LEAST)
+    estimate, confidence = best_estimate(posterior_points([explained(sound, first_prior(K), shared=shared)])[0], LEAST)
     np.testing.assert_allclose(estimate, [np.expm1(0.03), 0.0, 0.0, 0.02], atol=1e-9)
     assert confidence > 0.9
 
@@ -223,7 +162,7 @@ def test_what_a_group_shares_is_an_offset_where_it_is_one_of_the_sensors(of_sens
         truth.offset_a[0, 0] = 0.03
     else:
         load = 0.03
-    found = points_of([explained(truth, group_prior(), shared=np.append(np.zeros(4), of_sensor), load=load)], 0)
+    found = posterior_points([explained(truth, group_prior(), shared=np.append(np.zeros(4), of_sensor), load=load)])[0]
     expected = [0.0, 0.0, 0.03 * of_sensor, 0.0]
     np.testing.assert_allclose(best_estimate(found, LEAST)[0], expected, atol=1e-9)
 
@@ -236,5 +175,5 @@ def test_offset_beside_what_a_group_shares_is_that_of_the_sensor(of_sensor: bool
     law = explained(truth, prior, shared=shared, load=0.0 if of_sensor else 0.03)
     of_group = law.weight.copy()
     of_group[..., 0] = 0.0  # of those who belong to the group
-    found = points_of([law._replace(weight=of_group / of_group.sum())], 0)
+    found = posterior_points([law._replace(weight=of_group / of_group.sum())])[0]
     np.testing.assert_allclose(found.weight @ found.faults, [0.1, 0.0, truth.offset_a[0, 0], 0.0], atol=0.004)

@@ -56,13 +56,6 @@ def test_read_outs_are_those_of_faultless_vehicles_however_lopsided_the_faults(s
     np.testing.assert_allclose(model.read_out.sum(axis=1), 0.0, atol=1e-9)
 
 
-def test_faulty_majority_of_one_branch_does_not_carry_the_reference_away() -> None:
-    faults = one_sided_faults(60, 0.0)
-    drift = faults.drift.copy()
-    drift[:35, 0] = np.random.default_rng(2).uniform(0.05, 0.25, 35)
-    assert largest_error(model_of(summaries_of(replace(faults, drift=drift)))) < 0.005
-
-
 def test_slopes_and_intercepts_are_those_of_the_faults() -> None:
     faults = draw_faults(
         np.random.default_rng(1),
@@ -98,12 +91,6 @@ def test_branch_that_never_moves_counts_as_faultless_and_unknown() -> None:
     assert np.isfinite(model.read_out).all()
     assert fit.estimate[0, 0] == pytest.approx(1.0, abs=0.01)
     assert fit.sd[0, 0] == pytest.approx(0.4, rel=0.05)
-
-
-def test_one_vehicle_is_its_own_fleet() -> None:
-    a, b = slopes_of(summaries_of(no_faults(1, K), Conditions(noise_a=0.0)))
-    np.testing.assert_allclose(a, 1.0, atol=1e-3)
-    np.testing.assert_allclose(b, 0.0, atol=0.1)
 
 
 def test_vehicle_with_an_input_in_another_unit_does_not_bend_the_model() -> None:

@@ -9,8 +9,8 @@ import pytest
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.errors import FleetError
-from calibrator.estimator.explanations import evidence_of, row_residuals
-from calibrator.estimator.fleet_model import FleetModel, fit_fleet_model
+from calibrator.estimator.explanations import row_residuals
+from calibrator.estimator.fleet_model import FleetModel
 from calibrator.estimator.moments import stack_summaries
 from calibrator.estimator.rows import (
     UNKNOWN_VARIANCE,
@@ -74,42 +74,6 @@ def test_standardised_errors_are_standard_normal(conditions: Conditions) -> None
     assert (np.abs(z.mean(axis=0)) < 0.45).all(), z.mean(axis=0)
 
 
-def test_rows_are_as_right_over_the_model_learnt_from_the_fleet() -> None:
-    faults = random_faults(2, 100)
-    summaries = summaries_of(faults, seed=2)
-    error = errors(rows_of(summaries, fit_fleet_model(stack_summaries(summaries))), faults)
-    assert np.abs(np.median(error[:, AT.slopes], axis=0)).max() < 0.003
-    assert np.abs(np.median(error[:, AT.ratios], axis=0)).max() < 0.003
-    assert np.abs(np.median(error[:, AT.intercepts], axis=0)).max() < 0.002
-    assert abs(np.median(error[:, AT.junction])) < 0.002
-    assert np.abs(error[:, MEASURED]).max() < 0.05
-
-
-def test_full_scale_is_only_the_unit_of_the_constant_rows() -> None:
-    summaries = summaries_of(random_faults(3, 10), seed=3)
-    plain, half = (rows_of(summaries, scale_a=scale) for scale in (400.0, 200.0))
-    np.testing.assert_allclose(half.relative, plain.relative)
-    np.testing.assert_allclose(half.constant, 2.0 * plain.constant)
-
-
-def test_one_vehicle_with_the_fleet_s_correlation_is_as_among_the_fleet() -> None:
-    fleet = stack_summaries(summaries := summaries_of(random_faults(3, 10), seed=3))
-    rows, usual = collect_rows(fleet, TRUE_MODEL, full_scale_a=FULL_SCALE_A)
-    alone, _ = collect_rows(
-        stack_summaries(summaries[4:5]), TRUE_MODEL, full_scale_a=FULL_SCALE_A, usual_correlation=usual
-    )
-    for name, values in vars(rows.take(slice(4, 5))).items():
-        np.testing.assert_allclose(getattr(alone, name), values, rtol=1e-12, err_msg=name)
-
-
-def test_twice_the_driving_halves_the_variance() -> None:
-    once, twice = (
-        rows_of(summaries_of(no_faults(40, K), Conditions(samples=samples, noise_a=3.0))) for samples in (1800, 3600)
-    )
-    variances = [np.median(np.einsum("nrr->nr", rows.covariance)[:, MEASURED], axis=0) for rows in (once, twice)]
-    np.testing.assert_allclose(variances[1] / variances[0], 0.5, atol=0.12)
-
-
 def test_readings_and_reversed_branches_are_unknown() -> None:
     faults = no_faults(4, K)
     faults.drift[2, 1] = -2.0
@@ -118,11 +82,6 @@ def test_readings_and_reversed_branches_are_unknown() -> None:
     assert np.flatnonzero(rows.known[0] != rows.known[2]).tolist() == [AT.slope(1), AT.ratio(1)]
     assert rows.covariance[2, 1, 1] == pytest.approx(UNKNOWN_VARIANCE)
     assert (rows.values[~rows.known] == 0.0).all()
-
-
-def test_covariances_are_positive_definite_with_few_blocks() -> None:
-    rows = rows_of(summaries_of(random_faults(5, 6), Conditions(samples=90), seed=5))
-    assert (np.linalg.eigvalsh(rows.covariance) > 0.0).all()
 
 
 @BRANCHES
@@ -157,23 +116,6 @@ def test_design_is_logarithms_and_true_currents_of_what_is_measured(branches: in
     theta = np.concatenate([np.log1p([d_h, *d]), o_h[:-1], o / (1.0 + d), [load]])
     made = row_design(branches, feed) @ theta
     np.testing.assert_allclose(made, np.append(relative, constant), atol=1e-12)
-
-
-@pytest.mark.parametrize("feed", [0, 1])
-@BRANCHES
-def test_rows_without_currents_leave_what_the_design_says(branches: int, feed: int) -> None:
-    """The compiled residuals count rows and parameters as the design does."""
-    n = branches
-    evidence = evidence_of(
-        np.zeros((1, 5 * n)),
-        np.eye(5 * n)[None],
-        np.zeros((1, 2, n)),
-        centre=np.zeros(5 * n),
-        shared=np.zeros(2 * n + 1),
-        feed=feed,
-    )
-    left = row_residuals(evidence, np.eye(3 * n + 1)[None])[0]
-    np.testing.assert_array_equal(left, -row_design(n, feed).T)
 
 
 @BRANCHES
@@ -221,20 +163,6 @@ def test_dispersion_widens_intercepts_at_their_means_alone_and_a_load_the_consta
     wider = rows.with_load_spread(0.01).covariance - rows.covariance
     np.testing.assert_allclose(wider[:, AT.junction, AT.junction], 1e-4)
     assert np.count_nonzero(wider) == len(rows)
-
-
-def test_intercepts_at_the_means_do_not_depend_on_the_slopes() -> None:
-    model, own = np.array([0.3, -0.2, -0.1]), np.diag([4e-6, 9e-6, 1e-6]) + 1e-6
-    pivot, at_means = np.eye(5 * K), np.diag(np.full(5 * K, 1e-4))
-    pivot[AT.intercepts, AT.slopes] = -np.diag(model)
-    at_means[AT.intercepts, AT.intercepts] = own
-    rows = EvidenceRows(
-        relative=np.zeros((1, 3 * K - 1)),
-        constant=np.zeros((1, 2 * K + 1)),
-        covariance=(pivot @ at_means @ pivot.T)[None],
-        means=np.stack([model, np.zeros(K)])[None],
-    )
-    np.testing.assert_allclose(rows.intercept_covariance()[0], own, atol=1e-18)
 
 
 def test_rows_that_do_not_fit_or_are_not_finite_are_refused() -> None:

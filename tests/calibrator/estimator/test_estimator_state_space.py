@@ -95,14 +95,6 @@ def test_known_system_is_found_through_noise(order: int, snr_db: float, least_db
         assert np.abs(slopes - 1.0).max() < slope
 
 
-def test_noise_free_system_is_found_to_rounding() -> None:
-    inputs, clean, _ = recording(4, 20, 0)
-    model, truth = identify(inputs, clean, order=4), true_system(4, 0)
-    np.testing.assert_allclose(model.simulate(inputs, initial_state=model.x0), clean, atol=1e-5)
-    poles = [np.sort_complex(np.linalg.eigvals(each.A)) for each in (model, truth)]
-    np.testing.assert_allclose(poles[0], poles[1], atol=1e-6)
-
-
 @pytest.mark.parametrize("order", [4, 6])
 def test_order_is_chosen_as_the_system_has_it_and_the_snr_is_that_of_the_simulation(order: int) -> None:
     inputs, _, noisy = recording(order, 30, 2)
@@ -110,25 +102,6 @@ def test_order_is_chosen_as_the_system_has_it_and_the_snr_is_that_of_the_simulat
     model = identify(inputs, noisy, order=order)
     simulated = model.simulate(inputs, initial_state=model.x0)
     np.testing.assert_allclose(model.snr_db, simulation_snr_db(noisy, simulated), atol=1e-3)
-
-
-def test_static_system_has_order_zero_and_its_gains() -> None:
-    inputs, gains = smooth_inputs(3), np.random.default_rng(3).normal(size=(BRANCHES, INPUTS))
-    noise = 0.1 * np.random.default_rng(4).normal(size=(SAMPLES, BRANCHES))
-    model = identify(inputs, inputs @ gains.T + 7.0 + noise)
-    assert len(model.A) == 0
-    np.testing.assert_allclose(model.D, gains, atol=0.01)
-    np.testing.assert_allclose(model.offset_a, 7.0, atol=0.05)
-
-
-def test_units_and_zeros_of_inputs_and_currents_pass_through() -> None:
-    inputs, _, noisy = recording(4, 20, 5)
-    scale, shift = np.array([1.2, -1.0, 0.8, 1000.0]), np.array([30.0, 0.0, -5.0, 1.0])
-    changed_inputs = np.array([1e3, 1.0, 1e-3, 5.0, -1.0]) * inputs + 10.0
-    plain, changed = identify(inputs, noisy, order=4), identify(changed_inputs, scale * noisy + shift, order=4)
-    expected = scale * plain.simulate(inputs) + shift
-    np.testing.assert_allclose(changed.simulate(changed_inputs), expected, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(changed.snr_db, plain.snr_db, atol=1e-6)
 
 
 def test_constant_equal_and_hardly_moving_inputs_and_a_dead_current_do_no_harm() -> None:

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.estimator.explanations import WIDE_SD, Evidence, Fits, fit_explanations, row_residuals
+from calibrator.estimator.explanations import Evidence, Fits, fit_explanations, row_residuals
 from calibrator.estimator.prior import first_prior
-from calibrator.estimator.rows import EvidenceRows
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_rows import (
     Errors,
@@ -36,14 +35,6 @@ def supports(fits: Fits, vehicle: int) -> list[tuple[int, ...]]:
 
 def random_parameters(seed: int, shape: tuple[int, ...], K: int) -> Array:
     return np.random.default_rng(seed).uniform(-0.3, 0.3, (*shape, 3 * K + 1))
-
-
-@BRANCHES
-def test_true_parameters_leave_nothing_of_rows_without_noise(K: int) -> None:
-    faults, load = random_faults(K, vehicles=30, branches=K, sparsity=50.0), np.linspace(0.0, 0.03, 30)
-    rows = rows_of(faults, errors=READ, noise=0.0, load=load)
-    left = row_residuals(plain_evidence(rows), parameters_of(faults, load)[:, None])
-    np.testing.assert_allclose(left, 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("of_sensor", [False, True])
@@ -77,29 +68,6 @@ def test_residuals_are_those_of_the_equations_of_the_rows(K: int) -> None:
     left = row_residuals(plain_evidence(rows), theta)
     for j in range(len(rows)):
         np.testing.assert_allclose(left[j], plain_residual(rows.take(slice(j, j + 1)), theta[j]), atol=1e-13)
-
-
-@pytest.mark.parametrize("of_sensor", [False, True])
-@BRANCHES
-def test_fits_are_stationary_and_their_covariance_that_of_the_slopes_there(K: int, of_sensor: bool) -> None:
-    """Numerical derivatives of the residuals against the design, with everything that sensors can share."""
-    rows = rows_of(random_faults(K, vehicles=6, branches=K, sparsity=60.0), seed=K, load=0.01)
-    shared = np.append(np.linspace(-0.003, 0.004, 2 * K), of_sensor)
-    evidence = plain_evidence(rows, centre=np.linspace(-0.002, 0.003, 5 * K), shared=shared)
-    fits, P, step = fitted(evidence), 3 * K + 1, 1e-6
-    for j in range(len(rows)):
-        likely = fits.log_evidence[j] > fits.log_evidence[j].max() - 8.0
-        q = int(np.argmax(fits.support[j].sum(axis=1) * likely))  # of the likely ones that with most parameters
-        on, theta, root = np.flatnonzero(fits.support[j, q]), fits.theta[j, q], fits.root[j, q]
-        around = theta + step * np.concatenate([[np.zeros(P)], np.eye(P)[on], -np.eye(P)[on]])
-        left = row_residuals(evidence, np.repeat(around[None], len(rows), axis=0))[j]
-        slopes = (left[1 + len(on) :] - left[1 : 1 + len(on)]) / (2.0 * step)
-        covariance = np.linalg.inv(slopes @ evidence.precision[j] @ slopes.T + np.eye(len(on)) / WIDE_SD**2)
-        pull = covariance @ (slopes @ evidence.precision[j] @ left[0] - theta[on] / WIDE_SD**2)
-        assert (np.abs(pull) < 1e-3 * np.sqrt(np.diag(covariance))).all()
-        np.testing.assert_allclose((root @ root.T)[np.ix_(on, on)], covariance, rtol=1e-3, atol=1e-9)
-        assert not np.delete(theta, on).any()
-        assert not np.delete(root, on, axis=0).any()
 
 
 @pytest.mark.parametrize("errors", [Errors(), Errors(slope=0.02, ratio=0.01, intercept=0.01, junction=0.01), READ])
@@ -148,31 +116,6 @@ def test_true_support_is_fitted_and_fits(K: int) -> None:
     assert np.sqrt(np.mean(np.concatenate(z) ** 2)) == pytest.approx(1.0, abs=0.25)
 
 
-@pytest.mark.parametrize("magnitude", [(0.05, 0.25), (0.3, 0.6)])
-@pytest.mark.parametrize("K", [2, 3])
-def test_support_that_holds_another_one_fits_as_well(K: int, magnitude: tuple[float, float]) -> None:
-    errors = Errors(slope=0.01, ratio=0.02, intercept=0.005, junction=0.005)
-    faults = random_faults(11, vehicles=60, branches=K, sparsity=60.0, magnitude=magnitude)
-    fits = fitted(plain_evidence(rows_of(faults, seed=11, errors=errors)))
-    misfit = fits.chi2 + np.sum((fits.theta / WIDE_SD) ** 2, axis=2)
-    for j, n in enumerate(fits.number):
-        on, log_evidence = fits.support[j, :n], fits.log_evidence[j, :n]
-        holds = (on[:, None] <= on).all(axis=2) & (log_evidence > log_evidence.max() - 8.0)
-        assert (misfit[j, :n] <= misfit[j, :n, None] + 1e-3)[holds].all()
-
-
-def test_vehicle_is_fitted_alike_alone_and_in_any_fleet() -> None:
-    rows = rows_of(random_faults(6, vehicles=300, branches=3, sparsity=60.0), seed=6)
-    together = fitted(plain_evidence(rows))
-    for j in (0, 157, 299):
-        alone = fitted(plain_evidence(rows.take(slice(j, j + 1))))
-        n = int(alone.number[0])
-        assert together.number[j] == n
-        for name, values in alone._asdict().items():
-            if name != "number":
-                np.testing.assert_array_equal(getattr(together, name)[j, :n], values[0], err_msg=name)
-
-
 def test_order_of_the_consumers_does_not_matter() -> None:
     """But for the first branch, which the gain ratios refer to, and the last, whose hardware offset is the others'."""
     K, order = 4, [0, 2, 1, 3]
@@ -196,22 +139,6 @@ def test_order_of_the_consumers_does_not_matter() -> None:
         for on, log_evidence in zip(found, other.log_evidence[j], strict=False):
             if log_evidence > best - 5.0:
                 assert value[on] == pytest.approx(log_evidence, abs=1e-3)
-
-
-def test_reversed_constants_have_reversed_offsets() -> None:
-    """A vehicle whose currents and offsets all have the other sign, with the same gains."""
-    rows = rows_of(random_faults(8, vehicles=15, branches=3, sparsity=60.0), seed=8)
-    turn = np.repeat([1.0, -1.0], [8, 7])
-    mirrored = EvidenceRows(
-        relative=rows.relative,
-        constant=-rows.constant,
-        covariance=rows.covariance * np.outer(turn, turn),
-        means=-rows.means,
-    )
-    plain, other = fitted(plain_evidence(rows)), fitted(plain_evidence(mirrored))
-    np.testing.assert_array_equal(other.support, plain.support)
-    np.testing.assert_allclose(other.log_evidence, plain.log_evidence, atol=1e-9)
-    np.testing.assert_allclose(other.theta, plain.theta * np.repeat([1.0, -1.0], [4, 6]), atol=1e-9)
 
 
 def test_offset_of_the_feeding_sensor_and_a_load_are_never_both_fitted() -> None:

@@ -1,6 +1,5 @@
 """From summaries to what is corrected: known truth, one vehicle at a time, limits, few vehicles, batches."""
 
-import pickle
 import re
 from dataclasses import replace
 
@@ -9,7 +8,7 @@ import pytest
 
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.errors import FleetError
-from calibrator.estimator.fleet_estimate import FleetEstimate, FleetReference, estimate_vehicles, learn_fleet
+from calibrator.estimator.fleet_estimate import FleetReference, estimate_vehicles, learn_fleet
 from calibrator.faults import Faults
 from calibrator.score import harmed, recovered
 from calibrator.summaries.moments import DriveSummary
@@ -29,12 +28,6 @@ def drawn(seed: int) -> Faults:
         full_scale_a=SCALE_A,
         balanced=True,
     )
-
-
-def applied_of(found: FleetEstimate, truth: Faults) -> Faults:
-    """What is corrected with, beside the hardware of the truth."""
-    drift, offset_a = (np.where(found.corrected, values, 0.0) for values in (found.drift, found.offset_a))
-    return replace(truth, drift=drift, offset_a=offset_a)
 
 
 @pytest.fixture(scope="module")
@@ -70,20 +63,6 @@ def test_faults_are_recovered_and_no_correction_does_harm(
     assert not (found.corrected & ~faulty).any()
 
 
-def test_a_vehicle_is_estimated_alike_alone_and_among_others(
-    summaries: list[DriveSummary], reference: FleetReference
-) -> None:
-    together, alone = estimate_vehicles(summaries, reference), estimate_vehicles(summaries[5:6], reference)
-    for name in ("drift", "offset_a", "confidence", "harm_probability", "drift_sd"):
-        np.testing.assert_array_equal(getattr(together, name)[5], getattr(alone, name)[0])
-
-
-def test_a_reference_goes_to_other_processes(summaries: list[DriveSummary], reference: FleetReference) -> None:
-    copy = pickle.loads(pickle.dumps(reference))
-    here, there = (estimate_vehicles(summaries[:2], each) for each in (reference, copy))
-    np.testing.assert_array_equal(here.drift, there.drift)
-
-
 def test_faults_beyond_the_limits_are_found_and_not_corrected(
     truth: Faults, summaries: list[DriveSummary], reference: FleetReference
 ) -> None:
@@ -99,12 +78,6 @@ def test_nothing_is_corrected_at_a_harm_limit_of_zero(summaries: list[DriveSumma
     found = estimate_vehicles(summaries, reference, harm_limit=0.0)
     assert not found.corrected.any()
     assert "corrected" not in found.verdicts
-
-
-def test_few_vehicles_are_compared_and_nothing_is_corrected(summaries: list[DriveSummary]) -> None:
-    few = learn_fleet(summaries[:4], full_scale_a=SCALE_A, branches=NAMES)
-    assert any("few for a fleet" in notice for notice in few.notices)
-    assert not estimate_vehicles(summaries[:4], few).corrected.any()
 
 
 def test_an_offset_that_all_battery_sensors_share_harms_nobody_and_is_said(truth: Faults) -> None:
@@ -152,8 +125,3 @@ def test_a_wrong_sign_or_unit_in_most_vehicles_is_refused(
     with pytest.raises(FleetError, match=re.escape(f"{told}, expected -1 A; check sign and unit of branch")):
         learn_fleet(most, full_scale_a=SCALE_A, branches=NAMES)
     assert learn_fleet(few, full_scale_a=SCALE_A, branches=NAMES).vehicles == VEHICLES
-
-
-def test_no_vehicle_is_no_fleet() -> None:
-    with pytest.raises(FleetError, match="no vehicle to learn"):
-        learn_fleet([], full_scale_a=SCALE_A, branches=NAMES)

@@ -49,13 +49,6 @@ def test_trusted_sensor_gives_the_other_gains(motor_off: pd.DataFrame) -> None:
     assert rows.corrected.to_dict() == {"battery": False, "motor": True, "heater": False}
 
 
-def test_correction_takes_the_error_out_of_another_drive(motor_off: pd.DataFrame) -> None:
-    calibrator = JunctionCalibrator(trusted=["battery"]).fit(motor_off, JUNCTION)
-    other = recording(7, gain=(0.0, 0.05, 0.0))
-    left_a = calibrator.vehicles_["vehicle"].correct(other).sum(axis=1)
-    assert left_a.std() < 0.3 * other.sum(axis=1).std()
-
-
 def test_gains_equal_those_of_least_squares(motor_off: pd.DataFrame) -> None:
     current_a = motor_off - motor_off.mean()
     ratio = -np.linalg.lstsq(current_a[["motor", "heater"]], current_a["battery"], rcond=None)[0]
@@ -145,14 +138,6 @@ def test_right_sensors_are_said_to_be_right() -> None:
     assert set(calibrator.parameters_.verdict) == {"no sensor fault"}
 
 
-def test_load_that_is_switched_without_a_sensor_is_found_and_nothing_is_corrected() -> None:
-    frame = recording(gain=(0.0, 0.1, 0.0))
-    frame["battery"] += 12.0 * (np.sin(frame.index / 3.0) > 0.3)
-    calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame, JUNCTION)
-    assert [each.cause for each in calibrator.vehicles_["vehicle"].parameters.findings] == ["switching"]
-    assert not calibrator.parameters_.corrected.any()
-
-
 def bent(frame: pd.DataFrame, rms_a: float) -> None:
     """Bend the motor's sensor: what no straight line explains has this RMS."""
     current_a = frame["motor"].to_numpy()
@@ -225,12 +210,6 @@ def test_contradicting_knowledge_corrects_nothing() -> None:
     assert not calibrator.parameters_.corrected.any()
 
 
-def test_trust_in_a_sensor_that_shows_an_offset_is_a_contradiction() -> None:
-    readings = pd.DataFrame({"vehicle": ["vehicle"], "branch": ["battery"], "offset_a": [3.0], "offset_sd_a": [0.05]})
-    calibrator = JunctionCalibrator(trusted=["battery"], readings=readings).fit(recording(), JUNCTION)
-    assert any("the offset of battery is known as" in notice for notice in calibrator.notices_)
-
-
 @pytest.mark.parametrize(
     ("change", "cause"),
     [
@@ -255,21 +234,6 @@ def test_linear_sensors_have_no_finding() -> None:
         frame = recording(seed, gain=(0.0, 0.1, -0.2), offset_a=(0.0, 3.0, 0.0))
         calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame, JUNCTION)
         assert not calibrator.vehicles_["vehicle"].parameters.findings
-
-
-def test_order_of_branches_makes_no_difference(motor_off: pd.DataFrame) -> None:
-    turned = Junction(branches=["heater", "motor", "battery"], full_scale_a=400.0)
-    here = found(motor_off, trusted=["battery"]).loc["vehicle"]
-    there = JunctionCalibrator(trusted=["battery"]).fit(motor_off, turned).parameters_.set_index("branch")
-    pd.testing.assert_series_equal(here.gain_error.sort_index(), there.gain_error.sort_index(), rtol=1e-6)
-
-
-def test_more_data_tells_more() -> None:
-    short, long = (
-        found(recording(seconds=seconds), trusted=["battery"]).loc["vehicle"].gain_error_sd["heater"]
-        for seconds in (30.0, 600.0)
-    )
-    assert long < short
 
 
 def test_branch_that_is_off_keeps_its_gain_open() -> None:

@@ -7,9 +7,8 @@ import pytest
 
 from calibrator.drive import Array
 from calibrator.estimator import learning
-from calibrator.estimator.learning import Law, Spread, explain, learn_laws, weigh_law
-from calibrator.estimator.posterior import weigh
-from calibrator.estimator.prior import TAIL_RANGE, Prior, first_prior, known_prior
+from calibrator.estimator.learning import Law, Spread, explain, learn_laws
+from calibrator.estimator.prior import Prior, first_prior
 from calibrator.estimator.rows import EvidenceRows, row_places
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
@@ -66,23 +65,6 @@ def test_sizes_and_numbers_are_those_that_the_fleet_was_drawn_with(K: int, magni
     assert law.prior.load_share < 0.02
 
 
-def test_fleet_without_faults_has_none() -> None:
-    law = learned(rows_of(no_faults(30, 2), seed=2))
-    assert law.prior.counts[0, 0] > 0.95
-    assert not law.prior.group_share.size
-    assert np.abs(law.spread.mean).max() < 0.001
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_scatter_of_sound_vehicles_is_not_learned_as_tiny_faults(seed: int) -> None:
-    """One vehicle with a hardware fault: sizes of other faults, which nobody has, stay above every resolution."""
-    faults = no_faults(16, 2)
-    faults.hardware_drift[2] = 0.1
-    prior = learned(rows_of(faults, seed=seed)).prior
-    assert min(prior.gain.low, prior.offset.low) > TAIL_RANGE[0]
-    assert prior.counts[1:].sum() < 0.1
-
-
 def test_what_vehicles_without_faults_differ_by_is_learned() -> None:
     K, rng, b = 2, np.random.default_rng(3), row_places(2).intercept(0)
     rows = rows_of(random_faults(3, vehicles=80, branches=K), seed=3)
@@ -123,22 +105,6 @@ def test_order_of_the_vehicles_does_not_matter_even_if_some_are_learned_from(
     monkeypatch.setattr(learning, "MOST_LEARNT", 25)
     rows = rows_of(random_faults(6, vehicles=40, branches=2), seed=6)
     same(learned(rows.take(np.random.default_rng(6).permutation(40))), learned(rows), rtol=1e-6)
-
-
-def test_fleet_twice_says_the_same() -> None:
-    faults = random_faults(7, vehicles=30, branches=2)
-    rows = rows_of(faults, seed=7)
-    once, twice = learned(rows), learned(rows.take(np.repeat(np.arange(30), 2)))
-    np.testing.assert_allclose(twice.spread.mean, once.spread.mean, atol=5e-4)
-    np.testing.assert_allclose(twice.prior.counts, once.prior.counts, atol=0.05)
-    assert twice.prior.gain.low == pytest.approx(once.prior.gain.low, rel=0.15)
-    assert twice.log_evidence == pytest.approx(2.0 * once.log_evidence, rel=0.05)
-
-
-def test_known_prior_is_kept() -> None:
-    prior = known_prior(first_prior(2).counts, (0.05, 0.25))
-    law = learn_laws(rows_of(random_faults(8, vehicles=20, branches=2), seed=8), feed=0, known=prior)[0]
-    assert law.priors == ((1.0, prior),)
 
 
 def test_share_of_faulty_vehicles_is_as_expected() -> None:
@@ -239,16 +205,6 @@ def test_vehicle_that_no_explanation_fits_is_known_less_well_and_others_are_as_b
     for j in (0, 1, 3, 4, 5):
         n = plain.fits.number[j]
         np.testing.assert_array_equal(odd.fits.theta[j, :n], plain.fits.theta[j, :n])
-
-
-def test_weights_are_averaged_over_the_priors_of_a_law() -> None:
-    K = 2
-    rows = rows_of(random_faults(16, vehicles=5, branches=K), seed=16)
-    priors = first_prior(K), known_prior(first_prior(K).counts, (0.05, 0.25))
-    law = replace(law_of(K), priors=((0.6, priors[0]), (0.4, priors[1])))
-    draws = explain(rows, law, feed=0)
-    expected = 0.6 * weigh(draws, priors[0])[0] + 0.4 * weigh(draws, priors[1])[0]
-    np.testing.assert_allclose(weigh_law(draws, law), expected, atol=1e-15)
 
 
 def test_one_vehicle_and_a_branch_that_nobody_used_are_learned_from_without_failing() -> None:

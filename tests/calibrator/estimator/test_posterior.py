@@ -11,7 +11,6 @@ from calibrator.estimator.explanations import fit_explanations
 from calibrator.estimator.posterior import GAIN, OFFSET, Draws, draw_explanations, size_evidence, weigh
 from calibrator.estimator.prior import GRID, LOAD_DENSITY, Prior, Slab, known_prior, with_slabs
 from calibrator.estimator.rows import EvidenceRows
-from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
 from tests.calibrator.estimator.simulated_rows import (
     Errors,
@@ -156,16 +155,6 @@ def test_load_weighs_as_on_a_grid_and_is_never_negative() -> None:
     assert [of_supports(draws, weight, j)[6,][0] > 0.5 for j in range(3)] == [True, False, False]
 
 
-@pytest.mark.parametrize("K", [2, 3])
-def test_weights_sum_to_one_over_every_vehicle(K: int) -> None:
-    rows = rows_of(random_faults(3, vehicles=20, branches=K, sparsity=60.0), seed=3)
-    rows.relative[0, 0], rows.constant[1, 0] = 3.0, -40.0  # nothing explains these
-    weight, log_evidence = weigh(drawn(rows, paper_prior(K, 1, 2)), paper_prior(K, 1, 2))
-    np.testing.assert_allclose(weight.sum(axis=(1, 2, 3)), 1.0, rtol=1e-12)
-    assert (weight >= 0.0).all()
-    assert np.isfinite(log_evidence).all()
-
-
 @pytest.mark.parametrize("sparsity", [83.0, 67.0])
 def test_weights_are_probabilities_for_fleets_that_the_prior_describes(sparsity: float) -> None:
     truth = random_faults(4, vehicles=500, branches=2, sparsity=sparsity)
@@ -187,50 +176,6 @@ def test_weights_are_probabilities_for_fleets_that_the_prior_describes(sparsity:
     hit = (draws.fits.support[np.arange(500), best] == present).all(axis=1)
     error = np.sqrt(np.sum(confidence * (1.0 - confidence))) / 500.0
     assert hit.mean() == pytest.approx(confidence.mean(), abs=3.0 * error + 0.005)
-
-
-def test_gain_that_no_row_shows_keeps_its_prior() -> None:
-    """The third branch hardly moves, and carries no current: whether its gain is wrong is as open as before."""
-    K, prior = 3, paper_prior(3, 0, 1)
-    rows = rows_of(no_faults(1, K), noise=0.0, currents=np.array([0.1, -0.1, 0.0]))
-    for row in (K - 1, 2 * K - 2):
-        rows.covariance[:, row], rows.covariance[:, :, row] = 0.0, 0.0
-        rows.covariance[:, row, row] = 100.0
-    draws = drawn(rows, prior)
-    weight, _ = weigh(draws, prior)
-    found = of_supports(draws, weight, 0)
-    odds = np.exp(prior.log_supports[0, 1] - prior.log_supports[0, 0])
-    assert found[3,][0] / found[()][0] == pytest.approx(odds, rel=0.3)  # few draws of a wide Gaussian meet the bounds
-    drift, w = np.expm1(draws.values[0, ..., 3]), weight[0].sum(axis=2) * draws.fits.support[0, :, 3:4]
-    assert (w * np.sign(drift)).sum() == pytest.approx(0.0, abs=0.1 * w.sum())
-    assert np.abs(drift[w > 1e-6]).min() < 0.08
-    assert np.abs(drift[w > 1e-6]).max() > 0.22
-
-
-def test_ever_smaller_errors_make_the_simplest_explanation_sure() -> None:
-    truth = random_faults(5, vehicles=30, branches=3, sparsity=89.0)
-    prior = paper_prior(3, 0, 1, 2)
-    sure = []
-    for sd in (0.02, 0.002):
-        draws = drawn(rows_of(truth, errors=Errors(slope=sd, ratio=sd, intercept=sd, junction=sd), noise=0.0), prior)
-        weight, _ = weigh(draws, prior)
-        right = (draws.fits.support == (parameters_of(truth) != 0.0)[:, None]).all(axis=2)
-        sure.append((weight.sum(axis=(2, 3)) * right).sum(axis=1))
-    assert sure[1].mean() > sure[0].mean()
-    assert sure[1].min() > 0.9
-
-
-@pytest.mark.parametrize("K", [2, 3])
-def test_exact_readings_of_offsets_make_no_false_gains(K: int) -> None:
-    """A hardware offset and a sensor offset in one branch, both known once the sensor was read without a current."""
-    truth, prior = no_faults(1, K), paper_prior(K, 0, 1, 2)
-    truth.hardware_offset_a[0, [0, -1]], truth.offset_a[0, 0] = (0.113, -0.113), -0.171
-    draws = drawn(rows_of(truth, seed=6, errors=Errors(offset_read=1e-4)), prior)
-    weight, _ = weigh(draws, prior)
-    false_gain = draws.fits.support[0, :, : K + 1].any(axis=1)
-    assert weight[0, false_gain].sum() < 0.05
-    mean = np.einsum("qmg,qmp->p", weight[0], draws.values[0])
-    np.testing.assert_allclose(mean, parameters_of(truth)[0], atol=0.003)
 
 
 @pytest.mark.parametrize("of_sensor", [False, True])
@@ -283,20 +228,3 @@ def test_evidence_of_sizes_is_that_of_the_weights(kind: int, every: int) -> None
     exact = np.array([weigh(draws, with_slabs(prior, *part))[1].sum() for part in parts])
     np.testing.assert_allclose(found - found[0], exact - exact[0], atol=1e-6 if every == 1 else 3.0)
     assert np.argmax(found) == np.argmax(exact) == 1
-
-
-def test_order_of_the_vehicles_does_not_matter() -> None:
-    truth, order = random_faults(10, vehicles=30, branches=3, sparsity=70.0), np.random.default_rng(10).permutation(30)
-    rows, prior = rows_of(truth, seed=10), paper_prior(3, 1, 2, 3)
-    plain, other = (weigh(drawn(each, prior), prior) for each in (rows, rows.take(order)))
-    np.testing.assert_array_equal(other[1], plain[1][order])
-    most = min(plain[0].shape[1], other[0].shape[1])
-    np.testing.assert_array_equal(other[0][:, :most], plain[0][order][:, :most])
-
-
-def test_vehicle_twice_is_counted_twice() -> None:
-    prior = paper_prior(2, 0, 1, 2)
-    truth = random_faults(11, vehicles=10, branches=2, sparsity=70.0)
-    twice = Faults(**{name: np.repeat(values, 2, axis=0) for name, values in vars(truth).items()})
-    once, doubled = (weigh(drawn(rows_of(each, noise=0.0), prior), prior)[1].sum() for each in (truth, twice))
-    assert doubled == pytest.approx(2.0 * once, rel=1e-12)

@@ -8,15 +8,11 @@ import pytest
 from calibrator.drive import Array
 from calibrator.estimator.prior import (
     GRID,
-    LOAD_DENSITY,
     TAIL_DENSITY,
-    Prior,
     Slab,
     first_prior,
     known_prior,
     sparse_counts,
-    uniform_density,
-    with_slabs,
 )
 from tests.calibrator.estimator.simulated_rows import random_faults
 
@@ -47,19 +43,6 @@ def test_slab_is_uniform_between_its_bounds_and_has_its_tail_beyond(low: float, 
     assert (density[(GRID > 0.002) & (GRID < 1.5)] > 0.0).all(), "no size is impossible"
 
 
-def test_densities_of_several_bounds_are_those_of_each() -> None:
-    low, high = np.array([0.01, 0.05]), np.array([0.4, 0.25])
-    both = uniform_density(low, high)
-    for s in range(2):
-        np.testing.assert_allclose(both[:, s], uniform_density(low[s : s + 1], high[s : s + 1])[:, 0])
-    assert mass(LOAD_DENSITY) == pytest.approx(1.0)
-
-
-def test_smallest_fault_is_near_the_lower_bound_unless_the_tail_is_heavy() -> None:
-    assert Slab(low=0.05, high=0.25, tail=0.001).smallest == pytest.approx(0.054, rel=0.1)
-    assert Slab(low=0.05, high=0.25, tail=0.1).smallest < 0.02
-
-
 @BRANCHES
 def test_supports_of_every_prior_sum_to_one(K: int) -> None:
     for prior in (first_prior(K), known_prior(counted(K, 70.0) / 4000.0, (0.05, 0.25))):
@@ -67,13 +50,6 @@ def test_supports_of_every_prior_sum_to_one(K: int) -> None:
         assert prior.counts.sum() == pytest.approx(1.0, abs=1e-6)
         assert np.sum(ways * np.exp(prior.log_supports)) == pytest.approx(1.0, abs=1e-6)
         assert prior.branches == K
-
-
-def test_first_prior_expects_few_faults_and_hardware_faults_in_some_vehicles() -> None:
-    counts = first_prior(3).counts
-    total = np.add.outer(np.arange(4), np.arange(7))
-    assert counts[total <= 3].sum() > 0.85
-    assert counts[1:].sum() == pytest.approx(0.5 * (1.0 - 0.8**3), abs=1e-12)  # half may have hardware faults
 
 
 @BRANCHES
@@ -92,19 +68,3 @@ def test_law_of_a_fleet_without_faults_has_next_to_none_and_of_no_fleet_is_a_law
     assert law.sum() == pytest.approx(1.0)
     assert law[0, 0] > 0.98
     assert (law > 0.0).all(), "nothing is impossible"
-
-
-def test_many_vehicles_change_the_law_more_than_few() -> None:
-    share = counted(3, 80.0) / 4000.0
-    apart = [float(np.abs(sparse_counts(vehicles * share) - share).sum()) for vehicles in (1.0, 5.0, 50.0, 500.0)]
-    assert apart == sorted(apart, reverse=True)
-    assert apart[0] > 10.0 * apart[3]
-
-
-def test_other_sizes_leave_numbers_loads_and_groups() -> None:
-    slab = Slab(low=0.05, high=0.25, tail=0.01)
-    prior = Prior(counts=first_prior(2).counts, gain=slab, offset=slab, load_share=0.2, group_share=np.array([0.3]))
-    other = with_slabs(prior, Slab(low=0.3, high=0.6, tail=0.01), slab)
-    assert other.gain.low == 0.3
-    assert {name for name in vars(prior) if vars(prior)[name] is not vars(other)[name]} == {"gain"}
-    assert other.log_density.shape == (3, len(GRID))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibrator.artificial.random_fleet import draw_faults
-from calibrator.estimator.published_fleet import LEAST_VEHICLES, SLOPE_SPREAD, few_vehicles_notice
+from calibrator.estimator.published_fleet import SLOPE_SPREAD
 from calibrator.faults import slopes_and_intercepts
 from tests.calibrator.command_here import calibrator
 
@@ -26,14 +26,6 @@ def test_spread_of_slopes_is_that_of_the_default_faults() -> None:
     )
     slopes, _ = slopes_and_intercepts(faults)
     assert slopes.std() == pytest.approx(SLOPE_SPREAD, rel=0.02)
-
-
-def test_few_vehicles_are_told_with_the_error_of_their_mean() -> None:
-    (notice,) = few_vehicles_notice(4)
-    assert "4 vehicles are few for the published method" in notice
-    assert "off by about 5%" in notice
-    assert len(few_vehicles_notice(LEAST_VEHICLES - 1)) == 1
-    assert few_vehicles_notice(LEAST_VEHICLES) == ()
 
 
 @pytest.fixture(scope="module")

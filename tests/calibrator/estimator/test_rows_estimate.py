@@ -81,14 +81,6 @@ def test_batch_of_sensors_with_a_common_gain_makes_no_vehicle_worse(K: int, gain
     assert not worse(estimated(faults, seed=4)[1], faults).any()
 
 
-def test_vehicles_without_faults_are_not_corrected() -> None:
-    found, deployed = estimated(no_faults(30, 3), seed=5)
-    assert not deployed.drift.any()
-    assert not deployed.offset_a.any()
-    assert found.confidence.min() > 0.9
-    assert found.hardware_probability.max() < 0.2
-
-
 def test_standard_deviations_are_those_of_the_errors() -> None:
     faults = random_faults(6, vehicles=120, branches=2)
     found, _ = estimated(faults, seed=6)
@@ -115,16 +107,3 @@ def test_vehicle_is_estimated_alike_to_the_bit_alone_and_in_any_fleet(K: int) ->
         for found, other in zip(alone.supports[0], together.supports[j], strict=True):
             assert found[0] == other[0]
             np.testing.assert_array_equal(found[1], other[1])
-
-
-def test_probabilities_of_the_explanations_are_those_of_the_posterior() -> None:
-    found, _ = estimated(random_faults(8, vehicles=20, branches=2, sparsity=60.0), seed=8)
-    for j, explanations in enumerate(found.supports):
-        shares = [share for share, _ in explanations]
-        assert shares == sorted(shares, reverse=True)
-        assert sum(shares) == pytest.approx(1.0, abs=0.001)
-        hardware = sum(share for share, values in explanations if values[:2].any())
-        assert found.hardware_probability[j] == pytest.approx(min(hardware, 1.0))
-        for k in range(2):
-            faulty = sum(share for share, values in explanations if values[2:, k].any())
-            assert found.fault_probability[j, k] == pytest.approx(faulty, abs=0.001)
