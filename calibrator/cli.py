@@ -16,7 +16,7 @@ from calibrator.kirchhoff.command import kirchhoff
 from calibrator.proposal.command import layout as layout_commands
 from calibrator.recordings.command import replay
 from calibrator.report.command import report
-from calibrator.signing.command import keys, revoke, sign
+from calibrator.repository.command import repository
 from calibrator.sources.command import import_
 from calibrator.summaries.command import store_app, summarise
 from calibrator.terminal.command_line import command_app, example, run_app
@@ -27,7 +27,7 @@ __all__ = ["app", "main"]
 ORDER = {
     "Commands to look at a recording": ("layout", "doctor", "kirchhoff", "replay"),
     "Commands to calibrate": ("import", "summarise", "store", "calibrate", "params", "report", "export"),
-    "Commands to sign parameters": ("keys", "sign", "revoke"),
+    "Commands to bring parameters to vehicles": ("repository",),
     "Commands for research": ("simulate", "identify", "score", "experiment"),
 }
 """Commands in the order of use, by the heading under which ``--help`` lists them."""
@@ -52,7 +52,7 @@ app = command_app(
 )
 app.add_typer(layout_commands, name="layout", epilog=example("calibrator layout init my_car.dbc --out my_car.toml"))
 app.add_typer(store_app, name="store", epilog=example("calibrator store info summaries"))
-app.add_typer(keys, name="keys", epilog=example("calibrator keys new alice --out keys"))
+app.add_typer(repository, name="repository", epilog=example("calibrator repository add repo result/params"))
 for function, lines in (
     (doctor, ["calibrator doctor --layout my_car.toml --log drive.blf"]),
     (
@@ -74,8 +74,6 @@ for function, lines in (
     (params, ["calibrator params result V001 V002 --out params"]),
     (report, ["calibrator report result --out report.html"]),
     (export, ["calibrator export result/params/V001.json --layout my_car.toml --format c --out hv_calibration.c"]),
-    (sign, ["calibrator sign result/params/*.json --key keys/alice.key --out signed"]),
-    (revoke, ["calibrator revoke --vehicle V001 --number 1 --why repaired --key keys/alice.key --out V001.revoked"]),
     (simulate, ["calibrator simulate --layout dbc/hv_powertrain.toml --vehicles 40 --currents 3 --out fleet"]),
     (identify, ["calibrator identify store --layout my_car.toml --out bank.json"]),
     (score, ["calibrator score result --truth fleet/truth.json"]),

@@ -13,7 +13,7 @@ __all__ = [
     "FleetError",
     "LogError",
     "ProposalError",
-    "SigningError",
+    "RepositoryStateError",
     "internal_error",
 ]
 
@@ -53,8 +53,8 @@ class ContradictionError(UserError):
     """Options contradict each other: wrong use, whatever is in the files."""
 
 
-class SigningError(UserError):
-    """Something cannot be signed (no key, another passphrase, a file that is no statement)."""
+class RepositoryStateError(UserError):
+    """A repository cannot be used, or lacks signatures or a vehicle."""
 
 
 class ProposalError(UserError):

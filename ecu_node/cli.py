@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 from ecu_node import __version__
 from ecu_node.errors import LayoutError
 from ecu_node.program import CommandParser, load_python_can, run_program, say_error, write_output, write_result
-from ecu_node.trust.commands import add_trust_commands
+from ecu_node.update.command import add_update_commands
 
 if TYPE_CHECKING:
     from ecu_node.database import VehicleDatabase
@@ -69,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_run(commands)
     _add_monitor(commands)
-    add_trust_commands(commands, _VEHICLE)
+    add_update_commands(commands, _VEHICLE)
     _add_faults(commands)
     _add_check(commands)
     _add_template(commands)

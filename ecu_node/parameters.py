@@ -226,8 +226,8 @@ def decode_parameters(content: bytes, where: str) -> VehicleParameters:
         return msgspec.json.decode(content, type=VehicleParameters)
     except msgspec.ValidationError as error:
         if isinstance(document, dict) and {"payload", "payloadType", "signatures"} <= document.keys():
-            advice = "use 'ecu-node activate' and --state, or name the file that was signed"
-            raise _malformed(where, "this file is signed", advice) from None
+            advice = "name the parameter file that was signed"
+            raise _malformed(where, "this file was signed by version 1.0", advice) from None
         steps, what = field_error(error, document, VehicleParameters)
         raise _malformed(where, f"{', '.join(steps)}: {what}" if steps else what) from None
 

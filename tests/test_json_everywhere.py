@@ -25,6 +25,7 @@ WITHOUT = {
     "ecu-node clear": "prints nothing",
     "ecu-node template": "prints JSON anyway",
     "ecu-node schema": "prints JSON anyway",
+    "ecu-node report": "prints JSON anyway",
 }
 """Commands that have no --json, and why."""
 
@@ -53,7 +54,7 @@ COMMANDS = dict([*calibrator_commands(), *node_commands()])
 
 
 def test_both_programs_were_walked() -> None:
-    assert {"calibrator import", "calibrator keys set", "ecu-node inspect"} <= COMMANDS.keys()
+    assert {"calibrator import", "calibrator repository add", "ecu-node inspect"} <= COMMANDS.keys()
     assert WITHOUT.keys() <= COMMANDS.keys()
 
 
@@ -95,41 +96,26 @@ def test_a_life_of_signed_parameters_in_json(
         return found
 
     layout, state = ["--layout", LAYOUT], ["--state", tmp_path / "state"]
-    anna, ben = (
-        done("calibrator", "keys", "new", name, "--no-passphrase", "--out", tmp_path / "keys")
-        for name in ("anna", "ben")
-    )
-    public, private = (
-        [anna["public_key"], ben["public_key"]],
-        ["--key", anna["private_key"], "--key", ben["private_key"]],
-    )
-    keys = done("calibrator", "keys", "set", *public, "--threshold", 2, "--out", tmp_path / "set.json")
-    assert (keys["signers"], keys["threshold"]) == (["anna", "ben"], 2)
-    signed = done("calibrator", "sign", params, *private, "--out", tmp_path / "signed")["signed"]
-    assert signed == [str(tmp_path / "signed" / "v1.json")]
-    again = done("calibrator", "sign", params, *private, "--out", tmp_path / "signed")
-    assert (again["signed"], again["kept"]) == ([], signed)
-    begun = done("ecu-node", "provision", "--vehicle", "v1", "--keys", keys["file"], *state)
-    assert begun["key_set"]["signers"].keys() == {"anna", "ben"}
-    verified = done("ecu-node", "verify", signed[0], *state, *layout)
-    taken = done("ecu-node", "activate", signed[0], *state, *layout)
-    assert (verified["taken"], taken["taken"]) == (False, True)
-    assert {**verified, "taken": True} == taken
-    file = done("ecu-node", "inspect", signed[0], "--keys", keys["file"])
-    assert (file["kind"], file["sequence"], file["verified_signers"]) == (
-        "parameters",
-        taken["sequence"],
-        ["anna", "ben"],
-    )
-    assert file["branches"]["battery"]["offset_a"] == 2.3
-    revocation = done(
-        *("calibrator", "revoke", "--vehicle", "v1", "--number", taken["sequence"], "--why", "a test"),
-        *(*private, "--out", tmp_path / "revocation.json", "--sequence", taken["sequence"] + 1),
-    )
-    assert done("ecu-node", "inspect", revocation["file"])["revokes"] == [taken["sequence"]]
-    done("ecu-node", "revoke", revocation["file"], *state, *layout)
-    after = done("ecu-node", "inspect", *state[1:])
-    assert (after["revoked"], after["audit_log"], after["problems"]) == ([taken["sequence"]], "whole", [])
+    repo = tmp_path / "repo"
+    made = done("calibrator", "repository", "key", "anna", "--no-passphrase", "--out", tmp_path / "keys")
+    roles = [
+        word for role in ("--root", "--targets", "--snapshot", "--timestamp") for word in (role, made["public_key"])
+    ]
+    assert done("calibrator", "repository", "init", repo, *roles)["root"] == {"keys": 1, "threshold": 1}
+    publish = ["calibrator", "repository", "publish", repo, "--key", made["private_key"]]
+    assert done("calibrator", "repository", "add", repo, params)["added"] == 1
+    assert done(*publish)["published"] == 3
+    done("ecu-node", "provision", "--vehicle", "v1", "--root", repo / "metadata" / "1.root.json", *state)
+    (bundle,) = done("calibrator", "repository", "bundle", repo, "v1", "--out", tmp_path / "bundles")["bundles"]
+    would = done("ecu-node", "update", bundle, *state, *layout, "--dry-run")
+    taken = done("ecu-node", "update", bundle, *state, *layout)
+    assert (would["taken"], taken["taken"], taken["on_trial"]["parameter_set"]) == (False, True, 300)
+    assert done("calibrator", "repository", "revoke", repo, "v1")["revoked"] == ["v1"]
+    done("calibrator", "repository", "rotate", repo, "timestamp", "--public", made["public_key"])
+    done(*publish)
+    assert done("ecu-node", "update", repo, *state, *layout)["on_trial"] is None
+    after = done("ecu-node", "inspect", *state)
+    assert (after["ended"], after["trusted"]["root"], after["problems"]) == ("revoked", 2, [])
 
 
 def test_exports_tell_their_files_and_notices(
@@ -148,7 +134,7 @@ def test_exports_tell_their_files_and_notices(
 
 
 def test_a_refusal_prints_no_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["sign", str(tmp_path / "none.json"), "--key", str(tmp_path / "none.key"), "--out", str(tmp_path), "--json"]
+    words = ["repository", "add", str(tmp_path), str(tmp_path / "none.json"), "--json"]
     assert run_app(app, "calibrator", words) == 1
     printed = capsys.readouterr()
     assert printed.out == ""

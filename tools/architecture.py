@@ -24,9 +24,13 @@ GROUND = frozenset({"files", "processes", "terminal"})
 """Rooms of the ground floor."""
 DOORS = frozenset({"__init__", "__main__", "cli"})
 """They import every room, to start it."""
-NODE_PACKAGES = frozenset({"_typeshed", "can", "cantools", "cryptography", "e2e", "fastcrc", "msgspec", "rfc8785"})
+NODE_PACKAGES = frozenset({"_typeshed", "can", "cantools", "e2e", "fastcrc", "msgspec"})
 """What the base install has, and what only type checkers see."""
-NODE_EXTRAS = {"service": frozenset({"prometheus_client"})}
+_UPDATE_PACKAGES = frozenset({"cryptography", "securesystemslib", "tuf", "urllib3"})
+NODE_EXTRAS = {
+    "telemetry": frozenset({"prometheus_client"}),
+    **dict.fromkeys(("client", "command", "signers", "sources"), _UPDATE_PACKAGES),
+}
 """What rooms or modules of this name may import besides: an extra brings it, and only their command needs it."""
 BOX_HEIGHT, ROW_HEIGHT, CHARACTER, GAP, WIDTH = 30, 92, 8.2, 22, 900
 """Sizes of the picture. [px]"""

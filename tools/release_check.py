@@ -71,7 +71,7 @@ def _judges(out: Path) -> Iterator[Callable[[], Iterator[Promise]]]:
     yield lambda: estimation_promises(out / "experiments")
     yield lambda: speed_promises(*(bench_file(out, name) for name in BENCHES))
     yield lambda: million_promises(_output(out, "million"))
-    yield lambda: fuzz_promises([_output(out, f"node fuzz {seed}") for seed in (31, 32)], _output(out, "trust fuzz"))
+    yield lambda: fuzz_promises([_output(out, f"node fuzz {seed}") for seed in (31, 32)], _output(out, "update fuzz"))
     yield lambda: chain_promises(_output(out, "chain"))
 
 

@@ -285,7 +285,7 @@ def _source(
 ) -> ParameterSource:
     if options.params is not None:
         return ParameterFile(options.params, database, options.vehicle, mode=mode, say=say)
-    from ecu_node.trust.parameter_store import ParameterStore  # noqa: PLC0415  # cryptography takes time to import
+    from ecu_node.update.store import ParameterStore  # noqa: PLC0415  # imports this room
 
     now, background = partial(datetime.now, UTC), ThreadPoolExecutor(1, "state of the vehicle")
     return ParameterStore(

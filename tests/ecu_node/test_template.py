@@ -15,7 +15,7 @@ from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
 from ecu_node.parameters import check_fit, decode_parameters
-from ecu_node.trust.trial import begin_trial
+from ecu_node.update.trial import begin_trial
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, answers
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)

@@ -9,8 +9,6 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from calibrator.cli import app
-from calibrator.terminal.command_line import run_app
 from ecu_node import __version__
 from release.clean_venv import ROOT, CleanVenv
 from tests.package.conftest import VEHICLE, Installed
@@ -77,31 +75,11 @@ def test_the_monitor_draws_a_table(node: CleanVenv, car: Path) -> None:
     assert b"\x1b[?1049h" in shown  # a screen of its own
 
 
-def test_signed_parameters_are_taken_and_taken_back(
-    node: CleanVenv, car: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def calibrator(*arguments: str) -> None:
-        assert run_app(app, "calibrator", arguments) == 0
-
-    def trust(*arguments: str) -> str:
-        done = node.run("ecu-node", *arguments, folder=car)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    monkeypatch.chdir(car)
-    calibrator("keys", "new", "anna", "--no-passphrase", "--out", "keys")
-    calibrator("keys", "set", "keys/anna.pub", "--threshold", "1", "--out", "keys-1.json")
-    calibrator("sign", "V001.json", "--key", "keys/anna.key", "--out", "signed", "--sequence", "1000")
-    state = ("--state", "state")
-    trust("provision", "--vehicle", VEHICLE, "--keys", "keys-1.json", *state)
-    trust("verify", "signed/V001.json", *state, *LAYOUT)
-    trust("activate", "signed/V001.json", *state, *LAYOUT)
-    slots = json.loads(trust("inspect", "state", "--json"))["slots"]
-    assert [slot["place"] for slot in slots.values()] == ["on trial"]
-    taken_back = ("--vehicle", VEHICLE, "--number", "1000", "--sequence", "1001", "--why", "a test")
-    calibrator("revoke", *taken_back, "--key", "keys/anna.key", "--out", "revoked.json")
-    trust("revoke", "revoked.json", *state, *LAYOUT)
-    assert json.loads(trust("inspect", "state", "--json"))["revoked"] == [1000]
+def test_updates_without_their_extra_are_refused_in_one_line(node: CleanVenv, car: Path) -> None:
+    for words in (("provision", "--vehicle", VEHICLE, "--root", "x"), ("update", "x", *LAYOUT)):
+        done = node.run("ecu-node", *words, "--state", "state", folder=car)
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+        assert "pip install 'hv-current-correction[update]'" in done.stderr
 
 
 def test_the_start_is_quick_enough_for_a_service(node: CleanVenv) -> None:

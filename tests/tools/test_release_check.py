@@ -86,12 +86,12 @@ def test_a_promise_is_met_if_all_its_tests_passed(inside: str, met: bool, tmp_pa
     names = (
         *("vcan.test_a", "vcan.test_faults_on_vcan", "real.test_tesla_model3", "real.test_i3_import"),
         *("real.test_delays_i3", "real.test_first_minutes", "test_user_mistakes"),
-        *("calibrator.test_fleet_commands", "ecu_node.test_fault_table", "trust.test_a", "calibrator.export.test_a"),
+        *("calibrator.test_fleet_commands", "ecu_node.test_fault_table", "update.test_a", "calibrator.export.test_a"),
         *("calibrator.report.test_a", "browser.test_a", "docs.test_a", "tools.test_architecture"),
     )
     cases = "".join(f'<testcase classname="tests.{name}" name="test_x"/>' for name in names)
     report = tmp_path / "tests.xml"
-    report.write_text(f'<r>{cases}<testcase classname="tests.trust.test_b" name="test_y">{inside}</testcase></r>')
+    report.write_text(f'<r>{cases}<testcase classname="tests.update.test_b" name="test_y">{inside}</testcase></r>')
     found = {promise.what: promise.met for promise in promises_of_tests(report)}
     assert found["all tests"] is met
     assert found["parameter files that were tampered with, expired, replayed, of others: refused"] is met

@@ -136,9 +136,9 @@ def _trials() -> Iterator[Step]:
         environment=TOOLS,
     )
     yield Step(
-        name="trust fuzz",
-        command=(PYTHON, "-m", "bench.trust_fuzz", "--seed", "7"),
-        runs=("tools/bench/trust_fuzz.py", "dbc"),
+        name="update fuzz",
+        command=(PYTHON, "-m", "bench.update_fuzz", "--seed", "7"),
+        runs=("tools/bench/update_fuzz.py", "dbc"),
         environment=TOOLS,
     )
     for seed in ("31", "32"):

@@ -60,12 +60,12 @@ def coverage_promises(path: Path) -> Iterator[Promise]:
         )
 
 
-def fuzz_promises(node: list[Path], trust: Path) -> Iterator[Promise]:
+def fuzz_promises(node: list[Path], update: Path) -> Iterator[Promise]:
     """Judge what the fuzzers printed."""
     frames = sum(_counted(path, r"^(\d+) frames right in both modes") for path in node)
     yield at_least("node: random frames that are right in both modes, no exception", (1e7,), (frames,))
-    files = _counted(trust, r"^(\d+) changed files refused, each in one line")
-    yield at_least("changed parameter files: none accepted, no crash", (1e6,), (files,))
+    bundles = _counted(update, r"^(\d+) changed bundles refused, each in one line")
+    yield at_least("changed bundles: none accepted, no crash", (1e6,), (bundles,))
 
 
 def chain_promises(path: Path) -> Iterator[Promise]:

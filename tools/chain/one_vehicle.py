@@ -1,4 +1,4 @@
-"""What becomes of one vehicle of the chain: its signed file is activated, tried on the road, and judged on the rest."""
+"""What becomes of one vehicle of the chain: it updates, and its set is tried on the road, and judged on the rest."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,13 +14,11 @@ from ecu_node.bus.wiring import InForce, Mode, sensor_fault, wire
 from ecu_node.core.status import State
 from ecu_node.errors import UserError
 from ecu_node.parameters import BranchParameters, VehicleParameters
-from ecu_node.trust.activation import accept
-from ecu_node.trust.key_set import KeySet
-from ecu_node.trust.parameter_store import ParameterStore
-from ecu_node.trust.provision import provision
-from ecu_node.trust.trial import ParameterTrial, TrialResult, begin_trial
+from ecu_node.update.client import provision, update
+from ecu_node.update.store import ParameterStore
+from ecu_node.update.trial import ParameterTrial, TrialResult, begin_trial
 
-__all__ = ["SignedFile", "VehicleOutcome", "WrongSet", "drive_vehicle"]
+__all__ = ["VehicleOutcome", "WrongSet", "drive_vehicle"]
 
 UNSEEN_STREAM = 1
 """Second part of the seed of the frames of an unseen drive; those of the drive to learn from have none."""
@@ -51,9 +49,9 @@ class VehicleOutcome:
     vehicle : str
         Its name.
     corrected : tuple of str
-        Branches that its parameters correct; none: nothing was activated.
+        Branches that its parameters correct; none: it took no update.
     refused : str
-        Why its signed file was not accepted; empty if it was.
+        Why its update was refused; empty if it was not.
     passed : bool
         Whether it passed its trial.
     text : str
@@ -80,29 +78,16 @@ class VehicleOutcome:
     wrong: Mapping[str, WrongSet]
 
 
-@dataclass(frozen=True, kw_only=True)
-class SignedFile:
-    """Parameters of a vehicle, as its node gets them.
-
-    Attributes
-    ----------
-    parameters : VehicleParameters
-        What was signed.
-    content : bytes
-        The signed file.
-    keys : KeySet
-        Whom the vehicle trusts.
-    """
-
-    parameters: VehicleParameters
-    content: bytes
-    keys: KeySet
-
-
 def drive_vehicle(
-    fleet: ChainFleet, number: int, file: SignedFile, others: VehicleParameters, state: Path
+    fleet: ChainFleet,
+    number: int,
+    parameters: VehicleParameters,
+    others: VehicleParameters,
+    *,
+    repository: Path,
+    state: Path,
 ) -> VehicleOutcome:
-    """Activate a signed file in a vehicle, and drive.
+    """Update a vehicle, and drive.
 
     Parameters
     ----------
@@ -110,10 +95,12 @@ def drive_vehicle(
         The fleet.
     number : int
         Of the vehicle.
-    file : SignedFile
-        Its own.
+    parameters : VehicleParameters
+        Its own, as they are published.
     others : VehicleParameters
         Of another vehicle.
+    repository : Path
+        What it trusts.
     state : Path
         Folder for the state of the vehicle.
 
@@ -122,13 +109,13 @@ def drive_vehicle(
     VehicleOutcome
         What became of it.
     """
-    name, database, parameters = fleet.vehicles[number].name, fleet.database, file.parameters
+    name, database = fleet.vehicles[number].name, fleet.database
     corrected = tuple(branch for branch, found in parameters.branches.items() if found.apply)
     if not corrected:
         return VehicleOutcome(vehicle=name, corrected=(), wrong={})
-    provision(state, name, file.keys, datetime.now(UTC))
+    provision(state, name, repository / "metadata" / "1.root.json", datetime.now(UTC))
     try:
-        accept(state, file.content, name, database, datetime.now(UTC))
+        update(state, str(repository), database, datetime.now(UTC))
     except UserError as error:
         return VehicleOutcome(vehicle=name, corrected=corrected, refused=str(error), wrong={})
     said: list[str] = []

@@ -11,11 +11,9 @@ from calibrator.processes.run_many import Workers, run_many
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps, table
 from chain.fleet import ChainFleet
-from chain.one_vehicle import SignedFile, VehicleOutcome, drive_vehicle
+from chain.one_vehicle import VehicleOutcome, drive_vehicle
 from ecu_node.errors import UserError
 from ecu_node.parameters import read_parameters
-from ecu_node.trust.canonical import read_canonical
-from ecu_node.trust.key_set import KEY_SET, KeySet
 
 __all__ = ["ChainScore", "drive_chain"]
 
@@ -95,7 +93,7 @@ def drive_chain(fleet: ChainFleet, folder: Path, *, workers: int) -> ChainScore:
     fleet : ChainFleet
         The fleet.
     folder : Path
-        Empty; for drives, parameters, keys, signed files and the states of the vehicles.
+        Empty; for drives, parameters, keys, repository and the states of the vehicles.
     workers : int
         Number of processes.
 
@@ -117,35 +115,37 @@ def drive_chain(fleet: ChainFleet, folder: Path, *, workers: int) -> ChainScore:
         progress=True,
     )
     files = [folder / "result" / "params" / f"{vehicle.name}.json" for vehicle in fleet.vehicles]
-    _sign(folder, [path for path in files if path.exists()])
-    keys = read_canonical((folder / "keys.json").read_bytes().rstrip(), KeySet, "keys.json", KEY_SET)
+    _publish(folder, [path for path in files if path.exists()])
     calibrated = [number for number, path in enumerate(files) if path.exists()]
     tasks = ((number, calibrated[(place + 1) % len(calibrated)]) for place, number in enumerate(calibrated))
-    driven = run_many(partial(_drive, fleet, folder, keys), tasks, Workers(processes=workers))
+    driven = run_many(partial(_drive, fleet, folder), tasks, Workers(processes=workers))
     return ChainScore(list(shown(driven, "drive, corrected", len(calibrated), "vehicles")))
 
 
-def _sign(folder: Path, files: Sequence[Path]) -> None:
-    """Two signers make their keys, and sign all files."""
+def _publish(folder: Path, files: Sequence[Path]) -> None:
+    """Two signers make their keys, and publish all files."""
     for name in SIGNERS:
-        _run("calibrator", "keys", "new", name, "--no-passphrase", "--out", folder / "keys")
-    public = [folder / "keys" / f"{name}.pub" for name in SIGNERS]
-    _run("calibrator", "keys", "set", *public, "--threshold", len(public), "--out", folder / "keys.json")
+        _run("calibrator", "repository", "key", name, "--no-passphrase", "--out", folder / "keys")
+    repository = folder / "repository"
+    public = [
+        word
+        for role in ("root", "targets", "snapshot", "timestamp")
+        for name in SIGNERS
+        for word in (f"--{role}", folder / "keys" / f"{name}.pub")
+    ]
+    _run("calibrator", "repository", "init", repository, *public)
+    _run("calibrator", "repository", "add", repository, *files)
     private = [part for name in SIGNERS for part in ("--key", folder / "keys" / f"{name}.key")]
-    _run("calibrator", "sign", *files, *private, "--out", folder / "signed")
+    _run("calibrator", "repository", "publish", repository, *private)
 
 
-def _drive(fleet: ChainFleet, folder: Path, keys: KeySet, task: tuple[int, int]) -> VehicleOutcome:
+def _drive(fleet: ChainFleet, folder: Path, task: tuple[int, int]) -> VehicleOutcome:
     number, other = task
     name = fleet.vehicles[number].name
     params = folder / "result" / "params"
-    file = SignedFile(
-        parameters=read_parameters(params / f"{name}.json"),
-        content=(folder / "signed" / f"{name}.json").read_bytes(),
-        keys=keys,
-    )
+    own = read_parameters(params / f"{name}.json")
     others = read_parameters(params / f"{fleet.vehicles[other].name}.json")
-    return drive_vehicle(fleet, number, file, others, folder / "states" / name)
+    return drive_vehicle(fleet, number, own, others, repository=folder / "repository", state=folder / "states" / name)
 
 
 def _run(*words: object, progress: bool = False) -> None:

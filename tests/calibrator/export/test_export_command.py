@@ -19,8 +19,8 @@ from ecu_node.errors import ParameterError, UserError
 from ecu_node.layout import file_digest
 from ecu_node.parameters import encode_parameters, write_parameters
 from tests.calibrator.export.exports import MakeDatabase, export, parameters_for, refused
+from tests.disk import full_disk
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT
-from tests.trust.signing_steps import full_disk
 
 FORMATS = ("c", "dcm", "cdfx", "csv")
 """Those that need no compiled program; the others write in the same way."""

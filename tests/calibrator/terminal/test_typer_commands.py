@@ -81,7 +81,7 @@ def test_help_is_not_cut_and_tells_exit_codes(capsys: pytest.CaptureFixture[str]
         assert text in words
 
 
-COMMANDS = [[], ["layout"], ["layout", "init"], ["keys"], ["keys", "new"], ["keys", "set"]]
+COMMANDS = [[], ["layout"], ["layout", "init"], ["repository"], ["repository", "init"], ["repository", "add"]]
 COMMANDS += [[name] for names in ORDER.values() for name in names if [name] not in COMMANDS]
 
 
@@ -98,10 +98,10 @@ def test_help_has_an_example_and_words_that_people_use(
 
 
 def test_help_says_what_may_be_repeated_and_no_bound_that_nobody_reaches(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(calibrator_app, "calibrator", ["sign", "--help"]) == 0
+    assert run_app(calibrator_app, "calibrator", ["repository", "publish", "--help"]) == 0
     words = " ".join(capsys.readouterr().out.split())
-    assert "calibrator sign [OPTIONS] PARAMS... " in words
-    assert "$CALIBRATOR_KEY_PASSPHRASE. May be repeated." in words
+    assert "calibrator repository publish [OPTIONS] REPOSITORY" in words
+    assert "PUBLIC.pem=URI. May be repeated." in words
     assert "(default: time in seconds, UTC), 1 or more." in words
 
 

@@ -1,0 +1,422 @@
+"""A TUF repository of parameter files: one target per vehicle, delegated to hashed bins.
+
+    metadata/    what vehicles read: N.root.json, N.targets.json, N.bins-XXX.json, N.snapshot.json, timestamp.json
+    targets/     parameter files, SHA256.VEHICLE.json
+    staged/      the next versions of root, targets and bins, with the signatures that they have so far
+
+Nothing that vehicles see changes until all that is staged has enough signatures: then :meth:`Repository.publish` puts
+it in place, timestamp last. So signers may sign one after the other, each on a machine of their own.
+"""
+
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime, timedelta
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+from msgspec.structs import replace
+from securesystemslib.signer import Key, Signer, SSlibKey
+from tuf.api.exceptions import RepositoryError, UnsignedMetadataError
+from tuf.api.metadata import (
+    Delegations,
+    Metadata,
+    MetaFile,
+    Root,
+    Signed,
+    Snapshot,
+    SuccinctRoles,
+    TargetFile,
+    Targets,
+    Timestamp,
+)
+from tuf.api.serialization.json import JSONSerializer
+
+from calibrator.errors import RepositoryStateError
+from calibrator.files.folders import write_files
+from ecu_node.parameters import decode_parameters, parameter_bytes
+from ecu_node.update.client import TargetFacts, target_path
+from ecu_node.update.sources import bundle_bytes
+
+__all__ = ["ROLES", "NewKeys", "Repository"]
+
+ROLES = ("root", "targets", "snapshot", "timestamp")
+_BIN_BITS = 11
+"""2048 bins: of 10^6 vehicles a bundle has about 20 kB, and the snapshot is still read in milliseconds."""
+_BINS = SuccinctRoles([], 1, _BIN_BITS, "bins")
+_DAYS = {"root": 730, "targets": 730, "bins": 400, "snapshot": 60, "timestamp": 30}
+"""How long metadata is valid. [d]"""
+_RENEW_DAYS = 60
+"""Targets and bins that expire within this time are staged anew, to be signed again. [d]"""
+
+_Signed = TypeVar("_Signed", Root, Timestamp, Snapshot, Targets)
+
+
+class NewKeys(NamedTuple):
+    """Public keys of a role, and how many of them must sign."""
+
+    keys: Sequence[SSlibKey]
+    threshold: int
+
+
+class _SignedExpiry(msgspec.Struct):
+    expires: datetime
+
+
+class _OnlyExpiry(msgspec.Struct):
+    """Metadata of which nothing else is read, as there are many bins."""
+
+    signed: _SignedExpiry
+
+
+class _File(NamedTuple):
+    """A parameter file in the repository."""
+
+    path: str
+    length: int
+    sha256: str
+    facts: TargetFacts
+
+
+def _expiry(role: str) -> datetime:
+    days = _DAYS["bins" if role.startswith("bins-") else role]
+    return (datetime.now(UTC) + timedelta(days=days)).replace(microsecond=0)
+
+
+class Repository:
+    """One repository.
+
+    Parameters
+    ----------
+    folder : Path
+        Made by :meth:`create`.
+
+    Raises
+    ------
+    RepositoryStateError
+        If there is no repository, or it is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._metadata, self._staged = folder, folder / "metadata", folder / "staged"
+        roots = [int(path.name.partition(".")[0]) for path in self._metadata.glob("*.root.json")]
+        if not roots and not (self._staged / "root.json").exists():
+            raise RepositoryStateError(f"{folder}: no repository; make one with 'calibrator repository init'")
+        self._root_version = max(roots, default=0)
+        self._versions: dict[str, int] = {}
+        self._snapshot_version = self._timestamp_version = 0
+        if (self._metadata / "timestamp.json").exists():
+            timestamp = self._read(self._metadata / "timestamp.json", Timestamp).signed
+            self._timestamp_version, self._snapshot_version = timestamp.version, timestamp.snapshot_meta.version
+            snapshot = self._read(self._metadata / f"{self._snapshot_version}.snapshot.json", Snapshot).signed
+            self._versions = {name.removesuffix(".json"): item.version for name, item in snapshot.meta.items()}
+
+    @classmethod
+    def create(cls, folder: Path, roles: Mapping[str, NewKeys]) -> "Repository":
+        """Stage the first root and the first targets of a new repository.
+
+        Parameters
+        ----------
+        folder : Path
+            New or empty.
+        roles : mapping of str to NewKeys
+            For each of :data:`ROLES`.
+        """
+        if folder.exists() and any(folder.iterdir()):
+            raise RepositoryStateError(f"{folder}: exists and is not empty; choose another folder")
+        for name in ("metadata", "targets", "staged"):
+            (folder / name).mkdir(parents=True)
+        root = Root(version=1, expires=_expiry("root"), consistent_snapshot=True)
+        for role, new in roles.items():
+            _set_keys(root, role, new)
+        targets = Targets(version=1, expires=_expiry("targets"))
+        _delegate(targets, roles["targets"])
+        write_files(
+            {
+                folder / "staged" / "root.json": _encoded(Metadata(root)),
+                folder / "staged" / "targets.json": _encoded(Metadata(targets)),
+            }
+        )
+        return cls(folder)
+
+    def _read(self, path: Path, kind: type[_Signed]) -> Metadata[Any]:
+        try:
+            found: Metadata[Any] = Metadata.from_file(str(path))
+        except (RepositoryError, OSError, ValueError) as error:
+            raise RepositoryStateError(f"{path}: cannot be read as metadata: {error}") from None
+        if not isinstance(found.signed, kind):
+            raise RepositoryStateError(f"{path}: metadata of another role; take a copy of the repository")
+        return found
+
+    def _live(self, role: str, kind: type[_Signed]) -> _Signed | None:
+        version = self._root_version if role == "root" else self._versions.get(role, 0)
+        if not version:
+            return None
+        found: _Signed = self._read(self._metadata / f"{version}.{role}.json", kind).signed
+        return found
+
+    def _latest(self, role: str, kind: type[_Signed]) -> _Signed | None:
+        """What is staged for a role, else what is live."""
+        path = self._staged / f"{role}.json"
+        if not path.exists():
+            return self._live(role, kind)
+        found: _Signed = self._read(path, kind).signed
+        return found
+
+    def _stage(self, role: str, signed: Signed) -> None:
+        """Keep the next version of a role; what was staged before has lost its signatures."""
+        live = self._root_version if role == "root" else self._versions.get(role, 0)
+        signed.version, signed.expires = live + 1, _expiry(role)
+        _write(self._staged / f"{role}.json", _encoded(Metadata[Any](signed)))
+
+    def _root(self) -> Root:
+        root = self._latest("root", Root)
+        assert root is not None, "the constructor has looked"
+        return root
+
+    def add(self, files: Iterable[Path], *, days: int, allow_large_step: bool) -> int:
+        """Stage parameter files, each in the place of what its vehicle had before.
+
+        Parameters
+        ----------
+        files : iterable of Path
+            Parameter files, one per vehicle.
+        days : int
+            How long they may be used. [d]
+        allow_large_step : bool
+            They may differ a lot from what is in force, as after a repair.
+
+        Returns
+        -------
+        int
+            Number of bins that are staged now.
+
+        Raises
+        ------
+        ParameterError
+            If one is no parameter file; nothing is staged then.
+        """
+        expires = (datetime.now(UTC) + timedelta(days=days)).replace(microsecond=0)
+        bins: dict[str, list[_File]] = defaultdict(list)
+        seen: set[str] = set()
+        for path in files:
+            content = parameter_bytes(path)
+            parameters = decode_parameters(content, str(path))
+            target, digest = target_path(parameters.vehicle), sha256(content).hexdigest()
+            if target in seen:
+                raise RepositoryStateError(f"{path}: a second file for vehicle {parameters.vehicle}; add one of them")
+            seen.add(target)
+            facts = TargetFacts(
+                vehicle=parameters.vehicle,
+                layout=parameters.layout.sha256,
+                dbc=parameters.dbc.sha256,
+                expires=expires,
+                allow_large_step=allow_large_step,
+            )
+            _write(self._folder / "targets" / f"{digest}.{target}", content)
+            bins[_BINS.get_role_for_target(target)].append(_File(target, len(content), digest, facts))
+        for role, added in bins.items():
+            targets = self._latest(role, Targets) or Targets()
+            for file in added:
+                before = targets.targets.get(file.path)
+                revoked = [item for item in _facts(before).revoked if item != file.sha256] if before else []
+                _set_target(targets, file.path, file.length, file.sha256, replace(file.facts, revoked=revoked))
+            self._stage(role, targets)
+        return len(bins)
+
+    def revoke(self, vehicles: Sequence[str], digest: str | None) -> None:
+        """Stage that a file of these vehicles must not be used any more: the present one, or another by its SHA-256."""
+        bins: dict[str, Targets] = {}
+        for vehicle in vehicles:
+            path = target_path(vehicle)
+            role = _BINS.get_role_for_target(path)
+            targets = bins.get(role) or self._latest(role, Targets)
+            if targets is None or path not in targets.targets:
+                raise RepositoryStateError(f"{self._folder}: no parameters of vehicle {vehicle!r} here")
+            file = targets.targets[path]
+            facts = _facts(file)
+            revoked = sorted({*facts.revoked, digest or file.hashes["sha256"]})
+            _set_target(targets, path, file.length, file.hashes["sha256"], replace(facts, revoked=revoked))
+            bins[role] = targets
+        for role, targets in bins.items():
+            self._stage(role, targets)
+
+    def rotate(self, role: str, new: NewKeys) -> None:
+        """Stage a root in which a role has other keys, and, for targets, all that the new keys must sign."""
+        root = self._root()
+        for keyid in list(root.roles[role].keyids):
+            root.revoke_key(keyid, role)
+        _set_keys(root, role, new)
+        self._stage("root", root)
+        if role == "targets":
+            targets = self._latest("targets", Targets)
+            assert targets is not None
+            _delegate(targets, new)
+            self._stage("targets", targets)
+            for name in self._versions:
+                if name.startswith("bins-"):
+                    self._restage(name)
+
+    def _restage(self, role: str) -> None:
+        found = self._latest(role, Targets)
+        assert found is not None
+        self._stage(role, found)
+
+    def renew(self) -> None:
+        """Stage root, targets and bins that expire soon; bins were signed when they were changed."""
+        soon = datetime.now(UTC) + timedelta(days=_RENEW_DAYS)
+        if not (self._staged / "root.json").exists() and self._root().expires < soon:
+            self._stage("root", self._root())
+        for role in self._versions:
+            if not (self._staged / f"{role}.json").exists() and self._expires(role) < soon:
+                self._restage(role)
+
+    def _expires(self, role: str) -> datetime:
+        """Expiry of live metadata."""
+        content = (self._metadata / f"{self._versions[role]}.{role}.json").read_bytes()
+        return msgspec.json.decode(content, type=_OnlyExpiry).signed.expires
+
+    def publish(self, signers: Sequence[Signer]) -> Iterator[str]:
+        """Sign what is staged; where all signatures are there, let vehicles see it.
+
+        Parameters
+        ----------
+        signers : sequence of Signer
+            Keys of any roles; each signs what is its own.
+
+        Yields
+        ------
+        str
+            Name of each role as it is signed; of those that lack signatures, with what is missing.
+        """
+        root = self._root()
+        targets = self._latest("targets", Targets)
+        assert targets is not None
+        missing = []
+        versions: dict[str, int] = {}
+        for role in sorted(path.stem for path in self._staged.glob("*.json")):
+            path = self._staged / f"{role}.json"
+            metadata = self._read(path, Root) if role == "root" else self._read(path, Targets)
+            versions[role] = metadata.signed.version
+            delegators: list[Root | Targets] = [targets] if role.startswith("bins-") else [root]
+            if role == "root" and (live := self._live("root", Root)) is not None:
+                delegators.append(live)
+            before = len(metadata.signatures)
+            for signer in signers:
+                if any(signer.public_key.keyid in _keyids(delegator, role) for delegator in delegators):
+                    metadata.sign(signer, append=True)
+            if len(metadata.signatures) > before:
+                _write(path, _encoded(metadata))
+            if not all(_is_signed(delegator, role, metadata) for delegator in delegators):
+                missing.append(role)
+            yield role
+        for role in ("snapshot", "timestamp"):
+            keyids = root.roles[role].keyids
+            if sum(signer.public_key.keyid in keyids for signer in signers) < root.roles[role].threshold:
+                missing.append(role)
+        if missing:
+            more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+            raise RepositoryStateError(
+                f"{self._folder}: nothing is published yet: signatures of {missing[0]}{more} are missing; publish "
+                "again with --key of those who have not signed (what was signed is kept)"
+            )
+        self._put_in_place(root, versions, signers)
+
+    def _put_in_place(self, root: Root, staged: Mapping[str, int], signers: Sequence[Signer]) -> None:
+        """Let what is staged be seen; a cut before the timestamp is replaced changes nothing, and a rerun goes on."""
+        for role, version in staged.items():
+            content = (self._staged / f"{role}.json").read_bytes()
+            _write(self._metadata / f"{version}.{role}.json", content)
+            if role != "root":
+                self._versions[role] = version
+        snapshot = Snapshot(
+            version=self._snapshot_version + 1,
+            expires=_expiry("snapshot"),
+            meta={f"{role}.json": MetaFile(version) for role, version in self._versions.items()},
+        )
+        content = _signed_by(root, "snapshot", snapshot, signers)
+        write_files({self._metadata / f"{snapshot.version}.snapshot.json": content})
+        timestamp = Timestamp(
+            version=self._timestamp_version + 1,
+            expires=_expiry("timestamp"),
+            snapshot_meta=MetaFile.from_data(snapshot.version, content, ["sha256"]),
+        )
+        os.sync()
+        write_files({self._metadata / "timestamp.json": _signed_by(root, "timestamp", timestamp, signers)})
+        for role, version in {**staged, "snapshot": snapshot.version}.items():
+            (self._staged / f"{role}.json").unlink(missing_ok=True)
+            if role != "root":  # the version before stays, as vehicles may be reading it
+                (self._metadata / f"{version - 2}.{role}.json").unlink(missing_ok=True)
+
+    def bundle(self, vehicle: str) -> bytes:
+        """All that one vehicle needs to update from any earlier version, in one file."""
+        path = target_path(vehicle)
+        role = _BINS.get_role_for_target(path)
+        targets = self._live(role, Targets)
+        if targets is None or path not in targets.targets:
+            raise RepositoryStateError(f"{self._folder}: no parameters of vehicle {vehicle!r} are published here")
+        names = [f"metadata/{version}.root.json" for version in range(1, self._root_version + 1)]
+        names += ["metadata/timestamp.json", f"metadata/{self._snapshot_version}.snapshot.json"]
+        names += [f"metadata/{self._versions[name]}.{name}.json" for name in ("targets", role)]
+        names.append(f"targets/{targets.targets[path].hashes['sha256']}.{path}")
+        try:
+            return bundle_bytes({name: (self._folder / name).read_bytes() for name in names})
+        except OSError as error:
+            raise RepositoryStateError(f"{error.filename}: cannot be read: {error.strerror}") from None
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Replace a file in one step; it is on the disk after the sync before the timestamp is replaced."""
+    new = path.with_suffix(".new")
+    try:
+        new.write_bytes(content)
+        new.replace(path)
+    except OSError as error:
+        raise RepositoryStateError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _set_keys(root: Root, role: str, new: NewKeys) -> None:
+    for key in new.keys:
+        root.add_key(key, role)
+    root.roles[role].threshold = new.threshold
+
+
+def _delegate(targets: Targets, new: NewKeys) -> None:
+    """Let the keys of targets sign the bins, too."""
+    keys: dict[str, Key] = {key.keyid: key for key in new.keys}
+    targets.delegations = Delegations(keys, succinct_roles=SuccinctRoles(list(keys), new.threshold, _BIN_BITS, "bins"))
+
+
+def _facts(file: TargetFile) -> TargetFacts:
+    return msgspec.convert(file.custom, TargetFacts)
+
+
+def _set_target(targets: Targets, path: str, length: int, digest: str, facts: TargetFacts) -> None:
+    custom = msgspec.to_builtins(facts)
+    targets.targets[path] = TargetFile(length, {"sha256": digest}, path, {"custom": custom})
+
+
+def _keyids(delegator: Root | Targets, role: str) -> Sequence[str]:
+    return delegator.get_delegated_role(role).keyids
+
+
+def _is_signed(delegator: Root | Targets, role: str, metadata: Metadata[Any]) -> bool:
+    try:
+        delegator.verify_delegate(role, metadata.signed_bytes, metadata.signatures)
+    except UnsignedMetadataError:
+        return False
+    return True
+
+
+def _signed_by(root: Root, role: str, signed: Signed, signers: Sequence[Signer]) -> bytes:
+    metadata = Metadata[Any](signed)
+    for signer in signers:
+        if signer.public_key.keyid in root.roles[role].keyids:
+            metadata.sign(signer, append=True)
+    return _encoded(metadata)
+
+
+def _encoded(metadata: Metadata[Any]) -> bytes:
+    return metadata.to_bytes(JSONSerializer(compact=True))

@@ -1,0 +1,326 @@
+"""The update of a vehicle: TUF's client verifies what the repository offers, then come the checks of our own.
+
+TUF sees to signatures, thresholds, versions, expiry and digests. Ours are about currents: vehicle, layout, DBC, limits,
+largest step against the set in force, expiry of the set. A set that passes goes on trial
+(:mod:`ecu_node.update.trial`) in the running node. Metadata that TUF has verified is kept, and revocations hold, even
+where our own checks then refuse the set; whatever TUF refuses leaves the state as it was.
+"""
+
+import os
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated
+from urllib.parse import quote
+
+import msgspec
+from msgspec.structs import replace
+from tuf.api import exceptions
+from tuf.api.metadata import Metadata, Root
+from tuf.ngclient import Updater, UpdaterConfig
+from urllib3.exceptions import HTTPError
+
+from ecu_node.core.status import Reason, TrustError, UnfitError
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import UserError
+from ecu_node.parameters import MAX_FILE_BYTES, BranchParameters, VehicleParameters, check_fit, decode_parameters
+from ecu_node.update.sources import open_source
+from ecu_node.update.state import (
+    ParameterSet,
+    State,
+    add_decision,
+    locked,
+    read_state,
+    require_not_expired,
+    state_path,
+    time_text,
+    write_state,
+)
+
+__all__ = ["TargetFacts", "provision", "target_path", "update"]
+
+_CONFIG = UpdaterConfig(max_delegations=4, targets_max_length=2_000_000)
+"""Other limits are TUF's own: 16 kB for a timestamp, 500 kB for a root, 2 MB for a snapshot."""
+_LARGEST_ROOT_BYTES = 512_000
+_WORK = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108
+"""Where TUF's client works: in memory where there is such a folder, which spares time and flash."""
+_ROLES = ("root", "timestamp", "snapshot")
+"""Metadata that a client keeps, against replays."""
+_Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+
+
+class TargetFacts(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Custom fields of a target: what is signed of a parameter file besides its digest."""
+
+    vehicle: str
+    layout: _Digest
+    dbc: _Digest
+    expires: datetime
+    allow_large_step: bool = False
+    revoked: Annotated[list[_Digest], msgspec.Meta(description="SHA-256 of files that must not be used any more")] = []
+
+
+class _SignedExpiry(msgspec.Struct):
+    expires: datetime
+
+
+class _OnlyExpiry(msgspec.Struct):
+    """Verified metadata, of which only the expiry is read again."""
+
+    signed: _SignedExpiry
+
+
+class _Offer(msgspec.Struct, frozen=True):
+    """What the repository has for this vehicle, verified by TUF."""
+
+    trusted: dict[str, str]
+    facts: TargetFacts
+    content: bytes
+    sha256: str
+
+
+def target_path(vehicle: str) -> str:
+    """Path of a vehicle's parameter file in the repository, such as ``V001.json``; it never leads anywhere else."""
+    return f"{quote(vehicle, safe='')}.json"
+
+
+def provision(folder: Path, vehicle: str, root: Path, now: datetime) -> int:
+    """Begin the state of a vehicle: which repository it trusts.
+
+    Parameters
+    ----------
+    folder : Path
+        State of the vehicle; made if it does not exist.
+    vehicle : str
+        Identity of the vehicle.
+    root : Path
+        Root metadata of the repository, such as ``metadata/1.root.json``; it is trusted as it is.
+    now : datetime
+        Time of day, for the log.
+
+    Returns
+    -------
+    int
+        Version of the root.
+
+    Raises
+    ------
+    UserError
+        If the file is no root that its own keys have signed, there is a state already, or it cannot be written.
+    """
+    try:
+        content = root.read_bytes()[: _LARGEST_ROOT_BYTES + 1]
+        metadata = Metadata[Root].from_bytes(content)
+        metadata.signed.verify_delegate("root", metadata.signed_bytes, metadata.signatures)
+        text = content.decode()
+    except OSError as error:
+        raise UserError(f"{root}: cannot read the root: {error.strerror}") from None
+    except (exceptions.RepositoryError, ValueError, AttributeError, UnicodeDecodeError):
+        hint = "a key set of version 1.0; " if content.startswith(b'{"keys":') else ""
+        raise UserError(f"{root}: {hint}1.root.json of 'calibrator repository init' is expected") from None
+    if not isinstance(metadata.signed, Root):
+        raise UserError(f"{root}: metadata, but not a root; 1.root.json is expected")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be made: {error.strerror}; choose another --state") from None
+    with locked(folder):
+        if state_path(folder).exists():
+            raise UserError(f"{folder}: there is a state already; a new root comes with 'ecu-node update'")
+        write_state(folder, State(vehicle=vehicle, root=text, latest=now))
+        add_decision(folder, "provisioned", f"vehicle {vehicle} trusts root {metadata.signed.version}", now)
+    return metadata.signed.version
+
+
+def update(
+    folder: Path,
+    source: str,
+    database: VehicleDatabase,
+    now: datetime,
+    *,
+    dry_run: bool = False,
+    on_wait: Callable[[str], None] = lambda _: None,
+) -> str:
+    """Take what a repository offers to this vehicle: a set goes on trial, a revocation holds at once.
+
+    Parameters
+    ----------
+    folder : Path
+        State of the vehicle.
+    source : str
+        Bundle, folder or URL.
+    database : VehicleDatabase
+        Layout and DBC of the vehicle.
+    now : datetime
+        Time of day.
+    dry_run : bool
+        Check all, change nothing.
+    on_wait : callable
+        Takes one line for the user if another process holds the state for more than a second.
+
+    Returns
+    -------
+    str
+        What became of it, one line.
+
+    Raises
+    ------
+    UnfitError
+        With the reason why it is refused.
+    UserError
+        If the state cannot be written.
+    """
+    with locked(folder, on_wait=on_wait):
+        state = read_state(folder)
+        try:
+            offer = _verified_offer(state, source, max(now, state.latest))
+            kept, told = _without_revoked(state, offer, now)
+        except UnfitError as error:
+            if not dry_run:
+                add_decision(folder, "refused", str(error), now)
+            raise
+        refusal = None
+        try:
+            taken, event, text = _judged(kept, offer, source, database, now)
+        except UnfitError as error:
+            refusal, taken, event, text = error, kept, "refused", str(error)
+        if not dry_run:
+            write_state(folder, taken)
+            for entry, words in (("revoked", told), (event, text)):
+                if words and entry != "nothing new":
+                    add_decision(folder, entry, words, now)
+        if refusal is not None:
+            raise type(refusal)(refusal.reason, f"{refusal}; {told}" if told else str(refusal))
+    return f"revoked: {told}; {event}: {text}" if told else f"{event}: {text}"
+
+
+def _verified_offer(state: State, source: str, now: datetime) -> _Offer:
+    """Run TUF's client workflow on a copy of the trusted metadata; the state is not touched."""
+    fetcher, base = open_source(source)
+    target = target_path(state.vehicle)
+    with TemporaryDirectory(prefix="ecu-node-", dir=_WORK) as name:
+        work = Path(name)
+        for role, text in (("timestamp", state.timestamp), ("snapshot", state.snapshot)):
+            if text is not None:
+                (work / f"{role}.json").write_text(text)
+        try:
+            updater = Updater(
+                name, f"{base}metadata", None, f"{base}targets", fetcher, _CONFIG, bootstrap=state.root.encode()
+            )
+            info = updater.get_targetinfo(target)
+            for path in work.glob("*.json"):
+                _require_fresh(path, source, now)
+            if info is None:
+                raise TrustError(
+                    Reason.NO_PARAMETERS, f"{source}: the repository has no parameters for vehicle {state.vehicle!r}"
+                )
+            if info.length > MAX_FILE_BYTES or set(info.hashes) != {"sha256"}:
+                raise TrustError(Reason.MALFORMED_PARAMETERS, f"{source}: {target} is no parameter file")
+            content = Path(updater.download_target(info, str(work / "parameters"))).read_bytes()
+            facts = msgspec.convert(info.custom, TargetFacts)
+        except (exceptions.RepositoryError, exceptions.DownloadError, HTTPError) as error:
+            raise _refusal(error, source, state.vehicle) from None
+        except msgspec.ValidationError as error:
+            raise TrustError(Reason.MALFORMED_PARAMETERS, f"{source}: custom fields of {target}: {error}") from None
+        trusted = {role: (work / f"{role}.json").read_text() for role in _ROLES}
+    return _Offer(trusted, facts, content, info.hashes["sha256"])
+
+
+def _require_fresh(path: Path, source: str, now: datetime) -> None:
+    """Check the expiry of verified metadata against the time that is believed: TUF's client asks the clock alone."""
+    expires = msgspec.json.decode(path.read_bytes(), type=_OnlyExpiry).signed.expires
+    if now >= expires:
+        raise TrustError(
+            Reason.NOT_VALID_NOW,
+            f"{source}: {path.name} expired at {time_text(expires)}, and the latest time seen here is "
+            f"{time_text(now)}; get a newer one",
+        )
+
+
+def _refusal(error: Exception, source: str, vehicle: str) -> TrustError:
+    """Translate an error of TUF's client into one line with a reason."""
+    hint = {
+        Reason.NOT_VALID_NOW: "; get a newer one, or set the clock",
+        Reason.REPLAYED: "; older than what was accepted before",
+        Reason.NO_PARAMETERS: f"; is it complete, and for vehicle {vehicle!r}, which this is?",
+    }
+    kinds = (
+        (exceptions.ExpiredMetadataError, Reason.NOT_VALID_NOW),
+        (exceptions.BadVersionNumberError, Reason.REPLAYED),
+        (exceptions.UnsignedMetadataError, Reason.NOT_SIGNED),
+        (exceptions.LengthOrHashMismatchError, Reason.NOT_SIGNED),
+        (exceptions.DownloadLengthMismatchError, Reason.MALFORMED_PARAMETERS),
+        (exceptions.DownloadError, Reason.NO_PARAMETERS),
+        (HTTPError, Reason.NO_PARAMETERS),
+        (exceptions.RepositoryError, Reason.MALFORMED_PARAMETERS),
+    )
+    reason = next(reason for kind, reason in kinds if isinstance(error, kind))
+    return TrustError(reason, f"{source}: {error}{hint.get(reason, '')}")
+
+
+def _without_revoked(state: State, offer: _Offer, now: datetime) -> tuple[State, str]:
+    """The state with the verified metadata and without the sets that were revoked; and what was revoked, in words."""
+    if offer.facts.vehicle != state.vehicle:
+        raise TrustError(
+            Reason.WRONG_VEHICLE, f"the parameters are for {offer.facts.vehicle!r}, this is {state.vehicle!r}"
+        )
+    held = {name: getattr(state, name) for name in ("in_force", "on_trial", "before")}
+    revoked = {name: found for name, found in held.items() if found and found.sha256 in offer.facts.revoked}
+    kept = {name: None if name in revoked else found for name, found in held.items()}
+    state = replace(state, latest=max(now, state.latest), **offer.trusted, **kept)
+    if "in_force" in revoked:
+        state = replace(state, in_force=state.before, before=None, ended="revoked")
+    elif revoked and state.in_force is None:
+        state = replace(state, ended="revoked")
+    names = list(dict.fromkeys(map(str, revoked.values())))
+    now_in_force = f"{state.in_force} is in force now" if state.in_force else "nothing is in force now"
+    return state, f"{', '.join(names)}; {now_in_force}" if names else ""
+
+
+def _judged(
+    state: State, offer: _Offer, source: str, database: VehicleDatabase, now: datetime
+) -> tuple[State, str, str]:
+    """Decide on the set that is offered: the new state, the event, and words."""
+    if offer.sha256 in offer.facts.revoked:
+        return state, "nothing new", f"what the repository has for vehicle {state.vehicle} is revoked"
+    try:
+        parameters = decode_parameters(offer.content, source)
+        found = ParameterSet(content=offer.content.decode(), expires=offer.facts.expires)
+        if (parameters.layout.sha256, parameters.dbc.sha256) != (offer.facts.layout, offer.facts.dbc):
+            raise TrustError(
+                Reason.MALFORMED_PARAMETERS, f"{source}: layout and DBC are not those of the signed description"
+            )
+        if state.in_force == found:
+            return replace(state, on_trial=None), "nothing new", f"{found} is in force"
+        if state.on_trial == found:
+            return state, "nothing new", f"{found} is on trial"
+        if state.failed == found:
+            raise TrustError(Reason.REPLAYED, f"{source}: {found} has failed its trial here; calibrate anew")
+        require_not_expired(found, state, now)
+        check_fit(parameters, database, state.vehicle)
+        if not offer.facts.allow_large_step and state.in_force is not None:
+            _require_small_step(state.in_force.parameters, parameters, database)
+    except UnfitError as error:
+        text = str(error)
+        raise type(error)(error.reason, text if text.startswith(source) else f"{source}: {text}") from None
+    return replace(state, on_trial=found), "on trial", str(found)
+
+
+def _require_small_step(before: VehicleParameters, new: VehicleParameters, database: VehicleDatabase) -> None:
+    """Check that parameters differ from those in force by the layout's largest step at most."""
+
+    def applied(branch: BranchParameters | None) -> tuple[float, float]:
+        return (branch.drift, branch.offset_a) if branch is not None and branch.apply else (0.0, 0.0)
+
+    layout = database.layout
+    for name in layout.branch_names:
+        (old_drift, old_a), (new_drift, new_a) = (applied(item.branches.get(name)) for item in (before, new))
+        drift, offset_a = abs(old_drift - new_drift), abs(old_a - new_a)
+        if drift > layout.activation.step_drift or offset_a > layout.step_offset_a:
+            raise TrustError(
+                Reason.IMPLAUSIBLE_PARAMETERS,
+                f"branch {name}: differs from the set in force by {drift:.3g} in drift and {offset_a:.3g} A in offset, "
+                f"at most {layout.activation.step_drift:g} and {layout.step_offset_a:g} A are allowed; if that is "
+                f"meant, add it with --allow-large-step",
+            )

@@ -1,0 +1,306 @@
+"""Parameters of a running node: those in force, those on trial, and the way from one to the other. Needs no TUF."""
+
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from datetime import datetime, timedelta
+from functools import partial
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from ecu_node.bus.wiring import InForce, Mode, put_in_force
+from ecu_node.core.corrector import Corrector
+from ecu_node.core.status import Reason, TrustError, UnfitError
+from ecu_node.database import VehicleDatabase
+from ecu_node.documents import signature
+from ecu_node.errors import UserError
+from ecu_node.parameters import VehicleParameters, check_fit
+from ecu_node.update.state import (
+    ParameterSet,
+    State,
+    add_decision,
+    locked,
+    read_state,
+    require_not_expired,
+    state_path,
+    write_state,
+)
+from ecu_node.update.trial import ParameterTrial, TrialResult, begin_trial
+
+__all__ = ["ParameterStore", "conclude", "end_expired"]
+
+_LOOK_EVERY_S = 1.0
+"""Between looks whether the state has changed, or what is in force has expired. [s]"""
+_RETRY_EVERY_S = 60.0
+"""Between attempts to begin a trial, as before the clock is set, or to write a decision, as on a full disk. [s]"""
+_SURELY_EXPIRED = timedelta(minutes=1)
+"""A clock that jumps ahead for a moment, as before it is set from the network, ends nothing for ever."""
+
+
+def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now: datetime) -> State:
+    """End a trial: the set is in force, or gone. Does not wait for other processes, as the bus would wait too.
+
+    Parameters
+    ----------
+    folder : Path
+        State of the vehicle.
+    tried : ParameterSet
+        The set that was on trial.
+    passed : bool
+        Whether it did as it promised; a set that has expired meanwhile did not.
+    text : str
+        What was seen, for the log.
+    now : datetime
+        Time of day.
+
+    Returns
+    -------
+    State
+        After that; as it was if another set is on trial by now.
+
+    Raises
+    ------
+    UserError
+        If the state cannot be read or written.
+    """
+    with locked(folder, wait=False):
+        state = read_state(folder)
+        if state.on_trial != tried:
+            return state
+        try:
+            require_not_expired(tried, state, now)
+        except TrustError as error:
+            passed, text = False, str(error)
+        if passed:
+            state = replace(state, in_force=tried, before=state.in_force, on_trial=None, failed=None, ended=None)
+        else:
+            state = replace(state, on_trial=None, failed=tried)
+        state = replace(state, latest=max(now, state.latest))
+        write_state(folder, state)
+        add_decision(folder, "in force" if passed else "failed", f"{tried}: {text}", now)
+    return state
+
+
+def end_expired(folder: Path, expired: ParameterSet, now: datetime) -> State:
+    """Take an expired set out of the state for good: a clock that is set back later does not bring it back."""
+    with locked(folder, wait=False):
+        state = read_state(folder)
+        if state.in_force != expired:
+            return state
+        state = replace(state, in_force=None, before=None, ended="expired")
+        write_state(folder, state)
+        add_decision(folder, "expired", str(expired), now)
+    return state
+
+
+class ParameterStore:
+    """Keeps the parameters of a running node as the state of its vehicle says.
+
+    Parameters
+    ----------
+    folder : Path
+        State of the vehicle.
+    database : VehicleDatabase
+        Layout and DBC in use.
+    mode : Mode
+        Where corrected values go.
+    say : callable
+        Takes one line for the log.
+    now : callable
+        The time of day.
+    vehicle : str or None
+        Identity of the vehicle, where it is known besides; the state of another one is not used.
+    background : Executor or None
+        Writes decisions, as a slow disk may take seconds, and the bus must not wait; None: written at once.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        database: VehicleDatabase,
+        *,
+        mode: Mode,
+        say: Callable[[str], None],
+        now: Callable[[], datetime],
+        vehicle: str | None = None,
+        background: Executor | None = None,
+    ) -> None:
+        self._folder, self._database, self._mode, self._say, self._now = folder, database, mode, say, now
+        self._vehicle, self._background = vehicle, background
+        self._due_s = self._retry_due_s = float("-inf")
+        self._state: State | None = None
+        self._seen = signature(state_path(folder))
+        self._unread: str | None = None
+        self._fitting: tuple[ParameterSet, VehicleParameters] | None = None
+        self._tried: ParameterSet | None = None
+        self._trial: ParameterTrial | None = None
+        self._result: TrialResult | None = None
+        self._no_trial: Reason | None = None
+        self._expired_since: datetime | None = None
+        self._writing: Future[State] | None = None
+        self._after_writing: Callable[[State], None] = lambda _: None
+        try:
+            self._state = read_state(folder)
+        except TrustError as error:
+            self.in_force, self.why_not = InForce(parameters=None, reason=error.reason), str(error) or None
+            self._unread = str(error)
+        else:
+            self.in_force, self.why_not = self._in_force(self._state)
+
+    def look(self, corrector: Corrector, now_s: float, *, asked: bool = False) -> bool:
+        """See whether a trial has ended, the state was changed, or time has passed; to be called now and then.
+
+        Parameters
+        ----------
+        corrector : Corrector
+            Where new parameters are put in force.
+        now_s : float
+            Now. [s]
+        asked : bool
+            Read the state whether it was changed or not.
+
+        Returns
+        -------
+        bool
+            Whether other parameters are in force than before, or none.
+        """
+        self._finish_writing(now_s)
+        self._try(corrector, now_s)
+        if not asked and now_s < self._due_s:
+            return False
+        self._due_s = now_s + _LOOK_EVERY_S
+        if self._writing is None:
+            self._read_again(asked=asked)
+        if self._state is None:
+            return False
+        self._end_expired(self._state, now_s)
+        in_force, why_not = self._in_force(self._state)
+        if in_force == self.in_force:
+            return False
+        put_in_force(corrector, self._database, in_force, now_s, mode=self._mode)
+        corrector.counters.reloads += 1
+        self.in_force, self.why_not = in_force, why_not
+        if in_force.parameters is not None:
+            self._say(f"{self._state.in_force} of vehicle {self._state.vehicle} is in force")
+        else:
+            self._say(f"passing measured values through: {why_not}")
+        return True
+
+    def _read_again(self, *, asked: bool) -> None:
+        """Read the state if it was changed, or could not be read the last time: it may hold a revocation."""
+        seen = signature(state_path(self._folder))
+        if not asked and self._unread is None and seen == self._seen:
+            return
+        self._seen = seen
+        try:
+            self._state, self._unread = read_state(self._folder), None
+        except UserError as error:
+            if asked or str(error) != self._unread:
+                self._say(f"the state of the vehicle is not read, what was in force stays: {error}")
+            self._unread = str(error)
+
+    def _in_force(self, state: State) -> tuple[InForce, str | None]:
+        """What the state says, and why there are no parameters."""
+        try:
+            if state.in_force is None:
+                raise _why_nothing(state)
+            return InForce(parameters=self._usable(state, state.in_force)), None
+        except UnfitError as error:
+            return InForce(parameters=None, reason=error.reason), f"{self._folder}: {error}"
+
+    def _usable(self, state: State, found: ParameterSet) -> VehicleParameters:
+        """Parameters of a set that has not expired and fits; decoded once, as the bus waits meanwhile."""
+        require_not_expired(found, state, self._now())
+        if self._fitting is None or self._fitting[0] is not found:
+            parameters = found.parameters
+            check_fit(parameters, self._database, self._vehicle or state.vehicle)
+            self._fitting = found, parameters
+        return self._fitting[1]
+
+    def _try(self, corrector: Corrector, now_s: float) -> None:
+        """Begin the trial of the set on trial, or go on with it; at its end the set is in force, or gone."""
+        on_trial = self._state.on_trial if self._state is not None else None
+        if on_trial != self._tried:
+            self._tried, self._trial, self._no_trial, self._result = on_trial, None, None, None
+            self._retry_due_s = float("-inf")
+        if self._state is None or on_trial is None:
+            return
+        if self._result is not None:
+            result = self._result
+            work = partial(conclude, self._folder, on_trial, passed=result.passed, text=result.text, now=self._now())
+            self._write(work, partial(self._say_result, on_trial, result), now_s)
+        elif self._trial is not None:
+            if corrector.watch.is_whole(now_s):
+                self._result = self._trial.look(now_s)
+        elif now_s >= self._retry_due_s:
+            try:
+                require_not_expired(on_trial, self._state, self._now())
+                parameters = on_trial.parameters
+                check_fit(parameters, self._database, self._vehicle or self._state.vehicle)
+            except UnfitError as error:
+                self._retry_due_s = now_s + _RETRY_EVERY_S
+                if error.reason is not self._no_trial:
+                    self._no_trial = error.reason
+                    self._say(f"no trial yet: {error}")
+                return
+            self._say(f"{on_trial} is on trial")
+            self._trial = begin_trial(parameters, self._database, corrector.branches)
+
+    def _say_result(self, tried: ParameterSet, result: TrialResult, state: State) -> None:
+        self._result = None
+        if result.passed and state.in_force != tried:
+            self._say(f"{tried} is not in force, though its trial went well: the end of decisions.log says why")
+        else:
+            self._say(f"{tried} has {'passed' if result.passed else 'failed'} its trial: {result.text}")
+
+    def _end_expired(self, state: State, now_s: float) -> None:
+        """Once the set in force is seen to be expired for a minute, it is so for good."""
+        found, now = state.in_force, self._now()
+        if found is None or now < found.expires:
+            self._expired_since = None
+            return
+        self._expired_since = self._expired_since or now
+        if now - self._expired_since >= _SURELY_EXPIRED:
+            self._write(partial(end_expired, self._folder, found, now), lambda _: None, now_s)
+
+    def _write(self, work: Callable[[], State], after: Callable[[State], None], now_s: float) -> None:
+        """Write a decision in the background, unless one is being written or could not be a moment ago."""
+        if self._writing is not None or now_s < self._retry_due_s:
+            return
+        self._after_writing = after
+        if self._background is not None:
+            self._writing = self._background.submit(work)
+        else:
+            self._writing = Future()
+            try:
+                self._writing.set_result(work())
+            except UserError as error:
+                self._writing.set_exception(error)
+        self._finish_writing(now_s)
+
+    def _finish_writing(self, now_s: float) -> None:
+        """Take a decision over once it is written; try again later if that failed, as nothing changes meanwhile."""
+        if self._writing is None or not self._writing.done():
+            return
+        written, self._writing = self._writing, None
+        try:
+            self._state = written.result()
+        except UserError as error:
+            self._retry_due_s = now_s + _RETRY_EVERY_S
+            self._say(
+                f"a decision cannot be written now, what was in force stays, and it is tried again in "
+                f"{_RETRY_EVERY_S:g} s: {error}"
+            )
+            return
+        self._due_s = float("-inf")
+        self._after_writing(self._state)
+
+
+def _why_nothing(state: State) -> TrustError:
+    if state.on_trial is not None:
+        return TrustError(Reason.ON_TRIAL, f"{state.on_trial} is on trial, and nothing is in force yet")
+    if state.ended == "revoked":
+        return TrustError(Reason.REVOKED, "what was in force is revoked; update to new parameters")
+    if state.ended == "expired":
+        return TrustError(Reason.NOT_VALID_NOW, "what was in force has expired; update to new parameters")
+    return TrustError(Reason.NO_PARAMETERS, "nothing came yet; see 'ecu-node update'")

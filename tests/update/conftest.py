@@ -1,0 +1,112 @@
+"""A repository, a vehicle that trusts it, and their commands in this process."""
+
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from calibrator.cli import main as calibrator_main
+from ecu_node.cli import main as node_main
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.layout import read_layout
+from ecu_node.parameters import VehicleParameters
+from ecu_node.update.signers import PASSPHRASE_VARIABLE
+from tests.ecu_node.vehicles import LAYOUT, parameters_for
+from tests.update.held import held, new_vehicle
+from tests.update.repo import Repo, pass_trial
+
+
+def _command(name: str, *arguments: object) -> tuple[int, str, str]:
+    """Run a command in this process: exit code, output, errors."""
+    words = [os.fsdecode(item) if isinstance(item, bytes) else str(item) for item in arguments]
+    with pytest.MonkeyPatch.context() as patch:
+        out, err = StringIO(), StringIO()
+        patch.setattr(sys, "argv", [name, *words])
+        patch.setattr(sys, "stdout", out)
+        patch.setattr(sys, "stderr", err)
+        try:
+            code = node_main(words) if name == "ecu-node" else calibrator_main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return code, out.getvalue(), err.getvalue()
+
+
+def node(*arguments: object) -> tuple[int, str, str]:
+    return _command("ecu-node", *arguments)
+
+
+def calibrator(*arguments: object) -> tuple[int, str, str]:
+    return _command("calibrator", *arguments)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _without_passphrase() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv(PASSPHRASE_VARIABLE, raising=False)
+        yield
+
+
+@pytest.fixture(scope="session")
+def database() -> VehicleDatabase:
+    """The project's own layout and DBC."""
+    return read_database(read_layout(LAYOUT))
+
+
+@pytest.fixture(scope="session")
+def parameters(database: VehicleDatabase) -> VehicleParameters:
+    return parameters_for(database, battery=(0.05, 2.0), motor=(0.0, -1.0))
+
+
+@pytest.fixture(scope="session")
+def other(parameters: VehicleParameters) -> VehicleParameters:
+    """Newer parameters of the same vehicle, a small step from the first."""
+    battery = replace(parameters.branches["battery"], drift=0.06)
+    return replace(parameters, number=301, branches={**parameters.branches, "battery": battery})
+
+
+@pytest.fixture(scope="session")
+def offered(tmp_path_factory: pytest.TempPathFactory, parameters: VehicleParameters) -> Repo:
+    """A repository that offers parameters for v1 and v2; not to be changed, see :func:`repo`."""
+    made = Repo(tmp_path_factory.mktemp("offered"), calibrator, node)
+    made.create()
+    made.add(parameters)
+    made.offer(parameters, vehicle="v2")
+    made.provision(made.folder / "new")
+    made.provision(made.folder / "in force")
+    made.updated(made.folder / "in force")
+    pass_trial(made.folder / "in force")
+    return made
+
+
+@pytest.fixture
+def repo(offered: Repo, tmp_path: Path) -> Repo:
+    return offered.copy(tmp_path)
+
+
+@pytest.fixture
+def new(offered: Repo, tmp_path: Path) -> Path:
+    """State of a vehicle that holds nothing yet."""
+    return Path(shutil.copytree(offered.folder / "new", tmp_path / "v1"))
+
+
+@pytest.fixture
+def state(offered: Repo, tmp_path: Path) -> Path:
+    """State of a vehicle with set 300 in force."""
+    return Path(shutil.copytree(offered.folder / "in force", tmp_path / "v1 in force"))
+
+
+@pytest.fixture
+def vehicle(tmp_path: Path) -> Path:
+    """State of a vehicle that holds nothing."""
+    return new_vehicle(tmp_path / "vehicle")
+
+
+@pytest.fixture
+def correcting(tmp_path: Path, parameters: VehicleParameters) -> Path:
+    """State of a vehicle with set 300 in force."""
+    return new_vehicle(tmp_path / "correcting", held(parameters))

@@ -1,0 +1,152 @@
+"""A repository with its keys, a vehicle that trusts it, and an attacker who has some of the keys."""
+
+import shutil
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from msgspec.structs import replace
+from tuf.api.metadata import Metadata, MetaFile, Snapshot, SuccinctRoles, Timestamp
+from tuf.api.serialization.json import JSONSerializer
+
+from ecu_node.parameters import VehicleParameters, write_parameters
+from ecu_node.update.signers import signer_of
+from ecu_node.update.state import read_state
+from ecu_node.update.store import conclude
+from tests.ecu_node.vehicles import LAYOUT
+
+VEHICLE = "v1"
+Run = Callable[..., tuple[int, str, str]]
+"""A command line, and what comes of it: exit code, output, errors."""
+ALL = ("r1", "r2", "t1", "t2", "snapshot", "timestamp")
+"""Names of the keys in the folder of a repository."""
+
+
+def pass_trial(state: Path, *, passed: bool = True) -> None:
+    """End the trial of a vehicle, as its node does after a drive."""
+    on_trial = read_state(state).on_trial
+    assert on_trial is not None
+    conclude(state, on_trial, passed=passed, text="seen", now=datetime.now(UTC))
+
+
+class Repo:
+    """A repository in ``folder / "repo"``, its keys in ``folder / "keys"``; the commands make it."""
+
+    def __init__(self, folder: Path, calibrator: Run, node: Run) -> None:
+        self.folder, self.calibrator, self.node, self.vehicle = folder, calibrator, node, VEHICLE
+        self.path, self.metadata = folder / "repo", folder / "repo" / "metadata"
+
+    def done(self, *words: object) -> str:
+        """Run ``calibrator repository``, which must succeed."""
+        code, out, err = self.calibrator("repository", *words)
+        assert code == 0, err
+        return out
+
+    def create(self) -> None:
+        keys = self.folder / "keys"
+        for name in (*ALL, "mallory", "new"):
+            self.done("key", name, "--no-passphrase", "--out", keys)
+        roles = {"root": ("r1", "r2"), "targets": ("t1", "t2"), "snapshot": ("snapshot",), "timestamp": ("timestamp",)}
+        options = [
+            word for role, names in roles.items() for name in names for word in (f"--{role}", keys / f"{name}.pub")
+        ]
+        self.done("init", self.path, *options)
+
+    def key(self, name: str) -> Path:
+        return self.folder / "keys" / f"{name}.key"
+
+    def publish(self, *names: str) -> None:
+        self.done("publish", self.path, *(word for name in names or ALL for word in ("--key", self.key(name))))
+
+    def add(self, parameters: VehicleParameters, *options: object, vehicle: str = VEHICLE) -> None:
+        path = self.folder / f"{vehicle}.json"
+        write_parameters(replace(parameters, vehicle=vehicle), path)
+        self.done("add", self.path, path, *options)
+
+    def offer(self, parameters: VehicleParameters, *options: object, vehicle: str = VEHICLE) -> None:
+        self.add(parameters, *options, vehicle=vehicle)
+        self.publish()
+
+    def bundle(self, vehicle: str = VEHICLE) -> Path:
+        self.done("bundle", self.path, vehicle, "--out", self.folder / "bundles")
+        return self.folder / "bundles" / f"{vehicle}.json.xz"
+
+    def provision(self, state: Path, vehicle: str = VEHICLE) -> None:
+        code, _, err = self.node(
+            "provision", "--vehicle", vehicle, "--root", self.metadata / "1.root.json", "--state", state
+        )
+        assert code == 0, err
+
+    def update(self, state: Path, source: object = None, *options: object) -> tuple[int, str, str]:
+        source = self.path if source is None else source
+        return self.node("update", source, "--state", state, "--layout", LAYOUT, *options)
+
+    def updated(self, state: Path, source: object = None) -> str:
+        code, out, err = self.update(state, source)
+        assert code == 0, err
+        return out
+
+    def refused(self, state: Path, words: str, source: object = None) -> None:
+        """Require that an update is refused in one line, and that nothing has changed."""
+        before = (state / "state.json").read_bytes()
+        code, out, err = self.update(state, source)
+        assert (code, out) == (1, ""), (out, err)
+        assert err.startswith("ecu-node: ")
+        assert err.count("\n") == 1
+        assert err[:-1].isprintable()
+        assert words in err, err
+        assert (state / "state.json").read_bytes() == before
+        assert words in (state / "decisions.log").read_text().splitlines()[-1]
+
+    def copy(self, place: Path) -> "Repo":
+        """The same with a repository of its own."""
+        shutil.copytree(self.path, place / "repo")
+        shutil.copytree(self.folder / "keys", place / "keys")
+        return Repo(place, self.calibrator, self.node)
+
+    def live(self, role: str) -> Path:
+        """Newest metadata of a role."""
+        if role == "timestamp":
+            return self.metadata / "timestamp.json"
+        return max(self.metadata.glob(f"*.{role}.json"), key=lambda path: int(path.name.partition(".")[0]))
+
+    @property
+    def bin(self) -> str:
+        """The bin that holds the vehicle."""
+        return SuccinctRoles([], 1, 11, "bins").get_role_for_target(f"{self.vehicle}.json")
+
+    def forge(self, role: str, change: Callable[[Any], object], *names: str, bump: bool = True) -> None:
+        """Change metadata in place, with a higher version, and sign it with these keys alone."""
+        path = self.live(role)
+        metadata: Metadata[Any] = Metadata.from_file(str(path))
+        change(metadata.signed)
+        metadata.signed.version += bump
+        metadata.signatures.clear()
+        for name in names:
+            metadata.sign(signer_of(str(self.key(name))), append=True)
+        name = "timestamp.json" if role == "timestamp" else f"{metadata.signed.version}.{role}.json"
+        metadata.to_file(str(self.metadata / name), JSONSerializer(compact=True))
+
+    def relist(self, role: str, *names: str) -> None:
+        """Let snapshot and timestamp name the newest metadata of a role, signed with these keys."""
+
+        def list_role(snapshot: Snapshot) -> None:
+            snapshot.meta[f"{role}.json"] = MetaFile(int(self.live(role).name.partition(".")[0]))
+
+        self.forge("snapshot", list_role, *names)
+        self.point(*names)
+
+    def point(self, *names: str) -> None:
+        """Let the timestamp name the newest snapshot."""
+
+        def name_snapshot(timestamp: Timestamp) -> None:
+            path = self.live("snapshot")
+            timestamp.snapshot_meta = MetaFile.from_data(int(path.name.split(".")[0]), path.read_bytes(), ["sha256"])
+
+        self.forge("timestamp", name_snapshot, *names)
+
+
+def expired(signed: Any) -> None:
+    """Change that makes metadata expire a second ago."""
+    signed.expires = datetime.now(UTC).replace(microsecond=0) - timedelta(seconds=1)

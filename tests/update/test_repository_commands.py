@@ -1,0 +1,151 @@
+"""``calibrator repository``: keys, thresholds, signers one after the other, and mistakes in one line."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, generate_private_key
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
+
+from ecu_node.parameters import VehicleParameters
+from ecu_node.update.signers import PASSPHRASE_VARIABLE
+from tests.disk import full_disk
+from tests.update.repo import ALL, Repo
+
+
+def failed(repo: Repo, words: str, *command: object, code: int = 1) -> None:
+    found, out, err = repo.calibrator("repository", *command)
+    assert (found, out, err.count("\n")) == (code, "", 1), (out, err)
+    assert err.startswith("calibrator: ")
+    assert words in err
+
+
+def keys(repo: Repo, *names: str) -> list[object]:
+    return [word for name in names for word in ("--key", repo.key(name))]
+
+
+def test_signers_sign_one_after_the_other(repo: Repo, new: Path, other: VehicleParameters) -> None:
+    repo.updated(new)
+    repo.add(other)
+    failed(repo, "signatures of bins-", "publish", repo.path, *keys(repo, "t1"))
+    assert repo.updated(new).startswith("nothing new: "), "vehicles see nothing of it yet"
+    failed(repo, "signatures of snapshot and 1 more are missing", "publish", repo.path, *keys(repo, "t2"))
+    repo.publish("snapshot", "timestamp")
+    assert repo.updated(new).startswith("on trial: parameter set 301")
+
+
+def test_change_after_a_signature_needs_all_signatures_anew(repo: Repo, other: VehicleParameters) -> None:
+    repo.add(other)
+    failed(repo, "signatures of bins-", "publish", repo.path, *keys(repo, "t1"))
+    repo.done("revoke", repo.path, "v1")
+    failed(repo, "signatures of bins-", "publish", repo.path, *keys(repo, "t2", "snapshot", "timestamp"))
+
+
+def test_publication_that_was_cut_goes_on(
+    repo: Repo, new: Path, other: VehicleParameters, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Up to the new timestamp vehicles see what was there before."""
+    repo.updated(new)
+    repo.add(other)
+    with monkeypatch.context() as patch:
+        patch.setattr("calibrator.repository.repository.os.sync", lambda: 1 / 0)
+        assert repo.calibrator("repository", "publish", repo.path, *keys(repo, *ALL))[0] == 70
+    assert repo.updated(new).startswith("nothing new: ")
+    repo.publish()
+    assert repo.updated(new).startswith("on trial: parameter set 301")
+
+
+def test_publishing_nothing_renews_the_timestamp(repo: Repo, state: Path) -> None:
+    repo.updated(state)
+    repo.publish("snapshot", "timestamp")
+    repo.updated(state)
+    assert "timestamp 2, snapshot 2" in repo.node("inspect", "--state", state)[1]
+
+
+def test_key_by_uri_signs_as_its_file_does(repo: Repo, new: Path, other: VehicleParameters) -> None:
+    """The same way leads to security modules and cloud services."""
+    repo.add(other)
+    private = generate_private_key(SECP256R1())
+    (repo.folder / "ec.pem").write_bytes(private.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    public = private.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
+    (repo.folder / "ec.pub").write_bytes(public)
+    repo.done("rotate", repo.path, "timestamp", "--public", repo.folder / "ec.pub")
+    uri = f"{repo.folder / 'ec.pub'}=file2:{repo.folder / 'ec.pem'}"
+    repo.done("publish", repo.path, *keys(repo, *ALL), "--key", uri)
+    assert repo.updated(new).startswith("on trial: parameter set 301")
+
+
+def test_key_that_cannot_be_had_is_one_line(repo: Repo, monkeypatch: pytest.MonkeyPatch) -> None:
+    public = repo.folder / "keys" / "t1.pub"
+    (repo.folder / "empty").touch()
+    for key, words in (
+        (repo.folder / "none", "cannot read the private key"),
+        (repo.folder / "empty", "cannot be used as a private key"),
+        (public, "cannot be used as a private key"),
+        (f"{public}=file2:{repo.folder / 'none'}", "the key cannot be used"),
+        (f"{public}=pigeon:1", "the key cannot be used"),
+        (f"{repo.folder / 'none'}=file2:x", "cannot read the public key"),
+    ):
+        failed(repo, words, "publish", repo.path, "--key", key)
+    repo.key("t1").chmod(0o644)
+    failed(repo, "others than its owner can read", "publish", repo.path, *keys(repo, "t1"))
+
+
+def test_encrypted_key_signs_with_its_passphrase_alone(
+    repo: Repo, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv(PASSPHRASE_VARIABLE, "short")
+    failed(repo, "at least 12 characters", "key", "dora", "--out", tmp_path, code=2)
+    monkeypatch.setenv(PASSPHRASE_VARIABLE, "a long passphrase")
+    repo.done("key", "dora", "--out", tmp_path)
+    private = tmp_path / "dora.key"
+    assert private.stat().st_mode & 0o777 == 0o600
+    read = ["openssl", "pkey", "-in", str(private), "-passin", "pass:a long passphrase", "-pubout"]
+    assert subprocess.run(read, capture_output=True, check=True).stdout == (tmp_path / "dora.pub").read_bytes()
+    failed(repo, "signatures of", "publish", repo.path, "--key", private)
+    monkeypatch.setenv(PASSPHRASE_VARIABLE, "another passphrase")
+    failed(repo, "is not its passphrase", "publish", repo.path, "--key", private)
+    monkeypatch.delenv(PASSPHRASE_VARIABLE)
+    failed(repo, "give its passphrase in", "publish", repo.path, "--key", private)
+    failed(repo, "give either a passphrase", "key", "e", "--out", tmp_path, code=2)
+
+
+def test_key_is_never_replaced(repo: Repo) -> None:
+    before = repo.key("t1").read_bytes()
+    failed(repo, "there is a key already", "key", "t1", "--no-passphrase", "--out", repo.folder / "keys")
+    failed(repo, "a name for a file is expected", "key", "a/b", "--no-passphrase", "--out", repo.folder, code=2)
+    assert repo.key("t1").read_bytes() == before
+
+
+def test_mistakes_are_one_line_and_change_nothing(repo: Repo, other: VehicleParameters, tmp_path: Path) -> None:
+    def files() -> dict[Path, bytes]:
+        return {path: path.read_bytes() for path in repo.path.rglob("*") if path.is_file()}
+
+    repo.add(other)
+    before, public = files(), repo.folder / "keys" / "t1.pub"
+    (tmp_path / "bad.json").write_text("{}")
+    roles = [word for role in ("--root", "--targets", "--snapshot", "--timestamp") for word in (role, public)]
+    failed(repo, "no repository; make one", "add", tmp_path, repo.folder / "v1.json")
+    failed(repo, "exists and is not empty", "init", repo.path, *roles)
+    failed(repo, "3 signatures of 1 keys", "init", tmp_path / "x", *roles, "--root-threshold", 3, code=2)
+    failed(repo, "no public key", "rotate", repo.path, "root", "--public", tmp_path / "bad.json")
+    failed(repo, "bad.json: ", "add", repo.path, repo.folder / "v1.json", tmp_path / "bad.json")
+    failed(repo, "a second file for vehicle v1", "add", repo.path, repo.folder / "v1.json", repo.folder / "v1.json")
+    failed(repo, "no parameters of vehicle 'v9' here", "revoke", repo.path, "v1", "v9")
+    failed(repo, "64 digits", "revoke", repo.path, "v1", "--sha256", "12", code=2)
+    failed(repo, "no parameters of vehicle 'v9' are published here", "bundle", repo.path, "v9", "--out", tmp_path / "b")
+    assert files() == before
+
+
+def test_damaged_repository_is_one_line(repo: Repo) -> None:
+    repo.live("snapshot").write_text("{}")
+    failed(repo, "cannot be read as metadata", "publish", repo.path, *keys(repo, *ALL))
+
+
+def test_full_disk_leaves_what_vehicles_see(repo: Repo, new: Path, other: VehicleParameters) -> None:
+    repo.updated(new)
+    repo.add(other)
+    with full_disk(300):
+        code, _, err = repo.calibrator("repository", "publish", repo.path, *keys(repo, *ALL))
+    assert (code, err.count("\n")) == (1, 1)
+    assert repo.updated(new).startswith("nothing new: ")

@@ -1,0 +1,289 @@
+"""The attacks that TUF lists, each through the command line: one line, and nothing has changed."""
+
+import lzma
+import shutil
+from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import msgspec
+import pytest
+from tuf.api.metadata import Key, Root, Snapshot, SuccinctRoles, TargetFile, Targets, Timestamp
+
+from ecu_node.parameters import VehicleParameters, encode_parameters
+from ecu_node.update.signers import public_key_of
+from ecu_node.update.sources import bundle_bytes
+from ecu_node.update.state import read_state
+from tests.update.repo import Repo, expired, pass_trial
+
+EVIL = b'{"vehicle": "v1"}'
+
+
+def evil_target(repo: Repo) -> Callable[[Targets], None]:
+    """Change that offers a file of the attacker's own."""
+
+    def change(targets: Targets) -> None:
+        file = targets.targets["v1.json"]
+        found = TargetFile.from_data("v1.json", EVIL, ["sha256"])
+        found.unrecognized_fields = file.unrecognized_fields
+        targets.targets["v1.json"] = found
+        (repo.path / "targets" / f"{found.hashes['sha256']}.v1.json").write_bytes(EVIL)
+
+    return change
+
+
+def test_honest_update_is_taken(repo: Repo, new: Path, state: Path, other: VehicleParameters) -> None:
+    assert repo.updated(new).startswith("on trial: parameter set 300 (")
+    repo.offer(other)
+    assert repo.updated(state, repo.bundle()).startswith("on trial: parameter set 301 (")
+
+
+def test_arbitrary_file_is_refused(repo: Repo, new: Path) -> None:
+    (target,) = (repo.path / "targets").glob("*.v1.json")
+    content = target.read_bytes()
+    target.write_bytes(content.replace(b"0.05", b"0.06"))
+    repo.refused(new, "Observed hash")
+    target.write_bytes(content[:-1])
+    repo.refused(new, "Observed length")
+
+
+@pytest.mark.parametrize("role", ["root", "timestamp", "snapshot", "targets", "bin"])
+def test_metadata_of_foreign_keys_is_refused(role: str, repo: Repo, state: Path, other: VehicleParameters) -> None:
+    repo.offer(other)
+    role = repo.bin if role == "bin" else role
+    repo.forge(role, lambda _: None, "mallory", bump=role == "root")
+    if role == "snapshot":
+        repo.point("timestamp")
+    repo.refused(state, "was signed by 0/")
+
+
+def test_rollback_is_refused(repo: Repo, state: Path, other: VehicleParameters) -> None:
+    old, new_bundle = repo.bundle().read_bytes(), repo.folder / "new.json.xz"
+    repo.offer(other)
+    new_bundle.write_bytes(repo.bundle().read_bytes())
+    repo.updated(state, new_bundle)
+    repo.bundle().write_bytes(old)
+    repo.refused(state, "older than what was accepted before", repo.folder / "bundles" / "v1.json.xz")
+
+
+def test_rollback_of_one_bin_is_refused(repo: Repo, state: Path, other: VehicleParameters) -> None:
+    """By somebody who has the keys of snapshot and timestamp."""
+    repo.offer(other)
+    repo.updated(state)
+
+    def back(snapshot: Snapshot) -> None:
+        snapshot.meta[f"{repo.bin}.json"].version -= 1
+
+    repo.forge("snapshot", back, "snapshot")
+    repo.point("timestamp")
+    repo.refused(state, "older than what was accepted before")
+
+
+@pytest.mark.parametrize("role", ["timestamp", "snapshot", "targets", "bin", "root"])
+def test_freeze_is_noticed_when_metadata_expires(role: str, repo: Repo, new: Path) -> None:
+    role = repo.bin if role == "bin" else role
+    repo.forge(role, expired, "r1", "r2", "t1", "t2", "snapshot", "timestamp", bump=role in ("root", "timestamp"))
+    if role == "snapshot":
+        repo.point("timestamp")
+    repo.refused(new, "expired")
+
+
+def test_freeze_with_the_clock_set_back_is_noticed(repo: Repo, state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time of an earlier update is kept, and no clock before it is believed."""
+    found = read_state(state)
+    later = msgspec.structs.replace(
+        found, latest=msgspec.json.decode(b'"2099-01-01T00:00:00Z"', type=type(found.latest))
+    )
+    monkeypatch.setattr("ecu_node.update.client.read_state", lambda _: later)
+    repo.refused(state, "expired at")
+
+
+def test_fast_forward_is_bounded_by_the_keys_of_a_role(repo: Repo, state: Path) -> None:
+    """Whoever has no key cannot raise a version; see test_update_recovery for who has."""
+
+    def far(timestamp: Timestamp) -> None:
+        timestamp.version = 2**31
+
+    repo.forge("timestamp", far, "mallory")
+    repo.refused(state, "timestamp was signed by 0/1 keys")
+
+
+def test_endless_data_is_refused(repo: Repo, new: Path) -> None:
+    with (repo.metadata / "timestamp.json").open("ab") as file:
+        file.truncate(1 << 30)
+    repo.refused(new, "larger than")
+    with (repo.metadata / "timestamp.json").open("ab") as file:
+        file.truncate(100_000)
+    repo.refused(new, "exceeding the maximum allowed length")
+
+
+def test_decompression_bomb_is_refused(repo: Repo, new: Path) -> None:
+    bomb = repo.folder / "bomb.json.xz"
+    bomb.write_bytes(lzma.compress(b'{"a": "' + bytes(50_000_000) + b'"}', check=lzma.CHECK_SHA256))
+    assert bomb.stat().st_size < 20_000
+    repo.refused(new, "not a whole bundle", bomb)
+    with bomb.open("ab") as file:
+        file.truncate(1 << 30)
+    repo.refused(new, "larger than", bomb)
+
+
+def test_mix_and_match_is_refused(repo: Repo, new: Path, other: VehicleParameters) -> None:
+    """Old metadata of a bin under a new snapshot, and a new target under an old bin."""
+    old = repo.live(repo.bin).read_bytes()
+    repo.offer(other)
+    whole = repo.live(repo.bin).read_bytes()
+    repo.live(repo.bin).write_bytes(old)
+    repo.refused(new, "Expected")
+    repo.live(repo.bin).write_bytes(whole)
+    first, second = sorted((repo.path / "targets").glob("*.v1.json"))
+    content = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(content)
+    repo.refused(new, "Observed ")
+
+
+def test_bundle_of_another_vehicle_is_refused(repo: Repo, new: Path) -> None:
+    repo.refused(new, "is it complete, and for vehicle 'v1', which this is?", repo.bundle("v2"))
+
+
+def test_parameters_of_another_vehicle_under_this_name_are_refused(repo: Repo, new: Path) -> None:
+    """By somebody who has the keys of all online roles and of targets."""
+
+    def swap(targets: Targets) -> None:
+        targets.targets["v1.json"].unrecognized_fields["custom"]["vehicle"] = "v2"
+
+    repo.forge(repo.bin, swap, "t1", "t2")
+    repo.relist(repo.bin, "snapshot", "timestamp")
+    repo.refused(new, "the parameters are for 'v2', this is 'v1'")
+
+
+def test_missing_vehicle_is_refused(repo: Repo, tmp_path: Path) -> None:
+    repo.provision(tmp_path / "v9", "v9")
+    repo.refused(tmp_path / "v9", "part of snapshot")
+
+
+@pytest.mark.parametrize("key", ["timestamp", "snapshot", "t1", "r1"])
+def test_one_stolen_key_brings_no_parameters(key: str, repo: Repo, new: Path) -> None:
+    """Whoever has one key and the repository signs all that the key can sign."""
+    repo.forge(repo.bin, evil_target(repo), key, "mallory")
+    repo.relist(repo.bin, key, "mallory")
+    repo.refused(new, "was signed by ")
+
+
+def test_stolen_online_keys_bring_no_parameters(repo: Repo, new: Path) -> None:
+    repo.forge(repo.bin, evil_target(repo), "snapshot", "timestamp")
+    repo.relist(repo.bin, "snapshot", "timestamp")
+    repo.refused(new, "was signed by 0/2 keys")
+
+
+def test_stolen_keys_of_targets_bring_nothing_beyond_the_limits(
+    repo: Repo, state: Path, parameters: VehicleParameters
+) -> None:
+    """Even with all keys but the root's there are limits, the largest step and the trial."""
+    battery = msgspec.structs.replace(parameters.branches["battery"], drift=0.5)
+    wild = msgspec.structs.replace(parameters, branches={**parameters.branches, "battery": battery})
+    repo.offer(wild)
+    code, _, err = repo.update(state)
+    assert code == 1
+    assert "drift" in err
+    assert read_state(state).on_trial is None
+
+
+def test_root_that_too_few_have_signed_is_refused(repo: Repo, new: Path) -> None:
+    def take_over(root: Root) -> None:
+        key = public_key_of(repo.folder / "keys" / "mallory.pub")
+        for role in list(root.roles):
+            root.add_key(key, role)
+
+    repo.forge("root", take_over, "r1", "mallory")
+    repo.refused(new, "root was signed by 1/2 keys")
+
+
+def test_revocation_cannot_be_held_back_by_an_old_bundle(repo: Repo, state: Path) -> None:
+    old = repo.folder / "old.json.xz"
+    old.write_bytes(repo.bundle().read_bytes())
+    repo.done("revoke", repo.path, "v1")
+    repo.publish()
+    assert "nothing is in force now" in repo.updated(state)
+    repo.refused(state, "older than what was accepted before", old)
+
+
+@pytest.mark.parametrize("name", ["bins/../../..", "../../../secret"])
+def test_no_name_in_metadata_leads_out_of_the_repository(name: str, repo: Repo, new: Path) -> None:
+    """By somebody who has the keys of targets."""
+    (repo.folder / "secret").write_bytes(EVIL)
+
+    def lead_out(targets: Targets) -> None:
+        targets.targets["v1.json"].hashes = {"sha256": name}
+
+    def lead_out_of_bins(targets: Targets) -> None:
+        keys: dict[str, Key] = {key.keyid: key for key in [public_key_of(repo.folder / "keys" / "t1.pub")]}
+        assert targets.delegations is not None
+        targets.delegations.keys = keys
+        targets.delegations.succinct_roles = SuccinctRoles(list(keys), 1, 1, name)
+
+    role, change = (repo.bin, lead_out) if name.startswith("..") else ("targets", lead_out_of_bins)
+    repo.forge(role, change, "t1", "t2")
+    repo.relist(role, "snapshot", "timestamp")
+    repo.refused(new, "")
+
+
+class _Server(BaseHTTPRequestHandler):
+    folder: Path
+    is_endless = False
+
+    def do_GET(self) -> None:
+        path = self.folder / self.path.lstrip("/")
+        if not path.is_file():
+            self.send_error(404)
+            return
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(path.read_bytes())
+        while self.is_endless:
+            try:
+                self.wfile.write(bytes(1 << 16))
+            except OSError:
+                return
+
+    def log_message(self, format: str, *arguments: Any) -> None:  # noqa: A002
+        pass
+
+
+@pytest.fixture
+def server(repo: Repo) -> Any:
+    handler = type("Handler", (_Server,), {"folder": repo.path})
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as served:
+        served.daemon_threads = True
+        thread = Thread(target=served.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{served.server_address[1]}", handler
+        served.shutdown()
+        thread.join()
+
+
+def test_web_server(repo: Repo, new: Path, server: Any) -> None:
+    url, handler = server
+    handler.is_endless = True
+    repo.refused(new, "exceeding the maximum allowed length", url)
+    handler.is_endless = False
+    assert repo.updated(new, url).startswith("on trial: ")
+    shutil.rmtree(repo.metadata)
+    repo.refused(new, "status 404; is it complete", url)
+
+
+def test_web_server_that_is_not_there_is_one_line(repo: Repo, new: Path) -> None:
+    repo.refused(new, "127.0.0.1", "http://127.0.0.1:1/x")
+
+
+def test_bundle_with_more_files_changes_nothing_more(repo: Repo, new: Path, parameters: VehicleParameters) -> None:
+    """Names in a bundle are looked up, never written."""
+    files = msgspec.json.decode(lzma.decompress(repo.bundle().read_bytes()), type=dict[str, str])
+    evil = {"../../evil": "x", "/tmp/evil": "x", "targets/v1.json": encode_parameters(parameters, "f").decode()}
+    path = repo.folder / "evil.json.xz"
+    path.write_bytes(bundle_bytes({name: text.encode() for name, text in {**files, **evil}.items()}))
+    assert repo.updated(new, path).startswith("on trial: ")
+    pass_trial(new)
+    assert not (repo.folder / "evil").exists()

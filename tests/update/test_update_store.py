@@ -1,0 +1,192 @@
+"""A running node whose state is damaged or cannot be written: what was in force stays, and the node goes on."""
+
+import os
+import shutil
+import threading
+from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from ecu_node.bus.wiring import Mode, wire
+from ecu_node.core.corrector import Corrector
+from ecu_node.core.status import Reason, TrustError
+from ecu_node.database import VehicleDatabase
+from ecu_node.parameters import VehicleParameters
+from ecu_node.update.state import State, locked, read_state, write_state
+from ecu_node.update.store import ParameterStore
+from ecu_node.update.trial import ParameterTrial, TrialResult
+from tests.update.damage import a_folder, cut, without, zeros
+from tests.update.held import NOW, put_on_trial
+
+DRIFT, OTHER_DRIFT = 0.05, 0.06
+
+
+class Running:
+    """A corrector with the store of its parameters, in time that is counted."""
+
+    def __init__(self, state: Path, database: VehicleDatabase, *, background: Executor | None = None) -> None:
+        self.said: list[str] = []
+        self.now = NOW
+        self.store = ParameterStore(
+            state, database, mode=Mode.OVERLAY, say=self.said.append, now=lambda: self.now, background=background
+        )
+        self.corrector: Corrector = wire(database, self.store.in_force, 0.0)
+
+    def look(self, *times_s: float) -> list[bool]:
+        return [self.store.look(self.corrector, now_s) for now_s in times_s]
+
+    @property
+    def drift(self) -> float:
+        return self.corrector.branches[0].fault.drift
+
+
+class _Ended(ParameterTrial):
+    """A trial that has seen enough."""
+
+    def look(self, now_s: float) -> TrialResult | None:
+        return TrialResult(passed=True, text="seen")
+
+
+@pytest.fixture
+def ended(
+    correcting: Path, other: VehicleParameters, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
+) -> Running:
+    """A node whose trial of set 301 ends well as soon as it is looked at."""
+    monkeypatch.setattr("ecu_node.update.trial.ParameterTrial", _Ended)
+    put_on_trial(correcting, other)
+    running = Running(correcting, database)
+    monkeypatch.setattr(running.corrector.watch, "is_whole", lambda _: True)
+    return running
+
+
+@pytest.mark.parametrize("damage", [without, cut, zeros, a_folder])
+def test_state_that_is_damaged_under_a_running_node_leaves_what_was_in_force(
+    damage: Callable[[Path], None], correcting: Path, database: VehicleDatabase
+) -> None:
+    running = Running(correcting, database)
+    whole = (correcting / "state.json").read_bytes()
+    damage(correcting / "state.json")
+    assert not any(running.look(2.0, 4.0, 6.0))
+    assert running.drift == DRIFT
+    (line,) = running.said
+    assert line.startswith("the state of the vehicle is not read, what was in force stays: ")
+    running.now = NOW + timedelta(days=400)
+    assert running.look(8.0) == [True], "it expires all the same"
+    assert running.corrector.reason is Reason.NOT_VALID_NOW
+    shutil.rmtree(correcting / "state.json", ignore_errors=True)
+    (correcting / "state.json").write_bytes(whole)
+    running.now = NOW
+    running.look(10.0)
+    assert running.drift == DRIFT
+
+
+@pytest.mark.parametrize("damage", [without, cut, a_folder])
+def test_node_that_starts_with_a_damaged_state_passes_through_until_it_is_mended(
+    damage: Callable[[Path], None], correcting: Path, database: VehicleDatabase
+) -> None:
+    whole = (correcting / "state.json").read_bytes()
+    damage(correcting / "state.json")
+    running = Running(correcting, database)
+    assert running.corrector.reason in (Reason.MALFORMED_PARAMETERS, Reason.NO_PARAMETERS)
+    assert not any(running.look(1.0))
+    shutil.rmtree(correcting / "state.json", ignore_errors=True)
+    (correcting / "state.json").write_bytes(whole)
+    assert running.look(3.0) == [True]
+    assert (running.drift, running.corrector.reason) == (DRIFT, Reason.NONE)
+
+
+def test_state_of_another_vehicle_is_not_used(correcting: Path, database: VehicleDatabase) -> None:
+    store = ParameterStore(correcting, database, mode=Mode.OVERLAY, say=print, now=lambda: NOW, vehicle="v2")
+    assert store.in_force.reason is Reason.WRONG_VEHICLE
+    assert store.why_not is not None
+
+
+def test_end_of_a_trial_that_cannot_be_written_now_is_written_later(correcting: Path, ended: Running) -> None:
+    with locked(correcting):
+        ended.look(*range(0, 59, 2))
+    assert (ended.drift, read_state(correcting).on_trial is None) == (DRIFT, False)
+    assert [line.split(":")[0] for line in ended.said[1:]] == [
+        "a decision cannot be written now, what was in force stays, and it is tried again in 60 s"
+    ]
+    ended.look(*range(60, 70, 2))
+    assert (ended.drift, read_state(correcting).on_trial) == (OTHER_DRIFT, None)
+
+
+@pytest.mark.parametrize("damage", [without, cut, a_folder])
+def test_trial_in_a_damaged_state_does_not_end_the_node(
+    damage: Callable[[Path], None], correcting: Path, ended: Running
+) -> None:
+    damage(correcting / "state.json")
+    ended.look(1.0, 3.0, 5.0)
+    assert ended.drift == DRIFT
+    assert all(line.isprintable() for line in ended.said)
+
+
+def test_state_that_could_not_be_read_for_a_moment_is_read_again(
+    correcting: Path, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a revocation would not be heeded before the next start."""
+
+    def broken_disk(folder: Path) -> State:
+        raise TrustError(Reason.NO_PARAMETERS, f"{folder}: Input/output error")
+
+    running = Running(correcting, database)
+    write_state(correcting, replace(read_state(correcting), in_force=None, ended="revoked"))
+    with monkeypatch.context() as broken:
+        broken.setattr("ecu_node.update.store.read_state", broken_disk)
+        assert not any(running.look(2.0, 4.0))
+    assert running.look(6.0) == [True]
+    assert running.corrector.reason is Reason.REVOKED
+
+
+def test_slow_disk_does_not_hold_the_node_up_at_the_end_of_a_trial(
+    correcting: Path, ended: Running, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writing, may_go_on = threading.Event(), threading.Event()
+
+    def slow_fsync(handle: int, fsync: Callable[[int], None] = os.fsync) -> None:
+        writing.set()
+        assert may_go_on.wait(20.0)
+        fsync(handle)
+
+    monkeypatch.setattr("ecu_node.update.state.os.fsync", slow_fsync)
+    with ThreadPoolExecutor(1) as background:
+        running = Running(correcting, database, background=background)
+        monkeypatch.setattr(running.corrector.watch, "is_whole", lambda _: True)
+        running.look(*range(0, 10, 2))
+        assert writing.wait(20.0)
+        running.look(10.0)
+        assert (running.drift, read_state(correcting).on_trial is None) == (DRIFT, False)
+        may_go_on.set()
+    running.look(*range(12, 20, 2))
+    assert (running.drift, read_state(correcting).on_trial) == (OTHER_DRIFT, None)
+    assert any("has passed its trial: seen" in line for line in running.said)
+
+
+def test_set_that_expires_during_its_trial_leaves_what_was_in_force(
+    correcting: Path, ended: Running, other: VehicleParameters
+) -> None:
+    put_on_trial(correcting, other, days=1)
+    ended.look(2.0, 2.1)
+    ended.now = NOW + timedelta(days=2)
+    ended.look(4.0, 6.0, 8.0)
+    assert (ended.drift, read_state(correcting).on_trial) == (DRIFT, None)
+    assert "expired at" in (correcting / "decisions.log").read_text().splitlines()[-1]
+    assert ended.said[-1].split(" is ")[1].startswith("not in force, though its trial went well")
+
+
+def test_trial_begins_only_with_a_set_that_fits_and_holds(
+    correcting: Path, other: VehicleParameters, database: VehicleDatabase
+) -> None:
+    put_on_trial(correcting, other, days=-1)
+    running = Running(correcting, database)
+    running.look(*range(0, 110, 2))
+    (line,) = running.said
+    assert line.startswith("no trial yet: ")
+    put_on_trial(correcting, other)
+    running.look(*range(110, 120, 2))
+    assert running.said[-1].endswith(" is on trial")

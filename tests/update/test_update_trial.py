@@ -1,0 +1,217 @@
+"""A parameter set on trial in a node: what is right comes in force, what is wrong does not, and why."""
+
+import math
+import shutil
+from collections.abc import Iterator
+from datetime import timedelta
+from itertools import count
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from ecu_node.bus.wiring import Mode, wire
+from ecu_node.core.signals import FrameKey
+from ecu_node.core.status import Reason, State
+from ecu_node.database import VehicleDatabase, read_database
+from ecu_node.layout import read_layout
+from ecu_node.parameters import JunctionResidual, VehicleParameters
+from ecu_node.update.state import read_state, write_state
+from ecu_node.update.store import ParameterStore
+from tests.ecu_node.vehicles import Frame, answers, parameters_for, protected
+from tests.update.held import NOW, put_on_trial
+
+PERIOD_S = 0.1
+DRIFT, OFFSET_A = 0.05, 2.0
+"""Of the battery's sensor in this vehicle."""
+
+
+class Drive:
+    """A vehicle whose battery's sensor is faulty, and its node, in time that is counted."""
+
+    def __init__(self, state: Path, database: VehicleDatabase) -> None:
+        self.database, self.said = database, list[str]()
+        self.time = NOW
+        self.store = ParameterStore(state, database, mode=Mode.OVERLAY, say=self.said.append, now=lambda: self.time)
+        self.corrector = wire(database, self.store.in_force, 0.0)
+        self._steps: Iterator[int] = count()
+
+    def go_on(
+        self,
+        duration_s: float,
+        *,
+        load_a: float = 0.0,
+        drift: float = DRIFT,
+        offset_a: float = OFFSET_A,
+        contactor: int = 0,
+    ) -> None:
+        """Drive; a load that nobody measures takes its share from the battery."""
+        others = {"ContactorState": contactor}
+        for _ in range(round(duration_s / PERIOD_S)):
+            k = next(self._steps)
+            now_s = PERIOD_S * k
+            motor_a = 100.0 * math.sin(0.3 * k) + 40.0
+            battery_a = (1.0 + drift) * (motor_a + load_a) + offset_a
+            frames = {
+                0x110: ("HV_Battery", {"BatteryCurrent": battery_a, **others}),
+                0x120: ("HV_Motor", {"MotorCurrent": motor_a}),
+            }
+            for identifier, (message, values) in frames.items():
+                data = protected(self.database, message, k % 15, **values)
+                answers(self.corrector, Frame(FrameKey(identifier, False), data), now_s)
+            self.corrector.look(now_s + 0.01)
+            self.store.look(self.corrector, now_s + 0.01)
+
+    @property
+    def told(self) -> tuple[State, Reason]:
+        return self.corrector.state()
+
+
+def right(database: VehicleDatabase, drift: float = DRIFT, offset_a: float = OFFSET_A) -> VehicleParameters:
+    found = parameters_for(database, battery=(drift, offset_a), motor=(0.0, 0.0))
+    return replace(found, junction_residual=JunctionResidual(measured_a=4.0, corrected_a=0.5, correction_a=4.0))
+
+
+def test_right_set_is_in_force_after_its_trial_and_not_before(vehicle: Path, database: VehicleDatabase) -> None:
+    put_on_trial(vehicle, right(database))
+    drive = Drive(vehicle, database)
+    drive.go_on(290.0)
+    assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
+    drive.go_on(30.0)
+    assert drive.told == (State.CORRECTING, Reason.NONE)
+    assert read_state(vehicle).in_force is not None
+    assert any("has passed its trial" in line for line in drive.said)
+    drive.go_on(10.0)
+    assert drive.corrector.watch.sums is not None
+    assert abs(drive.corrector.watch.sums.corrected_a) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("drift", "offset_a"), [(-DRIFT, -OFFSET_A), (0.0, -OFFSET_A), (3.0 * DRIFT, OFFSET_A), (DRIFT, 10.0)]
+)
+def test_wrong_set_never_comes_in_force(
+    vehicle: Path, database: VehicleDatabase, drift: float, offset_a: float
+) -> None:
+    put_on_trial(vehicle, right(database, drift, offset_a))
+    drive = Drive(vehicle, database)
+    drive.go_on(330.0)
+    assert drive.told == (State.PASSING_THROUGH, Reason.NO_PARAMETERS)
+    assert (read_state(vehicle).in_force, read_state(vehicle).on_trial) == (None, None)
+    assert any("has failed its trial" in line for line in drive.said)
+
+
+def test_set_before_stays_in_force_during_a_trial(vehicle: Path, database: VehicleDatabase) -> None:
+    put_on_trial(vehicle, right(database))
+    drive = Drive(vehicle, database)
+    drive.go_on(330.0)
+    put_on_trial(vehicle, right(database, -DRIFT, 0.0))
+    drive.go_on(100.0)
+    assert drive.told == (State.CORRECTING, Reason.NONE)
+    assert drive.corrector.branches[0].fault.drift == DRIFT
+    drive.go_on(250.0)
+    assert drive.told == (State.CORRECTING, Reason.NONE)
+    assert any("has failed its trial" in line for line in drive.said)
+
+
+def test_set_that_promises_less_passes_with_less(vehicle: Path, database: VehicleDatabase) -> None:
+    """A load that no sensor sees is half of the change: the share is about 0."""
+    half = replace(
+        right(database), junction_residual=JunctionResidual(measured_a=1.0, corrected_a=1.0, correction_a=3.0)
+    )
+    results = []
+    for parameters in (right(database), half):
+        put_on_trial(vehicle, parameters)
+        drive = Drive(vehicle, database)
+        drive.go_on(330.0, load_a=-3.0)
+        results.append(any("has passed" in line for line in drive.said))
+    assert results == [False, True]
+
+
+def test_set_is_tried_about_the_expected_sum(vehicle: Path, database: VehicleDatabase) -> None:
+    """A load that no sensor sees hides no error, and is no error itself."""
+    expected = replace(right(database).junction_residual, expected_a=3.0, measured_mean_a=7.0, corrected_mean_a=3.0)
+    takes_load_for_offset = right(database, 0.0, 3.0)
+    results = []
+    for parameters in (right(database), takes_load_for_offset):
+        put_on_trial(vehicle, replace(parameters, junction_residual=expected))
+        drive = Drive(vehicle, database)
+        faulty = parameters is not takes_load_for_offset
+        drive.go_on(360.0, load_a=3.0, drift=DRIFT if faulty else 0.0, offset_a=OFFSET_A if faulty else 0.0)
+        results.append(any("has passed" in line for line in drive.said))
+        if faulty:
+            assert drive.told == (State.CORRECTING, Reason.NONE), "the watch does not take the load for an error either"
+    assert results == [True, False]
+
+
+def test_set_that_leaves_an_error_fails(vehicle: Path, database: VehicleDatabase) -> None:
+    put_on_trial(vehicle, right(database, DRIFT / 2.0, OFFSET_A / 2.0))
+    drive = Drive(vehicle, database)
+    drive.go_on(330.0)
+    (told,) = (line for line in drive.said if "its trial" in line)
+    assert "has failed" in told
+    assert "at most 2 A were to be left" in told
+
+
+def test_set_without_a_predicted_change_may_leave_anything(vehicle: Path, database: VehicleDatabase) -> None:
+    """As one that was written by hand: what is taken away is measured all the same."""
+    unknown = JunctionResidual(measured_a=4.0, corrected_a=0.5)
+    put_on_trial(vehicle, replace(right(database), junction_residual=unknown))
+    drive = Drive(vehicle, database)
+    drive.go_on(330.0, load_a=-0.5)
+    assert any("has passed its trial" in line for line in drive.said)
+
+
+def test_trial_waits_while_a_current_is_not_measured(vehicle: Path, database: VehicleDatabase, tmp_path: Path) -> None:
+    """As while the vehicle charges, where the layout says so."""
+    shutil.copy(database.layout.dbc_path, tmp_path)
+    text = database.layout.path.read_text() + '\n[watch]\ninput = "contactor_state"\nvalid = [2]\n'
+    (tmp_path / "watched.toml").write_text(text)
+    own = read_database(read_layout(tmp_path / "watched.toml"))
+    put_on_trial(vehicle, right(own))
+    drive = Drive(vehicle, own)
+    drive.go_on(330.0, contactor=1)
+    assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
+    drive.go_on(330.0, contactor=2)
+    assert drive.told == (State.CORRECTING, Reason.NONE)
+
+
+def test_trial_needs_current(vehicle: Path, database: VehicleDatabase) -> None:
+    put_on_trial(vehicle, right(database))
+    drive = Drive(vehicle, database)
+    for _ in range(4000):
+        k = next(drive._steps)
+        for identifier, message in ((0x110, "HV_Battery"), (0x120, "HV_Motor")):
+            answers(
+                drive.corrector, Frame(FrameKey(identifier, False), protected(database, message, k % 15)), PERIOD_S * k
+            )
+        drive.corrector.look(PERIOD_S * k + 0.01)
+        drive.store.look(drive.corrector, PERIOD_S * k + 0.01)
+    assert drive.told == (State.PASSING_THROUGH, Reason.ON_TRIAL)
+
+
+def test_revocation_holds_at_once_in_a_running_node(vehicle: Path, database: VehicleDatabase) -> None:
+    put_on_trial(vehicle, right(database))
+    drive = Drive(vehicle, database)
+    drive.go_on(330.0)
+    write_state(vehicle, replace(read_state(vehicle), in_force=None, ended="revoked"))
+    drive.go_on(2.0)
+    assert drive.told == (State.PASSING_THROUGH, Reason.REVOKED)
+    assert drive.said[-1].startswith("passing measured values through: ")
+
+
+def test_set_that_expires_is_not_used_and_does_not_come_back_with_the_clock(
+    vehicle: Path, database: VehicleDatabase
+) -> None:
+    put_on_trial(vehicle, right(database))
+    drive = Drive(vehicle, database)
+    drive.go_on(330.0)
+    drive.time = NOW + timedelta(days=366)
+    drive.go_on(2.0)
+    assert drive.told == (State.PASSING_THROUGH, Reason.NOT_VALID_NOW)
+    drive.time = NOW  # the clock was wrong for a moment
+    drive.go_on(2.0)
+    assert drive.told == (State.CORRECTING, Reason.NONE)
+    for drive.time in (NOW + timedelta(days=366), NOW + timedelta(days=366, minutes=2), NOW):
+        drive.go_on(3.0)
+        assert drive.told == (State.PASSING_THROUGH, Reason.NOT_VALID_NOW)
+    assert read_state(vehicle).in_force is None

@@ -1,0 +1,217 @@
+#!/usr/bin/env python3
+"""Bundles that were changed, each given to a vehicle: none is accepted, each is refused in one line.
+
+    python -m bench.update_fuzz --bundles 1000000        (in tools/)
+
+Three of four are changed as they are: bytes, pieces, length. The others are taken apart, changed in one file (bytes,
+pieces, values of the JSON, files exchanged between two publications) and packed anew, so that they come as far as TUF's
+client and our own checks. What is drawn depends on the seed alone.
+"""
+
+import argparse
+import json
+import lzma
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import msgspec
+from msgspec.structs import replace
+from securesystemslib.signer import CryptoSigner, SSlibKey
+
+from bench.true_parameters import true_parameters
+from calibrator.repository.repository import ROLES, NewKeys, Repository
+from ecu_node.core.status import UnfitError
+from ecu_node.database import read_database
+from ecu_node.layout import read_layout
+from ecu_node.parameters import BranchParameters, encode_parameters
+from ecu_node.update.client import provision, update
+from ecu_node.update.sources import bundle_bytes
+
+__all__ = ["Vehicle", "WrongAnswerError", "fuzz"]
+
+_LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
+_ODD: tuple[Any, ...] = (None, True, -1, 0, 2**31, 1e308, "", "x", "é\ud800", "../../x", [], {}, [[]], "9" * 5000)
+"""Values that somebody might write in the place of others."""
+
+
+class WrongAnswerError(Exception):
+    """A changed bundle was accepted, or refused otherwise than in one line."""
+
+
+class Vehicle:
+    """A vehicle that took a first publication, and the bundles of the first and of a second one.
+
+    Parameters
+    ----------
+    folder : Path
+        Empty; for repository and state.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._state = folder / "state"
+        self._bundle = folder / "bundle.json.xz"
+        self._database = read_database(read_layout(_LAYOUT))
+        signers = {role: CryptoSigner.generate_ed25519() for role in ROLES}
+        keys = {role: NewKeys([_public(signer)], 1) for role, signer in signers.items()}
+        found = Repository.create(folder / "repository", keys)
+        self.bundles = []
+        for drift in (0.05, 0.06):
+            for vehicle in ("bench", "other"):
+                branch = BranchParameters(drift=drift, offset_a=1.0, apply=True)
+                parameters = true_parameters(self._database, {"battery": branch})
+                path = folder / f"{vehicle}.json"
+                path.write_bytes(encode_parameters(replace(parameters, vehicle=vehicle), "fuzz"))
+                found.add([path], days=365, allow_large_step=False)
+            list(found.publish(list(signers.values())))
+            found = Repository(folder / "repository")
+            self.bundles.append(found.bundle("bench"))
+            if drift == 0.05:
+                provision(self._state, "bench", folder / "repository" / "metadata" / "1.root.json", datetime.now(UTC))
+                self._bundle.write_bytes(self.bundles[0])
+                update(self._state, str(self._bundle), self._database, datetime.now(UTC))
+        self._files = [msgspec.json.decode(lzma.decompress(item), type=dict[str, str]) for item in self.bundles]
+
+    def changed(self, rng: Random) -> bytes:
+        """The second bundle, changed in one place or a few."""
+        if rng.random() < 0.75:
+            return changed_bytes(rng, self.bundles[1])
+        files = {name: text.encode() for name, text in self._files[1].items()}
+        name = rng.choice(sorted(files))
+        kind = rng.randrange(4)
+        if kind == 0:
+            files[name] = changed_bytes(rng, files[name])
+        elif kind == 1:
+            files[name] = json.dumps(changed_value(rng, json.loads(files[name]))).encode()
+        elif kind == 2:
+            old = {key.partition(".")[2] if "root" not in key else key: text for key, text in self._files[0].items()}
+            files[name] = old.get(name.partition(".")[2], rng.choice(list(self._files[0].values()))).encode()
+        else:
+            del files[name]
+        texts = {key: text.decode(errors="replace") for key, text in files.items()}
+        return bundle_bytes({key: text.encode() for key, text in texts.items()})
+
+    def update(self, content: bytes) -> str:
+        """What the vehicle says of a bundle; nothing is kept."""
+        self._bundle.write_bytes(content)
+        return update(self._state, str(self._bundle), self._database, datetime.now(UTC), dry_run=True)
+
+    def require_refused(self, content: bytes, where: str) -> bool:
+        """Give a bundle to the vehicle; False if it says the same as the second bundle, signatures included."""
+        try:
+            text = self.update(content)
+        except UnfitError as error:
+            if not str(error).isprintable():
+                raise WrongAnswerError(f"{where}: not one line: {str(error)!r}") from None
+            return True
+        except Exception as error:
+            raise WrongAnswerError(f"{where}: {error!r}: {content.hex()}") from error
+        if self._is_same(content):
+            return False
+        raise WrongAnswerError(f"{where}: accepted ({text}): {content.hex()}")
+
+    def _is_same(self, content: bytes) -> bool:
+        """Whether all that is signed in the files that count is as it was, as where a space outside was added."""
+        files = msgspec.json.decode(lzma.decompress(content), type=dict[str, str])
+
+        def signed(texts: dict[str, str]) -> dict[str, Any]:
+            newest = {name: text for name, text in texts.items() if name.startswith("metadata") and "root" not in name}
+            return {name: json.loads(text)["signed"] for name, text in newest.items()}
+
+        return signed(files) == signed(self._files[1])
+
+
+def _public(signer: CryptoSigner) -> SSlibKey:
+    key = signer.public_key
+    assert isinstance(key, SSlibKey)
+    return key
+
+
+def changed_bytes(rng: Random, content: bytes) -> bytes:
+    """Bytes with a bit turned, a byte replaced, a piece cut out, repeated or moved, or the end missing."""
+    found = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 5))):
+        place = rng.randrange(max(len(found), 1))
+        length = min(rng.choice((1, 2, 16, 200)), len(found) - place)
+        match rng.randrange(6):
+            case 0 if found:
+                found[place] ^= 1 << rng.randrange(8)
+            case 1 if found:
+                found[place] = rng.randrange(256)
+            case 2:
+                del found[place : place + length]
+            case 3:
+                found[place:place] = found[place : place + length]
+            case 4:
+                found[place:place] = rng.randbytes(length)
+            case _:
+                del found[place:]
+    return bytes(found)
+
+
+def changed_value(rng: Random, document: Any) -> Any:
+    """A JSON document with one value changed, removed, or put in the place of another."""
+    places: list[tuple[Any, Any]] = []
+
+    def collect(value: Any) -> None:
+        keys = list(value) if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else []
+        for key in keys:
+            places.append((value, key))
+            collect(value[key])
+
+    collect(document)
+    container, key = rng.choice(places)
+    match rng.randrange(4):
+        case 0:
+            container[key] = rng.choice(_ODD)
+        case 1:
+            del container[key]
+        case 2 if isinstance(container[key], str):
+            container[key] = changed_bytes(rng, container[key].encode()).decode(errors="replace")
+        case 2 if isinstance(container[key], int):
+            container[key] += rng.choice((-1, 1, 2**31))
+        case _:
+            other, name = rng.choice(places)
+            container[key] = json.loads(json.dumps(other.get(name) if isinstance(other, dict) else None))
+    return document
+
+
+def fuzz(bundles: int, seed: int = 0) -> Iterator[int]:
+    """Give changed bundles to a vehicle; yields how many were refused so far, and raises WrongAnswerError."""
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
+        vehicle, done = Vehicle(Path(folder)), 0
+        while done < bundles:
+            rng = Random(f"{seed} {done}")  # noqa: S311  # no secrets
+            content = vehicle.changed(rng)
+            if content not in vehicle.bundles and vehicle.require_refused(content, f"seed {seed}, bundle {done}"):
+                done += 1
+                yield done
+            else:
+                seed += 1
+
+
+def main() -> int:
+    """Run, and say how many were refused."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--bundles", type=int, default=1_000_000)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    start_s, done = time.monotonic(), 0
+    try:
+        for done in fuzz(options.bundles, options.seed):
+            if done % 1000 == 0:
+                print(f"{done} refused, {done / (time.monotonic() - start_s):.0f} per second", file=sys.stderr)
+    except WrongAnswerError as error:
+        print(error)
+        return 1
+    print(f"{done} changed bundles refused, each in one line")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
