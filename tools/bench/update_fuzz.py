@@ -23,6 +23,7 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 from securesystemslib.signer import CryptoSigner, SSlibKey
+from tuf.api.metadata import Metadata
 
 from bench.true_parameters import true_parameters
 from calibrator.repository.repository import ROLES, NewKeys, Repository
@@ -116,12 +117,12 @@ class Vehicle:
         raise WrongAnswerError(f"{where}: accepted ({text}): {content.hex()}")
 
     def _is_same(self, content: bytes) -> bool:
-        """Whether all that is signed in the files that count is as it was, as where a space outside was added."""
+        """Whether TUF reads all that is signed in the files that count as before, as where a space was added."""
         files = msgspec.json.decode(lzma.decompress(content), type=dict[str, str])
 
         def signed(texts: dict[str, str]) -> dict[str, Any]:
             newest = {name: text for name, text in texts.items() if name.startswith("metadata") and "root" not in name}
-            return {name: json.loads(text)["signed"] for name, text in newest.items()}
+            return {name: Metadata.from_bytes(text.encode()).signed for name, text in newest.items()}
 
         return signed(files) == signed(self._files[1])
 

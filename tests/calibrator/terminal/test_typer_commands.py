@@ -102,7 +102,6 @@ def test_help_says_what_may_be_repeated_and_no_bound_that_nobody_reaches(capsys:
     words = " ".join(capsys.readouterr().out.split())
     assert "calibrator repository publish [OPTIONS] REPOSITORY" in words
     assert "PUBLIC.pem=URI. May be repeated." in words
-    assert "(default: time in seconds, UTC), 1 or more." in words
 
 
 def test_nothing_but_the_name_shows_help(capsys: pytest.CaptureFixture[str]) -> None:
