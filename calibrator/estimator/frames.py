@@ -17,7 +17,7 @@ from calibrator.drives.store import require_plain_name, write_drive
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.settings import FEWEST_VEHICLES
 from calibrator.files.storage import open_storage
-from calibrator.recordings.log_time import CLOCK_GAP_S
+from calibrator.recordings.frame_arrays import CLOCK_GAP_S
 from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.record import Record

@@ -1,44 +1,43 @@
-"""BLF files (Vector's binary logging format) into frame arrays, without a Python object per frame.
+"""BLF files (Vector's binary logging format) into frame arrays, their objects by compiled code.
 
 A BLF file is a header ``LOGG`` and objects ``LOBJ``, each with its own size; most are containers, whose content, often
 compressed, is again objects, which may go over from one container into the next. There is no public specification; the
-layout of the objects is that of python-can's reader, which is the oracle of the tests and takes ten times as long.
+layout of the objects is that of python-can's reader, which is the oracle of the tests.
 
 A size of zero makes a naive reader go round for ever, and a file cut inside a container reads as a shorter one without
 any error: the structure is checked throughout, and damage is refused with its place.
 """
 
-import re
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import BinaryIO
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from calibrator.drive import Mask
+from calibrator.compiled import compiled, inner
 from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import (
     CLASSIC_BYTES,
+    DAMAGED,
+    DATA,
+    ERROR,
     EXTENDED_BIT,
     FD_BYTES,
     LARGEST_IDENTIFIER,
     LATEST_TIME_STAMP_NS,
+    REMOTE,
+    FrameColumns,
     Frames,
     concatenate_frames,
 )
 
 __all__ = ["read_blf"]
 
-_Bytes = NDArray[np.uint8]
-_Places = NDArray[np.int64]
-
 BATCH_BYTES = 1 << 21
-"""Content of containers that is taken apart at a time: array operations on it cost more than their calls. [byte]"""
+"""Content of containers that is taken apart at a time. [byte]"""
 LARGEST_OBJECT = 1 << 28
 """Containers have some 128 KiB; a larger size is damage. [byte]"""
 _FILE_HEADER = struct.Struct("<4sL8xQ16x8H")
@@ -46,63 +45,21 @@ _FILE_HEADER = struct.Struct("<4sL8xQ16x8H")
 _FILE_HEADER_BYTES = 144
 _OBJECT_HEADER = struct.Struct("<4sHHLL")
 """Signature, size and version of the header, size of the object, type."""
+_OBJECT_HEADER_BYTES = 16
 _CONTAINER = 10
 _CONTAINER_HEADER_BYTES = 16
 _STORED, _DEFLATE = 0, 2
-_SIGNATURE = b"LOBJ"
 _LONGEST_PADDING = 4
 """Between objects; at the end of a file it may lack. [byte]"""
+_CLASSIC, _CLASSIC_2, _FD, _FD_64 = 1, 86, 100, 101
+"""Types of objects that are data or remote frames."""
+_ERROR, _ERROR_EXT, _ERROR_FD = 2, 73, 104
 _TEN_MICROSECONDS = 1
 """Flag of the unit of time; nanoseconds otherwise."""
 _TEN_MICROSECONDS_NS = 10_000
 _FD_LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64], np.int64)
-
-
-def _record(size: int, fields: str) -> np.dtype[np.void]:
-    """A record of some bytes, of whose fields are given: type, first byte and name."""
-    parts = [re.split("[@ ]", field) for field in fields.split(", ")]
-    formats, offsets, names = ([part[k] for part in parts] for k in range(3))
-    return np.dtype({"names": names, "formats": formats, "offsets": [*map(int, offsets)], "itemsize": size})
-
-
-_HEADER = _record(32, "<u2@6 version, <u4@8 size, <u4@12 kind, <u4@16 flags, <u8@24 time")
-_BODY_AT = {1: 32, 2: 40}
-"""Where a frame begins, by version of the header; objects of other versions are not known. [byte]"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Kind:
-    """A type of objects that are data or remote frames: fields before the payload, and bits in them."""
-
-    fields: np.dtype[np.void]
-    remote: int
-    fd: tuple[str, int]
-    """Field, and the bit in it that says CAN FD."""
-
-
-_CLASSIC = _Kind(
-    fields=_record(8, "<u2@0 channel, u1@2 flags, u1@3 dlc, <u4@4 identifier"), remote=0x80, fd=("flags", 0)
-)
-_FD = _Kind(
-    fields=_record(20, "<u2@0 channel, u1@2 flags, u1@3 dlc, <u4@4 identifier, u1@13 fd_flags, u1@14 valid"),
-    remote=0x80,
-    fd=("fd_flags", 0x01),
-)
-_FD_64 = _Kind(
-    fields=_record(40, "u1@0 channel, u1@1 dlc, u1@2 valid, <u4@4 identifier, <u4@12 flags, u1@35 extension_at"),
-    remote=0x10,
-    fd=("flags", 0x1000),
-)
-_KINDS = {1: _CLASSIC, 86: _CLASSIC, 100: _FD, 101: _FD_64}
-_LEAST_BYTES = np.full((max(_BODY_AT) + 2, max(_KINDS) + 2), _OBJECT_HEADER.size)
-"""Of an object, by version of its header and type; the last ones stand for all beyond. [byte]"""
-for _version, _body_at in _BODY_AT.items():
-    _LEAST_BYTES[_version] = _HEADER.itemsize
-    for _number, _kind in _KINDS.items():
-        _LEAST_BYTES[_version, _number] = _body_at + _kind.fields.itemsize
-_ERROR_KINDS = (2, 73, 104)
-_ROOM = _HEADER.itemsize + _FD_64.fields.itemsize + FD_BYTES
-"""Behind the last object, so that fields may be taken before it is known whether they are whole. [byte]"""
+_SOUND, _IMPOSSIBLE, _NO_OBJECT, _WIDE = range(4)
+"""How taking a batch apart ended; the last one: it has payloads of CAN FD, and the columns are for classic ones."""
 
 
 class _DamageError(Exception):
@@ -148,19 +105,34 @@ def read_blf(file: BinaryIO, name: str) -> Frames:
 def _parts(file: BinaryIO) -> Iterator[Frames]:
     """Frames of some containers at a time; those before a damage come before its error."""
     size, start_ns = _file_header(file)
-    containers, tail, damage = _containers(file), b"", None
+    containers, tail, damage, fd = _containers(file), b"", None, False
     while damage is None:
-        batch, damage = _batch(containers)
+        batch: list[tuple[bytes, int]] = []
+        try:
+            while sum(len(content) for content, _ in batch) < BATCH_BYTES:
+                batch.append(next(containers))
+        except StopIteration:
+            pass
+        except _DamageError as error:
+            damage = error
         if not batch:
             break
-        contents = [tail, *(content for content, _ in batch), bytes(_ROOM)]
-        data = b"".join(contents)
-        at, end, wrong = _objects(data)
-        yield _frames(data, at, start_ns)
-        if wrong:
-            container = int(np.searchsorted(np.cumsum([*map(len, contents[:-2])]), end, side="right")) - 1
-            raise _DamageError(batch[max(container, 0)][1], wrong)
-        tail = data[end:-_ROOM]
+        contents = [tail, *(content for content, _ in batch)]
+        data = np.frombuffer(b"".join(contents), np.uint8)
+        ended = _WIDE
+        while ended == _WIDE:
+            columns = FrameColumns.of(len(data) // _OBJECT_HEADER_BYTES + 1, fd=fd)
+            ended, rows, end, wrong_size = _take_apart(data, start_ns, _FD_LENGTHS, columns)
+            fd = fd or ended == _WIDE
+        yield FrameColumns(*(column[:rows] for column in columns)).frames()
+        if ended != _SOUND:
+            container = int(np.searchsorted(np.cumsum([*map(len, contents[:-1])]), end, side="right")) - 1
+            wrong = f"an object of {wrong_size} bytes, which is impossible for its type"
+            raise _DamageError(
+                batch[max(container, 0)][1],
+                f"a container holds {wrong if ended == _IMPOSSIBLE else 'something that is no object'}",
+            )
+        tail = data[end:].tobytes()
     if damage is not None:
         raise damage
     if tail.strip(b"\0"):
@@ -189,14 +161,14 @@ def _file_header(file: BinaryIO) -> tuple[int, int]:
 def _containers(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
     """Content of each container, and the byte at which it starts."""
     position = file.tell()
-    while head := file.read(_OBJECT_HEADER.size):
-        if len(head) < _OBJECT_HEADER.size:
+    while head := file.read(_OBJECT_HEADER_BYTES):
+        if len(head) < _OBJECT_HEADER_BYTES:
             raise _DamageError(position, "the file ends inside an object's header")
         signature, _, _, length, kind = _OBJECT_HEADER.unpack(head)
-        if signature != _SIGNATURE or not _OBJECT_HEADER.size <= length <= LARGEST_OBJECT:
+        if signature != b"LOBJ" or not _OBJECT_HEADER_BYTES <= length <= LARGEST_OBJECT:
             raise _DamageError(position, f"'LOBJ' and a size are expected, found {signature!r} and {length}")
-        content = file.read(length - _OBJECT_HEADER.size)
-        if len(content) < length - _OBJECT_HEADER.size:
+        content = file.read(length - _OBJECT_HEADER_BYTES)
+        if len(content) < length - _OBJECT_HEADER_BYTES:
             raise _DamageError(position, f"an object of {length} bytes starts, but the file ends before")
         file.read(length % _LONGEST_PADDING)
         if kind == _CONTAINER:
@@ -222,125 +194,96 @@ def _container_content(content: bytes, position: int) -> bytes:
     return text
 
 
-def _batch(containers: Iterator[tuple[bytes, int]]) -> tuple[list[tuple[bytes, int]], _DamageError | None]:
-    """The next containers of some size together, and the damage that ended them."""
-    batch: list[tuple[bytes, int]] = []
-    size = 0
-    try:
-        for content, position in containers:
-            batch.append((content, position))
-            size += len(content)
-            if size >= BATCH_BYTES:
-                break
-    except _DamageError as damage:
-        return batch, damage
-    return batch, None
+@compiled
+def _take_apart(
+    data: NDArray[np.uint8], start_ns: int, fd_lengths: NDArray[np.int64], columns: FrameColumns
+) -> tuple[int, int, int, int]:
+    """Fill a row per frame: how it ended, rows, where what is left over begins, and the size that is impossible."""
+    here, row = 0, 0
+    while True:
+        at = here
+        while at - here <= _LONGEST_PADDING and at + 4 <= len(data) and not _is_signature(data, at):
+            at += 1
+        if at - here > _LONGEST_PADDING or at + 4 > len(data):
+            lost = here + 2 * _LONGEST_PADDING <= len(data)
+            return (_NO_OBJECT if lost else _SOUND), row, here, 0
+        if at + _OBJECT_HEADER_BYTES > len(data):
+            return _SOUND, row, here, 0
+        version, size, kind = _number(data, at + 6, 2), _number(data, at + 8, 4), _number(data, at + 12, 4)
+        is_frame = kind == _CLASSIC or kind == _CLASSIC_2 or kind == _FD or kind == _FD_64
+        fields = 8 if kind == _CLASSIC or kind == _CLASSIC_2 else 20 if kind == _FD else 40
+        known = version == 1 or version == 2
+        body = 32 if version == 1 else 40
+        least = _OBJECT_HEADER_BYTES if not known else body + fields if is_frame else 32
+        if size < least or size > LARGEST_OBJECT:
+            return _IMPOSSIBLE, row, here, size
+        if at + size > len(data):
+            return _SOUND, row, here, 0
+        if is_frame:
+            columns.kind[row] = DAMAGED
+            if known:
+                columns.kind[row] = _take(data, at, body, fields, start_ns, fd_lengths, row, columns)
+                if columns.kind[row] == _TOO_LONG:
+                    return _WIDE, row, here, 0
+            row += 1
+        elif kind == _ERROR or kind == _ERROR_EXT or kind == _ERROR_FD:
+            columns.kind[row] = ERROR
+            row += 1
+        here = at + size
 
 
-def _objects(data: bytes) -> tuple[_Places, int, str]:
-    """Where the complete objects start, where what is left over begins, and what is wrong there; empty for nothing."""
-    buffer, length = np.frombuffer(data, np.uint8), len(data) - _ROOM
-    starts = np.flatnonzero(buffer[: max(length - _OBJECT_HEADER.size + 1, 0)] == _SIGNATURE[0])
-    for offset in range(1, len(_SIGNATURE)):
-        starts = starts[buffer[starts + offset] == _SIGNATURE[offset]]
-    header = _fields(buffer, starts, _HEADER)
-    size = header["size"].astype(np.int64)
-    last = np.array(_LEAST_BYTES.shape) - 1
-    least = _LEAST_BYTES[np.minimum(header["version"], last[0]), np.minimum(header["kind"], last[1])]
-    possible = (size >= least) & (size <= LARGEST_OBJECT)
-    gap = starts - np.concatenate([[0], (starts + size)[:-1]])
-    wrong = ""
-    if possible.all() and np.all((gap >= 0) & (gap <= _LONGEST_PADDING)):
-        complete = np.flatnonzero(starts + size <= length)
+_TOO_LONG = 255
+"""For these columns."""
+
+
+@inner
+def _take(
+    data: NDArray[np.uint8],
+    at: int,
+    body: int,
+    fields: int,
+    start_ns: int,
+    fd_lengths: NDArray[np.int64],
+    row: int,
+    columns: FrameColumns,
+) -> int:
+    """Put one object that is a frame into a row; what it is."""
+    size, b = _number(data, at + 8, 4), at + body
+    if fields == 40:  # CAN FD 64
+        channel, code, length = data[b], data[b + 1], np.int64(data[b + 2])
+        flags, extension = _number(data, b + 12, 4), np.int64(data[b + 35])
+        remote, fd = flags & 0x10 > 0, flags & 0x1000 > 0
+        size = extension if extension > 0 else size
     else:
-        complete, wrong = _walk(starts, size, possible, length)
-    end = int(starts[complete[-1]] + size[complete[-1]]) if complete.size else 0
-    if end + 2 * _LONGEST_PADDING <= length and data.find(_SIGNATURE, end, end + 2 * _LONGEST_PADDING) < 0:
-        wrong = "a container holds something that is no object"
-    return starts[complete], end, wrong
+        channel, code = _number(data, b, 2), data[b + 3]
+        remote, fd = data[b + 2] & 0x80 > 0, fields == 20 and data[b + 13] & 1 > 0
+        length = np.int64(data[b + 14]) if fields == 20 else min(fd_lengths[min(code, 15)], CLASSIC_BYTES)
+    if remote:
+        return REMOTE
+    time = np.uint64(_number(data, at + 24, 4)) | np.uint64(_number(data, at + 28, 4)) << np.uint64(32)
+    unit = _TEN_MICROSECONDS_NS if _number(data, at + 16, 4) == _TEN_MICROSECONDS else 1
+    sound = length <= FD_BYTES if fd else length == min(fd_lengths[min(code, 15)], CLASSIC_BYTES)
+    if not sound or time > np.uint64(max(LATEST_TIME_STAMP_NS - start_ns, 0) // unit):
+        return DAMAGED
+    if length > columns.data.shape[1]:
+        return _TOO_LONG
+    for k in range(min(length, size - fields - body)):
+        columns.data[row, k] = data[b + fields + k]
+    columns.time_ns[row] = start_ns + np.int64(time) * unit
+    columns.key[row] = _number(data, b + 4, 4) & (LARGEST_IDENTIFIER | EXTENDED_BIT)
+    columns.channel[row], columns.length[row] = channel, length
+    return DATA
 
 
-def _walk(starts: _Places, size: _Places, possible: Mask, length: int) -> tuple[_Places, str]:
-    """Which signatures are those of complete objects, and what ends them: a payload may hold the same letters."""
-    found, here, wrong = [], 0, ""
-    while (k := int(np.searchsorted(starts, here))) < len(starts) and starts[k] <= here + _LONGEST_PADDING:
-        if not possible[k]:
-            wrong = f"a container holds an object of {size[k]} bytes, which is impossible for its type"
-        if wrong or starts[k] + size[k] > length:
-            break
-        found.append(k)
-        here = int(starts[k] + size[k])
-    return np.array(found, np.int64), wrong
+@inner
+def _is_signature(data: NDArray[np.uint8], at: int) -> bool:
+    return data[at] == ord("L") and data[at + 1] == ord("O") and data[at + 2] == ord("B") and data[at + 3] == ord("J")
 
 
-def _fields(buffer: _Bytes, at: _Places, fields: np.dtype[np.void]) -> NDArray[np.void]:
-    """Records that start at these bytes, shape (n,)."""
-    if not at.size:
-        return np.zeros(0, fields)
-    rows: NDArray[np.void] = sliding_window_view(buffer, fields.itemsize)[at].view(fields)[:, 0]
-    return rows
-
-
-def _frames(data: bytes, at: _Places, start_ns: int) -> Frames:
-    """Frames of the objects that start at these bytes."""
-    buffer = np.frombuffer(data, np.uint8)
-    headers = _fields(buffer, at, _HEADER)
-    body_at = np.select([headers["version"] == version for version in _BODY_AT], list(_BODY_AT.values()), 0)
-    parts, places = [], []
-    for number, kind in _KINDS.items():
-        which = np.flatnonzero((headers["kind"] == number) & (body_at > 0))
-        if which.size:
-            frames, kept = _frames_of_kind(buffer, at[which] + body_at[which], kind, headers[which], start_ns)
-            parts.append(frames)
-            places.append(which[kept])
-    joined = concatenate_frames(parts) if len(parts) != 1 else parts[0]
-    if len(parts) > 1:
-        joined = joined.take(np.argsort(np.concatenate(places), kind="stable"))
-    unknown = int(np.sum(np.isin(headers["kind"], list(_KINDS)) & (body_at == 0)))
-    errors = int(np.isin(headers["kind"], _ERROR_KINDS).sum())
-    return replace(joined, error_frames=errors, damaged=joined.damaged + unknown)
-
-
-def _frames_of_kind(
-    buffer: _Bytes, body_at: _Places, kind: _Kind, headers: NDArray[np.void], start_ns: int
-) -> tuple[Frames, _Places]:
-    """Data frames of objects of one type, whose bodies start at these bytes, and which of the objects they are."""
-    body, payload_at = _fields(buffer, body_at, kind.fields), body_at + kind.fields.itemsize
-    remote, is_fd = body["flags"] & kind.remote > 0, body[kind.fd[0]] & kind.fd[1] > 0
-    by_code = _FD_LENGTHS[np.minimum(body["dlc"], len(_FD_LENGTHS) - 1)]
-    classic = np.minimum(by_code, CLASSIC_BYTES)
-    length = body["valid"].astype(np.int64) if kind is not _CLASSIC else classic
-    size = headers["size"].astype(np.int64)
-    if kind is _FD_64:
-        size = np.where(body["extension_at"] > 0, body["extension_at"], size)
-    there = (
-        size - kind.fields.itemsize - np.select([headers["version"] == v for v in _BODY_AT], list(_BODY_AT.values()))
-    )
-    time_ns = _time_ns(headers, start_ns)
-    sound = np.where(is_fd, length <= FD_BYTES, length == classic) & (time_ns >= 0)
-    kept = np.flatnonzero(sound & ~remote)
-    width = FD_BYTES if np.any(length[kept] > CLASSIC_BYTES) else CLASSIC_BYTES
-    payloads = sliding_window_view(buffer, width)[payload_at[kept]]
-    payloads[np.arange(width) >= np.minimum(there, length)[kept, None]] = 0
-    numbers, channel = np.unique(body["channel"][kept], return_inverse=True)
-    frames = Frames(
-        time_ns=time_ns[kept],
-        key=body["identifier"][kept] & np.uint32(LARGEST_IDENTIFIER | EXTENDED_BIT),
-        channel=channel.astype(np.uint32),
-        length=length[kept].astype(np.uint8),
-        data=payloads,
-        channels=tuple(str(number - 1) for number in numbers.tolist()),
-        remote_frames=int(remote.sum()),
-        damaged=int(np.sum(~sound & ~remote)),
-    )
-    return frames, kept
-
-
-def _time_ns(headers: NDArray[np.void], start_ns: int) -> _Places:
-    """Time stamps since 1970, -1 where impossible. [ns]"""
-    time, coarse = headers["time"].copy(), headers["flags"] == _TEN_MICROSECONDS
-    latest = max(LATEST_TIME_STAMP_NS - start_ns, 0)
-    possible = time <= np.where(coarse, np.uint64(latest // _TEN_MICROSECONDS_NS), np.uint64(latest))
-    time[coarse] *= np.uint64(_TEN_MICROSECONDS_NS)
-    time_ns = np.where(possible, time, 0).astype(np.int64) + start_ns
-    return np.asarray(np.where(possible, time_ns, -1))
+@inner
+def _number(data: NDArray[np.uint8], at: int, size: int) -> int:
+    """Unsigned little-endian number of up to 4 bytes."""
+    value = 0
+    for k in range(size):
+        value |= np.int64(data[at + k]) << (8 * k)
+    return value

@@ -1,4 +1,4 @@
-"""Lines of ``candump`` turned into frame arrays; those of ``candump -L`` without a Python object per frame.
+"""Lines of ``candump`` turned into frame arrays, those of ``candump -L`` by compiled code.
 
     (1740960798.000833) can0 2E5#000007320000DD00           classic, 11 bits
     (1740960798.000833) can0 000002E5##1000007320000DD00    CAN FD, 29 bits; one digit of flags after ##
@@ -6,28 +6,31 @@
 
     (1740960798.000833)  can0  2E5   [8]  00 00 07 32      printed with -ta, -tA, -tz, -td: turned into the form above
 
-Lines of one shape (lengths of time stamp, channel, identifier and payload) are a matrix of characters; a file has a few
-dozen shapes at most. A line of no known shape is damaged and counted.
+A line of none of these forms is damaged and counted.
 """
 
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
 from math import isfinite, nan
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from calibrator.compiled import compiled, inner
 from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import (
     CLASSIC_BYTES,
+    DAMAGED,
+    DATA,
+    ERROR,
     EXTENDED_BIT,
     FD_BYTES,
     LARGEST_IDENTIFIER,
+    NOTHING,
+    REMOTE,
+    FrameColumns,
     Frames,
     concatenate_frames,
 )
@@ -35,35 +38,13 @@ from calibrator.recordings.log_files import (
     MAX_DAMAGED_SHARE,
     UNREADABLE,
     open_log,
-    read_undamaged,
     reason_of,
     remedy_for,
+    text_blocks,
     text_head,
 )
 
 __all__ = ["is_candump", "parse_candump", "read_candump"]
-
-_Characters = NDArray[np.uint8]
-_Numbers = NDArray[np.int64]
-
-BLOCK_BYTES = 1 << 23
-"""Text parsed at a time: bounds the memory, large enough for the array operations."""
-
-_ERROR_BIT = 1 << 29
-_STANDARD_DIGITS = 3
-_EXTENDED_DIGITS = 8
-_LARGEST_SHAPE = 256
-"""No field of a line is this long; longer ones are damage."""
-_FD_MARK = len("##1")
-_SECOND_DIGITS = range(1, 11)
-_FRACTION_DIGITS = (6, 9)
-"""candump writes microseconds, or nanoseconds where asked."""
-
-_NOT_HEX = 255
-_HEX = np.full(256, _NOT_HEX, np.uint8)
-for _digit, _character in enumerate("0123456789ABCDEF"):
-    _HEX[[ord(_character), ord(_character.lower())]] = _digit
-
 
 _PRINTED = re.compile(
     rb"^[ \t]*(?:\((?P<time>[-\d:. ]+)\)[ \t]+)?(?P<channel>[\w.-]+)[ \t]+(?:[RT]X [-B] [-E][ \t]+)?"
@@ -76,6 +57,17 @@ _MOST_DISORDER = 0.1
 """Share of lines whose time is not after the one before: in a log nearly none, of distances about half. [1]"""
 _SINCE_1970_S = 1e8
 """Later than any time since a start. [s]"""
+_ERROR_BIT = 1 << 29
+_MOST_CHANNELS = 256
+"""Different names in one block of text; no machine has more buses."""
+_LONGEST_NAME = 255
+_NOT_HEX = 255
+HEX = np.full(256, _NOT_HEX, np.uint8)
+"""Value of each character as a hexadecimal digit."""
+for _digit, _character in enumerate("0123456789ABCDEF"):
+    HEX[[ord(_character), ord(_character.lower())]] = _digit
+_Text = NDArray[np.uint8]
+_LF, _CR, _SPACE, _OPEN, _CLOSE, _POINT, _HASH = (ord(character) for character in "\n\r ().#")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +120,7 @@ def read_candump(path: Path) -> Frames:
     try:
         printed = is_candump(text_head(path)[0], printed=True)
         with open_log(path) as file:
-            for text in [_log_lines(file.read(), str(path))] if printed else _blocks(file):
+            for text in [_log_lines(file.read(), str(path))] if printed else text_blocks(file):
                 block = parse_candump(text)
                 if block.first_damaged is not None and first_damaged is None:
                     first_damaged = above + block.first_damaged + 1
@@ -148,21 +140,6 @@ def read_candump(path: Path) -> Frames:
             f"expected '(seconds) channel identifier#data' as 'candump -L' writes it; {len(frames)} frames are readable"
         )
     return frames
-
-
-def _blocks(file: BinaryIO) -> Iterator[bytes]:
-    """Pieces of some size that end at a line end; those before a damage come before its error."""
-    rest, damage, ended = b"", None, False
-    while damage is None and not ended:
-        part, damage = read_undamaged(file, BLOCK_BYTES)
-        ended = not part and damage is None
-        text = rest + part
-        cut = len(text) if ended else text.rfind(b"\n") + 1
-        rest = text[cut:]
-        if cut:
-            yield text[:cut]
-    if damage is not None:
-        raise damage
 
 
 def _log_lines(text: bytes, where: str) -> bytes:
@@ -211,151 +188,116 @@ def parse_candump(text: bytes) -> CandumpBlock:
     CandumpBlock
         The frames in the order of the lines, and what could not be read.
     """
-    buffer = np.frombuffer(text, np.uint8)
-    starts, ends, numbers = _lines(buffer)
-    if not starts.size:
-        return CandumpBlock(frames=concatenate_frames([]), lines=0, first_damaged=None)
-    edges, known = _edges(buffer, starts, ends)
-    damaged = ~known
-    kept, parts = [np.zeros(0, np.int64)], []
-    for lines in _shapes(edges, np.flatnonzero(known)):
-        frames, sound = _parse_shape(buffer, edges, damaged, lines)
-        parts.append(frames)
-        kept.append(sound)
-    frames = concatenate_frames(parts).take(np.argsort(np.concatenate(kept), kind="stable"))
-    first = int(numbers[np.argmax(damaged)]) if damaged.any() else None
-    return CandumpBlock(frames=replace(frames, damaged=int(damaged.sum())), lines=len(starts), first_damaged=first)
+    columns = FrameColumns.of(text.count(b"\n") + 1, fd=b"##" in text)
+    names = np.zeros((_MOST_CHANNELS, 2), np.int64)
+    found = _parse(np.frombuffer(text, np.uint8), HEX, names, columns)
+    frames = columns.frames([text[start:end].decode("latin-1") for start, end in names[:found].tolist()])
+    first = int(np.argmax(columns.kind == DAMAGED)) if frames.damaged else None
+    return CandumpBlock(frames=frames, lines=int(np.count_nonzero(columns.kind)), first_damaged=first)
 
 
-def _lines(buffer: _Characters) -> tuple[_Numbers, _Numbers, _Numbers]:
-    """Start, end and number of each line that is not blank; blanks at the ends are left out."""
-    breaks = np.flatnonzero(buffer == ord("\n"))
-    starts = np.concatenate([[0], breaks + 1])
-    ends = np.concatenate([breaks, [len(buffer)]])
-    has_return = (ends > starts) & (buffer[np.maximum(ends - 1, 0)] == ord("\r")) if buffer.size else ends > starts
-    ends = ends - has_return
-    kept = np.flatnonzero(ends > starts)
-    return starts[kept], ends[kept], kept
+@compiled
+def _parse(text: _Text, digits: _Text, names: NDArray[np.int64], columns: FrameColumns) -> int:
+    """Parse line by line; the number of different channels, whose first and last places in the text are `names`."""
+    row, start, channels = 0, 0, 0
+    while start < len(text):
+        end = start
+        while end < len(text) and text[end] != _LF:
+            end += 1
+        stop = end - 1 if end > start and text[end - 1] == _CR else end
+        columns.kind[row], first, last = _parse_line(text[:stop], start, digits, row, columns)
+        if columns.kind[row] == DATA:
+            number = 0
+            while number < channels and not _same(text, names[number], first, last):
+                number += 1
+            if number == _MOST_CHANNELS:
+                columns.kind[row] = DAMAGED
+            elif number == channels:
+                names[number, 0], names[number, 1] = first, last
+                channels += 1
+            columns.channel[row] = number
+        row += 1
+        start = end + 1
+    return channels
 
 
-def _edges(buffer: _Characters, starts: _Numbers, ends: _Numbers) -> tuple[list[_Numbers], NDArray[np.bool_]]:
-    """Where time, channel, identifier and payload of each line start and end; if it has just these."""
-
-    def at(position: _Numbers) -> _Characters:
-        return buffer[np.clip(position, 0, len(buffer) - 1)]
-
-    spaces = np.append(np.flatnonzero(buffer == ord(" ")), [len(buffer)] * 3)
-    hashes = np.append(np.flatnonzero(buffer == ord("#")), [len(buffer)])
-    first = np.searchsorted(spaces, starts)
-    space, second_space = spaces[first], spaces[first + 1]
-    payload_end = np.minimum(spaces[first + 2], ends)
-    mark = hashes[np.searchsorted(hashes, starts)]
-    fd = at(mark + 1) == ord("#")
-    time, channel, identifier = (starts + 1, space - 1), (space + 1, second_space), (second_space + 1, mark)
-    edges = [*time, *channel, *identifier, np.where(fd, mark + _FD_MARK, mark + 1), payload_end]
-    known = (buffer[starts] == ord("(")) & (at(space - 1) == ord(")"))
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
-        known &= (start <= end) & (end - start < _LARGEST_SHAPE)
-    direction = at(ends - 1) & ~np.uint8(0x20)
-    tail = ends - payload_end
-    known &= (tail == 0) | ((tail == len(" R")) & ((direction == ord("R")) | (direction == ord("T"))))
-    return edges, known & (~fd | (_HEX[at(mark + 2)] != _NOT_HEX))
+@inner
+def _same(text: _Text, name: NDArray[np.int64], first: int, last: int) -> bool:
+    """Whether two parts of the text are the same."""
+    if name[1] - name[0] != last - first:
+        return False
+    for k in range(last - first):
+        if text[name[0] + k] != text[first + k]:
+            return False
+    return True
 
 
-def _shapes(edges: list[_Numbers], known: _Numbers) -> list[_Numbers]:
-    """Groups of lines whose fields have the same lengths."""
-    if not known.size:
-        return []
-    shape = np.zeros(len(known), np.int64)
-    for k in (0, 2, 4, 5, 6):  # from 5 to 6 is the mark
-        shape = shape * _LARGEST_SHAPE + (edges[k + 1] - edges[k])[known]
-    order = np.argsort(shape, kind="stable")
-    return np.split(known[order], np.flatnonzero(np.diff(shape[order])) + 1)
+@inner
+def _parse_line(text: _Text, at: int, digits: _Text, row: int, columns: FrameColumns) -> tuple[int, int, int]:
+    """Parse what starts here and ends with the text into a row: what it is, and where its channel stands."""
+    stop = len(text)
+    if at == stop:
+        return NOTHING, 0, 0
+    if text[at] != _OPEN:
+        return DAMAGED, 0, 0
+    seconds, at = _decimal(text, at + 1, 10)
+    if at < 0 or seconds >= 9 * 10**9 or at == stop or text[at] != _POINT:
+        return DAMAGED, 0, 0
+    fraction, end = _decimal(text, at + 1, 9)
+    if end - at - 1 == 6:
+        fraction *= 1000
+    elif end - at - 1 != 9:
+        return DAMAGED, 0, 0
+    if end + 2 > stop or text[end] != _CLOSE or text[end + 1] != _SPACE:
+        return DAMAGED, 0, 0
+    first = last = end + 2
+    while last < stop and text[last] != _SPACE:
+        last += 1
+    at, identifier = last + 1, 0
+    while at < stop and digits[text[at]] != _NOT_HEX and at - last <= 8:
+        identifier = 16 * identifier + digits[text[at]]
+        at += 1
+    extended = at - last == 9
+    largest = (_ERROR_BIT | LARGEST_IDENTIFIER) if extended else 0x7FF
+    if last - first > _LONGEST_NAME or not (extended or at - last == 4) or identifier > largest:
+        return DAMAGED, 0, 0
+    if at >= stop or text[at] != _HASH:
+        return DAMAGED, 0, 0
+    fd = at + 1 < stop and text[at + 1] == _HASH
+    at += 1
+    if fd:
+        if at + 1 >= stop or digits[text[at + 1]] == _NOT_HEX:
+            return DAMAGED, 0, 0
+        at += 2
+    end = at
+    while end < stop and text[end] != _SPACE:
+        end += 1
+    direction = text[stop - 1] & 0xDF  # upper case
+    if end < stop and not (stop - end == 2 and (direction == ord("R") or direction == ord("T"))):
+        return DAMAGED, 0, 0
+    if identifier & _ERROR_BIT:
+        return ERROR, first, last
+    if not fd and end > at and text[at] & 0xDF == ord("R"):
+        return REMOTE, first, last
+    size = (end - at) // 2
+    if (end - at) % 2 or size > (FD_BYTES if fd else CLASSIC_BYTES):
+        return DAMAGED, 0, 0
+    for k in range(size):
+        high, low = digits[text[at + 2 * k]], digits[text[at + 2 * k + 1]]
+        if high == _NOT_HEX or low == _NOT_HEX:
+            return DAMAGED, 0, 0
+        columns.data[row, k] = 16 * high + low
+    columns.time_ns[row] = seconds * 10**9 + fraction
+    columns.key[row] = identifier | EXTENDED_BIT if extended else identifier
+    columns.length[row] = size
+    return DATA, first, last
 
 
-def _parse_shape(
-    buffer: _Characters, edges: list[_Numbers], damaged: NDArray[np.bool_], lines: _Numbers
-) -> tuple[Frames, _Numbers]:
-    """Frames of lines of one shape and their lines; marks the lines that are none in `damaged`."""
-    time, channel, identifier_text, payload = (
-        _matrix(buffer, edges[k][lines], edges[k + 1][lines[0]]) for k in (0, 2, 4, 6)
-    )
-    fd = edges[6][lines[0]] - edges[5][lines[0]] == _FD_MARK
-    remote = np.full(len(lines), fill_value=False)
-    if not fd and payload.shape[1]:
-        remote = (payload[:, 0] & ~np.uint8(0x20)) == ord("R")
-    time_ns, time_ok = _times(time)
-    identifier, identifier_ok = _identifiers(identifier_text)
-    data, data_ok = _payloads(payload, FD_BYTES if fd else CLASSIC_BYTES)
-    error = identifier_ok & (identifier & _ERROR_BIT > 0)
-    sound = time_ok & identifier_ok & (data_ok | remote | error)
-    damaged[lines[~sound]] = True
-    kept = sound & ~remote & ~error
-    number, channels = _channels(channel)
-    extended = EXTENDED_BIT if identifier_text.shape[1] == _EXTENDED_DIGITS else 0
-    frames = Frames(
-        time_ns=time_ns[kept],
-        key=(identifier[kept] & LARGEST_IDENTIFIER | extended).astype(np.uint32),
-        channel=number[kept],
-        length=np.full(int(kept.sum()), payload.shape[1] // 2 if data_ok.any() else 0, np.uint8),
-        data=data[kept],
-        channels=channels,
-        error_frames=int((sound & error).sum()),
-        remote_frames=int((sound & remote & ~error).sum()),
-    )
-    return frames, lines[kept]
-
-
-def _matrix(buffer: _Characters, starts: _Numbers, first_end: np.int64) -> _Characters:
-    """Characters of a field of the same length in all lines, shape (n, width)."""
-    width = int(first_end - starts[0])
-    return sliding_window_view(buffer, width)[starts] if width else np.zeros((len(starts), 0), np.uint8)
-
-
-def _decimal(digits: _Characters) -> tuple[_Numbers, NDArray[np.bool_]]:
-    values = digits - np.uint8(ord("0"))
-    return _positional(values, 10), np.all(values <= 9, axis=1)  # what lies below "0" wraps
-
-
-def _positional(digits: _Characters, base: int) -> _Numbers:
-    """Value of up to 10 digits; in float64, where that is exact, as it multiplies matrices faster."""
-    powers = float(base) ** np.arange(digits.shape[1])[::-1]
-    return np.asarray(digits.astype(np.float64) @ powers).astype(np.int64)
-
-
-def _times(text: _Characters) -> tuple[_Numbers, NDArray[np.bool_]]:
-    """Time stamps such as 1740960798.000833 in nanoseconds."""
-    for fraction in _FRACTION_DIGITS:
-        whole = text.shape[1] - fraction - 1
-        if whole in _SECOND_DIGITS and np.all(text[:, whole] == ord(".")):
-            seconds, seconds_ok = _decimal(text[:, :whole])
-            parts, parts_ok = _decimal(text[:, whole + 1 :])
-            time_ns = seconds * 10**9 + parts * 10 ** (9 - fraction)
-            return time_ns, seconds_ok & parts_ok & (seconds < 9 * 10**9)
-    return np.zeros(len(text), np.int64), np.full(len(text), fill_value=False)
-
-
-def _identifiers(text: _Characters) -> tuple[_Numbers, NDArray[np.bool_]]:
-    if text.shape[1] not in {_STANDARD_DIGITS, _EXTENDED_DIGITS}:
-        return np.zeros(len(text), np.int64), np.full(len(text), fill_value=False)
-    digits = _HEX[text]
-    value = _positional(digits, 16)
-    largest = 0x7FF if text.shape[1] == _STANDARD_DIGITS else _ERROR_BIT | LARGEST_IDENTIFIER
-    return value, np.all(digits != _NOT_HEX, axis=1) & (value <= largest)
-
-
-def _payloads(text: _Characters, width: int) -> tuple[_Characters, NDArray[np.bool_]]:
-    data = np.zeros((len(text), width), np.uint8)
-    if text.shape[1] % 2 or text.shape[1] > 2 * width:
-        return data, np.full(len(text), fill_value=False)
-    digits = _HEX[text]
-    data[:, : text.shape[1] // 2] = (digits[:, ::2] << 4) | (digits[:, 1::2] & 0xF)
-    return data, np.all(digits != _NOT_HEX, axis=1)
-
-
-def _channels(text: _Characters) -> tuple[NDArray[np.uint32], tuple[str, ...]]:
-    """Index of each line's channel, and the names."""
-    if not text.shape[1]:
-        return np.zeros(len(text), np.uint32), ("",)
-    names, index = np.unique(np.ascontiguousarray(text).view(f"S{text.shape[1]}").ravel(), return_inverse=True)
-    return index.astype(np.uint32), tuple(bytes(name).decode("latin-1") for name in names)
+@inner
+def _decimal(text: _Text, at: int, most: int) -> tuple[int, int]:
+    """Number of up to so many decimal digits, and where it ends; -1 if there is none."""
+    value, end = 0, at
+    while end < len(text) and end - at < most and ord("0") <= text[end] <= ord("9"):
+        value = 10 * value + (text[end] - ord("0"))
+        end += 1
+    return value, end if end > at else -1

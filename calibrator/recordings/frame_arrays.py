@@ -1,4 +1,4 @@
-"""Frames of a log as arrays, so that everything after reading works on whole columns.
+"""Frames of a log as arrays, so that everything after reading works on whole columns; and the time of a log, repaired.
 
 A frame is kept as it was logged: time stamp, identifier, channel, length and payload. Error and remote frames carry no
 payload; they and damaged lines are counted.
@@ -6,7 +6,7 @@ payload; they and damaged lines are counted.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import can
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 
-__all__ = ["EXTENDED_BIT", "FrameCollector", "Frames", "concatenate_frames", "frame_key"]
+__all__ = ["EXTENDED_BIT", "FrameCollector", "Frames", "LogTime", "concatenate_frames", "frame_key", "repaired_time"]
 
 EXTENDED_BIT = 1 << 31
 """Set in a frame's key where the identifier has 29 bits, as in Linux' ``can_id``."""
@@ -23,6 +23,8 @@ CLASSIC_BYTES = 8
 FD_BYTES = 64
 LATEST_TIME_STAMP_NS = 9 * 10**18
 """Larger time stamps do not fit into 64 bits, and no log has them. [ns]"""
+NOTHING, DATA, ERROR, REMOTE, DAMAGED = range(5)
+"""What a line or an object of a log is, in :class:`FrameColumns`."""
 
 
 def frame_key(frame_id: int, *, extended: bool) -> int:
@@ -94,10 +96,14 @@ _COUNTS = ("error_frames", "remote_frames", "damaged")
 
 def concatenate_frames(parts: Sequence[Frames]) -> Frames:
     """Join the pieces of one log; counts add up, channels are merged by name."""
-    parts = [FrameCollector().frames(), *parts]
+    if len(parts) == 1:
+        return parts[0]
+    parts = parts or [FrameCollector().frames()]
     channels = tuple(dict.fromkeys(name for part in parts for name in part.channels))
-    number = {name: index for index, name in enumerate(channels)}
     width = max(part.data.shape[1] for part in parts)
+    same = [np.array([channels.index(name) for name in part.channels], np.uint32)[part.channel] for part in parts]
+    data = [np.pad(part.data, ((0, 0), (0, width - part.data.shape[1]))) for part in parts if part.data.shape[1] < width]
+    padded = iter(data)
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts]) for name in ("time_ns", "key", "length")
     }
@@ -105,32 +111,68 @@ def concatenate_frames(parts: Sequence[Frames]) -> Frames:
     return Frames(
         **columns,
         **counts,
-        channel=np.concatenate(
-            [np.array([*map(number.get, part.channels)], np.uint32)[part.channel] for part in parts]
-        ),
-        data=np.concatenate([_widened(part.data, width) for part in parts]),
+        channel=np.concatenate(same),
+        data=np.concatenate([part.data if part.data.shape[1] == width else next(padded) for part in parts]),
         channels=channels,
     )
 
 
-def _widened(data: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    missing = width - data.shape[1]
-    return np.pad(data, ((0, 0), (0, missing))) if missing else data
+class FrameColumns(NamedTuple):
+    """What compiled readers fill in, a row per line or object of a log: what it is, and the columns of :class:`Frames`.
+
+    Channels are numbers of the reader's own.
+    """
+
+    kind: NDArray[np.uint8]
+    time_ns: NDArray[np.int64]
+    key: NDArray[np.uint32]
+    channel: NDArray[np.uint32]
+    length: NDArray[np.uint8]
+    data: NDArray[np.uint8]
+
+    @classmethod
+    def of(cls, rows: int, *, fd: bool) -> "FrameColumns":
+        """Columns of so many rows, for payloads of 8 bytes, or of 64 for CAN FD."""
+        types = (np.uint8, np.int64, np.uint32, np.uint32, np.uint8)
+        width = FD_BYTES if fd else CLASSIC_BYTES
+        return cls(*(np.zeros(rows, kind) for kind in types), np.zeros((rows, width), np.uint8))  # type: ignore[arg-type]
+
+    def frames(self, channels: Sequence[str] | None = None) -> Frames:
+        """Data frames, and the counts of the other rows.
+
+        `channels` are the names by the reader's numbers; without them these count from 1, and names from 0, as those of
+        python-can do.
+        """
+        counts = np.bincount(self.kind, minlength=DAMAGED + 1).tolist()
+        which = slice(None) if counts[DATA] == len(self.kind) else np.flatnonzero(self.kind == DATA)
+        channel = self.channel[which]
+        if channels is None:
+            numbers = np.flatnonzero(np.bincount(channel))
+            channel = np.searchsorted(numbers, channel).astype(np.uint32)
+            channels = [str(number - 1) for number in numbers.tolist()]
+        return Frames(
+            time_ns=self.time_ns[which],
+            key=self.key[which],
+            channel=channel,
+            length=self.length[which],
+            data=self.data[which],
+            channels=tuple(channels),
+            error_frames=counts[ERROR],
+            remote_frames=counts[REMOTE],
+            damaged=counts[DAMAGED],
+        )
 
 
 class FrameCollector:
     """Takes messages of python-can one by one and gives them back as :class:`Frames`."""
 
     def __init__(self) -> None:
-        self._time_ns: list[int] = []
-        self._key: list[int] = []
-        self._channel: list[int] = []
-        self._payload: list[bytes | bytearray] = []
+        self._rows: list[tuple[int, int, int, bytes | bytearray]] = []
         self._channels: dict[str, int] = {}
         self.counts = dict.fromkeys(_COUNTS, 0)
 
     def __len__(self) -> int:
-        return len(self._time_ns)
+        return len(self._rows)
 
     def add(self, message: can.Message) -> None:
         """Take one message; one with an impossible length, identifier or time stamp is counted as damaged."""
@@ -141,22 +183,22 @@ class FrameCollector:
         elif not _is_possible(message):
             self.counts["damaged"] += 1
         else:
-            self._time_ns.append(round(message.timestamp * 1e9))
-            self._key.append(frame_key(message.arbitration_id, extended=message.is_extended_id))
-            self._channel.append(self._channels.setdefault(str(message.channel), len(self._channels)))
-            self._payload.append(message.data)
+            key = frame_key(message.arbitration_id, extended=message.is_extended_id)
+            channel = self._channels.setdefault(str(message.channel), len(self._channels))
+            self._rows.append((round(message.timestamp * 1e9), key, channel, message.data))
 
     def frames(self) -> Frames:
         """Everything taken so far."""
-        length = np.fromiter(map(len, self._payload), np.uint8, len(self._payload))
+        time_ns, key, channel, payload = zip(*self._rows, strict=True) if self._rows else ((), (), (), ())
+        length = np.fromiter(map(len, payload), np.uint8, len(payload))
         width = FD_BYTES if np.any(length > CLASSIC_BYTES) else CLASSIC_BYTES
-        payload = b"".join(bytes(data).ljust(width, b"\0") for data in self._payload)
+        joined = b"".join(bytes(data).ljust(width, b"\0") for data in payload)
         return Frames(
-            time_ns=np.array(self._time_ns, np.int64),
-            key=np.array(self._key, np.uint32),
-            channel=np.array(self._channel, np.uint32),
+            time_ns=np.array(time_ns, np.int64),
+            key=np.array(key, np.uint32),
+            channel=np.array(channel, np.uint32),
             length=length,
-            data=np.frombuffer(payload, np.uint8).reshape(-1, width),
+            data=np.frombuffer(joined, np.uint8).reshape(-1, width),
             channels=tuple(self._channels),
             **self.counts,
         )
@@ -169,4 +211,71 @@ def _is_possible(message: can.Message) -> bool:
         (size <= FD_BYTES if message.is_fd else size == min(message.dlc, CLASSIC_BYTES))
         and 0 <= message.arbitration_id <= LARGEST_IDENTIFIER
         and 0.0 <= message.timestamp <= 1e-9 * LATEST_TIME_STAMP_NS
+    )
+
+
+# ---- time
+
+LARGEST_DISORDER_S = 1.0
+"""Buffers of loggers are emptied more often than this. [s]"""
+LONGEST_PAUSE_S = 600.0
+"""A bus that is silent for longer has been asleep; what follows counts as after a gap. [s]"""
+CLOCK_GAP_S = 60.0
+"""Length of the gap that replaces a clock step; longer than all time-outs of usual layouts. [s]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogTime:
+    """Time of the frames of one log: increasing, and without the jumps of a clock that was set while recording.
+
+    Attributes
+    ----------
+    order : ndarray of int64, shape (n,)
+        Order in which the frames are to be taken.
+    time_s : ndarray of shape (n,)
+        Time since the first frame, in that order, not decreasing. [s]
+    disordered : int
+        Frames that were logged before an earlier one.
+    clock_steps : int
+        Steps of the clock that were replaced by a gap of :data:`CLOCK_GAP_S`.
+    """
+
+    order: NDArray[np.int64]
+    time_s: Array
+    disordered: int
+    clock_steps: int
+
+
+def repaired_time(time_ns: NDArray[np.int64]) -> LogTime:
+    """Put time stamps into order.
+
+    Frames of several buses may be logged slightly out of order: they are sorted. A larger step back, or a step forward
+    longer than any pause within a drive, is the clock's: the recording goes on after a gap of fixed length, so that
+    nothing is interpolated across it and a wrong date cannot make a drive of years.
+
+    Parameters
+    ----------
+    time_ns : ndarray of int64, shape (n,)
+        Time stamps in the order of the file, n > 0. [ns]
+
+    Returns
+    -------
+    LogTime
+        Order, time since the first frame, and what was repaired.
+    """
+    elapsed = (time_ns - time_ns[0]) * 1e-9
+    step = np.diff(elapsed)
+    jump = (step < -LARGEST_DISORDER_S) | (step > LONGEST_PAUSE_S)
+    clock_steps = int(jump.sum())
+    if clock_steps:
+        elapsed = elapsed + np.concatenate([[0.0], np.cumsum(np.where(jump, CLOCK_GAP_S - step, 0.0))])
+    if not clock_steps and not (step < 0.0).any():  # as nearly always
+        return LogTime(order=np.arange(len(elapsed)), time_s=elapsed, disordered=0, clock_steps=0)
+    order = np.argsort(elapsed, kind="stable")
+    ordered = elapsed[order]
+    return LogTime(
+        order=order,
+        time_s=ordered - ordered[0],
+        disordered=int(np.sum(elapsed < np.maximum.accumulate(elapsed))),
+        clock_steps=clock_steps,
     )

@@ -23,6 +23,7 @@ from typing import TextIO
 import can
 
 from calibrator.errors import LogError
+from calibrator.recordings.asc import read_plain_asc
 from calibrator.recordings.blf import read_blf
 from calibrator.recordings.candump import is_candump, read_candump
 from calibrator.recordings.frame_arrays import CLASSIC_BYTES, FrameCollector, Frames, concatenate_frames
@@ -115,7 +116,8 @@ def _read_blf(path: Path) -> Frames:
 def _read_asc(path: Path) -> Frames:
     if _RELATIVE.search(text_head(path)[0]):
         raise LogError(f"{path}: the time stamps are relative to the line before; save it with absolute ones")
-    return _read_by_python_can(path, can.ASCReader)
+    plain = read_plain_asc(path)
+    return plain if plain is not None and len(plain) else _read_by_python_can(path, can.ASCReader)
 
 
 def _read_csv(path: Path) -> Frames:

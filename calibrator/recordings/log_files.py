@@ -35,6 +35,7 @@ __all__ = [
     "reason_of",
     "remedy_for",
     "suffix_of",
+    "text_blocks",
     "text_head",
 ]
 
@@ -48,6 +49,8 @@ MAX_DAMAGED_SHARE = 0.05
 """Of the lines of a text log. Recordings of a real car through a serial adapter had up to 3 % broken lines and decoded
 well. [1]"""
 _HEAD_BYTES = 1 << 16
+BLOCK_BYTES = 1 << 23
+"""Text parsed at a time: bounds the memory, large enough for calls not to count. [byte]"""
 
 
 def suffix_of(path: Path) -> str:
@@ -71,6 +74,21 @@ def read_undamaged(file: BinaryIO, size: int) -> tuple[bytes, Exception | None]:
     except UNREADABLE as error:
         return b"".join(parts), error
     return b"".join(parts), None
+
+
+def text_blocks(file: BinaryIO) -> Iterator[bytes]:
+    """Pieces of a text of :data:`BLOCK_BYTES` that end at a line end; those before a damage come before its error."""
+    rest, damage, ended = b"", None, False
+    while damage is None and not ended:
+        part, damage = read_undamaged(file, BLOCK_BYTES)
+        ended = not part and damage is None
+        text = rest + part
+        cut = len(text) if ended else text.rfind(b"\n") + 1
+        rest = text[cut:]
+        if cut:
+            yield text[:cut]
+    if damage is not None:
+        raise damage
 
 
 def text_head(path: Path) -> tuple[str, str]:

@@ -11,14 +11,28 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from calibrator.errors import LogError
-from calibrator.recordings.frame_arrays import Frames
+from calibrator.recordings.frame_arrays import (
+    CLASSIC_BYTES,
+    DAMAGED,
+    DATA,
+    EXTENDED_BIT,
+    FD_BYTES,
+    LARGEST_IDENTIFIER,
+    LATEST_TIME_STAMP_NS,
+    FrameColumns,
+    Frames,
+    concatenate_frames,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["convert", "is_bus_log", "read_mf4", "read_mf4_table"]
 
@@ -61,7 +75,7 @@ def read_mf4(path: Path) -> Frames:
     return Frames(**{**columns, "channels": tuple(map(str, columns["channels"]))})
 
 
-def read_mf4_table(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
+def read_mf4_table(path: Path) -> "tuple[pd.DataFrame, dict[str, str]]":
     """Read the decoded channels of an MDF 4 file; raises as :func:`read_mf4`.
 
     Parameters
@@ -76,6 +90,8 @@ def read_mf4_table(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
     units : dict of str to str
         By channel.
     """
+    import pandas as pd  # noqa: PLC0415 (the process that reads frames does without)
+
     with _converted(path, "channels.parquet") as result:
         frame = pd.read_parquet(result)
     return frame, frame.attrs["units"]
@@ -105,36 +121,68 @@ def _converted(path: Path, name: str) -> Iterator[Path]:
 
 def convert(path: str, result: str) -> None:
     """Write frames (.npz) or decoded channels (.parquet) of `path` to `result`: what the process does."""
-    if result.endswith(".parquet"):
-        _write_channels(path, result)
-        return
-    import can  # noqa: PLC0415 (only here: the parent needs neither)
-
-    from calibrator.recordings.frame_arrays import FrameCollector  # noqa: PLC0415
-
-    collector = FrameCollector()
-    with can.MF4Reader(path) as reader:
-        for message in reader:
-            collector.add(message)
-    frames = collector.frames()
-    np.savez(result, **{**vars(frames), "channels": np.array(frames.channels, dtype=np.str_)})
-
-
-def _write_channels(path: str, result: str) -> None:
-    from asammdf import MDF  # noqa: PLC0415
+    from asammdf import MDF  # noqa: PLC0415 (only here: the parent needs neither)
 
     with MDF(path) as mdf:
-        frame = mdf.to_dataframe(use_display_names=True, time_as_date=False, reduce_memory_usage=False)
-        units = {
-            name: channel.unit
-            for group in mdf.groups
-            for channel in group.channels
-            for name in (channel.name, *channel.display_names)
-            if channel.unit
-        }
+        if result.endswith(".parquet"):
+            _decoded_channels(mdf).to_parquet(result)
+        else:
+            frames = _frames(mdf)
+            np.savez(result, **{**vars(frames), "channels": np.array(frames.channels, dtype=np.str_)})
+
+
+def _decoded_channels(mdf: Any) -> "pd.DataFrame":
+    frame: pd.DataFrame = mdf.to_dataframe(use_display_names=True, time_as_date=False, reduce_memory_usage=False)
+    units = {
+        name: channel.unit
+        for group in mdf.groups
+        for channel in group.channels
+        for name in (channel.name, *channel.display_names)
+        if channel.unit
+    }
     frame = frame.rename_axis("time [s]")
     frame.attrs["units"] = {name: unit for name in frame if (unit := units.get(name))}
-    frame.to_parquet(result)
+    return frame
+
+
+def _frames(mdf: Any) -> Frames:
+    """Frames of all groups of a bus log, as the standard of ASAM names their channels."""
+    parts, counts = [], dict.fromkeys(("CAN_ErrorFrame", "CAN_RemoteFrame"), 0)
+    for number, group in enumerate(mdf.groups):
+        names = {channel.name for channel in group.channels}
+        for name in names & counts.keys():
+            counts[name] += int(group.channel_group.cycles_nr)
+        if "CAN_DataFrame" in names and group.channel_group.cycles_nr:
+            parts.append(_frames_of_group(mdf.get("CAN_DataFrame", group=number, raw=True), mdf.header.start_time))
+    frames = concatenate_frames(parts)
+    if len(parts) > 1:
+        frames = frames.take(np.argsort(frames.time_ns, kind="stable"))
+    errors, remote = counts.values()
+    return replace(frames, error_frames=errors, remote_frames=remote)
+
+
+def _frames_of_group(signal: Any, start: Any) -> Frames:
+    """Data frames of one group; those of impossible length or time are damaged."""
+    known = {name.removeprefix("CAN_DataFrame.") for name in signal.samples.dtype.names}
+
+    def field(name: str, default: int) -> Any:
+        return signal.samples[f"CAN_DataFrame.{name}"] if name in known else np.full(len(signal.samples), default)
+
+    length, dlc, fd = (field(name, 0).astype(np.int64) for name in ("DataLength", "DLC", "EDL"))
+    stored = field("DataBytes", 0)
+    columns = FrameColumns.of(len(length), fd=bool(np.any(length > CLASSIC_BYTES)))
+    width = min(columns.data.shape[1], stored.shape[1])
+    columns.data[:, :width] = np.where(np.arange(width) < length[:, None], stored[:, :width], 0)
+    time_s = signal.timestamps + start.timestamp()
+    possible = (time_s >= 0.0) & (time_s <= 1e-9 * LATEST_TIME_STAMP_NS)
+    possible &= np.where(fd > 0, length <= FD_BYTES, length == np.minimum(dlc, CLASSIC_BYTES))
+    columns.kind[:] = np.where(possible, DATA, DAMAGED)
+    columns.time_ns[:] = np.rint(1e9 * np.where(possible, time_s, 0.0))
+    identifier = field("ID", 0).astype(np.uint32) & np.uint32(LARGEST_IDENTIFIER)
+    columns.key[:] = identifier | np.where(field("IDE", 1) > 0, np.uint32(EXTENDED_BIT), np.uint32(0))
+    channels, columns.channel[:] = np.unique(field("BusChannel", 0), return_inverse=True)
+    columns.length[:] = length
+    return columns.frames([str(channel) for channel in channels.tolist()] if "BusChannel" in known else ["None"])
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from calibrator.files.formulas import evaluate_formula, formula_names, parse_for
 from calibrator.recordings.decode import codes_of_no_value, decode_signal, message_is_sound, signal_range
 from calibrator.recordings.frame_arrays import EXTENDED_BIT, Frames, frame_key
 from calibrator.recordings.frames import read_frames
-from calibrator.recordings.log_time import CLOCK_GAP_S, repaired_time
+from calibrator.recordings.frame_arrays import CLOCK_GAP_S, repaired_time
 from calibrator.recordings.tables import Table, is_table, read_table
 from calibrator.terminal.text import Notice
 from ecu_node.core.signals import AMPERE, VOLT, WATT, factor_of, usual_unit

@@ -35,7 +35,7 @@ from calibrator.recordings.log_files import (
     suffix_of,
     text_head,
 )
-from calibrator.recordings.log_time import repaired_time
+from calibrator.recordings.frame_arrays import repaired_time
 from calibrator.recordings.mf4 import is_bus_log, read_mf4_table
 from ecu_node.core.signals import AMPERE, usual_unit
 from ecu_node.database import VehicleDatabase, read_database

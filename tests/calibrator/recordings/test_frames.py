@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 
 from calibrator.errors import LogError
 from calibrator.recordings import mf4
-from calibrator.recordings.candump import BLOCK_BYTES, parse_candump
+from calibrator.recordings.candump import parse_candump
 from calibrator.recordings.frame_arrays import Frames
 from calibrator.recordings.frames import is_log, read_frames
+from calibrator.recordings.log_files import BLOCK_BYTES
 
 PYTHON_CAN_FORMATS = (".log", ".asc", ".blf", ".trc")
 

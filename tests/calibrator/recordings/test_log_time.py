@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from calibrator.recordings.log_time import CLOCK_GAP_S, repaired_time
+from calibrator.recordings.frame_arrays import CLOCK_GAP_S, repaired_time
 
 
 def nanoseconds(*seconds: float) -> NDArray[np.int64]:
