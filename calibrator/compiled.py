@@ -35,8 +35,9 @@ CACHE_VARIABLE = "CALIBRATOR_CACHE"
 SOURCES = (
     "compiled.py",
     "score.py",
+    "drives/align.py",
     "drives/charge.py",
-    "drives/delay_fit.py",
+    "drives/delays.py",
     "estimator/decision.py",
     "estimator/explanations.py",
     "estimator/posterior.py",
@@ -44,10 +45,10 @@ SOURCES = (
     "recordings/asc.py",
     "recordings/blf.py",
     "recordings/candump.py",
+    "recordings/decode.py",
     "recordings/frame_arrays.py",
-    "summaries/bank_state.py",
+    "summaries/filter_bank.py",
     "summaries/summariser.py",
-    "summaries/white_noise.py",
 )
 """Files of this package whose functions or constants are compiled."""
 KEPT = 4

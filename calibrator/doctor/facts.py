@@ -16,8 +16,8 @@ from calibrator.errors import DriveError, LogError
 from calibrator.kirchhoff.findings import Junction, look_at_junction
 from calibrator.kirchhoff.signs import multiplied
 from calibrator.kirchhoff.sums import VOLTAGE, junction_voltage, with_voltages
-from calibrator.recordings.frames import read_frames
 from calibrator.recordings.frame_arrays import repaired_time
+from calibrator.recordings.frames import read_frames
 from calibrator.recordings.readers import (
     FrameSource,
     RecordingReport,

@@ -10,10 +10,12 @@ are not valid stay in place with NaN in all columns.
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrator.compiled import compiled, inner
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.errors import DriveError
 from calibrator.files.formulas import evaluate_formula, formula_names, parse_formula
@@ -97,8 +99,16 @@ def base_inputs(layout: Layout, names: Collection[str]) -> set[str]:
     for item in reversed(layout.derived):
         if item.name in found:
             found.remove(item.name)
-            found.update(formula_names(parse_formula(item.formula)))
+            found.update(_names_in(item.formula))
     return found
+
+
+_parsed = cache(parse_formula)
+
+
+@cache
+def _names_in(formula: str) -> frozenset[str]:
+    return frozenset(formula_names(_parsed(formula)))
 
 
 def align(drive: Drive, layout: Layout, branches: Sequence[str], *, inputs: Sequence[str] | None = None) -> Samples:
@@ -134,10 +144,11 @@ def align(drive: Drive, layout: Layout, branches: Sequence[str], *, inputs: Sequ
     time_s, values, reasons = align_channels(
         channels, limits, period_s=layout.period_s, where=f"vehicle {drive.vehicle}, drive {drive.name}"
     )
+    recorded_inputs = {name: value for name, value in values.items() if name not in branches}
     for item in layout.derived:
-        if base_inputs(layout, [item.name]) <= values.keys():
-            values[item.name] = evaluate_formula(parse_formula(item.formula), _inputs_only(values, branches))
-    matrix = np.column_stack([np.zeros((len(time_s), 0)), *(values[name] for name in names)])
+        if base_inputs(layout, [item.name]) <= recorded_inputs.keys():
+            recorded_inputs[item.name] = evaluate_formula(_parsed(item.formula), recorded_inputs)
+    matrix = np.column_stack([np.zeros((len(time_s), 0)), *(recorded_inputs[name] for name in names)])
     reasons[_UNDEFINED] = ~np.all(np.isfinite(matrix), axis=1) & ~(reasons[_STALE] | reasons[_NOT_GOOD])
     valid = ~np.any(list(reasons.values()), axis=0)
     currents_a = np.column_stack([values[name] for name in branches])
@@ -183,19 +194,16 @@ def align_channels(
     DriveError
         If a channel has no good sample, or the channels have no instant in common.
     """
-    good = {name: _good_part(channel) for name, channel in channels.items()}
-    empty = [name for name, channel in good.items() if not channel.time_s.size]
+    empty = [name for name, channel in channels.items() if not channel.good.any()]
     if empty:
         raise DriveError(f"{where}: no good sample of {', '.join(empty)}; leave the drive out or repair the channel")
-    time_s = _time_base(good, period_s, where)
+    time_s = _time_base([channel.time_s[channel.good] for channel in channels.values()], period_s, where)
     values: dict[str, Array] = {}
-    reasons = {_STALE: np.zeros(len(time_s), np.bool_), _NOT_GOOD: np.zeros(len(time_s), np.bool_)}
-    for name, channel in good.items():
-        values[name], far = _interpolated(channel, time_s, limits_s[name])
-        spoilt = far & _has_bad_between(channels[name], channel, time_s)
-        reasons[_NOT_GOOD] |= spoilt
-        reasons[_STALE] |= far & ~spoilt
-    return time_s, values, reasons
+    label = np.zeros(len(time_s), np.uint8)
+    for name, channel in channels.items():
+        values[name], found = _interpolated(channel, time_s, limits_s[name])
+        label |= found
+    return time_s, values, {_STALE: label & _FAR > 0, _NOT_GOOD: label & _SPOILT > 0}
 
 
 def at_instants(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array, Mask]:
@@ -217,9 +225,9 @@ def at_instants(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array,
     known : ndarray of bool, shape (T,)
         False where the good samples beside the instant are too far apart, or are not on both sides.
     """
-    good = _good_part(channel)
-    value, far = _interpolated(good, time_s, limit_s)
-    return value, ~far & (time_s >= good.time_s[0]) & (time_s <= good.time_s[-1])
+    value, label = _interpolated(channel, time_s, limit_s)
+    good_s = channel.time_s[channel.good]
+    return value, (label == 0) & (time_s >= good_s[0]) & (time_s <= good_s[-1])
 
 
 def _require(drive: Drive, branches: Sequence[str], inputs: Sequence[str]) -> None:
@@ -232,20 +240,9 @@ def _require(drive: Drive, branches: Sequence[str], inputs: Sequence[str]) -> No
         )
 
 
-def _inputs_only(values: Mapping[str, Array], branches: Sequence[str]) -> dict[str, Array]:
-    return {name: value for name, value in values.items() if name not in branches}
-
-
-def _good_part(channel: Channel) -> Channel:
-    """Good samples only; of several at one instant the last."""
-    time_s, value = channel.time_s[channel.good], channel.value[channel.good]
-    last = np.append(np.diff(time_s) > 0.0, [True])[: len(time_s)]
-    return Channel(time_s=time_s[last], value=value[last], good=np.ones(int(last.sum()), np.bool_))
-
-
-def _time_base(channels: Mapping[str, Channel], period_s: float, where: str) -> Array:
-    start = max(float(channel.time_s[0]) for channel in channels.values())
-    stop = min(float(channel.time_s[-1]) for channel in channels.values())
+def _time_base(good_s: Sequence[Array], period_s: float, where: str) -> Array:
+    """Instants that the good samples of all channels cover."""
+    start, stop = max(float(time_s[0]) for time_s in good_s), min(float(time_s[-1]) for time_s in good_s)
     slack = TIME_RESOLUTION_S * period_s
     first, last = int(np.ceil((start - slack) / period_s)), int(np.floor((stop + slack) / period_s))
     if last < first:
@@ -258,25 +255,59 @@ def _time_base(channels: Mapping[str, Channel], period_s: float, where: str) -> 
     return np.arange(first, last + 1) * period_s
 
 
-def _interpolated(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array, Mask]:
-    """Values at the instants, and where the neighbours are too far apart."""
-    before, after = _neighbours(channel.time_s, time_s)
-    gap_s = channel.time_s[after] - channel.time_s[before]
-    share = np.divide(time_s - channel.time_s[before], gap_s, out=np.zeros(len(time_s)), where=gap_s > 0.0)
-    share = np.clip(share, 0.0, 1.0)
-    value = (1.0 - share) * channel.value[before] + share * channel.value[after]
-    return value, gap_s > limit_s + TIME_RESOLUTION_S
+def _interpolated(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array, NDArray[np.uint8]]:
+    """Values at the instants, and labels of those whose neighbours are too far apart."""
+    value, label = np.empty(len(time_s)), np.zeros(len(time_s), np.uint8)
+    samples = (np.ascontiguousarray(channel.time_s), np.ascontiguousarray(channel.value), channel.good)
+    _interpolate(samples, time_s, limit_s + TIME_RESOLUTION_S, value, label)
+    return value, label
 
 
-def _neighbours(known_s: Array, time_s: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Index of the last sample at or before and of the next at or after each instant; one and the same if at it."""
-    after = np.minimum(np.searchsorted(known_s, time_s, side="left"), len(known_s) - 1)
-    before = np.where(known_s[after] > time_s, np.maximum(after - 1, 0), after)
-    return before, after
+_FAR, _SPOILT = 1, 2
 
 
-def _has_bad_between(channel: Channel, good: Channel, time_s: Array) -> Mask:
-    """Whether samples that are not good lie between the good neighbours of each instant."""
-    bad_s = channel.time_s[~channel.good]
-    before, after = _neighbours(good.time_s, time_s)
-    return np.asarray(np.searchsorted(bad_s, good.time_s[before]) < np.searchsorted(bad_s, good.time_s[after], "right"))
+@compiled
+def _interpolate(
+    samples: tuple[Array, Array, Mask], time_s: Array, limit_s: float, value: Array, label: NDArray[np.uint8]
+) -> None:
+    """Values between the last good sample at or before and the next at or after each of some increasing instants.
+
+    Of several samples at one instant the last counts. Beyond the first and the last sample their values are held. Where
+    the two are farther apart than the limit, the label says whether samples that are not good lie between them.
+    """
+    known_s, known, good = samples
+    before, after = -1, _next_good(known_s, good, -1)
+    for j in range(len(time_s)):
+        while after < len(known_s) and known_s[after] <= time_s[j]:
+            before, after = after, _next_good(known_s, good, after)
+        first, last = before, after
+        if first < 0:
+            first = last
+        if last == len(known_s) or known_s[first] == time_s[j]:
+            last = first
+        gap_s = known_s[last] - known_s[first]
+        share = min(max((time_s[j] - known_s[first]) / gap_s, 0.0), 1.0) if gap_s > 0.0 else 0.0
+        value[j] = (1.0 - share) * known[first] + share * known[last]
+        if gap_s > limit_s:
+            label[j] = _FAR
+            k = first
+            while k > 0 and known_s[k - 1] == known_s[first]:
+                k -= 1
+            while k < len(known_s) and known_s[k] <= known_s[last]:
+                if not good[k]:
+                    label[j] = _SPOILT
+                k += 1
+
+
+@inner
+def _next_good(known_s: Array, good: Mask, at: int) -> int:
+    """Index of the next good sample after one, the last of those at its instant; the number of samples for none."""
+    at += 1
+    while at < len(good) and not good[at]:
+        at += 1
+    k = at + 1
+    while k < len(good) and known_s[k] == known_s[at]:
+        if good[k]:
+            at = k
+        k += 1
+    return at

@@ -10,6 +10,7 @@ compared between branches whose frames come at different instants. It is linear 
 junction law holds for it too.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from calibrator.compiled import compiled, inlined
 from calibrator.drive import Array, Channel, Mask
 
-__all__ = ["Band", "ChargeCurve", "charge_curve"]
+__all__ = ["Band", "ChargeCurve", "charge_curve", "covered"]
 
 _Curve = tuple[Array, Array, NDArray[np.int64]]
 """Instants and pieces of a :class:`ChargeCurve`, and which line each place of the windows was found on last."""
@@ -85,6 +86,11 @@ class ChargeCurve:
         inside = (first >= self.time_s[0]) & (last <= self.time_s[-1])
         gap_s = np.interp(last, self.time_s, self.gap_s) - np.interp(first, self.time_s, self.gap_s)
         return np.asarray(inside & (gap_s <= 0.0))
+
+
+def covered(curves: Sequence[ChargeCurve], time_s: Array, margin_s: float) -> Mask:
+    """Whether all curves cover this much time on both sides of each instant."""
+    return np.asarray(np.all([curve.covers(time_s, margin_s) for curve in curves], axis=0))
 
 
 @compiled

@@ -1,30 +1,35 @@
 """How much later than the first branch each branch current of one vehicle is seen, from raw frames.
 
 Sensors, filters and gateways delay the branch currents differently. Only the differences can be seen in the junction
-law: with x_k(t) the measured current of branch k, seen tau_k later than that of the first, and g_k its gain ratio
-(1 + d_1) / (1 + d_k),
+law. With x_k(t) the band (:mod:`calibrator.drives.charge`) of the measured current of branch k, seen tau_k later than
+that of the first, and g_k its gain ratio (1 + d_1) / (1 + d_k),
 
-    x_1(t) + sum over k > 1 of g_k x_k(t + tau_k) = constant.
+    e(t) = x_1(t) + sum over k > 1 of g_k x_k(t + tau_k),       sum over t of e x_k = 0,   sum over t of e f(x_k') = 0.
 
-The sum is made small over all drives of the vehicle, on currents of which offsets, and loads that no branch measures
-and that change slowly, have been taken out (:mod:`calibrator.drives.charge`): first on a grid of lags, so that no local
-minimum traps (:mod:`calibrator.drives.delay_search`), then to a fraction of the sample period, with gains and
-confidence (:mod:`calibrator.drives.delay_fit`). No noise level is assumed: the spread between blocks of time gives the
-standard deviation. A branch that changes too little to tell its delay is flagged.
+The last equation is that of the slopes x_k'. f weakens slopes that are no greater than the branch's noise: a small
+branch tells its delay by its few steps. Noise in x_k' would make the sums of f(x_k') g_k x_k', and so the confidence,
+too great; the slope g_k x_k' - e', which the other branches predict, stands in its place. The windows of x_k hold
+several samples of every branch: noise of a sensor then has nearly the same power in e whatever the phase of its
+frames, and pulls tau nowhere. Huber's weights defend against wild samples.
+
+A delay is a property of the vehicle. It is searched on a grid of lags, so that no local minimum traps, and found by
+Newton steps, in the few minutes in which the branches move most; a step or two on all drives make it exact and tell,
+by the spread between blocks of time, how sure it is. A branch that changes too little to tell its delay is flagged.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from calibrator.compiled import compiled
 from calibrator.drive import Array, Drive, Mask
-from calibrator.drives.charge import Band, ChargeCurve, charge_curve
-from calibrator.drives.delay_fit import Stretch, fit_delays
-from calibrator.drives.delay_search import covered, search_lags
+from calibrator.drives.charge import Band, ChargeCurve, charge_curve, covered
 from calibrator.errors import DriveError
 
-__all__ = ["BranchDelays", "estimate_delays", "without_delays"]
+__all__ = ["BranchDelays", "estimate_delays", "search_lags", "without_delays"]
 
 MAX_DELAY_S = 0.5
 """Filters and gateways of real cars delay by tens to hundreds of milliseconds. [s]"""
@@ -43,9 +48,38 @@ BLOCK_S = 10.0
 """As long as the long windows reach: blocks count as independent. [s]"""
 FEWEST_BLOCKS = 6
 """Fewer do not give a standard deviation worth the name."""
+SEARCHED_BLOCKS = 60
+"""Blocks in which delays are searched: ten minutes in which the branches move most. [1]"""
 GAIN_RANGE = (1.0 / 3.0, 3.0)
 """Ratios of two sensors' gains, each within 0.6 to 1.4, and some loss to noise; outside, it is not the branch's own
 current that was found. [1]"""
+
+LAG_STEP_S = 0.02
+"""Grid of the search, far finer than the windows: the true delay lies in the neighbourhood of the best lag. [s]"""
+SEARCHED_INSTANTS = 1200
+"""Instants at which the search looks at most. [1]"""
+SWEEPS = 2
+"""How many times each pair of branches takes its best lags: the first time those of the rest are still guesses."""
+SINGULAR = 1e-10
+"""Directions with less curvature or power than this share of the greatest are left alone. [1]"""
+
+MOST_STEPS = 15
+"""Five are usual; the delay of a branch that tells nothing wanders for ever."""
+CONVERGED_S = 1e-6
+"""A shorter step is none: a thousandth of what matters. [s]"""
+CONVERGED_ON_ALL_S = 1e-3
+"""The same for the last step, on all drives: Newton's error is the square of it over the windows, 5 us. [s]"""
+LONGEST_STEP_S = 0.02
+"""A longer step would leave the neighbourhood that the search found. [s]"""
+MAD_TO_SD = 1.4826
+"""Standard deviation of a Gaussian over its median absolute value. [1]"""
+SLOPE_NOISES = 3.0
+"""Slopes of this many standard deviations of a branch's usual slope count by half. [1]"""
+HUBER = 3.0
+"""Residuals of more than this many standard deviations weigh less: wild samples only. [1]"""
+LEAST_SCALE = 0.1
+"""Of the residual's root mean square: at rest most residuals are nearly zero, and their median says nothing. [1]"""
+_TINY = np.finfo(np.float64).tiny
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,13 +108,16 @@ class BranchDelays:
         return dict(zip(self.branches, self.delay_s.tolist(), strict=True))
 
 
-def estimate_delays(
-    drives: Sequence[Drive],
-    branches: Sequence[str],
-    *,
-    max_delay_s: float = MAX_DELAY_S,
-    max_sd_s: float = MAX_SD_S,
-) -> BranchDelays:
+@dataclass(frozen=True, kw_only=True)
+class _Stretch:
+    """One drive: currents of its K branches, instants around which all are known, and the block of each instant."""
+
+    curves: tuple[ChargeCurve, ...]
+    time_s: Array
+    block: NDArray[np.int64]
+
+
+def estimate_delays(drives: Sequence[Drive], branches: Sequence[str], *, max_sd_s: float = MAX_SD_S) -> BranchDelays:
     """Estimate by how much the branch currents of one vehicle are seen later than the first one.
 
     Parameters
@@ -89,8 +126,6 @@ def estimate_delays(
         Drives of one vehicle; a drive with too few good samples of a branch adds nothing.
     branches : sequence of str
         Names of the K branches that meet at the junction; the first, the reference, should be the one that moves most.
-    max_delay_s : float
-        Longest difference to look for. [s]
     max_sd_s : float
         Largest standard deviation of a delay that counts as known. [s]
 
@@ -104,23 +139,36 @@ def estimate_delays(
     DriveError
         If there is no drive, a drive lacks a branch, or fewer than two branches are asked for.
     """
-    _require(drives, branches)
-    recorded = [_curves(drive, branches) for drive in drives]
-    complete = [curves for curves in recorded if len(curves) == len(branches)]
+    if not drives:
+        raise DriveError("no drive to estimate delays from; record at least one drive of the vehicle")
+    for drive in drives:
+        _require_branches(drive, branches)
+    if len(branches) < 2:
+        raise DriveError(
+            f"vehicle {drives[0].vehicle}: a delay is a difference of two branches, and only "
+            f"{', '.join(branches) or 'none'} was asked for; choose at least two"
+        )
+    reference = np.arange(len(branches)) == 0
+    found = [[charge_curve(drive.branches[name]) for name in branches] for drive in drives]
+    complete = [tuple(curve for curve in curves if curve is not None) for curves in found if None not in curves]
     slowest_s = max((curve.period_s for curves in complete for curve in curves), default=0.0)
     band = Band(short_s=max(SHORT_S, SHORT_PERIODS * slowest_s), long_s=LONG_S)
-    found = [_stretch(curves, band, max_delay_s) for curves in complete]
-    stretches = [stretch for stretch in found if stretch.time_s.size]
-    if sum(len(stretch.starts) for stretch in stretches) < FEWEST_BLOCKS:
-        return _nothing_known(branches)
-    start_s = search_lags([stretch.curves for stretch in stretches], band, max_delay_s)
-    fit = fit_delays(stretches, band, start_s, max_delay_s)
-    plausible = (fit.gain > GAIN_RANGE[0]) & (fit.gain < GAIN_RANGE[1]) & (np.abs(fit.delay_s) < max_delay_s)
-    known = np.concatenate([[True], plausible & (fit.sd_s <= max_sd_s)])
+    stretches, blocks = _stretches(complete, band)
+    if blocks < FEWEST_BLOCKS:
+        sd_s = np.where(reference, 0.0, np.inf)
+        return BranchDelays(branches=tuple(branches), delay_s=np.zeros(len(branches)), sd_s=sd_s, known=reference)
+    telling = _most_telling(stretches, band, blocks)
+    gain, delay_s = np.ones(len(branches) - 1), search_lags([(part.curves, part.time_s) for part in telling], band)
+    gain, delay_s, sums = _newton(telling, band, gain, delay_s, CONVERGED_S)
+    if telling is not stretches:
+        gain, delay_s, sums = _newton(stretches, band, gain, delay_s, CONVERGED_ON_ALL_S)
+    sd_s = _jackknife_sd(sums)[len(gain) :]
+    plausible = (gain > GAIN_RANGE[0]) & (gain < GAIN_RANGE[1]) & (np.abs(delay_s) < MAX_DELAY_S)
+    known = np.concatenate([[True], plausible & (sd_s <= max_sd_s)])
     return BranchDelays(
         branches=tuple(branches),
-        delay_s=np.where(known, np.concatenate([[0.0], fit.delay_s]), 0.0),
-        sd_s=np.where(known, np.concatenate([[0.0], fit.sd_s]), np.inf),
+        delay_s=np.where(known, np.concatenate([[0.0], delay_s]), 0.0),
+        sd_s=np.where(known, np.concatenate([[0.0], sd_s]), np.inf),
         known=known,
     )
 
@@ -155,39 +203,6 @@ def without_delays(drive: Drive, delays: Mapping[str, float]) -> Drive:
     )
 
 
-def _curves(drive: Drive, branches: Sequence[str]) -> tuple[ChargeCurve, ...]:
-    """Currents of the branches; fewer if one has too few good samples."""
-    curves = (charge_curve(drive.branches[name]) for name in branches)
-    return tuple(curve for curve in curves if curve is not None)
-
-
-def _stretch(curves: tuple[ChargeCurve, ...], band: Band, max_delay_s: float) -> Stretch:
-    """Instants in blocks, and the currents around them."""
-    start_s, stop_s = max(curve.time_s[0] for curve in curves), min(curve.time_s[-1] for curve in curves)
-    time_s = np.arange(start_s, stop_s, band.short_s / INSTANTS_PER_WINDOW)
-    time_s = time_s[covered(curves, time_s, band.long_s + max_delay_s)]
-    block = np.floor((time_s - start_s) / BLOCK_S)
-    return Stretch(curves=curves, time_s=time_s, starts=np.flatnonzero(np.diff(block, prepend=-1.0)))
-
-
-def _nothing_known(branches: Sequence[str]) -> BranchDelays:
-    known = np.arange(len(branches)) == 0
-    sd_s = np.where(known, 0.0, np.inf)
-    return BranchDelays(branches=tuple(branches), delay_s=np.zeros(len(branches)), sd_s=sd_s, known=known)
-
-
-def _require(drives: Sequence[Drive], branches: Sequence[str]) -> None:
-    if not drives:
-        raise DriveError("no drive to estimate delays from; record at least one drive of the vehicle")
-    for drive in drives:
-        _require_branches(drive, branches)
-    if len(branches) < 2:
-        raise DriveError(
-            f"vehicle {drives[0].vehicle}: a delay is a difference of two branches, and only "
-            f"{', '.join(branches) or 'none'} was asked for; choose at least two"
-        )
-
-
 def _require_branches(drive: Drive, branches: Sequence[str]) -> None:
     missing = [name for name in branches if name not in drive.branches]
     if missing:
@@ -195,3 +210,169 @@ def _require_branches(drive: Drive, branches: Sequence[str]) -> None:
             f"vehicle {drive.vehicle}, drive {drive.name}: no branch {', '.join(missing)}; it has "
             f"{', '.join(drive.branches) or 'none'}; choose branches that all drives have"
         )
+
+
+def _stretches(complete: Sequence[tuple[ChargeCurve, ...]], band: Band) -> tuple[list[_Stretch], int]:
+    """Drives with the instants to look at, and the number of blocks of all of them."""
+    stretches: list[_Stretch] = []
+    blocks = 0
+    for curves in complete:
+        start_s, stop_s = max(curve.time_s[0] for curve in curves), min(curve.time_s[-1] for curve in curves)
+        time_s = np.arange(start_s, stop_s, band.short_s / INSTANTS_PER_WINDOW)
+        time_s = time_s[covered(curves, time_s, band.long_s + MAX_DELAY_S)]
+        if time_s.size:
+            number = np.floor((time_s - start_s) / BLOCK_S)
+            block = np.cumsum(np.diff(number, prepend=-1.0) != 0.0) - 1
+            stretches.append(_Stretch(curves=curves, time_s=time_s, block=blocks + block))
+            blocks += int(block[-1]) + 1
+    return stretches, blocks
+
+
+def _most_telling(stretches: Sequence[_Stretch], band: Band, blocks: int) -> Sequence[_Stretch]:
+    """The blocks in which the branches, each for itself, move most; small branches seldom do."""
+    if blocks <= SEARCHED_BLOCKS:
+        return stretches
+    K = len(stretches[0].curves)
+    _, slope = _bands(stretches, range(K), band, np.zeros(K))
+    starts = np.flatnonzero(np.diff(np.concatenate([stretch.block for stretch in stretches]), prepend=-1))
+    power = np.add.reduceat(slope**2, starts)
+    share = power / np.maximum(power.sum(axis=0), _TINY)
+    rank = np.full(blocks, -1)
+    chosen = np.sort(np.argsort(-share.sum(axis=1), kind="stable")[:SEARCHED_BLOCKS])
+    rank[chosen] = np.arange(SEARCHED_BLOCKS)
+    return [
+        replace(stretch, time_s=stretch.time_s[kept], block=rank[stretch.block[kept]])
+        for stretch in stretches
+        if (kept := rank[stretch.block] >= 0).any()
+    ]
+
+
+# ---- first guess
+
+
+def search_lags(parts: Sequence[tuple[tuple[ChargeCurve, ...], Array]], band: Band) -> Array:
+    """Find the lags on a grid that make the junction sum smallest, gains free.
+
+    The second moments of the bands of all branches at all lags are gathered once; every combination of lags is then a
+    small least-squares problem made of some of them. Two branches at a time take their best lags with those of the
+    others held: branches that do much the same, as two motors, pull each other's lag off when searched one by one.
+
+    Parameters
+    ----------
+    parts : sequence of (curves, time_s)
+        Currents of the K branches on each drive of one vehicle, and the instants to look at, shape (T,). [s]
+    band : Band
+        Windows of the averages.
+
+    Returns
+    -------
+    ndarray of shape (K-1,)
+        How much later than the first branch the others are seen, in whole steps of the grid. [s]
+    """
+    reach = int(MAX_DELAY_S / LAG_STEP_S)
+    width, K = 2 * reach + 1, len(parts[0][0])
+    lags_s = LAG_STEP_S * np.arange(-reach, reach + 1)
+    thinning = -(-sum(len(time_s) for _, time_s in parts) // SEARCHED_INSTANTS)
+    moments = np.zeros((K * width, K * width))
+    for curves, time_s in parts:
+        instants = (time_s[::thinning, None] + lags_s).ravel()
+        z = np.hstack([curve.band(instants, band)[0].reshape(-1, width) for curve in curves])
+        moments += z.T @ z
+    column = reach + width * np.arange(K)
+    for group in [*combinations(range(1, K), min(2, K - 1))] * SWEEPS:
+        column[list(group)] = _best_columns(moments, column, group, width)
+    return np.asarray((column[1:] % width - reach) * LAG_STEP_S)
+
+
+def _best_columns(moments: Array, column: NDArray[np.intp], group: Sequence[int], width: int) -> NDArray[np.intp]:
+    """Columns (lags) of some branches with which all together explain most of the first one."""
+    choices = np.stack(np.meshgrid(*(width * k + np.arange(width) for k in group)), axis=-1).reshape(-1, len(group))
+    tried = np.repeat(column[None, 1:], len(choices), axis=0)
+    tried[:, np.array(group) - 1] = choices
+    target = moments[tried, column[0]][:, :, None]
+    power = moments[tried[:, :, None], tried[:, None, :]]
+    floor = SINGULAR * np.trace(power, axis1=1, axis2=2).max() + _TINY
+    gain = np.linalg.solve(power + floor * np.eye(len(column) - 1), target)
+    return np.asarray(choices[np.argmax((gain * target).sum(axis=(1, 2)))])
+
+
+# ---- Newton's steps
+
+
+def _newton(
+    stretches: Sequence[_Stretch], band: Band, gain: Array, delay_s: Array, converged_s: float
+) -> tuple[Array, Array, Array]:
+    """Gains and delays, each of shape (K-1,), and the sums of the last step, from a first guess nearby."""
+    others = len(gain)
+    block = np.concatenate([stretch.block for stretch in stretches])
+    first = _bands(stretches, [0], band, np.zeros(1))
+    for _ in range(MOST_STEPS):
+        x, slope = _bands(stretches, range(1, others + 1), band, delay_s)
+        e = first[0][:, 0] + x @ gain
+        scale = max(MAD_TO_SD * float(np.median(np.abs(e))), LEAST_SCALE * float(np.sqrt(np.mean(e**2))), _TINY)
+        usual = SLOPE_NOISES * MAD_TO_SD * np.median(np.abs(slope), axis=0)
+        sums = np.zeros((int(block[-1]) + 1, 2 * others, 2 * others + 1))
+        _add_products((x, slope), (e, first[1][:, 0] + slope @ gain), gain, usual, HUBER * scale, block, sums)
+        step = -_solve(sums.sum(axis=0)[None])[0]
+        step_s = np.clip(step[others:], -LONGEST_STEP_S, LONGEST_STEP_S)
+        gain, delay_s = gain + step[:others], np.clip(delay_s + step_s, -MAX_DELAY_S, MAX_DELAY_S)
+        if np.all(np.abs(step_s) < converged_s):
+            break
+    return gain, delay_s, sums
+
+
+def _bands(stretches: Sequence[_Stretch], which: Sequence[int], band: Band, delay_s: Array) -> tuple[Array, Array]:
+    """Bands and slopes of some branches, their delays taken out, shape (T, n) each."""
+    parts = [
+        [stretch.curves[k].band(stretch.time_s + lag_s, band) for k, lag_s in zip(which, delay_s, strict=True)]
+        for stretch in stretches
+    ]
+    x, slope = (np.concatenate([np.stack([both[j] for both in part], axis=1) for part in parts]) for j in range(2))
+    return x, slope
+
+
+@compiled
+def _add_products(  # noqa: PLR0917 (compiled: no keywords)
+    branches: tuple[Array, Array],
+    residual: tuple[Array, Array],
+    gain: Array,
+    usual: Array,
+    limit: float,
+    block: NDArray[np.int64],
+    sums: Array,
+) -> None:
+    """Add the equations of every instant to those of its block, (B, 2K-2, 2K-1).
+
+    Rows are the products with instruments, (x, f(x')); columns the derivatives by (g, tau), and last the values.
+    """
+    (x, slope), (e, e_slope), others = branches, residual, len(gain)
+    column = np.empty(2 * others + 1)
+    for t in range(len(x)):
+        weight = limit / max(abs(e[t]), limit)
+        for k in range(others):
+            column[k], column[others + k] = x[t, k], gain[k] * slope[t, k]
+        column[2 * others] = e[t]
+        for k in range(others):
+            square = slope[t, k] ** 2
+            strong = weight * slope[t, k] * square / max(square + usual[k] ** 2, _TINY)
+            for j in range(2 * others + 1):
+                sums[block[t], k, j] += weight * x[t, k] * column[j]
+                sums[block[t], others + k, j] += strong * column[j]
+            sums[block[t], others + k, others + k] -= strong * e_slope[t]
+
+
+def _solve(moments: Array) -> Array:
+    """Solutions of n sets of equations (n, p, p+1), shape (n, p); nothing moves where nothing is known."""
+    matrix, value = moments[:, :, :-1], moments[:, :, -1]
+    size = np.sqrt(np.abs(np.einsum("nii->ni", matrix)))
+    size = np.where(size > 0.0, size, 1.0)
+    inverse = np.linalg.pinv(matrix / (size[:, :, None] * size[:, None, :]), rcond=SINGULAR)
+    return np.asarray(np.einsum("nij,nj->ni", inverse, value / size) / size)
+
+
+def _jackknife_sd(blocks: Array) -> Array:
+    """Standard deviation of the solution from leaving out one block at a time, one step each."""
+    total, count = blocks.sum(axis=0), len(blocks)
+    left_out = _solve(total - blocks)
+    sd = np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean(axis=0)) ** 2, axis=0))
+    return np.where(np.diagonal(total) != 0.0, sd, np.inf)

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrator.drive import Array, Channel, Drive
-from calibrator.drives.charge import Band, charge_curve
-from calibrator.drives.delay_search import covered
+from calibrator.drives.charge import Band, charge_curve, covered
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
 from calibrator.kirchhoff.sums import VOLTAGE

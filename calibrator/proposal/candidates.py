@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from calibrator.drive import Array, Channel, Mask
 from calibrator.errors import LogError
 from calibrator.recordings.decode import decode_signal, raw_values, signal_range
-from calibrator.recordings.frame_arrays import Frames, frame_key
-from calibrator.recordings.frame_arrays import repaired_time
+from calibrator.recordings.frame_arrays import Frames, frame_key, repaired_time
 from calibrator.recordings.tables import Table
 from calibrator.words import CURRENT, POWER, VOLTAGE, words_of
 from ecu_node.core.signals import AMPERE, VOLT, WATT, unit_factor

@@ -2,8 +2,8 @@
 
        0.011478 1  1F334455x       Rx   d 8 50 04 0C A9 D4 03 88 01  Length = 0 BitCount = 0
 
-python-can takes about thirty times as long, and reads what is left: files with CAN FD, decimal numbers, or anything that
-looks like a frame and is not quite one; what it makes of a file is what the compiled code makes of it.
+python-can takes about thirty times as long, and reads what is left: files with CAN FD, decimal numbers, or anything
+that looks like a frame and is not quite one.
 """
 
 import re
@@ -59,7 +59,7 @@ def read_plain_asc(path: Path) -> Frames | None:
             return None
         with open_log(path) as file:
             for text in text_blocks(file):
-                columns = FrameColumns.of(text.count(b"\n") + 1, fd=False)
+                columns = FrameColumns.of(text.count(b"\n") + (not text.endswith(b"\n")), fd=False)
                 if not _parse(np.frombuffer(text, np.uint8), HEX, columns):
                     return None
                 parts.append(columns.frames())
@@ -85,10 +85,12 @@ def _parse(text: _Text, digits: _Text, columns: FrameColumns) -> bool:
 
 
 @inner
-def _parse_line(text: _Text, at: int, digits: _Text, row: int, columns: FrameColumns) -> int:
+def _parse_line(  # noqa: PLR0911, PLR0912 (a line is judged from left to right)
+    text: _Text, at: int, digits: _Text, row: int, columns: FrameColumns
+) -> int:
     """Parse what starts here and ends with the text into a row; what it is."""
     at, end = _word(text, at)
-    seconds, fraction, at = 0, 0, at
+    seconds, fraction = 0, 0
     while at < end and ord("0") <= text[at] <= ord("9"):
         seconds = 10 * seconds + (text[at] - ord("0"))
         at += 1

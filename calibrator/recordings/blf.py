@@ -210,9 +210,9 @@ def _take_apart(
         if at + _OBJECT_HEADER_BYTES > len(data):
             return _SOUND, row, here, 0
         version, size, kind = _number(data, at + 6, 2), _number(data, at + 8, 4), _number(data, at + 12, 4)
-        is_frame = kind == _CLASSIC or kind == _CLASSIC_2 or kind == _FD or kind == _FD_64
-        fields = 8 if kind == _CLASSIC or kind == _CLASSIC_2 else 20 if kind == _FD else 40
-        known = version == 1 or version == 2
+        is_frame = kind in (_CLASSIC, _CLASSIC_2, _FD, _FD_64)
+        fields = 8 if kind in (_CLASSIC, _CLASSIC_2) else 20 if kind == _FD else 40
+        known = version in (1, 2)
         body = 32 if version == 1 else 40
         least = _OBJECT_HEADER_BYTES if not known else body + fields if is_frame else 32
         if size < least or size > LARGEST_OBJECT:
@@ -226,7 +226,7 @@ def _take_apart(
                 if columns.kind[row] == _TOO_LONG:
                     return _WIDE, row, here, 0
             row += 1
-        elif kind == _ERROR or kind == _ERROR_EXT or kind == _ERROR_FD:
+        elif kind in (_ERROR, _ERROR_EXT, _ERROR_FD):
             columns.kind[row] = ERROR
             row += 1
         here = at + size
@@ -237,7 +237,7 @@ _TOO_LONG = 255
 
 
 @inner
-def _take(
+def _take(  # noqa: PLR0917 (compiled: no keywords)
     data: NDArray[np.uint8],
     at: int,
     body: int,

@@ -188,7 +188,7 @@ def parse_candump(text: bytes) -> CandumpBlock:
     CandumpBlock
         The frames in the order of the lines, and what could not be read.
     """
-    columns = FrameColumns.of(text.count(b"\n") + 1, fd=b"##" in text)
+    columns = FrameColumns.of(text.count(b"\n") + (not text.endswith(b"\n")), fd=b"##" in text)
     names = np.zeros((_MOST_CHANNELS, 2), np.int64)
     found = _parse(np.frombuffer(text, np.uint8), HEX, names, columns)
     frames = columns.frames([text[start:end].decode("latin-1") for start, end in names[:found].tolist()])
@@ -226,14 +226,16 @@ def _same(text: _Text, name: NDArray[np.int64], first: int, last: int) -> bool:
     """Whether two parts of the text are the same."""
     if name[1] - name[0] != last - first:
         return False
-    for k in range(last - first):
+    for k in range(last - first):  # noqa: SIM110 (compiled)
         if text[name[0] + k] != text[first + k]:
             return False
     return True
 
 
 @inner
-def _parse_line(text: _Text, at: int, digits: _Text, row: int, columns: FrameColumns) -> tuple[int, int, int]:
+def _parse_line(  # noqa: PLR0911, PLR0912 (a line is judged from left to right)
+    text: _Text, at: int, digits: _Text, row: int, columns: FrameColumns
+) -> tuple[int, int, int]:
     """Parse what starts here and ends with the text into a row: what it is, and where its channel stands."""
     stop = len(text)
     if at == stop:
@@ -284,7 +286,7 @@ def _parse_line(text: _Text, at: int, digits: _Text, row: int, columns: FrameCol
         return DAMAGED, 0, 0
     for k in range(size):
         high, low = digits[text[at + 2 * k]], digits[text[at + 2 * k + 1]]
-        if high == _NOT_HEX or low == _NOT_HEX:
+        if max(high, low) == _NOT_HEX:
             return DAMAGED, 0, 0
         columns.data[row, k] = 16 * high + low
     columns.time_ns[row] = seconds * 10**9 + fraction

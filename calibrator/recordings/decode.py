@@ -18,6 +18,7 @@ import numpy as np
 from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
+from calibrator.compiled import compiled
 from calibrator.drive import Array, Mask
 from ecu_node.core.e2e import protection_of
 from ecu_node.database import VehicleDatabase
@@ -71,7 +72,7 @@ class Decoded:
     @property
     def good(self) -> Mask:
         """Whether each value is there and may be used, shape (n,)."""
-        return np.asarray(self.present & ~np.any(list(self.bad.values()), axis=0))
+        return np.asarray(self.present & ~np.logical_or.reduce(list(self.bad.values())))
 
 
 def codes_of_no_value(database: VehicleDatabase, name: SignalName) -> frozenset[int]:
@@ -335,10 +336,21 @@ def p01_is_sound(data: NDArray[np.uint8], length: NDArray[np.uint8], data_id: in
         True where byte 0 is the right CRC and the counter, the low half of byte 1, is not 15; False for frames shorter
         than these 2 bytes.
     """
-    crc = np.full(len(data), _CRC[_CRC[data_id & 0xFF] ^ (data_id >> 8)], np.uint8)
-    for column in range(1, data.shape[1]):
-        crc = np.where(length > column, _CRC[crc ^ data[:, column]], crc)
+    crc = np.empty(len(data), np.uint8)
+    _crc_of_rows(data, length, _CRC, _CRC[_CRC[data_id & 0xFF] ^ (data_id >> 8)], crc)
     return np.asarray((length >= 2) & (crc == data[:, 0]) & (data[:, 1] & 0x0F != _NO_COUNTER))
+
+
+@compiled
+def _crc_of_rows(
+    data: NDArray[np.uint8], length: NDArray[np.uint8], table: NDArray[np.uint8], start: int, crc: NDArray[np.uint8]
+) -> None:
+    """CRC over the bytes after the first of each row."""
+    for row in range(len(data)):
+        value = start
+        for column in range(1, length[row]):
+            value = table[value ^ data[row, column]]
+        crc[row] = value
 
 
 def message_is_sound(

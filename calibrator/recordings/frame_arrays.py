@@ -102,7 +102,9 @@ def concatenate_frames(parts: Sequence[Frames]) -> Frames:
     channels = tuple(dict.fromkeys(name for part in parts for name in part.channels))
     width = max(part.data.shape[1] for part in parts)
     same = [np.array([channels.index(name) for name in part.channels], np.uint32)[part.channel] for part in parts]
-    data = [np.pad(part.data, ((0, 0), (0, width - part.data.shape[1]))) for part in parts if part.data.shape[1] < width]
+    data = [
+        np.pad(part.data, ((0, 0), (0, width - part.data.shape[1]))) for part in parts if part.data.shape[1] < width
+    ]
     padded = iter(data)
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts]) for name in ("time_ns", "key", "length")

@@ -49,6 +49,8 @@ MAX_DAMAGED_SHARE = 0.05
 """Of the lines of a text log. Recordings of a real car through a serial adapter had up to 3 % broken lines and decoded
 well. [1]"""
 _HEAD_BYTES = 1 << 16
+_READ_BYTES = 1 << 17
+"""Asked for at a time: room for all of it is made for each piece that comes. [byte]"""
 BLOCK_BYTES = 1 << 23
 """Text parsed at a time: bounds the memory, large enough for calls not to count. [byte]"""
 
@@ -68,7 +70,7 @@ def read_undamaged(file: BinaryIO, size: int) -> tuple[bytes, Exception | None]:
     parts: list[bytes] = []
     read1 = cast("io.BufferedIOBase", file).read1
     try:
-        while size > 0 and (part := read1(size)):
+        while size > 0 and (part := read1(min(size, _READ_BYTES))):
             parts.append(part)
             size -= len(part)
     except UNREADABLE as error:

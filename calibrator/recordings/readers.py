@@ -20,9 +20,8 @@ from calibrator.drives.align import at_instants, base_inputs
 from calibrator.errors import LogError
 from calibrator.files.formulas import evaluate_formula, formula_names, parse_formula
 from calibrator.recordings.decode import codes_of_no_value, decode_signal, message_is_sound, signal_range
-from calibrator.recordings.frame_arrays import EXTENDED_BIT, Frames, frame_key
+from calibrator.recordings.frame_arrays import CLOCK_GAP_S, EXTENDED_BIT, Frames, frame_key, repaired_time
 from calibrator.recordings.frames import read_frames
-from calibrator.recordings.frame_arrays import CLOCK_GAP_S, repaired_time
 from calibrator.recordings.tables import Table, is_table, read_table
 from calibrator.terminal.text import Notice
 from ecu_node.core.signals import AMPERE, VOLT, WATT, factor_of, usual_unit

@@ -25,6 +25,7 @@ from calibrator.drives.charge import GAP_PERIODS
 from calibrator.errors import LogError
 from calibrator.files.formulas import check_formulas
 from calibrator.recordings.candump import is_candump
+from calibrator.recordings.frame_arrays import repaired_time
 from calibrator.recordings.log_files import (
     UNREADABLE,
     exists,
@@ -35,7 +36,6 @@ from calibrator.recordings.log_files import (
     suffix_of,
     text_head,
 )
-from calibrator.recordings.frame_arrays import repaired_time
 from calibrator.recordings.mf4 import is_bus_log, read_mf4_table
 from ecu_node.core.signals import AMPERE, usual_unit
 from ecu_node.database import VehicleDatabase, read_database

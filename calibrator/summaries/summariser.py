@@ -12,7 +12,6 @@ from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank, plain_bank
 from calibrator.summaries.fit_sums import LEVEL_EDGES_A, LEVEL_OF_AMPERE, FitSums, find_spikes, second_differences
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
-from calibrator.summaries.white_noise import white_noise_a2
 
 __all__ = ["Summariser", "summarise"]
 
@@ -20,6 +19,12 @@ BATCH_SAMPLES = 1500
 """Samples whose products are formed at a time: as many as the processor's cache holds. [1]"""
 LEAST_SHARE = 0.2
 """Least share of valid samples of a block that is used. [1]"""
+DIFFERENCE_GAIN = 20.0
+"""Variance of the third difference of white noise of variance 1."""
+NORMAL_MEDIAN = 0.6745
+"""Median magnitude of a standard normal variable."""
+MEDIAN_EXCESS = 3.8
+"""The squared median of n third differences of white noise is too large by this over n (simulated, n = 9 to 300)."""
 
 
 class Summariser:
@@ -177,7 +182,7 @@ class Summariser:
         table = self._table[: blocks * length].reshape(blocks, length, -1)
         table = table if kept.all() else table[kept]
         self._moments.append(np.swapaxes(table, 1, 2) @ table)
-        self._noise.append(white_noise_a2(self._currents[:filled], length)[kept])
+        self._noise.append(_white_noise_a2(self._currents[:filled], length)[kept])
         used = used.reshape(blocks, length)
         _add_levels(table, used[kept], first, LEVEL_OF_AMPERE, self._levels)
         fast = second_differences(currents.reshape(blocks, length, -1), used)[kept]
@@ -275,3 +280,24 @@ def _add_levels(table: Array, used: Mask, first: int, level_of_ampere: NDArray[n
                     for i in range(wide - 1):
                         sums[i] += row[i]
                     sums[wide - 1] += x * x
+
+
+@compiled
+def _white_noise_a2(currents: Array, length: int) -> Array:
+    """Variance of white noise per block from the median third difference; gaps (NaN) take no part. [A^2]"""
+    T, K = currents.shape
+    blocks = -(-T // length)
+    noise, third = np.zeros((blocks, K)), np.empty((K, length))
+    for block in range(blocks):
+        n = 0
+        for t in range(block * length, min((block + 1) * length, T) - 3):
+            known = True
+            for k in range(K):
+                late, early = currents[t + 3, k] - currents[t, k], currents[t + 2, k] - currents[t + 1, k]
+                third[k, n] = abs(late - 3.0 * early)
+                known = known and np.isfinite(third[k, n])
+            n += known
+        for k in range(K if n else 0):
+            scale = np.median(third[k, :n]) / NORMAL_MEDIAN
+            noise[block, k] = scale**2 / DIFFERENCE_GAIN / (1.0 + MEDIAN_EXCESS / n)
+    return noise
