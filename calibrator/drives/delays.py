@@ -158,7 +158,8 @@ def estimate_delays(drives: Sequence[Drive], branches: Sequence[str], *, max_sd_
         sd_s = np.where(reference, 0.0, np.inf)
         return BranchDelays(branches=tuple(branches), delay_s=np.zeros(len(branches)), sd_s=sd_s, known=reference)
     telling = _most_telling(stretches, band, blocks)
-    gain, delay_s = np.ones(len(branches) - 1), search_lags([(part.curves, part.time_s) for part in telling], band)
+    gain: Array = np.ones(len(branches) - 1)
+    delay_s = search_lags([(part.curves, part.time_s) for part in telling], band)
     gain, delay_s, sums = _newton(telling, band, gain, delay_s, CONVERGED_S)
     if telling is not stretches:
         gain, delay_s, sums = _newton(stretches, band, gain, delay_s, CONVERGED_ON_ALL_S)

@@ -46,6 +46,7 @@ _FILE_HEADER_BYTES = 144
 _OBJECT_HEADER = struct.Struct("<4sHHLL")
 """Signature, size and version of the header, size of the object, type."""
 _OBJECT_HEADER_BYTES = 16
+_SIGNATURE = int.from_bytes(b"LOBJ", "little")
 _CONTAINER = 10
 _CONTAINER_HEADER_BYTES = 16
 _STORED, _DEFLATE = 0, 2
@@ -124,7 +125,7 @@ def _parts(file: BinaryIO) -> Iterator[Frames]:
             columns = FrameColumns.of(len(data) // _OBJECT_HEADER_BYTES + 1, fd=fd)
             ended, rows, end, wrong_size = _take_apart(data, start_ns, _FD_LENGTHS, columns)
             fd = fd or ended == _WIDE
-        yield FrameColumns(*(column[:rows] for column in columns)).frames()
+        yield columns.frames(rows=rows)
         if ended != _SOUND:
             container = int(np.searchsorted(np.cumsum([*map(len, contents[:-1])]), end, side="right")) - 1
             wrong = f"an object of {wrong_size} bytes, which is impossible for its type"
@@ -250,19 +251,19 @@ def _take(  # noqa: PLR0917 (compiled: no keywords)
     """Put one object that is a frame into a row; what it is."""
     size, b = _number(data, at + 8, 4), at + body
     if fields == 40:  # CAN FD 64
-        channel, code, length = data[b], data[b + 1], np.int64(data[b + 2])
-        flags, extension = _number(data, b + 12, 4), np.int64(data[b + 35])
+        channel, code, length = int(data[b]), int(data[b + 1]), int(data[b + 2])
+        flags, extension = _number(data, b + 12, 4), int(data[b + 35])
         remote, fd = flags & 0x10 > 0, flags & 0x1000 > 0
         size = extension if extension > 0 else size
     else:
-        channel, code = _number(data, b, 2), data[b + 3]
+        channel, code = _number(data, b, 2), int(data[b + 3])
         remote, fd = data[b + 2] & 0x80 > 0, fields == 20 and data[b + 13] & 1 > 0
-        length = np.int64(data[b + 14]) if fields == 20 else min(fd_lengths[min(code, 15)], CLASSIC_BYTES)
+        length = int(data[b + 14]) if fields == 20 else int(min(fd_lengths[min(code, 15)], CLASSIC_BYTES))
     if remote:
         return REMOTE
     time = np.uint64(_number(data, at + 24, 4)) | np.uint64(_number(data, at + 28, 4)) << np.uint64(32)
     unit = _TEN_MICROSECONDS_NS if _number(data, at + 16, 4) == _TEN_MICROSECONDS else 1
-    sound = length <= FD_BYTES if fd else length == min(fd_lengths[min(code, 15)], CLASSIC_BYTES)
+    sound = length <= FD_BYTES if fd else length == int(min(fd_lengths[min(code, 15)], CLASSIC_BYTES))
     if not sound or time > np.uint64(max(LATEST_TIME_STAMP_NS - start_ns, 0) // unit):
         return DAMAGED
     if length > columns.data.shape[1]:
@@ -277,7 +278,7 @@ def _take(  # noqa: PLR0917 (compiled: no keywords)
 
 @inner
 def _is_signature(data: NDArray[np.uint8], at: int) -> bool:
-    return data[at] == ord("L") and data[at + 1] == ord("O") and data[at + 2] == ord("B") and data[at + 3] == ord("J")
+    return _number(data, at, 4) == _SIGNATURE
 
 
 @inner
@@ -285,5 +286,5 @@ def _number(data: NDArray[np.uint8], at: int, size: int) -> int:
     """Unsigned little-endian number of up to 4 bytes."""
     value = 0
     for k in range(size):
-        value |= np.int64(data[at + k]) << (8 * k)
+        value |= int(data[at + k]) << (8 * k)
     return value

@@ -135,18 +135,24 @@ class FrameColumns(NamedTuple):
     @classmethod
     def of(cls, rows: int, *, fd: bool) -> "FrameColumns":
         """Columns of so many rows, for payloads of 8 bytes, or of 64 for CAN FD."""
-        types = (np.uint8, np.int64, np.uint32, np.uint32, np.uint8)
-        width = FD_BYTES if fd else CLASSIC_BYTES
-        return cls(*(np.zeros(rows, kind) for kind in types), np.zeros((rows, width), np.uint8))  # type: ignore[arg-type]
+        return cls(
+            kind=np.zeros(rows, np.uint8),
+            time_ns=np.zeros(rows, np.int64),
+            key=np.zeros(rows, np.uint32),
+            channel=np.zeros(rows, np.uint32),
+            length=np.zeros(rows, np.uint8),
+            data=np.zeros((rows, FD_BYTES if fd else CLASSIC_BYTES), np.uint8),
+        )
 
-    def frames(self, channels: Sequence[str] | None = None) -> Frames:
-        """Data frames, and the counts of the other rows.
+    def frames(self, channels: Sequence[str] | None = None, *, rows: int | None = None) -> Frames:
+        """Data frames, and the counts of the others, of the first so many rows or of all.
 
         `channels` are the names by the reader's numbers; without them these count from 1, and names from 0, as those of
         python-can do.
         """
-        counts = np.bincount(self.kind, minlength=DAMAGED + 1).tolist()
-        which = slice(None) if counts[DATA] == len(self.kind) else np.flatnonzero(self.kind == DATA)
+        kind = self.kind[:rows]
+        counts = np.bincount(kind, minlength=DAMAGED + 1).tolist()
+        which = slice(rows) if counts[DATA] == len(kind) else np.flatnonzero(kind == DATA)
         channel = self.channel[which]
         if channels is None:
             numbers = np.flatnonzero(np.bincount(channel))
