@@ -76,7 +76,7 @@ def rows(*, quick: bool) -> list[Row]:
         hours = recording.drive.duration_s / 3600.0
         del logs["candump"]
         for name, path in logs.items():
-            entry = DriveFile(vehicle="V", name="d", path=path)
+            entry = DriveFile(vehicle="V", name="d", place=str(path))
             found.append(_summary_row(f"{name} log to summary", entry, ("battery", "motor", "auxiliary"), database))
         seconds = _best(lambda: gzip.decompress(packed.read_bytes()), READINGS)[1]
         found.append(Row(name="candump.gz unpacked, nothing else", value=hours / seconds, unit="h/s"))

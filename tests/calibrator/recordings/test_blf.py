@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import can
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from calibrator.errors import LogError
@@ -104,7 +104,6 @@ messages = st.builds(
 )
 
 
-@settings(deadline=None)  # the first call may compile
 @given(st.lists(messages, max_size=60), st.sampled_from([200, 1000, 1 << 17]), st.sampled_from([0, 6]))
 def test_any_log_gives_the_frames_that_python_can_reads(
     log: list[can.Message], container_bytes: int, compression: int

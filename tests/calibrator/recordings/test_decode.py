@@ -8,7 +8,7 @@ import pytest
 from cantools.database.can import Database, Message, Signal
 from cantools.database.conversion import BaseConversion
 from e2e.p01 import e2e_p01_check, e2e_p01_protect
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -325,7 +325,6 @@ def test_a_number_of_more_than_64_bits_is_refused() -> None:
         decode_signal(message, signal, *payloads([bytes(64)], 64))
 
 
-@settings(deadline=None)  # the first call may compile
 @given(st.binary(min_size=2, max_size=64), st.integers(0, 0xFFFF), st.integers(0, 10_000))
 def test_the_crc_of_profile_1_agrees_with_the_e2e_package(content: bytes, data_id: int, flip: int) -> None:
     right = bytearray(content)

@@ -11,7 +11,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -104,7 +104,6 @@ candump_lines = st.builds(
 )
 
 
-@settings(deadline=None)  # the first call may compile
 @given(st.lists(candump_lines, min_size=1, max_size=30), st.sampled_from(["\n", "\r\n", "\n\n"]))
 def test_the_candump_parser_agrees_with_python_can(lines: list[str], line_end: str) -> None:
     text = line_end.join(lines) + line_end
@@ -116,7 +115,6 @@ def test_the_candump_parser_agrees_with_python_can(lines: list[str], line_end: s
     assert [block.frames.channels[c] for c in block.frames.channel] == [str(m.channel) for m in messages]
 
 
-@settings(deadline=None)  # the first call may compile
 @given(st.text(alphabet="()#0123456789AFGRTcan .\r-", max_size=80))
 def test_a_damaged_line_is_counted_and_its_neighbours_are_read(line: str) -> None:
     good = "(1.000000) can0 123#01\n"
@@ -262,7 +260,6 @@ def test_a_blf_with_an_object_of_no_size_ends_in_an_error_not_in_a_loop(tmp_path
         read_frames(path)
 
 
-@settings(deadline=None)  # the first call may compile
 @given(st.binary(max_size=200), st.integers(0, 3000))
 def test_no_blf_content_ends_in_anything_but_frames_or_a_message(
     tmp_path_factory: pytest.TempPathFactory, junk: bytes, position: int
