@@ -9,12 +9,10 @@ sound, so a line of simulated over reference current (15) that is not the fleet'
 import numpy as np
 from rich.console import Console
 
-from calibrator.experiments.common_drive import builtin_common_drive
-from calibrator.experiments.judging import Effort
+from calibrator.experiments.experiments import EXPERIMENTS, fleet_for, run_experiment
 from calibrator.experiments.methods import PERFECT, POSTERIOR, Estimate
-from calibrator.experiments.paper_experiments import classifier_experiment
-from calibrator.experiments.table import result_table
-from calibrator.experiments.trial import FleetLaw, Trial
+from calibrator.experiments.pages import result_table
+from calibrator.experiments.trial import Trial
 from calibrator.faults import Faults
 
 
@@ -30,6 +28,6 @@ class SensorOnly:
         return Estimate(faults=faults, hardware=sound > 0.0, corrected=changed, confidence=None, failed=0)
 
 
-drive, law, methods = builtin_common_drive(), FleetLaw(vehicles=200), (PERFECT, POSTERIOR, SensorOnly())
-table = result_table(classifier_experiment(drive=drive, law=law, methods=methods, effort=Effort(repetitions=2)))
-Console(width=100).print(table)
+experiment, methods = EXPERIMENTS["classifier"].with_vehicles(200), (PERFECT, POSTERIOR, SensorOnly())
+result = run_experiment(experiment, fleet_for(experiment), methods=methods, repetitions=2)
+Console(width=100).print(result_table(result))

@@ -55,6 +55,18 @@ class GroundTruth:
         """Currents as an array of shape (T, K). [A]"""
         return np.stack(list(self.currents_a.values()), axis=1)
 
+    @classmethod
+    def joined(cls, trips: Sequence["GroundTruth"], name: str) -> "GroundTruth":
+        """Trips one after the other, with the inputs that all of them have."""
+        first = trips[0]
+        common = [key for key in first.inputs if all(key in trip.inputs for trip in trips)]
+        return cls(
+            name=name,
+            period_s=first.period_s,
+            currents_a={key: np.concatenate([trip.currents_a[key] for trip in trips]) for key in first.currents_a},
+            inputs={key: np.concatenate([trip.inputs[key] for trip in trips]) for key in common},
+        )
+
     def part(self, start: int, stop: int) -> "GroundTruth":
         """Samples start to stop (excluded) as a trip of its own."""
         return GroundTruth(
@@ -174,13 +186,7 @@ def cut_and_rejoin(
     while sum(len(piece) for piece in chosen) < samples:
         chosen += [pieces[k] for k in rng.permutation(len(pieces))]
     count = int(np.searchsorted(np.cumsum([len(piece) for piece in chosen]), samples)) + 1
-    inputs = [key for key in trips[0].inputs if all(key in trip.inputs for trip in trips)]
-    return GroundTruth(
-        name=name,
-        period_s=trips[0].period_s,
-        currents_a={k: np.concatenate([p.currents_a[k] for p in chosen[:count]]) for k in trips[0].currents_a},
-        inputs={k: np.concatenate([p.inputs[k] for p in chosen[:count]]) for k in inputs},
-    )
+    return GroundTruth.joined(chosen[:count], name)
 
 
 def _pieces(trip: GroundTruth) -> list[GroundTruth]:

@@ -24,8 +24,8 @@ from calibrator.estimator.state_space import StateSpaceModel, bridged, identify,
 from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.fleet_truth import faults_of
 from calibrator.processes.run_many import Workers
-from calibrator.published.calibration import ExpectedFaults, calibrate_published
-from calibrator.published.recovery import Recovery
+from calibrator.published.classify import ExpectedFaults
+from calibrator.published.recovery import Recovery, calibrate_published
 from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, read_vehicles
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import counted, few

@@ -1,6 +1,6 @@
 """``calibrator experiment`` and ``calibrator score``: the paper's figures and ours; a result beside its truth."""
 
-from enum import StrEnum
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,72 +10,38 @@ from rich.console import Console
 from calibrator.files.folders import require_possible_folder
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import JsonOption, SeedOption, WorkersOption, given_options, whole_option
+from calibrator.terminal.progress import one_pass
 from calibrator.terminal.text import print_report
 from ecu_node.program import write_output
 
-__all__ = ["RECORDED_EXPERIMENTS", "ExperimentName", "experiment", "score"]
+__all__ = ["experiment", "score"]
 
-
-class ExperimentName(StrEnum):
-    """Experiments of the paper (table 1, figure 7, figure 8, table 2), those beyond it, and all of them."""
-
-    CLASSIFIER = "classifier"
-    SNR = "snr"
-    SPARSITY = "sparsity"
-    STATESPACE = "statespace"
-    ASYMMETRY = "asymmetry"
-    REAL = "real"
-    DELAY = "delay"
-    DATA = "data"
-    PHASE = "phase"
-    ATTACKS = "attacks"
-    COVERAGE = "coverage"
-    CALIBRATION = "calibration"
-    ALL = "all"
-
-
-RECORDED_EXPERIMENTS = (
-    ExperimentName.REAL, ExperimentName.DELAY, ExperimentName.DATA, ExperimentName.PHASE, ExperimentName.ATTACKS,
-    ExperimentName.COVERAGE,
-)  # fmt: skip
-"""Those on recorded trips; the others take the built-in vehicle."""
-RECORDED_OPTIONS = ("drives", "layout")
-"""What only experiments on recorded trips heed."""
-RUN_OPTIONS = (*RECORDED_OPTIONS, "quick", "repetitions", "seed", "workers")
-"""What only experiments that run something heed."""
-MAX_REPETITIONS = 1000
-QuickOption = Annotated[bool, typer.Option("--quick", help="Small and fast: shows that it runs, not the figures.")]
-RepetitionsOption = Annotated[
-    int | None,
-    whole_option("--repetitions", 1, MAX_REPETITIONS, "Trials per setting (without it 10, with --quick 2)"),
-]
-ExperimentDrivesOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--drives", help=f"Drive store for {', '.join(RECORDED_EXPERIMENTS)}; without it the built-in vehicle."
-    ),
-]
-ExperimentLayoutOption = Annotated[
-    Path | None,
-    typer.Option("--layout", help="Layout of these drives; without it dbc/hv_powertrain.toml of a checkout."),
-]
-ResultsFolderOption = Annotated[
-    Path | None,
-    typer.Option("--out", help="Folder for NAME.md, NAME.json and NAME.png; FOLDER.md beside it lists all."),
-]
+REPETITIONS, QUICK_REPETITIONS, MAX_REPETITIONS = 10, 2, 1000
 
 
 def experiment(
     context: typer.Context,
-    name: Annotated[
-        ExperimentName, typer.Argument(show_choices=False, help=f"Experiment: {', '.join(ExperimentName)}.")
-    ],
-    quick: QuickOption = False,
-    repetitions: RepetitionsOption = None,
+    name: Annotated[str | None, typer.Argument(help="Experiment, or 'all'; without a name they are listed.")] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Small and fast: shows that it runs, not the figures.")
+    ] = False,
+    repetitions: Annotated[
+        int | None,
+        whole_option("--repetitions", 1, MAX_REPETITIONS, "Trials per setting (without it 10, with --quick 2)"),
+    ] = None,
     seed: SeedOption = 0,
-    drives: ExperimentDrivesOption = None,
-    layout: ExperimentLayoutOption = None,
-    out: ResultsFolderOption = None,
+    drives: Annotated[
+        Path | None,
+        typer.Option("--drives", help="Drive store, for those on recorded trips; without it the built-in vehicle."),
+    ] = None,
+    layout: Annotated[
+        Path | None,
+        typer.Option("--layout", help="Layout of these drives; without it dbc/hv_powertrain.toml of a checkout."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for NAME.md, NAME.json and NAME.png; FOLDER.md beside it lists all."),
+    ] = None,
     workers: WorkersOption = 2,
     json: JsonOption = False,
 ) -> None:
@@ -84,18 +50,67 @@ def experiment(
     'calibration' runs nothing: it pools the confidences of the experiments that were recorded in --out before. Options
     that an experiment does not heed are refused.
     """
-    require_heeded_options(context, name)
     with importing():
-        from calibrator.experiments.runner import CALIBRATION, EXPERIMENTS, RunOptions, run_experiments
+        from calibrator.errors import FleetError
+        from calibrator.experiments.calibration import CALIBRATION, pool_confidences
+        from calibrator.experiments.experiments import EXPERIMENTS, fleet_for, run_experiment
+        from calibrator.experiments.pages import ORDER, result_table, write_result
+        from calibrator.experiments.result import made_now, read_results
 
+    if name is None:
+        titles = {CALIBRATION: "Reliability of the confidence", **{row.name: row.title for row in EXPERIMENTS.values()}}
+        write_output("\n".join(f"{each:<12} {titles[each]}" for each in ORDER))
+        return
+    if name not in {*ORDER, "all"}:
+        raise typer.BadParameter(f"{name}: expected one of {', '.join(ORDER)} or all", param_hint="NAME")
+    unheeded, reason = (), ""
+    if name == CALIBRATION:
+        unheeded = ("drives", "layout", "quick", "repetitions", "seed", "workers")
+        reason = "calibration runs nothing, it pools what is recorded in --out"
+    elif name != "all" and not EXPERIMENTS[name].recorded:
+        recorded = ", ".join(each for each in EXPERIMENTS if EXPERIMENTS[each].recorded)
+        unheeded, reason = ("drives", "layout"), f"{name} takes the built-in vehicle; this is only for {recorded}"
+    if given := given_options(context, unheeded):
+        raise typer.BadParameter(reason, param_hint=given[0])
+    if name == CALIBRATION and out is None:
+        raise typer.BadParameter(
+            "calibration pools what is recorded there; first run 'calibrator experiment all --out FOLDER', or some "
+            "experiments by their names",
+            param_hint="--out",
+        )
     if out is not None:
         require_possible_folder(out)
         require_possible_folder(out.absolute().parent)
-    names = (*EXPERIMENTS, CALIBRATION) if name is ExperimentName.ALL else (name.value,)
-    options = RunOptions(quick=quick, seed=seed, repetitions=repetitions, jobs=workers, layout=layout, drives=drives)
-    results = run_experiments(names, options, out=out, console=None if json else Console())
+    names = ORDER if name == "all" else (name,)
+    # recorded trips are read before anything is run, and once
+    trips = next((e for each, e in EXPERIMENTS.items() if each in names and e.recorded), None)
+    fleet = None if trips is None else fleet_for(trips, quick=quick, drives=drives, layout=layout)
+    count = repetitions or (QUICK_REPETITIONS if quick else REPETITIONS)
+    done = []
+    for number, each in enumerate(names, start=1):
+        with one_pass(number, len(names)):
+            if each == CALIBRATION:
+                before = [] if out is None else read_results(out, EXPERIMENTS)
+                pooled = {result.name: result for result in (*before, *done)}
+                if not pooled:
+                    raise FleetError(
+                        f"{out}: no experiment is recorded that calibration could pool; first run 'calibrator "
+                        f"experiment all --out {out}', or some experiments by their names"
+                    )
+                result = pool_confidences(list(pooled.values()))
+            else:
+                row = EXPERIMENTS[each]
+                own = fleet if row.recorded and fleet is not None else fleet_for(row, quick=quick)
+                result = run_experiment(
+                    row.small() if quick else row, own, repetitions=count, seed=seed, workers=workers
+                )
+        done.append(replace(result, made=made_now()))
+        if not json:
+            Console().print(result_table(done[-1]))
+        if out is not None:
+            write_result(out, done[-1])
     if json:
-        texts = [result.to_json().decode().rstrip() for result in results]
+        texts = [result.to_json().decode().rstrip() for result in done]
         write_output(texts[0] if len(texts) == 1 else f"[{','.join(texts)}]")
 
 
@@ -108,38 +123,4 @@ def score(
     with importing():
         from calibrator.experiments.result_score import score_result
 
-    figures = score_result(result, truth)
-    print_report(figures, json=json)
-
-
-def require_heeded_options(context: typer.Context, name: ExperimentName) -> None:
-    """Refuse options that an experiment does not heed, and ``calibration`` without the folder that it pools.
-
-    Parameters
-    ----------
-    context : typer.Context
-        Of the command.
-    name : ExperimentName
-        The experiment; all together heed every option.
-
-    Raises
-    ------
-    typer.BadParameter
-        Naming the first such option.
-    """
-    unheeded: tuple[str, ...] = ()
-    reason = ""
-    if name is ExperimentName.CALIBRATION:
-        unheeded, reason = RUN_OPTIONS, "calibration runs nothing, it pools what is recorded in --out"
-    elif name not in (*RECORDED_EXPERIMENTS, ExperimentName.ALL):
-        unheeded = RECORDED_OPTIONS
-        reason = f"{name.value} takes the built-in vehicle; this is only for {', '.join(RECORDED_EXPERIMENTS)}"
-    given = given_options(context, unheeded)
-    if given:
-        raise typer.BadParameter(reason, param_hint=given[0])
-    if name is ExperimentName.CALIBRATION and context.params["out"] is None:
-        raise typer.BadParameter(
-            "calibration pools what is recorded there; first run 'calibrator experiment all --out FOLDER', or some "
-            "experiments by their names",
-            param_hint="--out",
-        )
+    print_report(score_result(result, truth), json=json)

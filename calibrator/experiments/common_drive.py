@@ -1,33 +1,59 @@
-"""The one drive that all vehicles of an experiment make, section IV-A of [1]_.
+"""Trials in which all vehicles make one drive, sections IV-A to IV-D of [1]_.
+
+The evidence rows of the default are made of simulations over the fleet reference, and of the junction law. The
+reference is not the mean r of the fleet (3), which an asymmetric fleet shifts, but c_0 r + c_1 with the densest cluster
+of slopes and of intercepts as c_0 and c_1, branch by branch. Slopes and intercepts a, b over r become
+
+    a' = a / c_0,    b' = b - a c_1 / c_0
+
+The measured currents hold no noise here, so the junction law on their second moments is exact: with (.)_1 the first
+branch, (.)_r the others and M the covariance of the measured currents, g = M_rr^-1 M_r1 and c = mean_1 - g^T mean_r.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from calibrator.artificial.builtin_drives import builtin_trip
+from calibrator.artificial.builtin_drives import BUILTIN_BRANCHES, builtin_trip
 from calibrator.artificial.ground_truth import with_branches
+from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.errors import DriveError
+from calibrator.estimator.fleet_model import densest_clusters
+from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows
+from calibrator.estimator.state_space import choose_order, identify
+from calibrator.experiments.trial import CommonEvidence, Trial, UnseenDrive
+from calibrator.faults import Faults, slopes_and_intercepts
+from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.random_streams import Purpose, random_stream
 
-__all__ = ["CommonDrive", "builtin_common_drive"]
+__all__ = [
+    "CommonCase", "CommonDrive", "builtin_common_drive", "common_rows", "common_trial", "measured_moments",
+    "noise_sd_a",
+]  # fmt: skip
 
 TRAIN_SHARE = 0.8
 """Share of the drive on which models are trained; the rest is the unity drive, section IV-C. [1]"""
 DURATION_S = 3600.0
 """An hour: 7,200 samples of unity drive at 10 Hz; the paper does not say. [s]"""
-BRANCHES = ("battery", "motor", "auxiliary", "dcdc", "motor_rear")
 BALANCE = "motor"
 FULL_SCALE_A = 400.0
 """Nominal maximum current of the built-in vehicle's junction, as in its layout. [A]"""
+GAIN_VARIANCE, CONSTANT_VARIANCE = 1e-10, 1e-12
+"""Of the exact junction law: above rounding, far below any fault. [1]"""
+ROUNDS = 3
+"""Over a better reference, vehicles agree more closely; more rounds change nothing. [1]"""
+LEAST_SD = 1e-6
+"""Of slopes [1] and intercepts [A] of simulations without noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CommonDrive:
-    """Ideal currents and inputs of one drive.
+    """Ideal currents and inputs of the one drive.
 
     Attributes
     ----------
@@ -71,9 +97,20 @@ class CommonDrive:
         """Ideal currents on the unity drive, shape (T - T_1, K). [A]"""
         return self.i_s[self.unity_start :]
 
+    @property
+    def record(self) -> dict[str, int | float | str]:
+        """What is needed to make the drive again."""
+        return {
+            "drive": self.name,
+            "branches": self.branches,
+            "samples": len(self.i_s),
+            "unity_samples": len(self.unity),
+            "full_scale_a": self.full_scale_a,
+        }
+
 
 def builtin_common_drive(*, branches: int = 2, seed: int = 0, duration_s: float = DURATION_S) -> CommonDrive:
-    """Take the common drive from the built-in vehicle.
+    """Take the common drive from the built-in vehicle; it has the model inputs of ``dbc/hv_powertrain.toml``.
 
     Parameters
     ----------
@@ -84,18 +121,12 @@ def builtin_common_drive(*, branches: int = 2, seed: int = 0, duration_s: float 
     duration_s : float
         Least duration. [s]
 
-    Returns
-    -------
-    CommonDrive
-        With the model inputs of ``dbc/hv_powertrain.toml``.
-
     Raises
     ------
     FleetError
         If fastsim is not installed.
     """
     trip = builtin_trip(random_stream(Purpose.COMMON_DRIVE, seed), duration_s=duration_s, name=f"builtin-{seed}")
-    trip = with_branches(trip, BRANCHES[:branches], BALANCE)
     unseen = builtin_trip(random_stream(Purpose.UNSEEN_TRIP, seed), duration_s=duration_s, name="unseen")
     x, voltage = trip.inputs, trip.inputs["voltage"]
     power = x["torque"] * x["speed"]
@@ -107,10 +138,194 @@ def builtin_common_drive(*, branches: int = 2, seed: int = 0, duration_s: float 
         x["aircon_demand"] / voltage,
         x["low_voltage_demand"] / voltage,
     )
+    currents, other = (with_branches(t, BUILTIN_BRANCHES[:branches], BALANCE).matrix_a() for t in (trip, unseen))
     return CommonDrive(
-        name=trip.name,
-        i_s=trip.matrix_a(),
-        inputs=np.stack(inputs, axis=1),
-        full_scale_a=FULL_SCALE_A,
-        unseen=with_branches(unseen, BRANCHES[:branches], BALANCE).matrix_a(),
+        name=trip.name, i_s=currents, inputs=np.stack(inputs, axis=1), full_scale_a=FULL_SCALE_A, unseen=other
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommonCase:
+    """How a fleet on the common drive is drawn, section IV-B of [1]_, and simulated.
+
+    Attributes
+    ----------
+    vehicles : int
+        Fleet size N, a multiple of 4 for a symmetric fleet.
+    training_vehicles : int
+        Size of the artificial fleet that trees learn from; 3,000 in section V-B.
+    sparsity : float
+        Sparsity level S. [%]
+    magnitude : tuple of float
+        a, b: gain errors [1], offsets in fractions of full scale.
+    snr_db : float
+        Of the artificial simulation (26). [dB]
+    balanced, symmetric : bool
+        See :func:`~calibrator.artificial.random_fleet.draw_faults`.
+    sign_bias : float
+        Faults are positive with probability 0.5 + sign_bias. [1]
+    state_space : bool
+        Simulate by a state-space model of each vehicle (2), trained on 80 % of the drive, instead of artificially (23).
+    """
+
+    vehicles: int = 1000
+    training_vehicles: int = 3000
+    sparsity: float = 60.0
+    magnitude: tuple[float, float] = (0.05, 0.25)
+    snr_db: float = 20.0
+    balanced: bool = True
+    symmetric: bool = True
+    sign_bias: float = 0.0
+    state_space: bool = False
+
+    def draw(self, drive: CommonDrive, vehicles: int, purpose: Purpose, seed: int) -> Faults:
+        """Draw the faults of a fleet."""
+        return draw_faults(
+            random_stream(purpose, seed),
+            vehicles=vehicles,
+            branches=drive.branches,
+            sparsity=self.sparsity,
+            magnitude=self.magnitude,
+            full_scale_a=drive.full_scale_a,
+            balanced=self.balanced,
+            symmetric=self.symmetric,
+            sign_bias=self.sign_bias,
+        )
+
+
+def noise_sd_a(drive: CommonDrive, snr_db: float) -> float:
+    """Standard deviation of the artificial simulation error, (26), with the power of i_s,1 on the unity drive. [A]"""
+    return float(np.sqrt(10.0 ** (-snr_db / 10.0) * np.mean(drive.unity[:, 0] ** 2)))
+
+
+def common_trial(drive: CommonDrive, case: CommonCase, seed: int) -> Trial:
+    """Evidence of N vehicles on the unity drive; the same for the same seed."""
+    truth = case.draw(drive, case.vehicles, Purpose.FAULTS, seed)
+    simulate = _simulation(drive, truth, case, Purpose.SIMULATION_ERROR, seed)
+    if case.state_space:
+        simulated = list(_state_space_simulations(drive, truth))
+        simulate = lambda: simulated  # noqa: E731
+    reference = fleet_mean(simulate())
+    evidence = collect_evidence(simulate(), reference, _junction_a2(drive, truth))
+
+    def record() -> CommonEvidence:
+        mean_a, covariance_a2 = measured_moments(drive.unity, truth)
+        rows = common_rows(evidence, reference.mean(axis=0), mean_a, covariance_a2, full_scale_a=drive.full_scale_a)
+        return CommonEvidence(rows=rows, mean_a=mean_a, covariance_a2=covariance_a2)
+
+    return Trial(
+        smallest_fault=case.magnitude[0],
+        full_scale_a=drive.full_scale_a,
+        truth=truth,
+        unseen=UnseenDrive.of_linear_sensors(drive.unseen, truth),
+        record=record,
+        collect=lambda: evidence,
+        training=partial(_training, drive, case, seed),
+    )
+
+
+def _training(drive: CommonDrive, case: CommonCase, seed: int) -> tuple[FleetEvidence, Faults]:
+    """Evidence and truth of another fleet, for the trees."""
+    truth = case.draw(drive, case.training_vehicles, Purpose.TRAINING_FAULTS, seed)
+    simulate = _simulation(drive, truth, case, Purpose.TRAINING_ERROR, seed)
+    return collect_evidence(simulate(), fleet_mean(simulate()), _junction_a2(drive, truth)), truth
+
+
+def _simulation(
+    drive: CommonDrive, truth: Faults, case: CommonCase, purpose: Purpose, seed: int
+) -> Callable[[], Iterable[Array]]:
+    """Measured currents with white noise (23), made anew by each call instead of kept in memory."""
+    noise_a = noise_sd_a(drive, case.snr_db)
+
+    def simulate() -> Iterator[Array]:
+        for j, measured in enumerate(_measured(drive.unity, truth)):
+            yield measured + noise_a * random_stream(purpose, seed, j).standard_normal(measured.shape)
+
+    return simulate
+
+
+def _state_space_simulations(drive: CommonDrive, truth: Faults) -> Iterator[Array]:
+    """Simulations by state-space models (2); identical vehicles have the same order, chosen on the first."""
+    start, order = drive.unity_start, None
+    for measured in _measured(drive.i_s, truth):
+        if order is None:
+            order = choose_order(drive.inputs[:start], measured[:start])
+        model = identify(drive.inputs[:start], measured[:start], order=order)
+        yield model.simulate(drive.inputs, initial_state=model.x0)[start:]
+
+
+def _measured(i_s: Array, truth: Faults) -> Iterator[Array]:
+    """Measured currents (21) of one vehicle after the other."""
+    for slope, intercept in zip(*slopes_and_intercepts(truth), strict=True):
+        yield slope * i_s + intercept
+
+
+def _junction_a2(drive: CommonDrive, truth: Faults) -> Array:
+    """Mean square of the sum of each vehicle's measured currents (6), shape (N,). [A^2]"""
+    return np.array([np.mean(measured.sum(axis=1) ** 2) for measured in _measured(drive.unity, truth)])
+
+
+def measured_moments(i_s: Array, truth: Faults) -> tuple[Array, Array]:
+    """Mean (N, K) [A] and covariance (N, K, K) [A^2] of what N vehicles measure of ideal currents (T, K), (14)."""
+    slope, intercept = slopes_and_intercepts(truth)
+    centred = i_s - i_s.mean(axis=0)
+    covariance = centred.T @ centred / len(i_s)
+    return slope * i_s.mean(axis=0) + intercept, slope[:, :, None] * covariance * slope[:, None, :]
+
+
+def common_rows(
+    evidence: FleetEvidence, reference_mean_a: Array, mean_a: Array, covariance_a2: Array, *, full_scale_a: float
+) -> EvidenceRows:
+    """Evidence rows of a fleet on its common drive, without bench readings.
+
+    Parameters
+    ----------
+    evidence : FleetEvidence
+        Slopes and intercepts of the simulations over the fleet mean, with white residuals.
+    reference_mean_a : ndarray of shape (K,)
+        Mean of the fleet mean on the unity drive. [A]
+    mean_a, covariance_a2 : ndarray of shape (N, K) and (N, K, K)
+        Moments of the measured currents of the same vehicles. [A], [A^2]
+    full_scale_a : float
+        Full scale of the junction. [A]
+    """
+    N, K = evidence.slopes.shape
+    slope, intercept_a, of_line = _over_cluster(evidence, reference_mean_a)
+    # junction law: gains of the other branches (N, K - 1) and constant (N, 1) in the first branch's measured current
+    gain = np.linalg.solve(covariance_a2[:, 1:, 1:], covariance_a2[:, 1:, :1])[:, :, 0]
+    constant_a = mean_a[:, :1] - np.sum(gain * mean_a[:, 1:], axis=1, keepdims=True)
+    nothing = np.zeros((N, K))
+    covariance = np.tile(np.diag(np.full(5 * K, UNKNOWN_VARIANCE)), (N, 1, 1))
+    for k in range(K):
+        unit = np.array([np.ones(N), np.full(N, 1.0 / full_scale_a)]).T / slope[:, k, None]
+        place = np.array([k, 3 * K - 1 + k])
+        covariance[:, place[:, None], place] = of_line[:, k] * unit[:, :, None] * unit[:, None, :]
+    for row in range(K, 2 * K - 1):
+        covariance[:, row, row] = GAIN_VARIANCE
+    covariance[:, 4 * K - 1, 4 * K - 1] = CONSTANT_VARIANCE
+    return EvidenceRows(
+        relative=np.concatenate([np.log(slope), np.log(-gain), nothing], axis=1),
+        constant=np.concatenate([intercept_a / full_scale_a, constant_a / full_scale_a, nothing], axis=1),
+        covariance=covariance,
+        means=np.zeros((N, 2, K)),
+    )
+
+
+def _over_cluster(evidence: FleetEvidence, reference_mean_a: Array) -> tuple[Array, Array, Array]:
+    """Slopes (N, K), intercepts (N, K) [A] over the densest cluster, and the covariance of both (N, K, 2, 2)."""
+    slope, intercept_a = evidence.slopes, evidence.intercepts_a
+    covariance = np.empty((*slope.shape, 2, 2))
+    covariance[..., 0, 0] = np.maximum(evidence.slope_variances, LEAST_SD**2)
+    covariance[..., 1, 1] = np.maximum(evidence.intercept_variances_a2, LEAST_SD**2)
+    covariance[..., 0, 1] = covariance[..., 1, 0] = -reference_mean_a * evidence.slope_variances
+    for _ in range(ROUNDS):
+        sd = np.sqrt(np.einsum("nkii->nki", covariance))
+        scale, zero = (
+            np.array([densest_clusters(values[:, k], sd[:, k, i])[0].centre for k in range(values.shape[1])])
+            for i, values in enumerate((slope, intercept_a))
+        )
+        jacobian = np.zeros((len(scale), 2, 2))
+        jacobian[:, 0, 0], jacobian[:, 1, 0], jacobian[:, 1, 1] = 1.0 / scale, -zero / scale, 1.0
+        slope, intercept_a = slope / scale, intercept_a - slope * zero / scale
+        covariance = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+    return slope, intercept_a, covariance

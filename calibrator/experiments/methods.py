@@ -1,4 +1,7 @@
-"""Methods that experiments compare: a trial in, estimated faults out."""
+"""Methods that experiments compare: a trial in, estimated faults out.
+
+A method of your own is any object with a ``name`` and a function ``estimate(trial)`` that returns an :class:`Estimate`.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,6 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from calibrator.drive import Array, Mask
+from calibrator.errors import FleetError
 from calibrator.estimator.decision import RowsEstimate, estimate_rows
 from calibrator.estimator.fleet_estimate import HARM_LIMIT, estimate_vehicles, learn_fleet
 from calibrator.estimator.learning import learn_laws
@@ -19,7 +23,11 @@ from calibrator.published.recovery import recover_fleet
 
 __all__ = [
     "CEILING", "LEFT_IN", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "Estimate", "Method", "Posterior", "Published",
+    "require_estimate",
 ]  # fmt: skip
+
+ROUNDING = 1e-9
+"""By which a probability may leave 0 to 1. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,31 +115,27 @@ class Posterior:
     ----------
     name : str
         As on the command line.
-    knows_law : bool
+    knows_distribution : bool
         Whether it is told how the faults were drawn, to show the ceiling; the default is told nothing.
     """
 
     name: str = "posterior"
-    knows_law: bool = False
+    knows_distribution: bool = False
 
     def estimate(self, trial: Trial) -> Estimate:
         """Estimate, and correct the branches that are hardly ever made worse."""
-        return _estimate(trial, trial.drawn_from if self.knows_law else None)
-
-
-def _estimate(trial: Trial, known: FaultDistribution | None) -> Estimate:
-    """Run the estimator on a trial: the only place of the experiments that knows its interface."""
-    prior = None if known is None else known_prior(known.counts, known.gain)
-    if isinstance(trial.recorded, CommonEvidence):
-        return _of_rows(trial.recorded, prior, trial.full_scale_a)
-    names = [f"{k + 1}" for k in range(trial.truth.drift.shape[1])]
-    reference = learn_fleet(trial.recorded, full_scale_a=trial.full_scale_a, branches=names, known=prior)
-    found = estimate_vehicles(trial.recorded, reference)
-    return replace(
-        _estimated(found, found.corrected, reference.laws[0].prior),
-        pit=lambda truth: found.pit(truth.drift, truth.offset_a),
-        findings=[[finding.cause for finding in findings] for findings in found.findings],
-    )
+        known = trial.drawn_from if self.knows_distribution else None
+        prior = None if known is None else known_prior(known.counts, known.gain)
+        if isinstance(trial.recorded, CommonEvidence):
+            return _of_rows(trial.recorded, prior, trial.full_scale_a)
+        names = [f"{k + 1}" for k in range(trial.truth.drift.shape[1])]
+        reference = learn_fleet(trial.recorded, full_scale_a=trial.full_scale_a, branches=names, known=prior)
+        found = estimate_vehicles(trial.recorded, reference)
+        return replace(
+            _estimated(found, found.corrected, reference.laws[0].prior),
+            pit=lambda truth: found.pit(truth.drift, truth.offset_a),
+            findings=[[finding.cause for finding in findings] for findings in found.findings],
+        )
 
 
 def _of_rows(recorded: CommonEvidence, known: Prior | None, full_scale_a: float) -> Estimate:
@@ -172,19 +176,60 @@ def _by_threshold(trial: Trial) -> Classification:
     return classify_by_threshold(trial.evidence.features)
 
 
-def _by_tree(trial: Trial) -> Classification:
-    assert trial.training is not None
-    evidence, faults = trial.training()
-    return FaultTrees(evidence.features, faults).classify(trial.evidence.features)
-
-
 def _by_truth(trial: Trial) -> Classification:
     return classify_by_truth(trial.truth)
+
+
+def _by_tree(trial: Trial) -> Classification:
+    if trial.training is None:
+        raise FleetError("published/tree: these trials have no artificial fleet that its trees could learn from")
+    evidence, faults = trial.training()
+    return FaultTrees(evidence.features, faults).classify(trial.evidence.features)
 
 
 THRESHOLD = Published(name="published/threshold", classify=_by_threshold)
 TREE = Published(name="published/tree", classify=_by_tree)
 PERFECT = Published(name="published/perfect", classify=_by_truth)
 POSTERIOR = Posterior()
-CEILING = Posterior(name="posterior/law known", knows_law=True)
+CEILING = Posterior(name="posterior/law known", knows_distribution=True)
 LEFT_IN = Posterior(name="posterior, delays left in")
+
+
+def require_estimate(method: str, estimate: object, truth: Faults) -> Estimate:
+    """Return what a method gave for the N vehicles with K branches of a truth, if it can be judged.
+
+    Raises
+    ------
+    FleetError
+        If it is no estimate, or one of its arrays has another shape or type, or values that are not finite.
+    """
+
+    def require(good: object, what: str, given: object, expected: str) -> None:
+        if not good:
+            kind = "None" if given is None else f"an object of type {type(given).__name__}"
+            if isinstance(given, np.ndarray):
+                kind = f"an array of {given.dtype} of shape {given.shape}"
+            raise FleetError(f"method '{method}': {what} {kind}, expected {expected}; see Estimate of {__name__}")
+
+    def require_array(what: str, given: object, shape: tuple[int, ...], kinds: str, low: float = -np.inf) -> None:
+        elements, axes = "bool" if kinds == "b" else "numbers", "vehicles and branches" if shape[1:] else "vehicles"
+        good = isinstance(given, np.ndarray) and given.shape == shape and given.dtype.kind in kinds
+        require(good, f"{what} is", given, f"an array of {elements} of shape {shape}: {axes}")
+        assert isinstance(given, np.ndarray)
+        bad = int(np.sum(~(np.isfinite(given) & (given >= low) & (given <= 1.0 - low))))
+        expected = "finite ones, 0 where no fault is found" if low < -1.0 else "probabilities from 0 to 1"
+        require(not bad, f"{what} has {bad} wrong values in", given, expected)
+
+    require(isinstance(estimate, Estimate), "estimate() returned", estimate, "an Estimate")
+    assert isinstance(estimate, Estimate)
+    require(isinstance(estimate.faults, Faults), "faults are", estimate.faults, "Faults of calibrator.faults")
+    N, K = truth.drift.shape
+    for name in ("hardware_drift", "hardware_offset_a", "drift", "offset_a"):
+        shape = (N,) if name == "hardware_drift" else (N, K)
+        require_array(f"faults.{name}", getattr(estimate.faults, name), shape, "fiu")
+    require_array("hardware", estimate.hardware, (N,), "b")
+    require_array("corrected", estimate.corrected, (N, K), "b")
+    if estimate.confidence is not None:
+        require_array("confidence", estimate.confidence, (N,), "fiu", low=-ROUNDING)
+    require(isinstance(estimate.failed, int | np.integer), "failed is", estimate.failed, "a number of vehicles")
+    return estimate

@@ -22,11 +22,9 @@
     failed                           share of vehicles whose optimisation failed
     delay_rmse_ms                    root mean square error of the estimated delays [ms]
 
-The expected calibration error is that of [1]_. Records give shares with their counts; an upper bound beside a rare one
-is that of Clopper and Pearson [2]_, one-sided, with a confidence of 95 %.
+The expected calibration error is that of [1]_.
 
 .. [1] M. Naeini, G. Cooper, M. Hauskrecht, "Obtaining well calibrated probabilities using Bayesian binning", AAAI 2015.
-.. [2] C. Clopper, E. Pearson, "The use of confidence or fiducial limits ...", Biometrika 26 (1934).
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,6 @@
-"""Results of experiments as pictures: each kind of experiment has its drawing."""
+"""Results of experiments as pictures: one function per kind. Bars are 95 % intervals, rings the paper's figures."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,225 +13,169 @@ from matplotlib.transforms import ScaledTranslation
 
 from calibrator.drive import Array
 from calibrator.experiments.baselines import BASELINES
-from calibrator.experiments.calibration_experiment import ALL
+from calibrator.experiments.calibration import ALL, CALIBRATION
+from calibrator.experiments.experiments import EXPERIMENTS, Experiment
 from calibrator.experiments.methods import CEILING, LEFT_IN, PERFECT, POSTERIOR, THRESHOLD, TREE
 from calibrator.experiments.outcome import BINS
-from calibrator.experiments.result import ExperimentResult, Row
+from calibrator.experiments.result import ExperimentResult
 from calibrator.experiments.result import Figure as Merit
-from calibrator.experiments.table import PAPER
 
 __all__ = ["draw_result", "write_picture"]
 
-RATE = "recovery_rate"
-SHOWN = {RATE: "recovery rate", "confidence": "mean confidence"}
-PANELS = {
-    "attacks": {"harmed": "harmed of the corrected; bars to the 95 % bound", "named": "cause named"},
-    "coverage": {"gain_within_1": "gain errors within 1 sd", "offset_within_1": "offsets within 1 sd"},
+TITLES = {
+    "recovery_rate": "recovery rate",
+    "confidence": "mean confidence",
+    "harmed": "harmed of the corrected",
+    "named": "cause named",
+    "gain_within_1": "gain errors within 1 sd",
+    "offset_within_1": "offsets within 1 sd",
 }
 SHARES = (-0.03, 1.03)
 """Axis of a share: 0 to 1, with room for the markers at its ends. [1]"""
-SPREAD = "error bars: sd over repetitions"
 LOGARITHMIC = 20.0
 """Ratio of the largest to the smallest value from which on an axis is logarithmic. [1]"""
-MOST_TICKS = 10
-"""Up to so many values that an experiment varies are each a tick."""
-DODGE_PT = 5.0
-"""Curves stand side by side, so that equal ones do not hide each other. [pt]"""
 MARGIN = 0.08
 """Of the range of values, left and right of them. [1]"""
+DODGE_PT = 5.0
+"""Curves stand side by side, so that equal ones do not hide each other. [pt]"""
 FEW = 30
 """With fewer vehicles the share recovered is uncertain by more than about 0.1; their markers are hollow."""
-GREY = "0.6"
-
-
-@dataclass(frozen=True)
-class _Style:
-    """How a curve is told from others, also without colours; the first are those of Okabe and Ito, for all eyes."""
-
-    colour: str
-    marker: str
-    line: str
-
-
-STYLES = (
-    _Style("#0072B2", "o", "-"),
-    _Style("#D55E00", "s", "--"),
-    _Style("#009E73", "^", "-."),
-    _Style("#CC79A7", "D", ":"),
-    _Style("#E69F00", "v", "--"),
-    _Style("#56B4E9", "P", "-."),
-    _Style("#000000", "p", ":"),
-    _Style("#882255", "<", "-"),
-    _Style("#999999", "h", "--"),
-    _Style("#332288", ">", "-."),
-    _Style("#117733", "X", ":"),
-    _Style("#AA4499", "d", "--"),
-)
-"""More than there are experiments that can be pooled, or methods that are compared."""
+COLOURS = (
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#882255", "#999999", "#332288",
+    "#117733", "#AA4499",
+)  # fmt: skip
+"""The first are those of Okabe and Ito, for all eyes."""
+MARKERS, LINES = "os^DvPp<h>Xd", ("-", "--", "-.", ":")
 METHODS = tuple(method.name for method in (POSTERIOR, PERFECT, CEILING, TREE, THRESHOLD, LEFT_IN, *BASELINES))
 """Each has its style in all pictures."""
 
 
-def _style_of(method: str) -> _Style:
-    """Style of a method in all pictures."""
-    return STYLES[METHODS.index(method)] if method in METHODS else STYLES[-1]
+def _style(number: int) -> dict[str, Any]:
+    """How a curve is told from others, also without colours."""
+    return {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
 
 
-def _within_shares(figures: Sequence[Merit]) -> Array:
-    """Lengths of the error bars down and up, shape (2, n): a share cannot be below 0 or above 1."""
-    room = np.clip([[f.mean, 1.0 - f.mean] for f in figures], 0.0, None).T
-    return np.asarray(np.minimum(room, [f.sd for f in figures]))
-
-
-def _draw_legend(figure: Figure, all_axes: Sequence[Axes], *, title: str | None = None) -> None:
-    """One legend below all axes, each label once."""
-    found: dict[str, Artist] = {}
-    for axes in all_axes:
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
-    labels = sorted(found, key=lambda label: label.startswith((PAPER, SHOWN["confidence"])))
-    handles = [found[label] for label in labels]
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 6), fontsize="small", title=title)
+def _style_of(method: str) -> dict[str, Any]:
+    return _style(METHODS.index(method) if method in METHODS else len(METHODS))
 
 
 def write_picture(result: ExperimentResult, path: Path) -> None:
-    """Draw a result into a PNG file.
-
-    Parameters
-    ----------
-    result : ExperimentResult
-        Of one experiment.
-    path : Path
-        PNG file to write.
-    """
+    """Draw a result into a PNG file."""
     draw_result(result).savefig(path, dpi=110)
 
 
 def draw_result(result: ExperimentResult) -> Figure:
-    """Draw a result; error bars are standard deviations over repetitions, rings are the paper's figures.
-
-    Parameters
-    ----------
-    result : ExperimentResult
-        Of one experiment.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        With a legend beside the data.
-    """
-    drawings = {
-        "phase": _draw_phase,
-        "calibration": _draw_reliability,
-        "real": _draw_dots,
-        "classifier": _draw_dots,
-        "attacks": _draw_dots,
-        "coverage": _draw_dots,
-    }
+    """Draw a result of an experiment as its row in the table says, with one legend beside the data."""
+    kind = EXPERIMENTS[result.name].picture if result.name in EXPERIMENTS else "lines"
+    draw = {"lines": _draw_lines, "dots": _draw_dots, "map": _draw_map}[kind]
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(result.title)
-    drawings.get(result.name, _draw_lines)(figure, result)
+    (_draw_reliability if result.name == CALIBRATION else draw)(figure, result)
     return figure
 
 
+def _panels(result: ExperimentResult) -> tuple[str, ...]:
+    return EXPERIMENTS[result.name].panels if result.name in EXPERIMENTS else Experiment.panels
+
+
+def _bars(figures: Sequence[Merit]) -> Array:
+    """Lengths of the 95 % intervals down and up, shape (2, n); 0 where there is none."""
+    ends = [figure.interval or (figure.mean, figure.mean) for figure in figures]
+    return np.array([[max(f.mean - low, 0.0), max(high - f.mean, 0.0)] for f, (low, high) in zip(figures, ends)]).T  # noqa: B905
+
+
+def _rings(axes: Axes, points: Sequence[tuple[float, float | None]], label: str, colour: str, **more: Any) -> None:
+    """Figures of the paper: rings that hide nothing."""
+    known = [(x, y) for x, y in points if x is not None and y is not None]
+    if known:
+        axes.scatter(
+            *zip(*known, strict=True), s=110.0, facecolors="none", edgecolors=colour, linewidths=1.5, zorder=4,
+            label=f"paper, {label}", **more,
+        )  # fmt: skip
+
+
+def _legend(figure: Figure, *, title: str | None = None) -> None:
+    """One legend below all axes, each label once."""
+    found: dict[str, Artist] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    labels = sorted(found, key=lambda label: label.startswith("paper"))
+    columns = min(len(labels), 6)
+    figure.legend(
+        [found[label] for label in labels], labels, loc="outside lower center", ncols=columns, fontsize="small",
+        title=title,
+    )  # fmt: skip
+
+
 def _draw_dots(figure: Figure, result: ExperimentResult) -> None:
-    """A line of dots per setting and a panel per figure, where settings are no numbers; rings are of the paper."""
-    attacks = result.name == "attacks"  # of these few are harmed: bars go to the upper bound of the share
-    panels = PANELS.get(result.name, SHOWN)
+    """A line of dots per setting and a panel per figure, where settings are no numbers."""
     keys = list(dict.fromkeys((row.series, row.x) for row in result.rows))
     figure.set_size_inches(11.0, 2.0 + max(3.0, 0.3 * len(keys)))
+    panels = _panels(result)
     all_axes = figure.subplots(1, len(panels), sharey=True)
-    for axes, (name, title) in zip(all_axes, panels.items(), strict=True):
+    for axes, name in zip(all_axes, panels, strict=True):
         for number, method in enumerate(result.methods):
             rows = [row for row in result.rows if row.method == method and name in row.figures]
             aside = 0.6 * ((number + 0.5) / len(result.methods) - 0.5)
             place = [keys.index((row.series, row.x)) + aside for row in rows]
             figures, style = [row.figures[name] for row in rows], _style_of(method)
-            spread = _within_shares(figures)
-            if attacks:
-                spread = np.array([[0.0, (f.upper or f.mean) - f.mean] for f in figures]).reshape(-1, 2).T
-            line: dict[str, Any] = {"fmt": style.marker, "color": style.colour, "markersize": 5.0, "elinewidth": 1.0}
-            axes.errorbar([f.mean for f in figures], place, xerr=spread, label=method, **line)
-            papers = [(f.paper, y) for f, y in zip(figures, place, strict=True) if f.paper is not None]
-            _draw_rings(axes, papers, style, f"{PAPER}, {method}")
-        axes.set(title=title, xlim=SHARES)
+            if rows:
+                means = [figure.mean for figure in figures]
+                axes.errorbar(means, place, xerr=_bars(figures), label=method, linestyle="", markersize=5.0, **style)
+                points: Any = [(figure.paper, y) for figure, y in zip(figures, place, strict=True)]
+                _rings(axes, points, method, style["color"])
+        axes.set(title=TITLES[name], xlim=SHARES)
         axes.grid(visible=True, alpha=0.3)
-    all_axes[0].set_yticks(range(len(keys)), [_tick(result, *key) for key in keys], fontsize="small")
+    ticks = [f"{series}, {result.x_label.split()[0]} {x:g}".removeprefix(", ") for series, x in keys]
+    all_axes[0].set_yticks(range(len(keys)), ticks, fontsize="small")
     all_axes[0].invert_yaxis()
-    _draw_legend(figure, all_axes)
-
-
-def _draw_rings(axes: Axes, papers: Sequence[tuple[float, float]], style: _Style, label: str, **more: Any) -> None:
-    """Figures of the paper: rings that hide nothing."""
-    if papers:
-        ring: dict[str, Any] = {"marker": "o", "s": 110.0, "facecolors": "none", "linewidths": 1.5, "zorder": 4}
-        x, y = ([*values] for values in zip(*papers, strict=True))
-        axes.scatter(x, y, edgecolors=style.colour, label=label, **ring, **more)
-
-
-def _tick(result: ExperimentResult, series: str, x: float) -> str:
-    varied = f"K = {x:g}" if result.name == "attacks" else f"S = {x:g} %"
-    return ", ".join(part for part in (series.replace("+-", "±"), varied) if part)
+    _legend(figure)
 
 
 def _draw_lines(figure: Figure, result: ExperimentResult) -> None:
-    """Recovery rate and confidence over what is varied; with several series, a panel for each method."""
+    """Figures over what is varied: a curve per method; with several series a panel per method, a curve per series."""
     series = list(dict.fromkeys(row.series for row in result.rows))
     several = len(series) > 1
+    groups = [(method,) for method in result.methods] if several else [result.methods]
     panels = []
-    for name in SHOWN:
-        for group in [(method,) for method in result.methods] if several else [result.methods]:
-            keys = [(method, one) for method in group for one in series]
-            found = {key: [r for r in result.rows if (r.method, r.series) == key and name in r.figures] for key in keys}
-            panels += [(name, group, {key: rows for key, rows in found.items() if rows})] if any(found.values()) else []
+    for name in _panels(result):
+        for group in groups:
+            rows = [row for row in result.rows if row.method in group and name in row.figures]
+            panels += [(name, group, rows)] if rows else []
     all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axes, (name, group, curves) in zip(all_axes, panels, strict=True):
-        for number, ((method, one), rows) in enumerate(curves.items()):
-            style = STYLES[number % len(STYLES)] if several else _style_of(method)
+    for axes, (name, group, panel_rows) in zip(all_axes, panels, strict=True):
+        curves = list(dict.fromkeys((row.method, row.series) for row in panel_rows))
+        for number, (method, one) in enumerate(curves):
+            rows = [row for row in panel_rows if (row.method, row.series) == (method, one)]
+            label = (one or "as S says") if several else method
+            style = _style(number) if several else _style_of(method)
             aside_pt = DODGE_PT * (number - (len(curves) - 1) / 2.0)
-            _draw_curve(axes, rows, name, style, label=(one or "as S says") if several else method, aside_pt=aside_pt)
-        axes.set(title=f"{SHOWN[name]}, {group[0]}" if several else SHOWN[name], xlabel=result.x_label, ylim=SHARES)
+            transform = axes.transData + ScaledTranslation(aside_pt / 72.0, 0.0, figure.dpi_scale_trans)
+            x, figures = [row.x for row in rows], [row.figures[name] for row in rows]
+            axes.errorbar(
+                x, [figure.mean for figure in figures], yerr=_bars(figures), label=label, transform=transform,
+                linestyle=LINES[number % len(LINES)], markersize=5.5, capsize=2.5, elinewidth=1.0, **style,
+            )  # fmt: skip
+            points = [(row.x, row.figures[name].paper) for row in rows]
+            _rings(axes, points, label, style["color"], transform=transform)
+        axes.set(title=f"{TITLES[name]}, {group[0]}" if several else TITLES[name], xlabel=result.x_label, ylim=SHARES)
         axes.tick_params(labelleft=True)
         axes.grid(visible=True, alpha=0.3)
-        _set_x_axis(axes, sorted({row.x for row in result.rows}))
-    all_axes[0].set_ylabel(f"share of vehicles; {SPREAD}")
-    _draw_legend(figure, all_axes, title=result.series_label if several else None)
-
-
-def _draw_curve(axes: Axes, rows: Sequence[Row], name: str, style: _Style, *, label: str, aside_pt: float) -> None:
-    figure = axes.get_figure(root=True)
-    assert figure is not None
-    aside = axes.transData + ScaledTranslation(aside_pt / 72.0, 0.0, figure.dpi_scale_trans)
-    figures, x = [row.figures[name] for row in rows], [row.x for row in rows]
-    look: dict[str, Any] = {"marker": style.marker, "color": style.colour, "linestyle": style.line, "label": label}
-    sizes: dict[str, Any] = {
-        "markersize": 5.5,
-        "markeredgewidth": 0.5,
-        "capsize": 2.5,
-        "elinewidth": 1.0,
-        "linewidth": 1.4,
-    }
-    spread = _within_shares(figures)
-    axes.errorbar(x, [f.mean for f in figures], yerr=spread, markeredgecolor="white", transform=aside, **look, **sizes)
-    papers = [(row.x, f.paper) for row, f in zip(rows, figures, strict=True) if f.paper is not None]
-    _draw_rings(axes, papers, style, f"{PAPER}, {label}", transform=aside)
-
-
-def _set_x_axis(axes: Axes, values: Sequence[float]) -> None:
-    """Logarithmic if the values are far apart; a tick for each value if they are few."""
-    lowest, highest = values[0], values[-1]
-    margin = MARGIN * (highest - lowest) or 1.0
-    axes.set_xlim(lowest - margin, highest + margin)
-    if lowest > 0.0 and highest > LOGARITHMIC * lowest:
-        factor = (highest / lowest) ** MARGIN
-        axes.set(xscale="log", xlim=(lowest / factor, highest * factor))
-    if len(values) <= MOST_TICKS:
+        values = sorted({row.x for row in result.rows})
+        margin = MARGIN * (values[-1] - values[0]) or 1.0
+        axes.set_xlim(values[0] - margin, values[-1] + margin)
+        if values[0] > 0.0 and values[-1] > LOGARITHMIC * values[0]:
+            factor = (values[-1] / values[0]) ** MARGIN
+            axes.set(xscale="log", xlim=(values[0] / factor, values[-1] * factor))
         axes.set_xticks(values, [f"{value:g}" for value in values])
         axes.set_xticks([], minor=True)
+    all_axes[0].set_ylabel("share of vehicles; bars: 95 % intervals")
+    _legend(figure, title=result.series_label if several else None)
 
 
-def _draw_phase(figure: Figure, result: ExperimentResult) -> None:
+def _draw_map(figure: Figure, result: ExperimentResult) -> None:
     """A map of the recovery rate per method."""
     series = list(dict.fromkeys(row.series for row in result.rows))
     x = sorted({row.x for row in result.rows})
@@ -240,7 +183,7 @@ def _draw_phase(figure: Figure, result: ExperimentResult) -> None:
         rates: Array = np.full((len(series), len(x)), np.nan)
         for row in result.rows:
             if row.method == method:
-                rates[series.index(row.series), x.index(row.x)] = row.figures[RATE].mean
+                rates[series.index(row.series), x.index(row.x)] = row.figures["recovery_rate"].mean
         axes.imshow(rates, vmin=0.0, vmax=1.0, origin="lower", aspect="auto", cmap="viridis")
         for (i, j), rate in np.ndenumerate(rates):
             axes.text(j, i, f"{rate:.2f}", ha="center", va="center", color="black" if rate > 0.6 else "white")
@@ -252,23 +195,23 @@ def _draw_phase(figure: Figure, result: ExperimentResult) -> None:
 def _draw_reliability(figure: Figure, result: ExperimentResult) -> None:
     """Share recovered over confidence, experiment by experiment and all together, with the numbers of vehicles."""
     reliability, counts = figure.subplots(1, 2)
-    reliability.plot([0.0, 1.0], [0.0, 1.0], color=GREY, linewidth=1.0)
+    reliability.plot([0.0, 1.0], [0.0, 1.0], color="0.6", linewidth=1.0)
     for number, row in enumerate(result.rows):
         label = f"{row.series}, ECE {row.figures['ece'].mean:.3f}"
         if row.series == ALL:
             reliability.plot([b.confidence for b in row.bins], [b.recovered for b in row.bins], "k.-", label=label)
             continue
-        style = STYLES[number % len(STYLES)]
-        reliability.plot([], [], style.marker, color=style.colour, label=label)
+        style = _style(number)
+        reliability.plot([], [], linestyle="", label=label, **style)
         for b in row.bins:
-            face = style.colour if b.count >= FEW else "white"
-            reliability.plot(b.confidence, b.recovered, style.marker, color=style.colour, markerfacecolor=face)
-    reliability.plot([], [], "o", color=GREY, markerfacecolor="white", label=f"hollow: fewer than {FEW} vehicles")
+            face = style["color"] if b.count >= FEW else "white"
+            reliability.plot(b.confidence, b.recovered, linestyle="", markerfacecolor=face, **style)
+    reliability.plot([], [], "o", color="0.6", markerfacecolor="white", label=f"hollow: fewer than {FEW} vehicles")
     reliability.set(xlabel="confidence", ylabel="share recovered", xlim=SHARES, ylim=SHARES)
     reliability.grid(visible=True, alpha=0.3)
     bins = result.rows[-1].bins
-    bars = counts.bar([b.low + 0.5 / BINS for b in bins], [b.count for b in bins], width=0.9 / BINS, color=GREY)
+    bars = counts.bar([b.low + 0.5 / BINS for b in bins], [b.count for b in bins], width=0.9 / BINS, color="0.6")
     counts.bar_label(bars, fontsize="x-small")
     counts.set(xlabel="confidence", ylabel=f"vehicles, {ALL}", yscale="log", xlim=SHARES)
     counts.set_ylim(0.8, 3.0 * max(b.count for b in bins))
-    _draw_legend(figure, [reliability])
+    _legend(figure)

@@ -1,9 +1,10 @@
-"""Results of experiments: rows of figures, ours beside the paper's."""
+"""Records of experiments: rows of figures, ours beside the paper's, and what is needed to repeat them."""
 
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import msgspec
 from scipy.stats import beta
@@ -12,14 +13,12 @@ from calibrator.errors import FleetError
 from calibrator.time_of_run import time_of_run
 from ecu_node import __version__
 
-__all__ = ["BOUND", "Bin", "ExperimentResult", "Figure", "Row", "Settings", "decode_result", "made_now", "share"]
+__all__ = ["Bin", "ExperimentResult", "Figure", "Row", "Settings", "made_now", "read_results", "share"]
 
 Settings = Mapping[str, bool | int | float | str]
 """What is needed to repeat an experiment, by name; records of before version 1.0 hold flags as texts."""
-
-
-BOUND = 0.95
-"""One-sided confidence of the upper bounds beside rare counts. [1]"""
+CONFIDENCE = 0.95
+"""Of the intervals beside shares. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,11 +45,17 @@ class Figure:
     expected: float | None = None
 
     @property
-    def upper(self) -> float | None:
-        """Upper bound of the share with a confidence of 95 % (Clopper and Pearson), also for 0 of n; else None."""
+    def interval(self) -> tuple[float, float] | None:
+        """95 % interval of a share (Clopper and Pearson [1]_), for which vehicles are independent; None if no share.
+
+        .. [1] C. Clopper, E. Pearson, "The use of confidence or fiducial limits ...", Biometrika 26 (1934).
+        """
         if self.hits is None or not self.of:
             return None
-        return 1.0 if self.hits == self.of else float(beta.ppf(BOUND, self.hits + 1, self.of - self.hits))
+        tail, misses = (1.0 - CONFIDENCE) / 2.0, self.of - self.hits
+        low = float(beta.ppf(tail, self.hits, misses + 1)) if self.hits else 0.0
+        high = float(beta.ppf(1.0 - tail, self.hits + 1, misses)) if misses else 1.0
+        return low, high
 
 
 def share(hits: int, of: int, expected: float | None = None) -> Figure:
@@ -117,17 +122,15 @@ class ExperimentResult:
     x_label, series_label : str
         What the experiment varies, with units; the latter is empty if rows have no series.
     settings : mapping
-        Seed, repetitions, fleet law, drive.
+        Seed, repetitions, drive, and what all its settings have in common.
     rows : tuple of Row
         Figures.
     paper : mapping of float to float
-        Best recovery rate that the paper prints, by x, whatever methods were run; empty in records of before version
-        1.0, whose rows say the same.
+        Best recovery rate that the paper prints, by x, whatever methods were run.
     note : str
         What is to be known of the settings, for the captions.
     made : str
-        Version, machine and day, as :func:`made_now` says, of what the command ran; empty in records of before version
-        1.0, and for an experiment that was called as a function.
+        Version, machine and day, as :func:`made_now` says; empty for an experiment that was called as a function.
     """
 
     name: str
@@ -143,7 +146,7 @@ class ExperimentResult:
     def row(self, *, x: float, method: str, series: str = "") -> Row:
         """Return the row of a method under a setting; KeyError if there is none."""
         for row in self.rows:
-            if row.x == x and row.method == method and row.series == series:
+            if (row.x, row.method, row.series) == (x, method, series):
                 return row
         raise KeyError(f"no row for x={x:g}, series '{series}' and method '{method}'")
 
@@ -165,30 +168,22 @@ def made_now() -> str:
     )
 
 
-def decode_result(record: bytes, where: str) -> ExperimentResult:
-    """Decode what :meth:`ExperimentResult.to_json` wrote.
-
-    Parameters
-    ----------
-    record : bytes
-        JSON.
-    where : str
-        The file, for the message.
-
-    Returns
-    -------
-    ExperimentResult
-        The result.
+def read_results(folder: Path, names: Iterable[str]) -> list[ExperimentResult]:
+    """Read the records ``NAME.json`` of a folder in the given order; those that are not there are left out.
 
     Raises
     ------
     FleetError
-        If it is no record of an experiment.
+        If one is no record of an experiment.
     """
-    try:
-        return msgspec.json.decode(record, type=ExperimentResult)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise FleetError(
-            f"{where}: not a record of an experiment: {error}; expected what 'calibrator experiment --out' writes; "
-            "remove it, or run the experiment again"
-        ) from None
+    found = []
+    for path in (folder / f"{name}.json" for name in names):
+        if path.is_file():
+            try:
+                found.append(msgspec.json.decode(path.read_bytes(), type=ExperimentResult))
+            except (msgspec.DecodeError, UnicodeDecodeError) as error:
+                raise FleetError(
+                    f"{path}: not a record of an experiment: {error}; expected what 'calibrator experiment --out' "
+                    "writes; remove it, or run the experiment again"
+                ) from None
+    return found

@@ -1,7 +1,4 @@
-"""One trial: a random fleet with known faults, and what a method is given of it; sections IV-B to IV-D of [1]_.
-
-.. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
-"""
+"""One trial: a fleet with known faults, what a method is given of it, and the truth that it is judged by."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,84 +7,27 @@ from math import comb
 
 import numpy as np
 
-from calibrator.artificial.random_fleet import draw_faults, nonzero_count
+from calibrator.artificial.random_fleet import nonzero_count
 from calibrator.drive import Array, Mask
 from calibrator.estimator.rows import EvidenceRows
 from calibrator.faults import Faults
 from calibrator.published.evidence import FleetEvidence
 from calibrator.summaries.moments import DriveSummary
 
-__all__ = [
-    "CommonEvidence",
-    "FaultDistribution",
-    "FleetLaw",
-    "Trial",
-    "UnseenDrive",
-    "drawn_distribution",
-    "unseen_drive",
-]
-
-TRAINING_VEHICLES = 3000
-"""Size of the artificial fleet that trees learn from, section V-B."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FleetLaw:
-    """How the fleets of an experiment are drawn, section IV-B of [1]_.
-
-    Attributes
-    ----------
-    vehicles : int
-        Fleet size N, a multiple of 4 for a symmetric fleet.
-    training_vehicles : int
-        Size of the artificial fleet to learn from.
-    sparsity : float
-        Sparsity level S. [%]
-    magnitude : tuple of float
-        a, b: drifts [1], offsets in fractions of full scale.
-    snr_db : float
-        Of the artificial simulation (26). [dB]
-    balanced, symmetric : bool
-        See :func:`~calibrator.artificial.random_fleet.draw_faults`.
-    sign_bias : float
-        Faults are positive with probability 0.5 + sign_bias. [1]
-    """
-
-    vehicles: int = 1000
-    training_vehicles: int = TRAINING_VEHICLES
-    sparsity: float = 60.0
-    magnitude: tuple[float, float] = (0.05, 0.25)
-    snr_db: float = 20.0
-    balanced: bool = True
-    symmetric: bool = True
-    sign_bias: float = 0.0
-
-    def draw(self, rng: np.random.Generator, *, vehicles: int, branches: int, full_scale_a: float) -> Faults:
-        """Draw the faults of a fleet of this law."""
-        return draw_faults(
-            rng,
-            vehicles=vehicles,
-            branches=branches,
-            sparsity=self.sparsity,
-            magnitude=self.magnitude,
-            full_scale_a=full_scale_a,
-            balanced=self.balanced,
-            symmetric=self.symmetric,
-            sign_bias=self.sign_bias,
-        )
+__all__ = ["CommonEvidence", "FaultDistribution", "Trial", "UnseenDrive", "drawn_distribution"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FaultDistribution:
-    """Distribution of the faults of a fleet: what its faults were drawn from, or what an estimator has learnt.
+    """Distribution of a fleet's faults: what they were drawn from, or what an estimator has learnt.
 
     Attributes
     ----------
     counts : ndarray of shape (K + 1, 2K + 1)
-        Probability of so many hardware (rows) and sensor faults (columns) of a vehicle; all supports with the same
-        numbers are equally likely.
+        Probability that a vehicle has so many hardware faults (rows) and sensor faults (columns); all supports with
+        the same numbers are equally likely.
     gain, offset : tuple of float
-        Range of the uniform magnitudes of drifts [1], and of offsets in fractions of full scale; either sign.
+        Range of the uniform magnitudes of gain errors [1], and of offsets in fractions of full scale; either sign.
     """
 
     counts: Array
@@ -117,10 +57,10 @@ class FaultDistribution:
 def drawn_distribution(
     branches: int, sparsity: float, magnitude: tuple[float, float], *, balanced: bool
 ) -> FaultDistribution:
-    """Distribution that :func:`~calibrator.artificial.random_fleet.draw_faults` draws from, section IV-B of [1]_.
+    """Distribution that :func:`~calibrator.artificial.random_fleet.draw_faults` draws from.
 
-    With it, and the same evidence, no estimator recovers more on average than the posterior states as its mean
-    confidence, so far as the errors of the evidence are as they are said to be: a ceiling to hold the default against.
+    An estimator that knows it shows the ceiling: with the same evidence no estimator recovers more on average than its
+    mean confidence says, as far as the errors of the evidence are stated rightly.
 
     Parameters
     ----------
@@ -129,14 +69,9 @@ def drawn_distribution(
     sparsity : float
         Sparsity level S. [%]
     magnitude : tuple of float
-        Range of drifts [1] and of offsets in fractions of full scale.
+        Range of gain errors [1] and of offsets in fractions of full scale.
     balanced : bool
         Whether the hardware faults of half of the vehicles are set to zero.
-
-    Returns
-    -------
-    FaultDistribution
-        So many of the 3K parameters are not zero.
     """
     K, n = branches, nonzero_count(branches, sparsity)
     counts = np.zeros((K + 1, 2 * K + 1))
@@ -166,7 +101,7 @@ class CommonEvidence:
 
 @dataclass(frozen=True, kw_only=True)
 class UnseenDrive:
-    """Moments of true currents i and of the sensors' errors e = i_m - i on a drive that no method has seen.
+    """Moments of the true currents i and of the sensors' errors e = i_m - i on a drive that no method has seen.
 
     Attributes
     ----------
@@ -182,6 +117,34 @@ class UnseenDrive:
     error_mean_square_a2: Array
     error_product_a2: Array
 
+    @classmethod
+    def of_samples(cls, drives: Sequence[tuple[Array, Array]]) -> "UnseenDrive":
+        """Moments of the true and the measured currents, both of shape (T, K), of N vehicles. [A]"""
+        pairs = [(i, i_m - i) for i, i_m in drives]
+        return cls(
+            mean_a=np.stack([i.mean(axis=0) for i, _ in pairs]),
+            mean_square_a2=np.stack([np.mean(i**2, axis=0) for i, _ in pairs]),
+            error_mean_a=np.stack([e.mean(axis=0) for _, e in pairs]),
+            error_mean_square_a2=np.stack([np.mean(e**2, axis=0) for _, e in pairs]),
+            error_product_a2=np.stack([np.mean(e * i, axis=0) for i, e in pairs]),
+        )
+
+    @classmethod
+    def of_linear_sensors(cls, ideal_a: Array, truth: Faults) -> "UnseenDrive":
+        """Moments of N vehicles with linear sensors that all make one drive of ideal currents (T, K), (11) and (13)."""
+        gain, constant = 1.0 + truth.hardware_drift[:, None], truth.hardware_offset_a
+        mean_a, mean_square_a2 = ideal_a.mean(axis=0), np.mean(ideal_a**2, axis=0)
+        mean = gain * mean_a + constant
+        square = gain**2 * mean_square_a2 + 2.0 * gain * constant * mean_a + constant**2
+        d, o = truth.drift, truth.offset_a
+        return cls(
+            mean_a=mean,
+            mean_square_a2=square,
+            error_mean_a=d * mean + o,
+            error_mean_square_a2=d**2 * square + 2.0 * d * o * mean + o**2,
+            error_product_a2=d * square + o * mean,
+        )
+
     def rms_a(self, drift: Array, offset_a: Array) -> Array:
         """Root mean square error of the currents corrected with these parameters (25), shape (N, K). [A]
 
@@ -194,46 +157,6 @@ class UnseenDrive:
             + 2.0 * (drift * offset_a * self.mean_a - offset_a * self.error_mean_a - drift * self.error_product_a2)
         )
         return np.asarray(np.sqrt(np.maximum(square, 0.0)) / np.abs(1.0 + drift))
-
-    @staticmethod
-    def of_samples(drives: Sequence[tuple[Array, Array]]) -> "UnseenDrive":
-        """Moments of true and measured currents, both of shape (T, K), of N vehicles. [A]"""
-        pairs = [(i, i_m - i) for i, i_m in drives]
-        return UnseenDrive(
-            mean_a=np.stack([i.mean(axis=0) for i, _ in pairs]),
-            mean_square_a2=np.stack([np.mean(i**2, axis=0) for i, _ in pairs]),
-            error_mean_a=np.stack([e.mean(axis=0) for _, e in pairs]),
-            error_mean_square_a2=np.stack([np.mean(e**2, axis=0) for _, e in pairs]),
-            error_product_a2=np.stack([np.mean(e * i, axis=0) for i, e in pairs]),
-        )
-
-
-def unseen_drive(mean_a: Array, mean_square_a2: Array, truth: Faults) -> UnseenDrive:
-    """Moments of vehicles with linear sensors on one drive, (11) and (13).
-
-    Parameters
-    ----------
-    mean_a, mean_square_a2 : ndarray of shape (K,)
-        Of the ideal currents. [A], [A^2]
-    truth : Faults
-        Of N vehicles.
-
-    Returns
-    -------
-    UnseenDrive
-        Of the N vehicles.
-    """
-    gain, constant = 1.0 + truth.hardware_drift[:, None], truth.hardware_offset_a
-    mean = gain * mean_a + constant
-    square = gain**2 * mean_square_a2 + 2.0 * gain * constant * mean_a + constant**2
-    d, o = truth.drift, truth.offset_a
-    return UnseenDrive(
-        mean_a=mean,
-        mean_square_a2=square,
-        error_mean_a=d * mean + o,
-        error_mean_square_a2=d**2 * square + 2.0 * d * o * mean + o**2,
-        error_product_a2=d * square + o * mean,
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,14 +180,14 @@ class Trial:
     drawn_from : FaultDistribution or None
         What the faults were drawn from; only the method that is to show the ceiling may look.
     training : callable or None
-        Makes the evidence and truth of an artificial fleet that the published method's trees learn from; None: there
-        is none, and trees cannot be used.
+        Makes evidence and truth of an artificial fleet that the published method's trees learn from; None: there is
+        none, and trees cannot be used.
     delay_error_s : ndarray of shape (N, K - 1) or None
         Error of the delays that were estimated and taken out, if they were. [s]
     attacked : ndarray of bool of shape (N,) or None
         Vehicles that have what the world of an attack does to them; None: there is no attack.
     causes : tuple of str
-        Names under which a finding names this.
+        Names by which a finding may name this.
     """
 
     smallest_fault: float
@@ -281,10 +204,10 @@ class Trial:
 
     @cached_property
     def recorded(self) -> Sequence[DriveSummary] | CommonEvidence:
-        """What the default is given, and whoever works on the same."""
+        """What the default is given, made once."""
         return self.record()
 
     @cached_property
     def evidence(self) -> FleetEvidence:
-        """Evidence of the published method."""
+        """Evidence of the published method, made once."""
         return self.collect()

@@ -1,6 +1,9 @@
 """Does a vehicle have hardware faults, and its sensors faults? Section III-B of [1]_.
 
-Two rules on the features (5) and (6): a threshold, and decision trees that learned from an artificial fleet.
+Two rules on the features (5) and (6): a threshold, and decision trees that learned from an artificial fleet. For a
+real fleet, of which nobody knows the truth, that fleet is made on the real one's reference: with the sparsity and
+magnitudes that the user expects, the simulation error that the models show on held-out data, and the error that the
+mean of as many vehicles has when the fleet is not symmetric.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -10,10 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 from sklearn.tree import DecisionTreeClassifier
 
+from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array, Mask
-from calibrator.faults import Faults
+from calibrator.faults import Faults, slopes_and_intercepts
+from calibrator.published.evidence import FleetEvidence
+from calibrator.random_streams import Purpose, random_stream
 
-__all__ = ["Classification", "FaultTrees", "classify_by_threshold", "classify_by_truth", "decision_criterion"]
+__all__ = [
+    "Classification", "ExpectedFaults", "FaultTrees", "classify_by_expected_tree", "classify_by_threshold",
+    "classify_by_truth", "decision_criterion", "expected_features",
+]  # fmt: skip
+
+TRAINING_VEHICLES = 3000
+"""Size of the artificial fleet that the trees learn from, section V-B. [1]"""
 
 THRESHOLD_SHARE = 1.0 / 3.0
 """delta_h in standard deviations of the criterion across the fleet, section V-B. [1]"""
@@ -116,3 +128,106 @@ def _fit_tree(features: Array, faulty: Mask) -> DecisionTreeClassifier:
     weight = {False: 1.0, True: RECALL_WEIGHT}
     tree = DecisionTreeClassifier(max_depth=TREE_DEPTH, criterion="entropy", class_weight=weight, random_state=0)
     return tree.fit(features, faulty)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpectedFaults:
+    """What the user expects the fleet's faults to be like; the trees are trained on it.
+
+    Attributes
+    ----------
+    sparsity : float
+        Sparsity level S. [%]
+    magnitude : tuple of float
+        Range of drifts [1] and of offsets in fractions of full scale.
+    symmetric : bool
+        Whether the mean of the fleet is the ideal vehicle (22).
+    seed : int
+        Seed of the training fleet.
+    """
+
+    sparsity: float
+    magnitude: tuple[float, float]
+    symmetric: bool
+    seed: int
+
+
+def expected_features(
+    faults: Faults, i_s: Array, simulation_error_a: Array, *, reference_vehicles: int | None
+) -> Array:
+    """Features (5) and (6) that vehicles with given faults have, from the moments of the ideal currents.
+
+    Parameters
+    ----------
+    faults : Faults
+        Of N vehicles.
+    i_s : ndarray of shape (T, K)
+        Ideal currents on the unity drive. [A]
+    simulation_error_a : ndarray of shape (K,)
+        Standard deviation of the simulation error. [A]
+    reference_vehicles : int or None
+        So many vehicles in a row share their mean as their reference (3); None: the reference is the ideal current.
+
+    Returns
+    -------
+    ndarray of shape (N, K + 1)
+        Features. [A^2]
+    """
+    a, b = slopes_and_intercepts(faults)
+    mean, moment = np.mean(i_s, axis=0), i_s.T @ i_s / len(i_s)
+    constant = b.sum(axis=1)
+    junction = np.einsum("nk,kl,nl->n", a, moment, a) + 2.0 * constant * (a @ mean) + constant**2
+    if reference_vehicles is None:
+        slope, intercept = a - 1.0, b
+    else:
+        slope, intercept = a - _mean_of_groups(a, reference_vehicles), b - _mean_of_groups(b, reference_vehicles)
+    deviation = slope**2 * np.diag(moment) + 2.0 * slope * intercept * mean + intercept**2 + simulation_error_a**2
+    return np.column_stack([deviation, junction])
+
+
+def _mean_of_groups(values: Array, size: int) -> Array:
+    """Mean over each group of rows in a row, repeated for its rows; what is left over belongs to the last group."""
+    group = np.minimum(np.arange(len(values)) // size, max(len(values) // size - 1, 0))
+    return np.stack([values[group == number].mean(axis=0) for number in range(group[-1] + 1)])[group]
+
+
+def classify_by_expected_tree(
+    evidence: FleetEvidence,
+    reference: Array,
+    simulation_error_a: Array,
+    *,
+    full_scale_a: float,
+    expected: ExpectedFaults,
+    reference_vehicles: int,
+) -> Classification:
+    """Classify a real fleet by trees that learn from an artificial fleet with the faults that the user expects.
+
+    Parameters
+    ----------
+    evidence : FleetEvidence
+        Of N vehicles with K branches.
+    reference : ndarray of shape (T, K)
+        Fleet reference. [A]
+    simulation_error_a : ndarray of shape (K,)
+        Standard deviation of the simulation error. [A]
+    full_scale_a : float
+        Full scale of the junction. [A]
+    expected : ExpectedFaults
+        What the fleet's faults are like.
+    reference_vehicles : int
+        How many vehicles the reference is the mean of.
+    """
+    i_s = reference - reference.mean(axis=1, keepdims=True)
+    faults = draw_faults(
+        random_stream(Purpose.TRAINING_FAULTS, expected.seed),
+        vehicles=TRAINING_VEHICLES,
+        branches=evidence.branches,
+        sparsity=expected.sparsity,
+        magnitude=expected.magnitude,
+        full_scale_a=full_scale_a,
+        balanced=True,
+    )
+    features = expected_features(
+        faults, i_s, simulation_error_a, reference_vehicles=None if expected.symmetric else reference_vehicles
+    )
+    return FaultTrees(features, faults).classify(evidence.features)

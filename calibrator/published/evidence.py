@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrator.drive import Array, Mask
-from calibrator.errors import DriveError, FleetError
+from calibrator.drive import Array
+from calibrator.errors import FleetError
 from calibrator.faults import Index
 
-__all__ = ["FleetEvidence", "collect_evidence", "fleet_mean", "junction_mean_square"]
+__all__ = ["FleetEvidence", "collect_evidence", "fleet_mean"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +97,7 @@ def collect_evidence(simulated: Iterable[Array], reference: Array, junction_a2: 
     reference : ndarray of shape (T, K)
         Fleet reference. [A]
     junction_a2 : ndarray of shape (N,)
-        Of each vehicle's measured currents, see :func:`junction_mean_square`. [A^2]
+        Mean square of the sum of each vehicle's measured currents, (6): 0 for faultless sensors. [A^2]
 
     Returns
     -------
@@ -125,32 +125,6 @@ def collect_evidence(simulated: Iterable[Array], reference: Array, junction_a2: 
         deviation_a2=deviation,
         junction_a2=junction_a2,
     )
-
-
-def junction_mean_square(measured: Array, valid: Mask | None = None) -> float:
-    """Mean square of the sum of the measured currents, (6).
-
-    Parameters
-    ----------
-    measured : ndarray of shape (T, K)
-        Measured currents. [A]
-    valid : ndarray of bool of shape (T,) or None
-        Samples to use.
-
-    Returns
-    -------
-    float
-        Zero for faultless sensors. [A^2]
-
-    Raises
-    ------
-    DriveError
-        If there is no valid sample, or one of them is not finite.
-    """
-    total = (measured if valid is None else measured[valid]).sum(axis=1)
-    if not total.size or not np.isfinite(total).all():
-        raise DriveError(f"the junction sum needs finite samples; {np.isfinite(total).sum()} of {total.size} are")
-    return float(np.mean(total**2))
 
 
 def _compare(currents: Array, reference: Array, centred: Array, power: Array) -> Array:

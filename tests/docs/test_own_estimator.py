@@ -2,6 +2,7 @@
 
 import re
 import runpy
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,7 @@ import pytest
 
 from calibrator.drive import Channel, Drive
 from calibrator.drives.store import write_drive
-from calibrator.experiments import common_drive, recorded_experiments, trial
-from calibrator.experiments.recorded_trial import RecordedCase
+from calibrator.experiments import experiments
 from ecu_node.layout import read_layout
 from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet
 
@@ -27,11 +27,11 @@ MODULE = re.compile(r"(?m)^[ \"]*from ((?:calibrator|ecu_node)[\w.]*) import")
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small fleets, a short drive, one case."""
-    law, drive = trial.FleetLaw, common_drive.builtin_common_drive
-    monkeypatch.setattr(trial, "FleetLaw", lambda **_: law(vehicles=40))
-    monkeypatch.setattr(common_drive, "builtin_common_drive", lambda: drive(duration_s=300.0))
-    one = partial(recorded_experiments.real_experiment, cases=(RecordedCase(),))
-    monkeypatch.setattr(recorded_experiments, "real_experiment", one)
+    for name, row in experiments.EXPERIMENTS.items():
+        monkeypatch.setitem(experiments.EXPERIMENTS, name, row.small())
+    real = experiments.EXPERIMENTS["real"]
+    monkeypatch.setitem(experiments.EXPERIMENTS, "real", replace(real, settings=experiments.REAL[:1]))
+    monkeypatch.setattr(experiments, "fleet_for", partial(experiments.fleet_for, quick=True))
 
 
 def write_store(store: Path) -> None:

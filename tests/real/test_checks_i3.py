@@ -12,7 +12,7 @@ from calibrator.drives.align import Samples
 from calibrator.estimator.checks import check_fit, learn_usual_misfits
 from calibrator.estimator.fleet_model import fit_fleet_model
 from calibrator.estimator.moments import stack_summaries
-from calibrator.experiments.recorded_fleet import RecordedFleet, read_fleet
+from calibrator.experiments.recorded_trips import RecordedFleet, read_fleet
 from calibrator.faults import measured_currents, true_currents
 from calibrator.files.layout_files import vehicle_database
 from calibrator.summaries.summariser import summarise

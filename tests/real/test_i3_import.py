@@ -13,8 +13,7 @@ from calibrator.drives.align import align, choose_inputs
 from calibrator.drives.store import iterate_drives
 from calibrator.experiments.methods import POSTERIOR
 from calibrator.experiments.outcome import judge
-from calibrator.experiments.recorded_fleet import RecordedFleet, read_fleet
-from calibrator.experiments.recorded_trial import RecordedCase, recorded_trial
+from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet, read_fleet, recorded_trial
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 

@@ -3,7 +3,7 @@ from bench.posterior import rows
 
 def test_figures_of_the_posterior_stand_beside_those_of_basis_pursuit() -> None:
     figures = {row.name: row for row in rows(quick=True)}
-    beside = [f"{what}, K = {K}, S = {S} %" for what in ("l1 optimum", "posterior") for K in (2, 4) for S in (80, 60)]
+    beside = [f"posterior, K = {K}, S = {S} %" for K in (2, 4) for S in (80, 60)]
     alone = [f"posterior, K = {K}, S = {S} %" for K in (3, 5, 6, 8) for S in (80, 60)]
     assert {name for name, row in figures.items() if row.peer is not None} == set(beside)
     assert set(alone) < set(figures)

@@ -1,4 +1,4 @@
-"""How long the explanations of one vehicle take: the exact l1 optimum and the posterior, beside basis pursuit.
+"""How long the explanations of one vehicle take: the posterior beside basis pursuit, the convex problem of the paper.
 
 Fleets are simulated with the paper's faults (5 to 25 % of full scale, balanced fleets) and the errors of good drives.
 The peer solves the quadratic basis pursuit of the same vehicles: built once, with parameters. The posterior is that of
@@ -19,8 +19,7 @@ from calibrator.drive import Array
 from calibrator.estimator.decision import estimate_rows
 from calibrator.estimator.learning import Law, learn_laws
 from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows, row_design, row_places
-from calibrator.published.basis_pursuit import BasisPursuit
-from calibrator.published.enumeration import l1_optimum
+from calibrator.published.recovery import BasisPursuit
 
 __all__ = ["rows"]
 
@@ -67,7 +66,6 @@ def _rows(*, quick: bool) -> Iterator[Row]:
         for sparsity in SPARSITIES:
             fleet = _simulated(branches, QUICK_VEHICLES if quick else VEHICLES[branches], sparsity)
             peer_s = _basis_pursuit_s(fleet, QUICK_SOLVED if quick else SOLVED)
-            yield _row("l1 optimum", fleet, _l1_s(fleet), peer_s)
             yield _row("posterior", fleet, _posterior_s(fleet), peer_s)
     for branches in ALONE:
         for sparsity in SPARSITIES:
@@ -121,12 +119,6 @@ def _basis_pursuit_s(fleet: _Fleet, vehicles: int) -> float:
             problem.solve(a, b, epsilon=epsilon)
 
     return _best_s(solve) / len(slopes[:vehicles])
-
-
-def _l1_s(fleet: _Fleet) -> float:
-    """Time per vehicle. [s]"""
-    slopes, intercepts = _slopes_and_intercepts(fleet)
-    return _best_s(lambda: l1_optimum(slopes, intercepts)) / len(slopes)
 
 
 def _slopes_and_intercepts(fleet: _Fleet) -> tuple[Array, Array]:

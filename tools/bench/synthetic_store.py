@@ -14,8 +14,7 @@ import numpy as np
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
-from calibrator.experiments.recorded_fleet import builtin_fleet
-from calibrator.experiments.recorded_trial import RecordedCase, record_vehicles
+from calibrator.experiments.recorded_trips import RecordedCase, builtin_fleet, record_vehicles
 from calibrator.faults import Faults
 from calibrator.files.storage import open_storage
 from calibrator.processes.run_many import Workers, run_many

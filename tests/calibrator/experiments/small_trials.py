@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from calibrator.artificial.ground_truth import GroundTruth
 from calibrator.drive import Array
 from calibrator.experiments.common_drive import CommonDrive
-from calibrator.experiments.recorded_fleet import RecordedFleet
+from calibrator.experiments.recorded_trips import RecordedFleet
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 

@@ -12,8 +12,7 @@ from calibrator.drive import Channel, Drive
 from calibrator.drives.store import write_drive
 from calibrator.experiments.methods import POSTERIOR
 from calibrator.experiments.outcome import judge
-from calibrator.experiments.recorded_fleet import read_fleet
-from calibrator.experiments.recorded_trial import RecordedCase, recorded_trial
+from calibrator.experiments.recorded_trips import RecordedCase, read_fleet, recorded_trial
 from calibrator.faults import Faults
 from calibrator.score import recovered
 from ecu_node.database import read_database

@@ -5,8 +5,9 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.options import Classifier
-from calibrator.published.calibration import ExpectedFaults, calibrate_published, expected_features
+from calibrator.published.classify import ExpectedFaults, expected_features
 from calibrator.published.evidence import collect_evidence
+from calibrator.published.recovery import calibrate_published
 from calibrator.score import f2_score, recovery_rate
 
 FULL_SCALE_A = 400.0

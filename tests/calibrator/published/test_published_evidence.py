@@ -3,9 +3,9 @@ import pytest
 
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
-from calibrator.errors import DriveError, FleetError
+from calibrator.errors import FleetError
 from calibrator.faults import Faults, slopes_and_intercepts
-from calibrator.published.evidence import collect_evidence, fleet_mean, junction_mean_square
+from calibrator.published.evidence import collect_evidence, fleet_mean
 
 
 def ideal_currents(samples: int = 600) -> Array:
@@ -58,10 +58,10 @@ def test_variances_are_those_of_white_noise() -> None:
 def test_features_are_the_mean_squares_of_deviation_and_junction_sum() -> None:
     i_s, faults = ideal_currents(), symmetric_fleet(4)
     simulated = simulations(i_s, faults, 2.0)
-    junction = np.array([junction_mean_square(x) for x in simulated])
-    features = collect_evidence(simulated, i_s, junction).features
+    junction_a2 = np.mean(simulated.sum(axis=2) ** 2, axis=1)
+    features = collect_evidence(simulated, i_s, junction_a2).features
     np.testing.assert_allclose(features[:, :3], np.mean((simulated - i_s) ** 2, axis=1))
-    np.testing.assert_allclose(features[:, 3], np.mean(simulated.sum(axis=2) ** 2, axis=1))
+    np.testing.assert_array_equal(features[:, 3], junction_a2)
 
 
 def test_evidence_scales_with_the_currents() -> None:
@@ -72,24 +72,6 @@ def test_evidence_scales_with_the_currents() -> None:
     np.testing.assert_allclose(scaled.slopes, plain.slopes)
     np.testing.assert_allclose(scaled.intercepts_a, 3.0 * plain.intercepts_a)
     np.testing.assert_allclose(scaled.deviation_a2, 9.0 * plain.deviation_a2)
-
-
-def test_faultless_sensors_have_no_junction_sum() -> None:
-    assert junction_mean_square(ideal_currents()) == pytest.approx(0.0, abs=1e-20)
-
-
-def test_junction_sum_leaves_out_samples_that_are_not_valid() -> None:
-    measured = ideal_currents() + 1.0
-    valid = np.ones(len(measured), bool)
-    valid[10], measured[10] = False, np.nan
-    assert junction_mean_square(measured, valid) == pytest.approx(9.0)
-
-
-def test_junction_sum_of_nothing_or_nan_is_refused() -> None:
-    with pytest.raises(DriveError, match="0 of 0"):
-        junction_mean_square(np.empty((0, 2)))
-    with pytest.raises(DriveError, match="1 of 2"):
-        junction_mean_square(np.array([[1.0, np.nan], [1.0, -1.0]]))
 
 
 def test_empty_fleet_is_refused() -> None:

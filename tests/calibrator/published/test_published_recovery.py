@@ -5,11 +5,16 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 from calibrator.faults import Faults, slopes_and_intercepts
-from calibrator.published.basis_pursuit import BasisPursuit, BasisPursuitError, quadratic_forms
 from calibrator.published.classify import Classification, classify_by_truth
 from calibrator.published.evidence import FleetEvidence
-from calibrator.published.recovery import recover_fleet
-from calibrator.published.refit import refit_support, support_of
+from calibrator.published.recovery import (
+    BasisPursuit,
+    BasisPursuitError,
+    quadratic_forms,
+    recover_fleet,
+    refit_support,
+    support_of,
+)
 from calibrator.score import recovered
 
 FULL_SCALE_A = 400.0

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from calibrator.experiments.result import decode_result
-from calibrator.experiments.table import result_table
+from calibrator.experiments.pages import result_table
+from calibrator.experiments.result import read_results
 
 RESULTS = sorted((Path(__file__).parents[3] / "docs" / "results").glob("*.json"))
 
@@ -16,7 +16,8 @@ RESULTS = sorted((Path(__file__).parents[3] / "docs" / "results").glob("*.json")
 @pytest.mark.parametrize("width", [80, 60])
 def test_a_table_of_results_is_as_wide_as_the_terminal_and_nothing_is_cut(path: Path, width: int) -> None:
     out = io.StringIO()
-    Console(width=width, file=out).print(result_table(decode_result(path.read_bytes(), path.name)))
+    (result,) = read_results(path.parent, [path.stem])
+    Console(width=width, file=out).print(result_table(result))
     lines = out.getvalue().splitlines()
     assert max(map(len, lines)) <= width
     assert "…" not in out.getvalue()

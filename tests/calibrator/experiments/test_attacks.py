@@ -7,8 +7,7 @@ from calibrator.experiments.attacks import WORLDS
 from calibrator.experiments.baselines import BASELINES
 from calibrator.experiments.methods import POSTERIOR
 from calibrator.experiments.outcome import figures_of, judge
-from calibrator.experiments.recorded_fleet import RecordedFleet
-from calibrator.experiments.recorded_trial import NOISE, RecordedCase, record_vehicles, recorded_trial
+from calibrator.experiments.recorded_trips import NOISE, RecordedCase, RecordedFleet, record_vehicles, recorded_trial
 from tests.calibrator.experiments.small_trials import small_fleet
 
 SOUND = RecordedCase(sparsity=100.0)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from calibrator.experiments.baselines import BASELINES, Baseline
-from calibrator.experiments.common_trial import artificial_trial
+from calibrator.experiments.common_drive import CommonCase, common_trial
 from calibrator.experiments.outcome import figures_of, judge
-from calibrator.experiments.recorded_trial import RecordedCase, recorded_trial
-from calibrator.experiments.trial import FleetLaw, Trial
+from calibrator.experiments.recorded_trips import RecordedCase, recorded_trial
+from calibrator.experiments.trial import Trial
 from calibrator.faults import Faults
 from tests.calibrator.experiments.small_trials import small_fleet, smooth_drive
 
@@ -26,8 +26,8 @@ def test_best_subset_and_lasso_recover_single_faults(trial: Trial) -> None:
     assert rate(best, trial) >= 0.8
     assert rate(lasso, trial) >= 0.6
     assert rate(median, trial) >= 0.4
-    law = FleetLaw(vehicles=60, sparsity=80.0)
-    assert rate(best, artificial_trial(smooth_drive(), law, 0)) >= 0.9
+    case = CommonCase(vehicles=60, sparsity=80.0)
+    assert rate(best, common_trial(smooth_drive(), case, 0)) >= 0.9
 
 
 def test_best_subset_finds_hardware_faults(trial: Trial) -> None:
@@ -37,7 +37,7 @@ def test_best_subset_finds_hardware_faults(trial: Trial) -> None:
 
 @pytest.mark.parametrize("baseline", BASELINES[3:], ids=lambda baseline: baseline.name)
 def test_methods_on_the_junction_law_alone_know_ratios_of_gains(baseline: Baseline) -> None:
-    trial = artificial_trial(smooth_drive(), FleetLaw(vehicles=40, sparsity=80.0), 0)
+    trial = common_trial(smooth_drive(), CommonCase(vehicles=40, sparsity=80.0), 0)
     found = baseline.estimate(trial)
     np.testing.assert_array_equal(found.hardware, False)
     corrected = np.all(found.corrected, axis=1)

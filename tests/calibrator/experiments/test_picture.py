@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from calibrator.drive import Array
-from calibrator.experiments.calibration_experiment import NOT_POOLED, calibration_experiment
+from calibrator.experiments.calibration import NOT_POOLED, pool_confidences
+from calibrator.experiments.experiments import EXPERIMENTS
 from calibrator.experiments.methods import PERFECT, POSTERIOR, TREE
 from calibrator.experiments.picture import draw_result
 from calibrator.experiments.result import Bin, ExperimentResult, Row
 from calibrator.experiments.result import Figure as Merit
-from calibrator.experiments.runner import EXPERIMENTS
 
 BIASES = ("0", "0.2", "0.4", "0.5")
 
@@ -28,10 +28,10 @@ def result_of(*rows: Row, name: str = "asymmetry", series_label: str = "sign bia
     )
 
 
-def row_of(x: float, method: str, rate: float, series: str = "", sd: float = 0.0, paper: float | None = None) -> Row:
-    figures = {"recovery_rate": Merit(mean=rate, sd=sd, paper=paper)}
+def row_of(x: float, method: str, rate: float, series: str = "", paper: float | None = None) -> Row:
+    figures = {"recovery_rate": Merit(mean=rate, hits=round(30 * rate), of=30, paper=paper)}
     if method == POSTERIOR.name:
-        figures["confidence"] = Merit(mean=rate, sd=sd)
+        figures["confidence"] = Merit(mean=rate)
     return Row(x=x, series=series, method=method, figures=figures)
 
 
@@ -40,13 +40,13 @@ def equal() -> ExperimentResult:
     """All series and methods the same, at the ends of the scale."""
     methods = (PERFECT.name, POSTERIOR.name)
     return result_of(
-        *(row_of(x, m, rate, one, sd=0.1) for one in BIASES for x, rate in ((20, 0.0), (2000, 1.0)) for m in methods)
+        *(row_of(x, m, rate, one) for one in BIASES for x, rate in ((20, 0.0), (2000, 1.0)) for m in methods)
     )
 
 
 def test_a_mean_that_rounding_lifts_over_one_is_drawn() -> None:
     over = float(np.nextafter(1.0, 2.0))
-    drawn(result_of(row_of(20, POSTERIOR.name, over, sd=0.1), row_of(100, POSTERIOR.name, 1.0, sd=0.1)))
+    drawn(result_of(row_of(20, POSTERIOR.name, over), row_of(100, POSTERIOR.name, 1.0)))
 
 
 def curves_of(axes: Axes) -> list[Line2D]:
@@ -74,17 +74,13 @@ def test_equal_curves_stand_side_by_side_inside_the_axes(equal: ExperimentResult
         assert all(axes.get_window_extent().contains(*point) for place in places for point in place)
 
 
-def test_error_bars_end_where_a_share_ends(equal: ExperimentResult) -> None:
+def test_bars_are_the_95_percent_intervals(equal: ExperimentResult) -> None:
     single = replace(equal, name="snr", rows=tuple(replace(r, series="") for r in equal.rows if r.series == "0"))
-    dots = replace(equal, name="real")
-    for result in (equal, single, dots):
-        for axes in drawn(result).axes:
-            lines = [c for c in axes.collections if isinstance(c, LineCollection)]
-            across = 0 if result is dots else 1
-            ends = np.concatenate([np.ravel([s[:, across] for s in line.get_segments()]) for line in lines])
-            assert ends.min() >= 0.0
-            assert ends.max() <= 1.0
-            assert {0.0, 0.1, 0.9, 1.0} == {round(float(end), 6) for end in ends}
+    for result, across in ((equal, 1), (single, 1), (replace(equal, name="real"), 0)):
+        axes = drawn(result).axes[0]
+        lines = [c for c in axes.collections if isinstance(c, LineCollection)]
+        ends = np.concatenate([np.ravel([s[:, across] for s in line.get_segments()]) for line in lines])
+        assert {0.0, 0.116, 0.884, 1.0} == {round(float(end), 3) for end in ends}, "of 0 and of 30 of 30 vehicles"
 
 
 def test_curves_of_a_panel_differ_in_colour_marker_and_line_style(equal: ExperimentResult) -> None:
@@ -97,7 +93,7 @@ def test_curves_of_a_panel_differ_in_colour_marker_and_line_style(equal: Experim
 
 
 def test_legend_covers_no_data_and_names_each_curve_once(equal: ExperimentResult) -> None:
-    pooled = calibration_experiment([_with_bins(equal)])
+    pooled = pool_confidences([_with_bins(equal)])
     for result in (equal, replace(equal, name="real"), pooled):
         figure = drawn(result)
         (legend,) = figure.legends
@@ -126,7 +122,7 @@ def test_papers_figure_does_not_hide_ours(name: str) -> None:
 
 def test_every_experiment_that_can_be_pooled_has_a_colour_and_a_marker_of_its_own(equal: ExperimentResult) -> None:
     results = [replace(_with_bins(equal), name=name, settings={"seed": k}) for k, name in enumerate(EXPERIMENTS)]
-    reliability = drawn(calibration_experiment(results)).axes[0]
+    reliability = drawn(pool_confidences(results)).axes[0]
     names = [name for name in EXPERIMENTS if name not in NOT_POOLED]
     labelled = [line for line in reliability.lines if str(line.get_label()).startswith(tuple(names))]
     assert len({line.get_color() for line in labelled}) == len(names)
@@ -134,7 +130,7 @@ def test_every_experiment_that_can_be_pooled_has_a_colour_and_a_marker_of_its_ow
 
 
 def test_markers_of_few_vehicles_are_hollow(equal: ExperimentResult) -> None:
-    reliability = drawn(calibration_experiment([_with_bins(equal)])).axes[0]
+    reliability = drawn(pool_confidences([_with_bins(equal)])).axes[0]
     faces = {tuple(np.asarray(line.get_xydata())[0]): line.get_markerfacecolor() for line in reliability.lines[1:]
              if len(np.asarray(line.get_xydata())) == 1}  # fmt: skip
     assert faces[0.25, 0.5] == "white"

@@ -18,10 +18,12 @@ from calibrator.experiments.outcome import (
     pooled,
 )
 from calibrator.experiments.result import Bin, Figure, share
-from calibrator.experiments.trial import Trial, UnseenDrive, unseen_drive
+from calibrator.experiments.trial import Trial, UnseenDrive
 from calibrator.faults import Faults, corrected_currents, measured_currents, true_currents
 
 N = 1000
+SWINGING_A = np.array([[11.0, -11.0], [-9.0, 9.0]])
+"""Ideal currents with a root mean square of about 10 A. [A]"""
 
 
 def outcome(confidence: Array, recovered: Array | Mask) -> Outcome:
@@ -59,7 +61,7 @@ def two_vehicles(*, drift: float, harm_second: float) -> tuple[Estimate, Trial]:
         smallest_fault=0.05,
         full_scale_a=400.0,
         truth=truth,
-        unseen=unseen_drive(np.array([1.0, -1.0]), np.array([100.0, 100.0]), truth),
+        unseen=UnseenDrive.of_linear_sensors(SWINGING_A, truth),
         record=lambda: pytest.fail("not needed"),
         collect=lambda: pytest.fail("not needed"),
     )
@@ -144,7 +146,7 @@ def test_unseen_moments_are_those_of_the_samples() -> None:
     )
     i = true_currents(i_s, truth.take(0))
     i_m = measured_currents(i, truth.take(0))
-    unseen, sampled = unseen_drive(i_s.mean(axis=0), np.mean(i_s**2, axis=0), truth), UnseenDrive.of_samples([(i, i_m)])
+    unseen, sampled = UnseenDrive.of_linear_sensors(i_s, truth), UnseenDrive.of_samples([(i, i_m)])
     for field in fields(UnseenDrive):
         np.testing.assert_allclose(getattr(unseen, field.name), getattr(sampled, field.name))
     drift, offset_a = np.array([[0.15, -0.1]]), np.array([[2.0, 1.0]])
@@ -154,27 +156,25 @@ def test_unseen_moments_are_those_of_the_samples() -> None:
 
 def test_worsening_is_that_of_the_worst_branch() -> None:
     figures = figures_of(judge(*two_vehicles(drift=0.1, harm_second=0.2)))
-    measured, corrected = 0.0, 10.0 * (1.0 - 1.0 / 1.2)  # the second sensor is sound, its current 10 A rms
-    assert figures["worst_a"].mean == pytest.approx(corrected - measured)
+    rms_a = np.sqrt(np.mean(SWINGING_A[:, 1] ** 2))  # of the second branch, whose sensor is sound
+    assert figures["worst_a"].mean == pytest.approx(rms_a * (1.0 - 1.0 / 1.2))
 
 
 def test_inverted_sensor_can_be_corrected() -> None:
     estimate, trial = two_vehicles(drift=0.1, harm_second=0.0)
     truth = replace(trial.truth, drift=np.full((2, 2), -2.0))
-    inverted = replace(trial, truth=truth, unseen=unseen_drive(np.ones(2), np.full(2, 100.0), truth))
+    inverted = replace(trial, truth=truth, unseen=UnseenDrive.of_linear_sensors(SWINGING_A, truth))
     whole = replace(estimate, faults=truth, corrected=np.ones((2, 2), bool))
     assert means_of(judge(whole, inverted))["harmed"] == 0.0
 
 
-def test_rare_shares_have_their_counts_and_an_upper_bound() -> None:
+def test_shares_have_their_counts_and_an_exact_interval() -> None:
     figures = figures_of(judge(*two_vehicles(drift=0.1, harm_second=0.2)))
     assert (figures["harmed"].hits, figures["harmed"].of) == (1, 2)
-    assert share(0, 100).upper == pytest.approx(1.0 - 0.05 ** (1.0 / 100.0))
-    hits = binomtest(3, 175, alternative="less").proportion_ci(0.95, method="exact").high
-    assert share(3, 175).upper == pytest.approx(hits)
-    assert share(5, 5).upper == 1.0
-    assert share(0, 0).upper is None
-    assert Figure(mean=0.3).upper is None
+    for hits, of in ((0, 100), (3, 175), (5, 5)):
+        assert share(hits, of).interval == pytest.approx(binomtest(hits, of).proportion_ci(0.95, method="exact"))
+    assert share(0, 0).interval is None
+    assert Figure(mean=0.3).interval is None
 
 
 def test_confident_vehicles_that_are_wrong_are_counted_beside_those_expected() -> None:
@@ -198,8 +198,8 @@ def test_standard_deviations_that_are_right_have_normal_scores() -> None:
         drift_sd=sd,
         offset_sd_a=sd,
     )
-    moments = np.ones(2), np.full(2, 100.0)
-    trial = replace(two_vehicles(drift=0.1, harm_second=0.0)[1], truth=truth, unseen=unseen_drive(*moments, truth))
+    unseen = UnseenDrive.of_linear_sensors(SWINGING_A, truth)
+    trial = replace(two_vehicles(drift=0.1, harm_second=0.0)[1], truth=truth, unseen=unseen)
     judged = judge(estimate, trial)
     figures = figures_of(judged)
     assert figures["gain_within_1"].mean == pytest.approx(0.683, abs=0.02)

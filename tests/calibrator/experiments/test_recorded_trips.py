@@ -8,15 +8,14 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.drives.store import write_drive
 from calibrator.errors import FleetError
-from calibrator.experiments.delay_experiment import delayed_trial
 from calibrator.experiments.methods import PERFECT, POSTERIOR
 from calibrator.experiments.outcome import figures_of, judge
-from calibrator.experiments.recorded_fleet import RecordedFleet, builtin_fleet, read_fleet
-from calibrator.experiments.recorded_trial import (
+from calibrator.experiments.recorded_trips import (
     NOISE,
     RecordedCase,
-    joined_trial,
-    own_prior_trial,
+    RecordedFleet,
+    builtin_fleet,
+    read_fleet,
     record_vehicles,
     recorded_trial,
 )
@@ -128,31 +127,28 @@ def test_any_vehicle_of_a_fleet_that_is_not_balanced_may_have_a_hardware_fault(f
 
 def test_faults_of_the_own_prior_are_drawn_anew_for_the_same_trips(fleet: RecordedFleet) -> None:
     first = recorded_trial(fleet, RecordedCase(), 0)
-    own = own_prior_trial(fleet, RecordedCase(), 0, method=POSTERIOR)
-    np.testing.assert_array_equal(
-        own_prior_trial(fleet, RecordedCase(), 0, method=POSTERIOR).truth.drift, own.truth.drift
-    )
+    own = recorded_trial(fleet, RecordedCase(own_prior=True), 0)
     assert not np.array_equal(own.truth.drift, first.truth.drift)
     figures = figures_of(judge(POSTERIOR.estimate(own), own))
     assert figures["recovery_rate"].mean >= 0.8
     assert figures["harmed"].hits == 0
 
 
-def test_joined_trial_has_the_vehicles_and_minutes_asked_for(fleet: RecordedFleet) -> None:
-    trial = joined_trial(fleet, RecordedCase(), 0, vehicles=15, duration_s=120.0)
+def test_case_with_minutes_has_the_vehicles_asked_for(fleet: RecordedFleet) -> None:
+    trial = recorded_trial(fleet, RecordedCase(vehicles=15, minutes=2.0), 0)
     assert len(trial.truth) == 15
     assert len(trial.evidence) == 15
     with pytest.raises(FleetError, match="3 usable trips, at least 4 are needed"):
-        joined_trial(fleet, RecordedCase(), 0, vehicles=3, duration_s=120.0)
+        recorded_trial(fleet, RecordedCase(vehicles=3, minutes=2.0), 0)
 
 
 def test_delays_are_found_and_taken_out(fleet: RecordedFleet) -> None:
     few = fleet.take(6, duration_s=200.0)
-    trial = delayed_trial(few, RecordedCase(), 0, delay_max_s=0.3, compensate=True)
+    trial = recorded_trial(few, RecordedCase(delay_max_s=0.3), 0)
     assert trial.delay_error_s is not None
     assert trial.delay_error_s.shape == (6, 1)
     assert figures_of(judge(POSTERIOR.estimate(trial), trial))["delay_rmse_ms"].mean < 5.0
-    left_in = delayed_trial(few, RecordedCase(), 0, delay_max_s=0.3, compensate=False)
+    left_in = recorded_trial(few, RecordedCase(delay_max_s=0.3, delays_left_in=True), 0)
     assert left_in.delay_error_s is None
     np.testing.assert_array_equal(left_in.truth.drift, trial.truth.drift)
 

@@ -1,0 +1,430 @@
+"""Trials in which each trip, recorded or of the built-in vehicle, is a vehicle with faults of its own.
+
+The ideal currents are those of the trip; faults (11) and (13), an unmeasured load, the world of an attack, sensor noise
+and the steps of the DBC signals are put on top of them. The model of a vehicle is imperfect here, as it is in the car.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from calibrator.artificial.builtin_drives import builtin_trip
+from calibrator.artificial.ground_truth import GroundTruth, choose_branches, with_branches
+from calibrator.artificial.random_fleet import draw_faults
+from calibrator.artificial.trips import read_recorded_trips
+from calibrator.artificial.vehicle import Disturbances, Vehicle, vehicle_drive
+from calibrator.drive import Array
+from calibrator.drives.align import Samples, align, base_inputs, choose_inputs
+from calibrator.drives.delays import estimate_delays, without_delays
+from calibrator.errors import FleetError
+from calibrator.estimator.published_fleet import identify_vehicle
+from calibrator.experiments.attacks import WORLDS, Attack, draw_attack
+from calibrator.experiments.methods import POSTERIOR
+from calibrator.experiments.trial import Trial, UnseenDrive, drawn_distribution
+from calibrator.faults import Faults, measured_currents, true_currents
+from calibrator.files.formulas import evaluate_formula, parse_formula
+from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
+from calibrator.random_streams import Purpose, random_stream
+from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.summariser import summarise
+from calibrator.terminal.progress import shown
+from ecu_node.database import VehicleDatabase
+from ecu_node.layout import Layout
+
+__all__ = [
+    "NOISE", "RecordedCase", "RecordedFleet", "VehicleSamples", "builtin_fleet", "read_fleet", "record_vehicles",
+    "recorded_trial",
+]  # fmt: skip
+
+NOISE = 0.001
+"""Standard deviation of the sensor noise, in fractions of full scale. [1]"""
+BUILTIN_TRIPS = 27
+"""As many as a summer of recordings has. [1]"""
+BUILTIN_DURATION_S = 1500.0
+"""As long as recorded trips are in the median. [s]"""
+FEWEST_TRIPS = 4
+"""Fewer vehicles are no fleet."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedFleet:
+    """Trips of the ideal vehicle.
+
+    Attributes
+    ----------
+    name : str
+        Where they come from, for the record.
+    trips : tuple of GroundTruth
+        All with the same branches and inputs.
+    database : VehicleDatabase
+        DBC and layout.
+    """
+
+    name: str
+    trips: tuple[GroundTruth, ...]
+    database: VehicleDatabase
+
+    def __post_init__(self) -> None:
+        if len(self.trips) < FEWEST_TRIPS:
+            raise FleetError(
+                f"{self.name}: {len(self.trips)} usable trips, at least {FEWEST_TRIPS} are needed, as each is a "
+                "vehicle; import more drives"
+            )
+
+    @property
+    def full_scale_a(self) -> float:
+        """Full scale of the junction. [A]"""
+        return self.database.layout.full_scale_a
+
+    @property
+    def period_s(self) -> float:
+        """Sample period of the trips. [s]"""
+        return self.trips[0].period_s
+
+    @property
+    def balance_branch(self) -> str:
+        """The branch whose current is minus the sum of the others."""
+        return self._balance_of(tuple(self.trips[0].currents_a))
+
+    @property
+    def record(self) -> dict[str, int | float | str]:
+        """What is needed to make the trips again."""
+        return {
+            "drive": self.name,
+            "vehicles": len(self.trips),
+            "driving_minutes": round(sum(map(len, self.trips)) * self.period_s / 60.0, 1),
+            "full_scale_a": self.full_scale_a,
+            "noise_a": NOISE * self.full_scale_a,
+            "balance_branch": self.balance_branch,
+        }
+
+    def take(self, trips: int, *, duration_s: float) -> "RecordedFleet":
+        """First trips, cut to their beginnings."""
+        samples = int(duration_s / self.period_s)
+        taken = tuple(trip.part(0, samples) for trip in self.trips[:trips])
+        return replace(self, name=f"the first {duration_s:g} s of {len(taken)} of {self.name}", trips=taken)
+
+    def with_branches(self, count: int) -> tuple[GroundTruth, ...]:
+        """Trips of a fleet of K currents that sum to zero, as one of them takes the balance (19).
+
+        Raises
+        ------
+        FleetError
+            If the trips have fewer branches.
+        """
+        names = choose_branches(self.database.layout, tuple(self.trips[0].currents_a), count)
+        return tuple(with_branches(trip, names, self._balance_of(names)) for trip in self.trips)
+
+    def _balance_of(self, names: tuple[str, ...]) -> str:
+        layout = self.database.layout
+        return next((branch.name for branch in layout.branch if branch.balance and branch.name in names), names[-1])
+
+    def resolution_a(self, branches: tuple[str, ...]) -> Array:
+        """Steps of the signals of some branches, shape (K,); 0 where a branch has none. [A]"""
+        return np.array([self.database.current_step_a(name) for name in branches])
+
+    def inputs(self, trip: GroundTruth) -> Mapping[str, Array]:
+        """Inputs of the vehicles' and of the fleet's model that a trip has, by name, each of shape (T,)."""
+        layout = self.database.layout
+        names, _ = choose_inputs(layout, tuple(trip.inputs), names=_all_inputs(layout))
+        values = dict(trip.inputs)
+        for item in layout.derived:
+            if base_inputs(layout, [item.name]) <= values.keys():
+                values[item.name] = evaluate_formula(parse_formula(item.formula), values)
+        return {name: values[name] for name in names}
+
+
+def _all_inputs(layout: Layout) -> tuple[str, ...]:
+    """Inputs of the vehicles' and of the fleet's model, each once."""
+    return tuple(dict.fromkeys([*layout.model_inputs, *layout.fleet_inputs]))
+
+
+def read_fleet(store: Path, database: VehicleDatabase) -> RecordedFleet:
+    """Trips of a drive store; drives without good samples of some channel are left out.
+
+    Parameters
+    ----------
+    store : Path
+        A drive store.
+    database : VehicleDatabase
+        DBC and the layout that the store was made with.
+
+    Raises
+    ------
+    UserError
+        If the store cannot be read or has too few usable drives.
+    """
+    trips, unusable = read_recorded_trips(store, database.layout)
+    name = f"{len(trips)} drives of {store.name}" + (f" ({len(unusable)} left out)" if unusable else "")
+    return RecordedFleet(name=name, trips=tuple(trips), database=database)
+
+
+def builtin_fleet(
+    database: VehicleDatabase, *, trips: int = BUILTIN_TRIPS, duration_s: float = BUILTIN_DURATION_S
+) -> RecordedFleet:
+    """Trips of the built-in vehicle, for where there are no recordings; the layout must have its names.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        DBC and layout.
+    trips : int
+        How many.
+    duration_s : float
+        Least duration of each. [s]
+    """
+    made = tuple(
+        builtin_trip(random_stream(Purpose.CALIBRATION_TRIP, 0, k), duration_s=duration_s, name=f"builtin-{k}")
+        for k in shown(range(trips), "make trips", trips, "trips")
+    )
+    return RecordedFleet(name=f"{trips} built-in trips, no recordings", trips=made, database=database)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedCase:
+    """How vehicles are made of trips.
+
+    Attributes
+    ----------
+    branches : int
+        Number of branches K.
+    sparsity : float
+        Sparsity level S. [%]
+    magnitude : tuple of float
+        Gain errors [1], offsets in fractions of full scale.
+    unmeasured_a : tuple of float
+        Mean and standard deviation over vehicles of a load that no branch measures, never negative. [A]
+    balanced : bool
+        Whether half of the vehicles have no hardware fault; else any vehicle may have one.
+    world : str
+        What else befalls some vehicles, of :data:`~calibrator.experiments.attacks.WORLDS`; empty: nothing.
+    own_prior : bool
+        Draw the faults from the prior that the default learns of this very fleet: its prior is then right.
+    vehicles, minutes : int or None, float or None
+        Number of vehicles, each of which starts at a random instant of the trips and drives so long, from trip to
+        trip; None: each trip is a vehicle.
+    delay_max_s : float or None
+        Record through asynchronous frames at 100 Hz, each branch late by a uniform delay of 0 to this. [s]
+    delays_left_in : bool
+        Whether these delays stay; else they are estimated and taken out.
+    """
+
+    branches: int = 2
+    sparsity: float = 80.0
+    magnitude: tuple[float, float] = (0.05, 0.25)
+    unmeasured_a: tuple[float, float] = (0.0, 0.0)
+    balanced: bool = True
+    world: str = ""
+    own_prior: bool = False
+    vehicles: int | None = None
+    minutes: float | None = None
+    delay_max_s: float | None = None
+    delays_left_in: bool = False
+
+    @property
+    def magnitudes(self) -> tuple[float, float]:
+        """Range of the faults' magnitudes, which a world may change."""
+        own = WORLDS[self.world].magnitude if self.world else None
+        return self.magnitude if own is None else own
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleSamples:
+    """What the vehicles of a trial are and record.
+
+    Attributes
+    ----------
+    truth : Faults
+        Of N vehicles.
+    unmeasured_a : ndarray of shape (N,)
+        Load that no branch measures. [A]
+    attack : Attack or None
+        What befalls some of them.
+    samples : sequence of N Samples
+        One drive of each.
+    delay_error_s : ndarray of shape (N, K - 1) or None
+        Error of the delays that were taken out, if they were. [s]
+    """
+
+    truth: Faults
+    unmeasured_a: Array
+    attack: Attack | None
+    samples: Sequence[Samples] = ()
+    delay_error_s: Array | None = None
+
+    def currents_a(self, vehicle: int, own: Array, following: Array | None = None) -> tuple[Array, Array]:
+        """True and measured currents of a vehicle, without noise, each of shape (T, K). [A]
+
+        Parameters
+        ----------
+        vehicle : int
+            Its number.
+        own : ndarray of shape (T', K)
+            Ideal currents of its own trip. [A]
+        following : ndarray of shape (T, K) or None
+            Ideal currents of the trip on which corrections are judged; None: its own trip is wanted. [A]
+        """
+        i, i_m = self._linear(vehicle, own, unseen=False)
+        peak_a = np.abs(i_m).max(axis=0)
+        if following is not None:
+            i, i_m = self._linear(vehicle, following, unseen=True)
+        if self.attack is None:
+            return i, i_m
+        return i, self.attack.measured_a(vehicle, i_m, unseen=following is not None, peak_a=peak_a)
+
+    def _linear(self, vehicle: int, i_s: Array, *, unseen: bool) -> tuple[Array, Array]:
+        """True currents, and those that linear sensors measure."""
+        faults = self.truth.take(vehicle)
+        i = true_currents(i_s, faults)
+        i[:, 0] += self.unmeasured_a[vehicle]
+        if self.attack is not None:
+            i = self.attack.true_a(vehicle, i, unseen=unseen)
+        return i, measured_currents(i, faults)
+
+
+def recorded_trial(fleet: RecordedFleet, case: RecordedCase, seed: int) -> Trial:
+    """Trial of one vehicle per trip, or of as many as the case says; the same for the same seed.
+
+    Corrections are judged on the trip of the next vehicle.
+    """
+    if case.minutes is not None:
+        fleet = replace(fleet, trips=_runs(fleet, case, seed))
+    trips, truth, N = fleet.with_branches(case.branches), None, len(fleet.trips)
+    if case.own_prior:
+        redraw = POSTERIOR.estimate(recorded_trial(fleet, replace(case, own_prior=False), seed)).redraw
+        assert redraw is not None
+        truth = redraw(random_stream(Purpose.TRAINING_FAULTS, seed), N)
+    vehicles = record_vehicles(fleet, case, trips, seed, truth=truth)
+    attack, ideal = vehicles.attack, [trip.matrix_a() for trip in trips]
+    return Trial(
+        smallest_fault=case.magnitudes[0],
+        full_scale_a=fleet.full_scale_a,
+        truth=vehicles.truth,
+        unseen=UnseenDrive.of_samples([vehicles.currents_a(j, ideal[j], ideal[(j + 1) % N]) for j in range(N)]),
+        record=partial(_summaries, vehicles.samples, fleet),
+        collect=partial(_published_evidence, vehicles.samples, fleet),
+        drawn_from=drawn_distribution(case.branches, case.sparsity, case.magnitudes, balanced=case.balanced),
+        delay_error_s=vehicles.delay_error_s,
+        attacked=None if attack is None else attack.has,
+        causes=() if attack is None else attack.world.causes,
+    )
+
+
+def _runs(fleet: RecordedFleet, case: RecordedCase, seed: int) -> tuple[GroundTruth, ...]:
+    """Drives of so many minutes, each from a random start on; vehicles may share trips, but hardly ever a start."""
+    assert case.minutes is not None
+    trips, samples, runs = fleet.trips, int(60.0 * case.minutes / fleet.period_s), []
+    for number in range(len(trips) if case.vehicles is None else case.vehicles):
+        rng = random_stream(Purpose.CALIBRATION_TRIP, seed, number)
+        k = int(rng.integers(len(trips)))
+        parts = [trips[k].part(int(rng.integers(len(trips[k]))), len(trips[k]))]
+        while sum(map(len, parts)) < samples:
+            k = (k + 1) % len(trips)
+            parts.append(trips[k])
+        runs.append(GroundTruth.joined(parts, f"run-{number}").part(0, samples))
+    return tuple(runs)
+
+
+def record_vehicles(
+    fleet: RecordedFleet, case: RecordedCase, trips: Sequence[GroundTruth], seed: int, *, truth: Faults | None = None
+) -> VehicleSamples:
+    """Draw vehicles and let each record its trip.
+
+    Parameters
+    ----------
+    fleet : RecordedFleet
+        Says full scale and signals.
+    case : RecordedCase
+        What is put on top of the trips.
+    trips : sequence of N GroundTruth
+        Ideal currents of each vehicle.
+    seed : int
+        Of this repetition.
+    truth : Faults or None
+        Faults of the vehicles; None: drawn as the case says.
+    """
+    N, full_scale_a = len(trips), fleet.full_scale_a
+    drawn = draw_faults(
+        random_stream(Purpose.FAULTS, seed),
+        vehicles=N,
+        branches=case.branches,
+        sparsity=case.sparsity,
+        magnitude=case.magnitudes,
+        full_scale_a=full_scale_a,
+        balanced=case.balanced,
+    )
+    faults = drawn if truth is None else truth
+    attack = draw_attack(case.world, N, full_scale_a=full_scale_a, seed=seed) if case.world else None
+    vehicles = VehicleSamples(
+        truth=faults if attack is None else attack.truth(faults),
+        unmeasured_a=np.maximum(random_stream(Purpose.FRAMES, seed).normal(*case.unmeasured_a, size=N), 0.0),
+        attack=attack,
+    )
+    if case.delay_max_s is not None:
+        pairs = [_through_frames(fleet, case, vehicles, trip, (seed, j)) for j, trip in enumerate(trips)]
+        errors_s = None if case.delays_left_in else np.stack([error_s for _, error_s in pairs])
+        return replace(vehicles, samples=[samples for samples, _ in pairs], delay_error_s=errors_s)
+    steps_a = fleet.resolution_a(tuple(trips[0].currents_a))
+    samples = []
+    for j, trip in enumerate(trips):
+        _, i_m = vehicles.currents_a(j, trip.matrix_a())
+        seen = i_m + NOISE * full_scale_a * random_stream(Purpose.FRAMES, seed, j).standard_normal(i_m.shape)
+        safe = np.where(steps_a > 0.0, steps_a, 1.0)
+        inputs = fleet.inputs(trip)
+        samples.append(
+            Samples(
+                branch_names=tuple(trip.currents_a),
+                input_names=tuple(inputs),
+                time_s=trip.time_s,
+                currents_a=np.where(steps_a > 0.0, np.rint(seen / safe) * safe, seen),
+                inputs=np.column_stack(list(inputs.values())),
+                valid=np.ones(len(trip), dtype=bool),
+                masked={},
+            )
+        )
+    return replace(vehicles, samples=samples)
+
+
+def _through_frames(
+    fleet: RecordedFleet, case: RecordedCase, vehicles: VehicleSamples, trip: GroundTruth, seed: tuple[int, int]
+) -> tuple[Samples, Array]:
+    """Aligned samples of a vehicle, whose branches are late, and the error of its delays, shape (K - 1,). [s]"""
+    assert case.delay_max_s is not None
+    rng, j = random_stream(Purpose.FRAMES, *seed), seed[1]
+    delay_s = rng.uniform(0.0, 1.0, size=case.branches) * case.delay_max_s
+    disturbances = Disturbances(
+        noise_a=NOISE * fleet.full_scale_a, delay_s=delay_s, unmeasured_a=float(vehicles.unmeasured_a[j])
+    )
+    vehicle = Vehicle(
+        name=trip.name, branches=tuple(trip.currents_a), faults=vehicles.truth.take(j), disturbances=disturbances
+    )
+    drive = vehicle_drive(rng, fleet.database, vehicle, trip)
+    found_s: Array = np.zeros(len(delay_s))
+    if not case.delays_left_in:
+        delays = estimate_delays([drive], vehicle.branches)
+        drive = without_delays(drive, delays.by_branch())
+        found_s = delays.delay_s
+    layout = fleet.database.layout
+    inputs, _ = choose_inputs(layout, tuple(drive.inputs), names=_all_inputs(layout))
+    return align(drive, layout, vehicle.branches, inputs=inputs), (found_s - delay_s + delay_s[0])[1:]
+
+
+def _summaries(samples: Sequence[Samples], fleet: RecordedFleet) -> list[DriveSummary]:
+    names = fleet.database.layout.fleet_inputs or fleet.database.layout.model_inputs
+    return [summarise([drive.with_inputs(names)], period_s=fleet.period_s) for drive in samples]
+
+
+def _published_evidence(samples: Sequence[Samples], fleet: RecordedFleet) -> FleetEvidence:
+    """A model per vehicle, simulated on the longest held-out drive (2)."""
+    drives = [drive.with_inputs(fleet.database.layout.model_inputs) for drive in samples]
+    vehicles = [
+        identify_vehicle([drive], period_s=fleet.period_s, vehicle=str(j), names=(str(j),))
+        for j, drive in enumerate(drives)
+    ]
+    unity = max(vehicles, key=lambda vehicle: len(vehicle.held_out_inputs) - vehicle.lead_in)
+    simulated = [vehicle.model.simulate(unity.held_out_inputs)[unity.lead_in :] for vehicle in vehicles]
+    junction_a2 = np.array([float(np.sum(vehicle.moment_a2)) for vehicle in vehicles])
+    return collect_evidence(simulated, fleet_mean(simulated), junction_a2)

@@ -1,0 +1,217 @@
+"""The table of experiments, its runner, and what is written of a result."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from calibrator.cli import app
+from calibrator.errors import FleetError
+from calibrator.experiments.calibration import ALL, pool_confidences
+from calibrator.experiments.common_drive import CommonCase
+from calibrator.experiments.experiments import EXPERIMENTS, Experiment, Setting, fleet_for, run_experiment
+from calibrator.experiments.methods import LEFT_IN, PERFECT, POSTERIOR
+from calibrator.experiments.pages import headline, result_markdown, result_table, write_result
+from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet
+from calibrator.experiments.result import ExperimentResult, Figure, read_results
+from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, smooth_drive
+
+
+@pytest.fixture(scope="module")
+def fleet() -> RecordedFleet:
+    return small_fleet(trips=6, samples=1800)
+
+
+@pytest.fixture(scope="module")
+def snr() -> ExperimentResult:
+    settings = tuple(Setting(x=x, case=CommonCase(vehicles=16, snr_db=x)) for x in (10.0, 20.0))
+    return run_experiment(replace(EXPERIMENTS["snr"], settings=settings), smooth_drive(), repetitions=2)
+
+
+def printed(result: ExperimentResult, width: int = 200) -> str:
+    console = Console(width=width)
+    with console.capture() as capture:
+        console.print(result_table(result))
+    return capture.get()
+
+
+def test_new_experiment_is_one_row(fleet: RecordedFleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = Experiment(
+        name="loads",
+        title="Loads without a sensor",
+        x_label="load [A]",
+        methods=(POSTERIOR,),
+        settings=tuple(Setting(x=a, case=RecordedCase(unmeasured_a=(a, 0.0))) for a in (0.0, 5.0)),
+    )
+    monkeypatch.setitem(EXPERIMENTS, "loads", row)
+    result = run_experiment(row, fleet, repetitions=1)
+    write_result(tmp_path / "results", result)
+    assert [found.x for found in result.rows] == [0.0, 5.0]
+    assert result.settings["sparsity"] == 80.0
+    assert "unmeasured_a" not in result.settings
+    page = (tmp_path / "results" / "loads.md").read_text()
+    assert "| load [A] | posterior |" in page
+    assert re.search(r"\| 5 \| [01]\.\d{3} \([01]\.\d{3} to [01]\.\d{3}\)", page), "each rate with its interval"
+    assert (tmp_path / "results" / "loads.png").read_bytes().startswith(b"\x89PNG")
+    assert "(results/loads.md)" in (tmp_path / "results.md").read_text()
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_row_is_whole_and_has_a_small_version(name: str) -> None:
+    row, small = EXPERIMENTS[name], EXPERIMENTS[name].small()
+    places = [(setting.series, setting.x, setting.methods) for setting in row.settings]
+    assert len(places) == len(set(places))
+    assert {type(setting.case) for setting in row.settings} == {RecordedCase if row.recorded else CommonCase}
+    assert bool(row.series_label) == any(setting.series for setting in row.settings)
+    assert {x for x, _ in row.paper} <= {setting.x for setting in row.settings}
+    assert 1 <= len(small.settings) <= 4
+    for setting in small.settings:
+        assert not isinstance(setting.case, CommonCase) or setting.case.vehicles <= 20
+
+
+@pytest.mark.parametrize("name", ["classifier", "real", "delay", "phase", "attacks", "coverage"])
+def test_rows_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet, tmp_path: Path) -> None:
+    row = EXPERIMENTS[name].small()
+    more = replace(fleet, trips=fleet.trips + small_fleet(trips=12, samples=1800).trips[6:])
+    result = run_experiment(row, more if row.recorded else smooth_drive(samples=2000), repetitions=1)
+    result = replace(result, made="calibrator 1.0")
+    write_result(tmp_path / "results", result)
+    assert [(each.series, each.x, each.method) for each in result.rows] == [
+        (setting.series, setting.x, method.name)
+        for setting in row.settings
+        for method in setting.methods or row.methods
+    ]
+    assert read_results(tmp_path / "results", EXPERIMENTS) == [result]
+    page = (tmp_path / "results" / f"{name}.md").read_text()
+    assert f"`calibrator experiment {name} --out FOLDER`" in page
+    assert ("minus the sum of the other branches" in page) == row.recorded
+    assert (tmp_path / "results" / f"{name}.png").is_file()
+    for line in printed(result, width=80).splitlines():
+        assert len(line) <= 80
+        assert "…" not in line
+    if name == "delay":
+        assert LEFT_IN.name in result.methods
+        assert result.row(x=300.0, method=POSTERIOR.name).figures["delay_rmse_ms"].mean < 5.0
+    if name == "coverage":
+        counts = [
+            (sum(r.pit), sum(r.figures[k].of or 0 for k in r.figures if k.endswith("beyond_3"))) for r in result.rows
+        ]
+        assert all(pit == deployed for pit, deployed in counts)
+        assert "by tenths of their probability integral transform" in page
+
+
+def test_figures_depend_on_the_seed_and_not_on_the_number_of_processes(snr: ExperimentResult) -> None:
+    settings = tuple(Setting(x=x, case=CommonCase(vehicles=16, snr_db=x)) for x in (10.0, 20.0))
+    row = replace(EXPERIMENTS["snr"], settings=settings, methods=(PERFECT,))
+    again = run_experiment(row, smooth_drive(), repetitions=2, workers=2)
+    assert again.rows == tuple(found for found in snr.rows if found.method == PERFECT.name)
+    other = run_experiment(row, smooth_drive(), repetitions=2, seed=100)
+    assert other.rows != again.rows
+
+
+def test_table_puts_paper_published_method_and_default_side_by_side(snr: ExperimentResult) -> None:
+    header, rows = headline(snr)
+    assert header[:5] == ["SNR [dB]", "paper", PERFECT.name, POSTERIOR.name, "confidence"]
+    assert [row[:2] for row in rows] == [["10", "-"], ["20", "0.91"]]
+    rate = snr.row(x=20.0, method=POSTERIOR.name).figures["recovery_rate"]
+    assert rate.interval is not None
+    assert rows[1][3] == f"{rate.mean:.3f} ({rate.interval[0]:.3f} to {rate.interval[1]:.3f})"
+    assert f" / {0.91:.2f} |" in result_markdown(snr)
+
+
+def test_captions_explain_only_columns_that_are_there(snr: ExperimentResult) -> None:
+    only_published = replace(snr, rows=tuple(row for row in snr.rows if row.method == PERFECT.name))
+    for text in (result_markdown(only_published), " ".join(printed(only_published).split())):
+        assert "the paper's best printed figure and the published method (/ its classifier)." in text
+        for absent in ("the default", "confidence", "calibration error", "delays", "law known"):
+            assert absent not in text
+    assert "counts as harmed although it is recovered." in result_markdown(snr)
+    only_default = replace(snr, rows=tuple(row for row in snr.rows if row.method == POSTERIOR.name))
+    assert "The published method corrects" not in result_markdown(only_default)
+
+
+def test_record_without_counts_is_shown_without_intervals(snr: ExperimentResult) -> None:
+    plain = {name: Figure(mean=0.5) for name in ("recovery_rate", "confidence")}
+    old = replace(snr, paper={}, rows=tuple(replace(row, figures=plain) for row in snr.rows))
+    assert headline(old)[1][0] == ["10", "0.500", "0.500", "0.500"]
+
+
+def test_damaged_record_is_named(tmp_path: Path) -> None:
+    (tmp_path / "snr.json").write_bytes(b'{"name": 3}')
+    with pytest.raises(FleetError, match=r"snr\.json: not a record of an experiment: .*run the experiment again"):
+        read_results(tmp_path, ["real", "snr"])
+
+
+def test_flags_are_booleans_in_records_and_words_on_pages(snr: ExperimentResult) -> None:
+    settings = json.loads(snr.to_json())["settings"]
+    assert (settings["balanced"], settings["symmetric"]) == (True, True)
+    assert "balanced true, symmetric true" in result_markdown(snr)
+
+
+def test_index_lists_the_results_of_the_folder_in_order(snr: ExperimentResult, tmp_path: Path) -> None:
+    write_result(tmp_path / "results", snr)
+    write_result(tmp_path / "results", replace(snr, name="classifier", title="Second"))
+    index = (tmp_path / "results.md").read_text()
+    assert index.index("[Second](results/classifier.md)") < index.index("(results/snr.md)")
+    assert "2 repetitions, seed 0, drive smooth" in index
+    once = replace(snr, settings={**snr.settings, "repetitions": 1})
+    assert "1 repetition, seed 0" in printed(once)
+
+
+def test_calibration_pools_the_confidences_of_the_default(snr: ExperimentResult) -> None:
+    other = replace(snr, name="sparsity", settings={**snr.settings, "seed": 100})
+    result = pool_confidences([snr, other])
+    assert [row.series for row in result.rows] == ["snr", "sparsity", ALL]
+    one, _, both = result.rows
+    assert (one.x, both.x) == (64.0, 128.0)
+    assert both.figures["ece"].mean == pytest.approx(one.figures["ece"].mean)
+    rates = [row.figures["recovery_rate"].mean for row in snr.rows if row.method == POSTERIOR.name]
+    assert one.figures["recovery_rate"].mean == pytest.approx(np.mean(rates))
+    with pytest.raises(FleetError, match="no experiment has a confidence"):
+        pool_confidences([])
+
+
+def test_trials_that_experiments_share_count_once(snr: ExperimentResult) -> None:
+    shared = replace(snr, name="classifier", rows=tuple(row for row in snr.rows if row.x == 20.0))
+    classifier, whole, together = pool_confidences([shared, snr]).rows
+    assert (classifier.x, whole.x, together.x) == (32.0, 64.0, 64.0)
+    assert together.bins == whole.bins
+    assert together.figures == whole.figures
+
+
+def test_only_experiments_on_recorded_trips_need_a_layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert fleet_for(EXPERIMENTS["snr"], quick=True).full_scale_a == 400.0
+    with pytest.raises(FleetError, match=r"hv_powertrain\.toml: not in this folder.*name it with --layout$"):
+        fleet_for(EXPERIMENTS["real"], quick=True)
+    assert fleet_for(EXPERIMENTS["real"], quick=True, layout=LAYOUT).record["vehicles"] == 8
+
+
+def test_wrong_fleet_and_no_repetition_are_refused(fleet: RecordedFleet) -> None:
+    with pytest.raises(FleetError, match="CommonCase cannot be run on a RecordedFleet"):
+        run_experiment(EXPERIMENTS["snr"].small(), fleet, repetitions=1)
+    with pytest.raises(FleetError, match="at least 1 repetition, not 0"):
+        run_experiment(EXPERIMENTS["snr"], smooth_drive(), repetitions=0)
+
+
+def test_command_runs_records_and_pools(tmp_path: Path) -> None:
+    out = ("--out", str(tmp_path / "results"))
+    ran = CliRunner().invoke(app, ["experiment", "snr", "--quick", "--repetitions", "1", "--workers", "1", *out])
+    assert ran.exit_code == 0, ran.output
+    ran = CliRunner().invoke(app, ["experiment", "calibration", "--json", *out])
+    assert ran.exit_code == 0, ran.output
+    assert json.loads(ran.stdout)["settings"]["experiments"] == "snr"
+    assert (tmp_path / "results" / "calibration.png").is_file()
+    listed = CliRunner().invoke(app, ["experiment"]).stdout.splitlines()
+    assert [line.split()[0] for line in listed] == [*EXPERIMENTS, "calibration"]
+
+
+def test_calibration_without_records_says_what_to_run_first(tmp_path: Path) -> None:
+    ran = CliRunner().invoke(app, ["experiment", "calibration", "--out", str(tmp_path / "results")])
+    assert re.search("no experiment is recorded .* 'calibrator experiment all --out", str(ran.exception))
+    assert not (tmp_path / "results").exists()
