@@ -8,8 +8,8 @@ TRIPS ?= ../shared/data/bmw_i3_summer
 PYTHONS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test coverage bench bench-quick experiments soak fuzz release-check mutants lint types docs notebook dist \
-	package sbom licences schema constraints clean
+.PHONY: help setup demo test check-long coverage bench bench-quick experiments soak fuzz release-check mutants lint types docs \
+	notebook dist package sbom licences schema constraints clean
 
 help:                    ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -27,17 +27,22 @@ $(VENV)/.installed: constraints.txt pyproject.toml
 demo: setup              ## a fleet, its calibration, and the Kirchhoff sum before and after (DRIVES=folder: real drives)
 	$(BIN)/python tools/demo.py --drives $(DRIVES) --out $(OUT)
 
-test: setup              ## all tests; those of SocketCAN on a kernel that has it
-	$(BIN)/python -m pytest --numprocesses auto --dist worksteal --durations 20
-	$(BIN)/python -m tests.vcan.calibrated_fleet build/vcan_fleet
-	HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan --or-skip $(BIN)/python -m pytest tests/vcan
+TEST := $(BIN)/python -m pytest --numprocesses auto --dist worksteal
+VCAN := HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan
 
-coverage: setup          ## the same, and which lines and branches they reach: all of ecu_node, 95 % of calibrator
-	rm -rf build/coverage
-	$(BIN)/python -m pytest --cov --cov-report= --numprocesses auto --dist worksteal
+test: setup              ## all tests but the long ones; those of SocketCAN on a kernel that has it
+	$(TEST) -m "not long" --durations 20
 	$(BIN)/python -m tests.vcan.calibrated_fleet build/vcan_fleet
-	HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan \
-		$(BIN)/python -m pytest --cov=ecu_node --cov-append --cov-report= tests/vcan
+	$(VCAN) --or-skip $(BIN)/python -m pytest -m "not long" tests/vcan
+
+check-long: setup        ## the long tests: whole fleets, soak, power cuts, fuzz of many seeds (half an hour)
+	$(TEST) -m long --durations 20
+
+coverage: setup          ## all tests, and which lines and branches they reach: all of ecu_node, 95 % of calibrator
+	rm -rf build/coverage
+	$(TEST) --cov --cov-report=
+	$(BIN)/python -m tests.vcan.calibrated_fleet build/vcan_fleet
+	$(VCAN) $(BIN)/python -m pytest --cov=ecu_node --cov-append --cov-report= tests/vcan
 	$(BIN)/coverage report --include='ecu_node/*' --fail-under=100
 	$(BIN)/coverage report --include='calibrator/*' --fail-under=95
 
@@ -61,11 +66,11 @@ fuzz: setup              ## 10^7 random frames through node and C core, 10^6 cha
 	PYTHONPATH=tools $(BIN)/python -m bench.c_core compare
 	PYTHONPATH=tools $(BIN)/python -m bench.c_core fuzz --seconds 3600
 
-release-check: setup     ## measure again all that was promised, on this commit (hours; goes on where it stopped)
-	PYTHONPATH=tools $(BIN)/python tools/release_check.py
+release-check: coverage bench experiments fuzz mutants package ## all that is measured for a release, on one commit (hours)
 
-mutants: setup           ## change the code in small ways and see that tests notice (an hour; GROUPS=e2e: that part only)
-	$(BIN)/python tools/mutants.py $(GROUPS)
+mutants: setup           ## change the code in small ways and see that tests notice (an hour; goes on where it stopped)
+	unshare --map-current-user --pid --fork --kill-child --mount-proc $(BIN)/mutmut run --max-children 2
+	$(BIN)/mutmut results
 
 lint: setup              ## ruff, formatting included
 	$(BIN)/ruff check .
@@ -80,22 +85,27 @@ docs: setup              ## the documentation, in build/docs; its examples are r
 		--doctree-dir build/doctrees . build/docs
 
 notebook: setup          ## run the notebook of the examples, and keep its outputs in it
-	PYTHONPATH=tools OMP_NUM_THREADS=1 $(BIN)/python -m docs_site.run_notebook examples/fleet_to_node.ipynb
+	OMP_NUM_THREADS=1 $(BIN)/jupyter execute --inplace --timeout 1800 examples/fleet_to_node.ipynb
 
 dist: setup              ## wheel and source distribution, in dist/, checked
 	rm -rf dist
 	$(BIN)/python -m build --no-isolation
 	$(BIN)/python -m twine check --strict dist/*
 
-sbom: dist               ## and bills of materials of what they bring (CycloneDX JSON)
-	PYTHONPATH=tools $(BIN)/python -m release.sbom dist
+sbom: dist               ## and a bill of materials of what they bring (CycloneDX JSON)
+	rm -rf build/sbom
+	$(PYTHON) -m venv build/sbom
+	grep -oE '^[^ ]+==[^\\]*' constraints.txt > build/sbom/pins.txt # without hashes: the wheel itself has none
+	build/sbom/bin/pip install --quiet --constraint build/sbom/pins.txt \
+		"$$(ls $$PWD/dist/*.whl)[calibrator,cluster,demo,metrics,mf4]"
+	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --of JSON -o dist/sbom.cdx.json \
+		build/sbom/bin/python
 
 package: sbom            ## and all of it, with every extra, in clean environments (long; PYTHONS='other interpreters')
-	PYTHONPATH=tools $(BIN)/python -m release.measure_install dist
 	HV_PYTHONS="$(PYTHONS)" $(BIN)/python -m pytest tests/package
 
-licences: setup          ## write docs/licences.md anew; fails on licences that do not go with Apache-2.0
-	PYTHONPATH=tools $(BIN)/python -m release.licences
+licences: setup          ## what is installed, with its licence; fails on those that do not go with Apache-2.0
+	$(BIN)/python tools/licences.py
 
 schema: setup            ## write the JSON Schema of the parameter file anew
 	$(BIN)/ecu-node schema > ecu_node/parameters.schema.json

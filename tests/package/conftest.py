@@ -12,7 +12,7 @@ from ecu_node import __version__
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_parameters
-from release.clean_venv import ROOT, CleanVenv, new_venv, the_wheel
+from tests.package.clean_venv import ROOT, CleanVenv, new_venv, the_wheel
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
 
 DIST = ROOT / "dist"

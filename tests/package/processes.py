@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from release.clean_venv import CleanVenv
+from tests.package.clean_venv import CleanVenv
 
 __all__ = ["on_terminal", "started", "until"]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from release.clean_venv import ROOT
+from tests.package.clean_venv import ROOT
 
 PACKAGES = ("calibrator", "ecu_node")
 LEFT_OUT = {"__pycache__", ".venv", "build", "dist", "api"}

@@ -9,7 +9,7 @@ from pathlib import Path
 import can
 import pytest
 
-from release.clean_venv import CleanVenv
+from tests.package.clean_venv import CleanVenv
 from tests.package.conftest import VEHICLE, Installed
 from tests.package.processes import started, until
 

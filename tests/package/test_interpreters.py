@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from release.clean_venv import new_venv
+from tests.package.clean_venv import new_venv
 
 INTERPRETERS = os.environ.get("HV_PYTHONS", "").split() or [sys.executable]
 

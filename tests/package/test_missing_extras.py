@@ -8,7 +8,7 @@ from pathlib import Path
 import can
 import pytest
 
-from release.clean_venv import CleanVenv, new_venv
+from tests.package.clean_venv import CleanVenv, new_venv
 
 LAYOUT = ("--layout", "my_car.toml")
 BUS = ("--interface", "virtual", "--channel", "c")

@@ -10,7 +10,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from ecu_node import __version__
-from release.clean_venv import ROOT, CleanVenv
+from tests.package.clean_venv import ROOT, CleanVenv
 from tests.package.conftest import VEHICLE, Installed
 from tests.package.processes import on_terminal
 

@@ -1,0 +1,40 @@
+#!/usr/bin/env python3
+"""List what is installed with its licence; exit code 1 for one that does not go with Apache-2.0 or is not stated."""
+
+import sys
+from importlib.metadata import Distribution, distributions
+
+GOOD = ("apache", "bsd", "mit", "isc", "psf", "python", "mpl", "mozilla", "lgpl", "lesser", "unlicense", "zlib", "cc0",
+        "public domain", "0bsd")  # fmt: skip
+"""Words of licences that go with Apache-2.0 as those of a dependency; LGPL and MPL: see docs/licences.md."""
+READ = {"docutils": "BSD-2-Clause AND public domain", "fastsim": "Apache-2.0"}
+"""Licences read by hand, as their metadata mislead: COPYING.rst, LICENSE."""
+
+
+def licence_of(one: Distribution) -> str:
+    """Licence by the metadata, in one line; empty if they state none."""
+    name, found = one.metadata["Name"], one.metadata.get_all("License-Expression") or []
+    classifiers = [text.rpartition(" :: ")[2] for text in one.metadata.get_all("Classifier") or [] if "License" in text]
+    stated = [text for text in one.metadata.get_all("License") or [] if "\n" not in text and len(text) < 60]
+    texts = [READ.get(name, ""), *found, " AND ".join(classifiers), *stated]
+    return next((text for text in texts if is_good(text)), next((text for text in texts if text), ""))
+
+
+def is_good(licence: str) -> bool:
+    """Whether a licence goes with Apache-2.0."""
+    return any(word in licence.lower() for word in GOOD)
+
+
+def main() -> int:
+    """Print the list."""
+    bad = 0
+    for one in sorted(distributions(), key=lambda one: one.metadata["Name"].lower()):
+        licence = licence_of(one)
+        good = is_good(licence)
+        bad += not good
+        print(f"{one.metadata['Name']:<28} {one.version:<14} {licence or 'not stated'}{'' if good else '   <- read it'}")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
