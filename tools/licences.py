@@ -32,7 +32,9 @@ def main() -> int:
         licence = licence_of(one)
         good = is_good(licence)
         bad += not good
-        print(f"{one.metadata['Name']:<28} {one.version:<14} {licence or 'not stated'}{'' if good else '   <- read it'}")
+        print(
+            f"{one.metadata['Name']:<28} {one.version:<14} {licence or 'not stated'}{'' if good else '   <- read it'}"
+        )
     return 1 if bad else 0
 
 

@@ -12,8 +12,8 @@ from ecu_node import __version__
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import write_parameters
-from tests.package.clean_venv import ROOT, CleanVenv, new_venv, the_wheel
 from tests.ecu_node.vehicles import LAYOUT, parameters_for
+from tests.package.clean_venv import ROOT, CleanVenv, new_venv, the_wheel
 
 DIST = ROOT / "dist"
 VEHICLE = "V001"
