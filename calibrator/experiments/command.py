@@ -55,7 +55,7 @@ def experiment(
         from calibrator.experiments.calibration import CALIBRATION, pool_confidences
         from calibrator.experiments.experiments import EXPERIMENTS, fleet_for, run_experiment
         from calibrator.experiments.pages import ORDER, result_table, write_result
-        from calibrator.experiments.result import made_now, read_results
+        from calibrator.experiments.result import ExperimentResult, made_now, read_results
 
     if name is None:
         titles = {CALIBRATION: "Reliability of the confidence", **{row.name: row.title for row in EXPERIMENTS.values()}}
@@ -63,11 +63,11 @@ def experiment(
         return
     if name not in {*ORDER, "all"}:
         raise typer.BadParameter(f"{name}: expected one of {', '.join(ORDER)} or all", param_hint="NAME")
-    unheeded, reason = (), ""
-    if name == CALIBRATION:
-        unheeded = ("drives", "layout", "quick", "repetitions", "seed", "workers")
-        reason = "calibration runs nothing, it pools what is recorded in --out"
-    elif name != "all" and not EXPERIMENTS[name].recorded:
+    unheeded: tuple[str, ...] = ("drives", "layout", "quick", "repetitions", "seed", "workers")
+    reason = "calibration runs nothing, it pools what is recorded in --out"
+    if name == "all" or (name in EXPERIMENTS and EXPERIMENTS[name].recorded):
+        unheeded = ()
+    elif name != CALIBRATION:
         recorded = ", ".join(each for each in EXPERIMENTS if EXPERIMENTS[each].recorded)
         unheeded, reason = ("drives", "layout"), f"{name} takes the built-in vehicle; this is only for {recorded}"
     if given := given_options(context, unheeded):
@@ -86,7 +86,7 @@ def experiment(
     trips = next((e for each, e in EXPERIMENTS.items() if each in names and e.recorded), None)
     fleet = None if trips is None else fleet_for(trips, quick=quick, drives=drives, layout=layout)
     count = repetitions or (QUICK_REPETITIONS if quick else REPETITIONS)
-    done = []
+    done: list[ExperimentResult] = []
     for number, each in enumerate(names, start=1):
         with one_pass(number, len(names)):
             if each == CALIBRATION:

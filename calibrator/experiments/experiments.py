@@ -422,9 +422,9 @@ def run_experiment(
         raise FleetError(f"an experiment needs at least 1 repetition, not {repetitions}")
     usual = tuple(experiment.methods if methods is None else methods)
     names = [method.name for method in usual]
-    for method in names:
-        if names.count(method) > 1:
-            raise FleetError(f"{names.count(method)} methods are called '{method}'; give each method a name of its own")
+    for called in names:
+        if names.count(called) > 1:
+            raise FleetError(f"{names.count(called)} methods are called '{called}'; give each method a name of its own")
     settings, seeds = experiment.settings, range(seed, seed + repetitions)
     tasks = (delayed(_run_trial)(fleet, s.case, s.methods or usual, each) for s in settings for each in seeds)
     total = len(settings) * repetitions

@@ -89,10 +89,9 @@ def _rings(axes: Axes, points: Sequence[tuple[float, float | None]], label: str,
     """Figures of the paper: rings that hide nothing."""
     known = [(x, y) for x, y in points if x is not None and y is not None]
     if known:
-        axes.scatter(
-            *zip(*known, strict=True), s=110.0, facecolors="none", edgecolors=colour, linewidths=1.5, zorder=4,
-            label=f"paper, {label}", **more,
-        )  # fmt: skip
+        look: dict[str, Any] = {"s": 110.0, "facecolors": "none", "edgecolors": colour, "linewidths": 1.5, "zorder": 4}
+        x, y = ([*values] for values in zip(*known, strict=True))
+        axes.scatter(x, y, label=f"paper, {label}", **look, **more)
 
 
 def _legend(figure: Figure, *, title: str | None = None) -> None:
