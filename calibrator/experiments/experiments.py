@@ -9,11 +9,11 @@ the same seeds; all methods of a setting see the same trials.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from joblib import delayed
 
 from calibrator.errors import FleetError
 from calibrator.experiments.attacks import WORLDS
@@ -39,7 +39,7 @@ from calibrator.experiments.recorded_trips import (
 )
 from calibrator.experiments.result import ExperimentResult, Row
 from calibrator.files.layout_files import vehicle_database
-from calibrator.processes.computing import in_processes
+from calibrator.processes.run_many import Workers, run_many
 from calibrator.terminal.progress import shown
 
 __all__ = ["EXPERIMENTS", "Experiment", "Setting", "fleet_for", "run_experiment"]
@@ -426,9 +426,9 @@ def run_experiment(
         if names.count(called) > 1:
             raise FleetError(f"{names.count(called)} methods are called '{called}'; give each method a name of its own")
     settings, seeds = experiment.settings, range(seed, seed + repetitions)
-    tasks = (delayed(_run_trial)(fleet, s.case, s.methods or usual, each) for s in settings for each in seeds)
-    total = len(settings) * repetitions
-    outcomes = iter(shown(in_processes(tasks, workers=workers), experiment.name, total, "trials"))
+    tasks = ((setting.case, setting.methods or usual, each) for setting in settings for each in seeds)
+    judged = run_many(partial(_run_trial, fleet), tasks, Workers(processes=workers))
+    outcomes = iter(shown(judged, experiment.name, len(settings) * repetitions, "trials"))
     rows = []
     for setting in settings:
         trials = [next(outcomes) for _ in seeds]
@@ -467,8 +467,9 @@ def run_experiment(
 
 
 def _run_trial(
-    fleet: CommonDrive | RecordedFleet, case: CommonCase | RecordedCase, methods: Sequence[Method], seed: int
+    fleet: CommonDrive | RecordedFleet, task: tuple[CommonCase | RecordedCase, Sequence[Method], int]
 ) -> list[Outcome]:
+    case, methods, seed = task
     if isinstance(fleet, CommonDrive) and isinstance(case, CommonCase):
         trial = common_trial(fleet, case, seed)
     elif isinstance(fleet, RecordedFleet) and isinstance(case, RecordedCase):
