@@ -63,8 +63,8 @@ SWEEPS = 2
 SINGULAR = 1e-10
 """Directions with less curvature or power than this share of the greatest are left alone. [1]"""
 
-MOST_STEPS = 15
-"""Five are usual; the delay of a branch that tells nothing wanders for ever."""
+MOST_STEPS, MOST_STEPS_ON_ALL = 10, 2
+"""Five are usual; the delay of a branch that tells nothing wanders for ever. On all drives one is."""
 CONVERGED_S = 1e-6
 """A shorter step is none: a thousandth of what matters. [s]"""
 CONVERGED_ON_ALL_S = 1e-3
@@ -160,9 +160,9 @@ def estimate_delays(drives: Sequence[Drive], branches: Sequence[str], *, max_sd_
     telling = _most_telling(stretches, band, blocks)
     gain: Array = np.ones(len(branches) - 1)
     delay_s = search_lags([(part.curves, part.time_s) for part in telling], band)
-    gain, delay_s, sums = _newton(telling, band, gain, delay_s, CONVERGED_S)
+    gain, delay_s, sums = _newton(telling, band, gain, delay_s, MOST_STEPS, CONVERGED_S)
     if telling is not stretches:
-        gain, delay_s, sums = _newton(stretches, band, gain, delay_s, CONVERGED_ON_ALL_S)
+        gain, delay_s, sums = _newton(stretches, band, gain, delay_s, MOST_STEPS_ON_ALL, CONVERGED_ON_ALL_S)
     sd_s = _jackknife_sd(sums)[len(gain) :]
     plausible = (gain > GAIN_RANGE[0]) & (gain < GAIN_RANGE[1]) & (np.abs(delay_s) < MAX_DELAY_S)
     known = np.concatenate([[True], plausible & (sd_s <= max_sd_s)])
@@ -300,14 +300,14 @@ def _best_columns(moments: Array, column: NDArray[np.intp], group: Sequence[int]
 # ---- Newton's steps
 
 
-def _newton(
-    stretches: Sequence[_Stretch], band: Band, gain: Array, delay_s: Array, converged_s: float
+def _newton(  # noqa: PLR0917 (it is read as one formula)
+    stretches: Sequence[_Stretch], band: Band, gain: Array, delay_s: Array, steps: int, converged_s: float
 ) -> tuple[Array, Array, Array]:
     """Gains and delays, each of shape (K-1,), and the sums of the last step, from a first guess nearby."""
     others = len(gain)
     block = np.concatenate([stretch.block for stretch in stretches])
     first = _bands(stretches, [0], band, np.zeros(1))
-    for _ in range(MOST_STEPS):
+    for _ in range(steps):
         x, slope = _bands(stretches, range(1, others + 1), band, delay_s)
         e = first[0][:, 0] + x @ gain
         scale = max(MAD_TO_SD * float(np.median(np.abs(e))), LEAST_SCALE * float(np.sqrt(np.mean(e**2))), _TINY)
