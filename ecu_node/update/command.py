@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -12,7 +12,11 @@ from ecu_node import __version__
 from ecu_node.core.status import TrustError
 from ecu_node.errors import UserError, printable
 from ecu_node.program import say_error, write_output, write_result, write_text
-from ecu_node.update.state import ParameterSet, State, read_state, require_not_expired, time_text
+
+if TYPE_CHECKING:
+    from ecu_node.update.state import ParameterSet, State
+
+# what stands on python-can is imported by the commands themselves, after load_python_can
 
 __all__ = ["add_update_commands"]
 
@@ -90,7 +94,8 @@ def _provision(options: argparse.Namespace) -> int:
 
 
 def _update(options: argparse.Namespace) -> int:
-    from ecu_node.database import node_database  # noqa: PLC0415  # after load_python_can
+    from ecu_node.database import node_database  # noqa: PLC0415
+    from ecu_node.update.state import read_state  # noqa: PLC0415
 
     client, database = _client(), node_database(options.layout)
     text = client.update(
@@ -107,10 +112,11 @@ def _update(options: argparse.Namespace) -> int:
     return 0
 
 
-def _facts(state: State) -> dict[str, Any]:
+def _facts(state: "State") -> dict[str, Any]:
     """State for programs; ``null`` where there is no set."""
+    from ecu_node.update.state import time_text  # noqa: PLC0415
 
-    def of_set(found: ParameterSet | None) -> dict[str, Any] | None:
+    def of_set(found: "ParameterSet | None") -> dict[str, Any] | None:
         if found is None:
             return None
         number = found.parameters.number
@@ -130,6 +136,8 @@ def _facts(state: State) -> dict[str, Any]:
 
 
 def _inspect(options: argparse.Namespace) -> int:
+    from ecu_node.update.state import read_state, require_not_expired, time_text  # noqa: PLC0415
+
     state, now, problems = read_state(options.state), datetime.now(UTC), []
     facts = _facts(state)
     lines = [
@@ -162,6 +170,8 @@ def _inspect(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
+    from ecu_node.update.state import read_state, time_text  # noqa: PLC0415
+
     facts = {
         "time": time_text(datetime.now(UTC)),
         "tool": f"ecu-node {__version__}",

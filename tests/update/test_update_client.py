@@ -347,7 +347,7 @@ def test_inspect_fails_where_the_set_in_force_has_expired(
     found = read_state(state)
     assert found.in_force is not None
     late: State = replace(found, latest=found.in_force.expires)
-    monkeypatch.setattr("ecu_node.update.command.read_state", lambda _: late)
+    monkeypatch.setattr("ecu_node.update.state.read_state", lambda _: late)
     code, _, err = repo.node("inspect", "--state", state)
     assert code == 1
     assert "expired at" in err
