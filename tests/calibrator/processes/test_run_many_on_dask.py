@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -21,19 +20,12 @@ from calibrator.processes.run_many import Failed, Workers, run_many, try_many
 from calibrator.summaries.identity import read_identity
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
-from tests.calibrator.processes.dask_cluster import DaskCluster
+from tests.calibrator.processes.dask_cluster import DaskCluster, gated
 from tests.calibrator.processes.test_run_many import LIMIT_S, dying_once, hostile
 
 pytest.importorskip("distributed")
 LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
 PLAN = FleetPlan(vehicles=6, currents=2, sparsity=80.0, magnitude=(0.05, 0.25))
-
-
-def gated(number: int, folder: Path) -> int:
-    """Wait from the third item on until a file is there."""
-    while number >= 2 and not (folder / "go").exists():
-        time.sleep(0.02)
-    return number
 
 
 def test_lost_workers_and_hostile_items_cost_themselves_only(tmp_path: Path) -> None:
