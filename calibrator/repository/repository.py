@@ -40,12 +40,12 @@ from ecu_node.parameters import decode_parameters, parameter_bytes
 from ecu_node.update.client import TargetFacts, target_path
 from ecu_node.update.sources import bundle_bytes
 
-__all__ = ["ROLES", "NewKeys", "Repository"]
+__all__ = ["BIN_BITS", "ROLES", "NewKeys", "Repository"]
 
 ROLES = ("root", "targets", "snapshot", "timestamp")
-_BIN_BITS = 11
+BIN_BITS = 11
 """2048 bins: of 10^6 vehicles a bundle has about 20 kB, and the snapshot is still read in milliseconds."""
-_BINS = SuccinctRoles([], 1, _BIN_BITS, "bins")
+_BINS = SuccinctRoles([], 1, BIN_BITS, "bins")
 _DAYS = {"root": 730, "targets": 730, "bins": 400, "snapshot": 60, "timestamp": 30}
 """How long metadata is valid. [d]"""
 _RENEW_DAYS = 60
@@ -386,7 +386,7 @@ def _set_keys(root: Root, role: str, new: NewKeys) -> None:
 def _delegate(targets: Targets, new: NewKeys) -> None:
     """Let the keys of targets sign the bins, too."""
     keys: dict[str, Key] = {key.keyid: key for key in new.keys}
-    targets.delegations = Delegations(keys, succinct_roles=SuccinctRoles(list(keys), new.threshold, _BIN_BITS, "bins"))
+    targets.delegations = Delegations(keys, succinct_roles=SuccinctRoles(list(keys), new.threshold, BIN_BITS, "bins"))
 
 
 def _facts(file: TargetFile) -> TargetFacts:
