@@ -488,5 +488,5 @@ def test_mistakes_of_a_file_that_was_written_by_hand_are_told(
 
 def test_a_signed_file_in_the_place_of_one_that_nobody_signed_is_told(tmp_path: Path) -> None:
     (tmp_path / "p.json").write_bytes(b'{"payload":"","payloadType":"x","signatures":[]}\n')
-    with pytest.raises(UnfitError, match="this file is signed; use 'ecu-node activate' and --state, or name"):
+    with pytest.raises(UnfitError, match=r"this file was signed by version 1\.0; name the parameter file"):
         read_parameters(tmp_path / "p.json")
