@@ -50,6 +50,9 @@ FEWEST_BLOCKS = 6
 """Fewer do not give a standard deviation worth the name."""
 SEARCHED_BLOCKS = 60
 """Blocks in which delays are searched: ten minutes in which the branches move most. [1]"""
+HOPELESS = 3.0
+"""Of a branch whose standard deviation, in these minutes, is more than so many times the largest allowed, no delay is
+looked for: it would wander, and take those of the others along. [1]"""
 GAIN_RANGE = (1.0 / 3.0, 3.0)
 """Ratios of two sensors' gains, each within 0.6 to 1.4, and some loss to noise; outside, it is not the branch's own
 current that was found. [1]"""
@@ -117,6 +120,22 @@ class _Stretch:
     block: NDArray[np.int64]
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Fit:
+    """Of the branches after the first, shape (K-1,) each: gains, delays and their deviations, and which are free."""
+
+    gain: Array
+    delay_s: Array
+    sd_s: Array
+    free: Mask
+
+    @property
+    def plausible(self) -> Mask:
+        """Whether it is the branch's own current that was found."""
+        gain = self.gain
+        return np.asarray((gain > GAIN_RANGE[0]) & (gain < GAIN_RANGE[1]) & (np.abs(self.delay_s) < MAX_DELAY_S))
+
+
 def estimate_delays(drives: Sequence[Drive], branches: Sequence[str], *, max_sd_s: float = MAX_SD_S) -> BranchDelays:
     """Estimate by how much the branch currents of one vehicle are seen later than the first one.
 
@@ -149,8 +168,8 @@ def estimate_delays(drives: Sequence[Drive], branches: Sequence[str], *, max_sd_
             f"{', '.join(branches) or 'none'} was asked for; choose at least two"
         )
     reference = np.arange(len(branches)) == 0
-    found = [[charge_curve(drive.branches[name]) for name in branches] for drive in drives]
-    complete = [tuple(curve for curve in curves if curve is not None) for curves in found if None not in curves]
+    recorded = [[charge_curve(drive.branches[name]) for name in branches] for drive in drives]
+    complete = [tuple(curve for curve in curves if curve is not None) for curves in recorded if None not in curves]
     slowest_s = max((curve.period_s for curves in complete for curve in curves), default=0.0)
     band = Band(short_s=max(SHORT_S, SHORT_PERIODS * slowest_s), long_s=LONG_S)
     stretches, blocks = _stretches(complete, band)
@@ -158,14 +177,23 @@ def estimate_delays(drives: Sequence[Drive], branches: Sequence[str], *, max_sd_
         sd_s = np.where(reference, 0.0, np.inf)
         return BranchDelays(branches=tuple(branches), delay_s=np.zeros(len(branches)), sd_s=sd_s, known=reference)
     telling = _most_telling(stretches, band, blocks)
-    gain: Array = np.ones(len(branches) - 1)
-    delay_s = search_lags([(part.curves, part.time_s) for part in telling], band)
-    gain, delay_s, sums = _newton(telling, band, gain, delay_s, MOST_STEPS, CONVERGED_S)
+    found = _Fit(
+        gain=np.ones(len(branches) - 1),
+        delay_s=search_lags([(part.curves, part.time_s) for part in telling], band),
+        sd_s=np.zeros(len(branches) - 1),
+        free=np.ones(len(branches) - 1, np.bool_),
+    )
+    while True:
+        found = _newton(telling, band, found, MOST_STEPS, CONVERGED_S)
+        hopeless = found.free & ~(found.plausible & (found.sd_s <= HOPELESS * max_sd_s))
+        if not hopeless.any():
+            break
+        worst = np.arange(len(hopeless)) == np.argmax(np.where(hopeless, found.sd_s, -1.0))
+        found = replace(found, free=found.free & ~worst, delay_s=np.where(worst, 0.0, found.delay_s))
     if telling is not stretches:
-        gain, delay_s, sums = _newton(stretches, band, gain, delay_s, MOST_STEPS_ON_ALL, CONVERGED_ON_ALL_S)
-    sd_s = _jackknife_sd(sums)[len(gain) :]
-    plausible = (gain > GAIN_RANGE[0]) & (gain < GAIN_RANGE[1]) & (np.abs(delay_s) < MAX_DELAY_S)
-    known = np.concatenate([[True], plausible & (sd_s <= max_sd_s)])
+        found = _newton(stretches, band, found, MOST_STEPS_ON_ALL, CONVERGED_ON_ALL_S)
+    delay_s, sd_s = found.delay_s, found.sd_s
+    known = np.concatenate([[True], found.free & found.plausible & (sd_s <= max_sd_s)])
     return BranchDelays(
         branches=tuple(branches),
         delay_s=np.where(known, np.concatenate([[0.0], delay_s]), 0.0),
@@ -300,11 +328,9 @@ def _best_columns(moments: Array, column: NDArray[np.intp], group: Sequence[int]
 # ---- Newton's steps
 
 
-def _newton(  # noqa: PLR0917 (it is read as one formula)
-    stretches: Sequence[_Stretch], band: Band, gain: Array, delay_s: Array, steps: int, converged_s: float
-) -> tuple[Array, Array, Array]:
-    """Gains and delays, each of shape (K-1,), and the sums of the last step, from a first guess nearby."""
-    others = len(gain)
+def _newton(stretches: Sequence[_Stretch], band: Band, start: _Fit, steps: int, converged_s: float) -> _Fit:
+    """Gains, and those of the delays that are free, from a first guess nearby."""
+    others, gain, delay_s = len(start.gain), start.gain, start.delay_s
     block = np.concatenate([stretch.block for stretch in stretches])
     first = _bands(stretches, [0], band, np.zeros(1))
     for _ in range(steps):
@@ -314,12 +340,17 @@ def _newton(  # noqa: PLR0917 (it is read as one formula)
         usual = SLOPE_NOISES * MAD_TO_SD * np.median(np.abs(slope), axis=0)
         sums = np.zeros((int(block[-1]) + 1, 2 * others, 2 * others + 1))
         _add_products((x, slope), (e, first[1][:, 0] + slope @ gain), gain, usual, HUBER * scale, block, sums)
-        step = -_solve(sums.sum(axis=0)[None])[0]
+        rows = np.concatenate([np.ones(others, np.bool_), start.free])
+        sums = sums[:, rows][:, :, np.append(rows, [True])]
+        step = np.zeros(2 * others)
+        step[rows] = -_solve(sums.sum(axis=0)[None])[0]
         step_s = np.clip(step[others:], -LONGEST_STEP_S, LONGEST_STEP_S)
         gain, delay_s = gain + step[:others], np.clip(delay_s + step_s, -MAX_DELAY_S, MAX_DELAY_S)
         if np.all(np.abs(step_s) < converged_s):
             break
-    return gain, delay_s, sums
+    sd_s = np.full(others, np.inf)
+    sd_s[start.free] = _jackknife_sd(sums)[others:]
+    return _Fit(gain=gain, delay_s=delay_s, sd_s=sd_s, free=start.free)
 
 
 def _bands(stretches: Sequence[_Stretch], which: Sequence[int], band: Band, delay_s: Array) -> tuple[Array, Array]:

@@ -214,12 +214,14 @@ def test_a_constant_drive_tells_nothing() -> None:
     assert_nothing_known(estimate_delays([drive], TWO))
 
 
-def test_a_branch_lost_in_noise_is_flagged_and_the_others_are_still_found() -> None:
-    vehicle = replace(TRIO, size_a={"motor": 50.0, "auxiliary": 0.05})
+@pytest.mark.parametrize("duration_s", [300.0, 1500.0])
+def test_a_branch_lost_in_noise_is_flagged_and_the_others_are_still_found(duration_s: float) -> None:
+    vehicle = replace(TRIO, size_a={"motor": 50.0, "auxiliary": 0.05}, duration_s=duration_s)
     found = estimate_delays([made_up_drive(2, vehicle)], THREE)
     assert found.known.tolist() == [True, True, False]
     assert found.delay_s[1] == pytest.approx(-0.23, abs=1e-3)
     assert found.delay_s[2] == 0.0
+    assert found.sd_s[1] < 1e-3
     assert np.isinf(found.sd_s[2])
 
 
