@@ -6,6 +6,7 @@ import typer
 
 from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
+from calibrator.terminal.command_line import example
 from calibrator.terminal.options import (
     TIME_LIMIT_S,
     BankOption,
@@ -56,7 +57,7 @@ def summarise(
     end_if_internal(report.left_out)
 
 
-@store_app.command()
+@store_app.command(epilog=example("calibrator store info summaries"))
 def info(store: StoreArgument, json: JsonOption = False) -> None:
     """Tell how many vehicles, drives and hours a store holds, of what, and how large it is."""
     with importing():
@@ -65,7 +66,7 @@ def info(store: StoreArgument, json: JsonOption = False) -> None:
     print_report(look_at_store(store), json=json)
 
 
-@store_app.command()
+@store_app.command(epilog=example("calibrator store check summaries"))
 def check(store: StoreArgument, json: JsonOption = False) -> None:
     """Read all of a store; exit code 1 if something in it is damaged, or counts twice."""
     with importing():
@@ -77,10 +78,10 @@ def check(store: StoreArgument, json: JsonOption = False) -> None:
         raise typer.Exit(1)
 
 
-@store_app.command()
-def compact(store: StoreArgument) -> None:
+@store_app.command(epilog=example("calibrator store compact summaries"))
+def compact(store: StoreArgument, json: JsonOption = False) -> None:
     """Put the files of each bucket together, and remove damaged records, whose drives are then summarised again."""
     with importing():
         from calibrator.summaries.store_report import compact_store
 
-    typer.echo(compact_store(store))
+    print_report(compact_store(store), json=json)

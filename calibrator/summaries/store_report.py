@@ -11,7 +11,7 @@ from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import counted, dumps, few, reasons_text
 from ecu_node.errors import UserError
 
-__all__ = ["StoreReport", "compact_store", "look_at_store"]
+__all__ = ["CompactReport", "StoreReport", "compact_store", "look_at_store"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,8 +106,26 @@ def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
     )
 
 
-def compact_store(place: str) -> str:
-    """Make one file of each bucket, without damaged records; what was done, in words. FleetError if it is no store."""
+@dataclass(frozen=True, kw_only=True)
+class CompactReport:
+    """What was put together: numbers of buckets written anew and of damaged records removed."""
+
+    store: str
+    buckets: int
+    removed: int
+
+    def as_json(self) -> str:
+        """The report as JSON."""
+        return dumps(vars(self))
+
+    def as_text(self) -> str:
+        """The report for people."""
+        done = f"{counted(self.buckets, 'bucket')} written anew, {counted(self.removed, 'damaged record')} removed"
+        return f"{self.store}: {done}"
+
+
+def compact_store(place: str) -> CompactReport:
+    """Make one file of each bucket, without damaged records. FleetError if it is no store."""
     store, merged, removed = _open(place), 0, 0
     buckets = store.buckets()
     with progress_bar("put files together", len(buckets), "buckets") as progress:
@@ -120,7 +138,7 @@ def compact_store(place: str) -> str:
                     store.write(bucket, sound)
                     merged, removed = merged + 1, removed + lost
             progress(done)
-    return f"{place}: {counted(merged, 'bucket')} written anew, {counted(removed, 'damaged record')} removed"
+    return CompactReport(store=place, buckets=merged, removed=removed)
 
 
 def _open(place: str) -> SummaryStore:

@@ -83,7 +83,7 @@ def test_added_records_are_files_of_their_own_until_they_are_put_together(
     old = store.files(bucket)[0]
     kept = {name: (tmp_path / "store" / "buckets" / name).read_bytes() for name in old}
     assert look_at_store(store.url).drives == 5
-    assert compact_store(store.url).endswith("1 bucket written anew, 0 damaged records removed")
+    assert compact_store(store.url).as_text().endswith("1 bucket written anew, 0 damaged records removed")
     (whole,), rest = store.files(bucket)
     assert rest == []
     for name, content in kept.items():  # as if the run had been killed before it removed them
