@@ -61,7 +61,7 @@ def test_every_command_of_calibrator_has_examples_that_it_accepts() -> None:
 
 def test_commands_stand_in_the_order_of_use() -> None:
     text = dict(command_help("calibrator"))["calibrator"]
-    first, second, third, last = ("look at a recording:", "to calibrate:", "to bring parameters to vehicles:", "for research:")
+    first, second, third, last = ("look at a recording:", "to calibrate:", "to bring parameters", "for research:")
     assert text.index(first) < text.index(second) < text.index(third) < text.index(last)
     assert text.index("  layout ") < text.index("  doctor ") < text.index("  kirchhoff ") < text.index(second)
 

@@ -34,9 +34,8 @@ def write(store: Path, vehicle: str, name: str, database: VehicleDatabase, *, sc
 
     battery = scale * (2.0 * speed + rng.normal(size=len(time_s)))
     branches = {"battery": channel(battery), "motor": channel(-battery)}
-    write_drive(
-        store, Drive(vehicle=vehicle, name=name, branches=branches, inputs={"speed": channel(speed)}), database.layout
-    )
+    inputs = {"speed": channel(speed), "torque": channel(speed), "voltage": channel(np.full(len(time_s), 350.0))}
+    write_drive(store, Drive(vehicle=vehicle, name=name, branches=branches, inputs=inputs), database.layout)
 
 
 def add(drives: Path, out: Path, database: VehicleDatabase, *, exactly: bool = False) -> tuple[Added, SummaryStore]:
