@@ -1,4 +1,4 @@
-"""The table of experiments, and the one runner of all of them.
+"""The table of experiments, those of the paper [1]_ and ours, and the one runner of all of them.
 
 An experiment is a row of :data:`EXPERIMENTS`: settings (a case of how fleets are made, and where it stands in the
 table), the methods that are compared on them, and how it is shown. A new one is a new row. Every setting is run with

@@ -207,7 +207,7 @@ def branch_signals(database: VehicleDatabase, branch: Branch, mode: Mode) -> Sig
 
 
 def branch_plan(database: VehicleDatabase, branch: Branch, fault: SensorFault, mode: Mode) -> IntegerPlan:
-    """Integer plan of one branch, from measured to written codes; raises as :func:`branch_signals`."""
+    """Integer plan of one branch, from measured to written codes; raises as ``branch_signals``."""
     return correction_plan(branch_signals(database, branch, mode), fault)
 
 

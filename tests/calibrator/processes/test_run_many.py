@@ -173,7 +173,7 @@ print(list(try_many(partial(waiting, folder=Path(sys.argv[1])), range(9), Worker
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_nothing_is_left_of_a_parent_that_ends(tmp_path: Path, how: signal.Signals) -> None:
-    script, temporary = tmp_path / "parent.py", tmp_path / "temporary"
+    script, temporary = tmp_path / "parent.py", tmp_path / "t"  # paths of sockets are short
     script.write_text(PARENT)  # without a guard: workers must not run it once more
     temporary.mkdir()
     path = os.pathsep.join([str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")])
