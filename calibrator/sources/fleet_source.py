@@ -490,7 +490,7 @@ def _probed(fleet: FleetSource, database: VehicleDatabase, limit_s: float) -> tu
     """Names in the first drive of the first vehicles that can be read, and the errors met before."""
     found: list[_Names] = []
     errors: list[str] = []
-    first = (fleet.vehicles[vehicle][0] for vehicle in fleet.vehicles)
+    first = (drives[0] for drives in fleet.vehicles.values() if drives)
     with closing(try_many(partial(_names, database=database), first, Workers(), limit_s=limit_s)) as read:
         for _, names in read:
             if isinstance(names, Failed):

@@ -229,13 +229,13 @@ def test_a_fleet_of_copies_is_refused_with_the_reason(fleet: Path, tmp_path: Pat
         shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / name)
     run = calibrator("calibrate", tmp_path / "logs", "--layout", LAYOUT, "--out", tmp_path / "x")
     assert run.returncode == 1
-    assert "no drive that is one vehicle's alone; one: same recording as other" in run.stderr
+    assert "one: same recording as other; it cannot be told whose it is" in run.stderr
 
 
 def test_copy_of_a_vehicle_cannot_be_trusted(broken_fleet: Path, tmp_path: Path) -> None:
     run = calibrator("calibrate", broken_fleet, "--layout", LAYOUT, "--out", tmp_path / "x", "--trusted", "other")
     assert run.returncode == 1
-    assert "no vehicle other to trust; other: same recording as V002" in run.stderr
+    assert "vehicle other to trust; other: same recording as V002" in run.stderr
 
 
 @pytest.mark.parametrize(
