@@ -89,8 +89,8 @@ def test_where_standard_error_is_closed_the_exit_code_tells_it() -> None:
 def test_a_file_that_must_not_be_read_is_no_internal_error(tmp_path: Path) -> None:
     # The state is a file where a folder is expected: the operating system's own words, in one line.
     (tmp_path / "state").write_text("")
-    command = [sys.executable, "-m", "ecu_node", "verify", str(LAYOUT), "--state", str(tmp_path / "state")]
-    run = subprocess.run([*command, "--layout", str(LAYOUT)], capture_output=True, text=True, check=False, timeout=60)
+    command = [sys.executable, "-m", "ecu_node", "inspect", "--state", str(tmp_path / "state")]
+    run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert run.returncode == FAILED
     (line,) = run.stderr.splitlines()
     assert str(tmp_path / "state") in line

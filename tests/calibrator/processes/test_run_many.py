@@ -147,7 +147,9 @@ def killing_itself(_: int) -> None:
 
 
 def test_item_that_kills_its_workers_ends_the_run_in_words() -> None:
-    with pytest.raises(FleetError, match="a worker process was killed by SIGKILL, and another one again"):
+    # (255): the process that starts workers did not learn in time how it ended
+    how = r"was killed by SIGKILL|ended \(255\)"
+    with pytest.raises(FleetError, match=rf"a worker process ({how}), and another one again"):
         list(run_many(killing_itself, range(2), TWO))
 
 
