@@ -12,7 +12,6 @@ from ecu_node.cli import main
 from ecu_node.core.status import Reason, TrustError
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.program import FAILED, INTERNAL_ERROR, end_of, split_debug
-from tests.ecu_node.vehicles import LAYOUT
 
 
 @pytest.mark.parametrize(
