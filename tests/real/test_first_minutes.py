@@ -51,9 +51,8 @@ def test_three_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -> Non
     assert again.stderr.startswith("calibrator: my_car.toml: exists, and is not overwritten")
     told = calibrator(tesla, *["doctor", "--layout", "my_car.toml", "--log", "drive.log.gz"])
     assert told.returncode == 0, told.stdout
-    assert (
-        "ready for: kirchhoff, import, calibrate --trusted, calibrate, ecu-node --gateway" in told.stdout.splitlines()
-    )
+    ready = "ready for: kirchhoff, import, calibrate --trusted, ecu-node --gateway"  # too short for a fleet
+    assert ready in told.stdout.splitlines()
     drawn = calibrator(tesla, *["kirchhoff", "drive.log.gz", "--layout", "my_car.toml", "--plot", "sum.png", "--json"])
     assert drawn.returncode == 0, drawn.stderr
     total = json.loads(drawn.stdout)["before"]["sum"]
