@@ -226,6 +226,10 @@ class _Processes:
         self._folder.cleanup()
 
 
+_UNKNOWN = 255
+"""Exit code by which multiprocessing says that it does not know it, as where two threads ask at the same time."""
+
+
 class _Process:
     """One process, replaced when it dies or takes too long."""
 
@@ -252,8 +256,12 @@ class _Process:
                 why = f"reading took more than {job.limit_s:g} s and was ended; {REMEDY}, or allow more with"
                 return Failed(reason=f"{why} --time-limit")
             except ProcessExpired as error:
-                killed = error.exitcode < 0
-                how = f"was killed by {signal.Signals(-error.exitcode).name}" if killed else f"ended ({error.exitcode})"
+                if error.exitcode < 0:
+                    how = f"was killed by {signal.Signals(-error.exitcode).name}"
+                elif error.exitcode == _UNKNOWN:
+                    how = "ended, or was killed"
+                else:
+                    how = f"ended ({error.exitcode})"
             except BrokenProcessPool:
                 how = "was killed"
             self.join()

@@ -14,7 +14,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         memcpy(&calibration, data, sizeof calibration);
         data += sizeof calibration;
         size -= sizeof calibration;
-        if (data[size ? size - 1 : 0] & 2)
+        if (size && (data[size - 1] & 2))
             calibration.layout = hv_layout.digest;
     }
     while (size > 2) {

@@ -147,8 +147,7 @@ def killing_itself(_: int) -> None:
 
 
 def test_item_that_kills_its_workers_ends_the_run_in_words() -> None:
-    # (255): the process that starts workers did not learn in time how it ended
-    how = r"was killed by SIGKILL|ended \(255\)"
+    how = "was killed by SIGKILL|ended, or was killed"  # the latter where multiprocessing does not know
     with pytest.raises(FleetError, match=rf"a worker process ({how}), and another one again"):
         list(run_many(killing_itself, range(2), TWO))
 
