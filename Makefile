@@ -8,7 +8,7 @@ TRIPS ?= ../shared/data/bmw_i3_summer
 PYTHONS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check-long coverage bench bench-quick experiments soak fuzz release-check mutants lint types docs \
+.PHONY: help setup demo test bus-gateway bus-node check-long coverage bench bench-quick experiments soak fuzz release-check mutants lint types docs \
 	notebook dist package sbom licences schema constraints clean
 
 help:                    ## this list
@@ -33,7 +33,12 @@ VCAN := HV_CALIBRATED_FLEET=build/vcan_fleet tools/with_vcan
 test: setup              ## all tests but the long ones; those of SocketCAN on a kernel that has it
 	$(TEST) -m "not long" --durations 20
 	$(BIN)/python -m tests.vcan.calibrated_fleet build/vcan_fleet
-	$(VCAN) --or-skip $(BIN)/python -m pytest -m "not long" tests/vcan
+	$(MAKE) --no-print-directory --jobs=2 --output-sync bus-gateway bus-node
+
+GATEWAY := tests/vcan/test_kernel_gateway.py
+bus-gateway bus-node:    # each half takes two minutes on a kernel of its own, most of them waiting
+	$(VCAN) --or-skip $(BIN)/python -m pytest -m "not long" \
+		$(if $(filter bus-gateway,$@),$(GATEWAY),tests/vcan --ignore $(GATEWAY))
 
 check-long: setup        ## the long tests: whole fleets, soak, power cuts, fuzz of many seeds (half an hour)
 	$(TEST) -m long --durations 20
