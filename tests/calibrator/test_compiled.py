@@ -85,11 +85,13 @@ def test_code_is_compiled_once_and_the_user_is_told(folder: Path, cache: Path) -
     assert said(started(folder, cache)) == ""
 
 
+@pytest.mark.long
 def test_of_two_processes_at_once_one_compiles(folder: Path, cache: Path) -> None:
     both = [started(folder, cache) for _ in range(2)]
     assert sorted(said(process).count(LINE) for process in both) == [0, 1]
 
 
+@pytest.mark.long
 def test_a_changed_source_is_compiled_anew(folder: Path, cache: Path) -> None:
     said(started(folder, cache))
     with (folder / "calibrator" / "estimator" / "prior.py").open("a", encoding="utf-8") as source:
@@ -107,6 +109,7 @@ def test_every_file_with_compiled_functions_is_among_those_whose_change_is_notic
     assert users - set().union(*found.values()) == set()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("variable", "other"), [("NUMBA_CPU_NAME", "generic"), ("NUMBA_CPU_FEATURES", "+sse2")])
 def test_another_processor_has_code_of_its_own(folder: Path, cache: Path, variable: str, other: str) -> None:
     said(started(folder, cache))
@@ -114,6 +117,7 @@ def test_another_processor_has_code_of_its_own(folder: Path, cache: Path, variab
     assert len(list(cache.glob("compiled-*"))) == 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("files", "content"), [("*.nbi", b""), ("*.nbc", b"\0" * 64)])
 def test_code_that_cannot_be_read_is_compiled_anew(folder: Path, cache: Path, files: str, content: bytes) -> None:
     said(started(folder, cache))
@@ -125,6 +129,7 @@ def test_code_that_cannot_be_read_is_compiled_anew(folder: Path, cache: Path, fi
     assert all(kept.stat().st_size > len(content) for kept in cache.rglob(files))
 
 
+@pytest.mark.long
 def test_without_a_folder_that_can_be_written_every_run_compiles_and_says_why(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for _ in range(2):

@@ -48,6 +48,7 @@ def write_store(store: Path) -> None:
         write_drive(store, drive, read_layout(LAYOUT))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("small")
 def test_it_stands_beside_the_published_method_and_the_default_also_on_recorded_trips(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path

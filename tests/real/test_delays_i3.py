@@ -23,6 +23,7 @@ def three(store: Path) -> DelayErrors:
     return delay_errors(store, branches=3)
 
 
+@pytest.mark.long
 def test_battery_and_motor_are_told_apart_to_half_a_millisecond_on_all_32_trips(store: Path) -> None:
     two = delay_errors(store, branches=2)
     assert two.known.shape == (32, 1)
@@ -38,6 +39,7 @@ def test_with_the_auxiliaries_as_third_branch_the_motor_is_found_as_well(three: 
     assert 0.7 < rms(three.error_s[:, 0] / three.sd_s[:, 0]) < 1.6
 
 
+@pytest.mark.long
 def test_the_auxiliaries_are_found_within_5_ms_or_flagged(three: DelayErrors) -> None:
     known = three.known[:, 1]
     assert 0 < known.sum() < len(known)

@@ -62,6 +62,7 @@ def test_three_commands_lead_from_dbc_and_log_to_the_picture(tesla: Path) -> Non
     assert imported.returncode == 0, imported.stderr
 
 
+@pytest.mark.long
 def test_with_one_car_the_template_of_the_guessed_layout_fits_as_the_document_types_it(tesla: Path) -> None:
     """The commands of docs/first_minutes.md that need no bus; before them the load that it names."""
     calibrator(tesla, *["layout", "init", "Model3CAN.dbc", "--log", "drive.log.gz", "--out", "one_car.toml"])

@@ -36,6 +36,7 @@ def imported(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
     return store, {name: drive["notices"] for name, drive in account["drives"].items()}
 
 
+@pytest.mark.long
 def test_all_32_trips_are_imported_and_the_stuck_heaters_named(imported: tuple[Path, dict[str, list[str]]]) -> None:
     _, notices = imported
     assert len(notices) == 32
@@ -64,6 +65,7 @@ def trips(imported: tuple[Path, dict[str, list[str]]]) -> RecordedFleet:
     return read_fleet(imported[0], read_database(read_layout(LAYOUT)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("balanced", [True, False])
 def test_fleet_with_many_faults_is_not_left_alone(trips: RecordedFleet, balanced: bool) -> None:
     """Three branches, S = 60: some vehicles of every fleet are corrected, and none is made worse."""

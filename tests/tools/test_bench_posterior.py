@@ -1,6 +1,9 @@
+import pytest
+
 from bench.posterior import rows
 
 
+@pytest.mark.long
 def test_figures_of_the_posterior_stand_beside_those_of_basis_pursuit() -> None:
     figures = {row.name: row for row in rows(quick=True)}
     beside = [f"posterior, K = {K}, S = {S} %" for K in (2, 4) for S in (80, 60)]

@@ -10,6 +10,7 @@ from bench.node_fuzz_oracle import FuzzFrame
 from bench.node_fuzz_vehicles import FuzzSignal, draw_vehicle
 
 
+@pytest.mark.long
 def test_twenty_thousand_frames_are_right_in_both_modes() -> None:
     assert list(fuzz(20_000, seed=1, frames_per_vehicle=2_000))[-1] == 20_000
 
