@@ -11,11 +11,13 @@ from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import quote
 
 import msgspec
+import tuf.api.serialization.json as tuf_json
 from msgspec.structs import replace
+from securesystemslib.formats import encode_canonical
 from tuf.api import exceptions
 from tuf.api.metadata import Metadata, Root
 from tuf.ngclient import Updater, UpdaterConfig
@@ -48,6 +50,19 @@ _WORK = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108
 _ROLES = ("root", "timestamp", "snapshot")
 """Metadata that a client keeps, against replays."""
 _Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+
+
+def _canonical_json(document: Any) -> str | None:
+    """Write what is signed; a text without escapes is the same in canonical JSON and in msgspec's with sorted keys.
+
+    securesystemslib writes it in Python, and python-tuf has it written twice for each file: of the snapshot of 10^6
+    vehicles that was two thirds of the time of an update.
+    """
+    text = msgspec.json.encode(document, order="sorted").decode()
+    return encode_canonical(document) if "\\" in text else text
+
+
+tuf_json.encode_canonical = _canonical_json  # type: ignore[assignment]  # called with one argument
 
 
 class TargetFacts(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):

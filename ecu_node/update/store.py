@@ -25,7 +25,7 @@ from ecu_node.update.state import (
     state_path,
     write_state,
 )
-from ecu_node.update.trial import ParameterTrial, TrialResult, begin_trial
+from ecu_node.update.trial import ParameterTrial, TrialResult
 
 __all__ = ["ParameterStore", "conclude", "end_expired"]
 
@@ -244,7 +244,7 @@ class ParameterStore:
                     self._say(f"no trial yet: {error}")
                 return
             self._say(f"{on_trial} is on trial")
-            self._trial = begin_trial(parameters, self._database, corrector.branches)
+            self._trial = ParameterTrial(parameters, self._database, corrector.branches)
 
     def _say_result(self, tried: ParameterSet, result: TrialResult, state: State) -> None:
         self._result = None

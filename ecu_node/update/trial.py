@@ -14,17 +14,16 @@ error and leaves others is not this vehicle's, or no more.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from ecu_node.bus.wiring import InForce, sensor_fault
 from ecu_node.core.branch import LiveBranch
-from ecu_node.core.correction import NO_FAULT, SensorFault
 from ecu_node.core.junction import aligned_currents
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import JunctionResidual, VehicleParameters
+from ecu_node.parameters import VehicleParameters
 
-__all__ = ["ParameterTrial", "TrialResult", "TrialRules", "begin_trial"]
+__all__ = ["ParameterTrial", "TrialResult"]
 
 _LEAST_CURRENT_SHARE = 0.02
 """A trial counts while a branch carries this share of full scale. [1]"""
@@ -34,30 +33,7 @@ _LONGEST_STEP_S = 0.5
 """More time than this between two looks is none in which currents were watched. [s]"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrialRules:
-    """When a trial ends, and what it takes.
-
-    Attributes
-    ----------
-    duration_s : float
-        So long currents must have flown. [s]
-    tolerance : float
-        By so much the share may be below what the calibrator saw. [1]
-    margin_a : float
-        Sums that differ by less are the same. [A]
-    least_current_a : float
-        A branch carries this at least, or no current flows. [A]
-    """
-
-    duration_s: float
-    tolerance: float
-    margin_a: float
-    least_current_a: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrialResult:
+class TrialResult(NamedTuple):
     """How a trial ended."""
 
     passed: bool
@@ -65,31 +41,26 @@ class TrialResult:
 
 
 class ParameterTrial:
-    """One set on trial.
+    """One set on trial, to be asked at each look at the junction.
 
     Parameters
     ----------
+    parameters : VehicleParameters
+        The set; it tells what the calibrator saw.
+    database : VehicleDatabase
+        Layout and DBC in use; the layout says what a trial takes.
     branches : sequence of LiveBranch
-        All branches of the layout.
-    faults : mapping of str to SensorFault
-        What the set corrects, by branch; a branch that is not named is not corrected.
-    delays_s : mapping of str to float
-        Delays of the set. [s]
-    residual : JunctionResidual
-        What the calibrator saw.
-    rules : TrialRules
-        When it ends.
+        All branches of the layout, as the node sees them.
     """
 
     def __init__(
-        self,
-        branches: Sequence[LiveBranch],
-        faults: Mapping[str, SensorFault],
-        delays_s: Mapping[str, float],
-        residual: JunctionResidual,
-        rules: TrialRules,
+        self, parameters: VehicleParameters, database: VehicleDatabase, branches: Sequence[LiveBranch]
     ) -> None:
-        self._branches, self._faults, self._delays_s, self._rules = branches, faults, delays_s, rules
+        layout, residual = database.layout, parameters.junction_residual
+        self._branches, self._activation, self._margin_a = branches, layout.activation, layout.watch_margin_a
+        self._least_current_a = _LEAST_CURRENT_SHARE * layout.full_scale_a
+        self._faults = {name: sensor_fault(InForce(parameters=parameters), name) for name in layout.branch_names}
+        self._delays_s = {name: branch.delay_s or 0.0 for name, branch in parameters.branches.items()}
         self._expected_a = residual.expected_a
         measured_a, corrected_a = residual.about_expected()
         self._promised = _share(measured_a**2, corrected_a**2, (residual.correction_a or 0.0) ** 2)
@@ -118,18 +89,16 @@ class ParameterTrial:
             return None
         self._instant_s, currents = found
         measured = {name: pair[0] for name, pair in currents.items()}
-        if max(map(abs, measured.values())) < self._rules.least_current_a:
+        if max(map(abs, measured.values())) < self._least_current_a:
             return None
-        corrected = [self._faults.get(name, NO_FAULT).true_current(current) for name, current in measured.items()]
-        self._add(sum(measured.values()), sum(corrected))
-        self._time_s += min(passed_s, _LONGEST_STEP_S)
-        return self._result() if self._time_s >= self._rules.duration_s else None
-
-    def _add(self, measured_a: float, corrected_a: float) -> None:
+        measured_a = sum(measured.values())
+        corrected_a = sum(self._faults[name].true_current(current) for name, current in measured.items())
         self._looks += 1
         self._measured2 += (measured_a - self._expected_a) ** 2
         self._corrected2 += (corrected_a - self._expected_a) ** 2
         self._step2 += (measured_a - corrected_a) ** 2
+        self._time_s += min(passed_s, _LONGEST_STEP_S)
+        return self._result() if self._time_s >= self._activation.trial_s else None
 
     def _result(self) -> TrialResult:
         measured, corrected, step = (
@@ -144,11 +113,9 @@ class ParameterTrial:
                 text=f"{seen}: at most {most:.3g} A were to be left; this vehicle has changed since its drives were "
                 f"recorded, or the set is not its own",
             )
-        if step <= self._rules.margin_a:
-            return TrialResult(
-                passed=corrected <= measured + self._rules.margin_a, text=f"{seen}: no change that counts"
-            )
-        share, least = _share(measured**2, corrected**2, step**2), self._promised - self._rules.tolerance
+        if step <= self._margin_a:
+            return TrialResult(passed=corrected <= measured + self._margin_a, text=f"{seen}: no change that counts")
+        share, least = _share(measured**2, corrected**2, step**2), self._promised - self._activation.tolerance
         return TrialResult(
             passed=share >= least,
             text=f"{seen}: {share:.2f} of what the set changes was an error, {self._promised:.2f} was promised, "
@@ -159,8 +126,8 @@ class ParameterTrial:
         """What may be left of the sum (RMS); more where the set changes more than the calibrator saw. [A]"""
         if self._step_a is None:
             return math.inf
-        harder = step_a / self._step_a if self._step_a > self._rules.margin_a else 1.0
-        return _MOST_LEFT * self._left_a * max(harder, 1.0) + self._rules.margin_a
+        harder = step_a / self._step_a if self._step_a > self._margin_a else 1.0
+        return _MOST_LEFT * self._left_a * max(harder, 1.0) + self._margin_a
 
 
 def _share(measured2: float, corrected2: float, step2: float) -> float:
@@ -168,38 +135,3 @@ def _share(measured2: float, corrected2: float, step2: float) -> float:
     if step2 <= 0.0:
         return 1.0 if corrected2 <= measured2 else 0.0
     return min(1.0, (measured2 - corrected2) / step2)
-
-
-def begin_trial(
-    parameters: VehicleParameters, database: VehicleDatabase, branches: Sequence[LiveBranch]
-) -> ParameterTrial:
-    """Put a set on trial.
-
-    Parameters
-    ----------
-    parameters : VehicleParameters
-        The set.
-    database : VehicleDatabase
-        Layout and DBC in use; the layout says what a trial takes.
-    branches : sequence of LiveBranch
-        All branches of the layout, as the node sees them.
-
-    Returns
-    -------
-    ParameterTrial
-        To be asked at each look at the junction.
-    """
-    layout = database.layout
-    faults = {name: sensor_fault(InForce(parameters=parameters), name) for name in layout.branch_names}
-    return ParameterTrial(
-        branches,
-        {name: fault for name, fault in faults.items() if fault.applied},
-        {name: branch.delay_s or 0.0 for name, branch in parameters.branches.items()},
-        parameters.junction_residual,
-        TrialRules(
-            duration_s=layout.activation.trial_s,
-            tolerance=layout.activation.tolerance,
-            margin_a=layout.watch_margin_a,
-            least_current_a=_LEAST_CURRENT_SHARE * layout.full_scale_a,
-        ),
-    )

@@ -15,7 +15,7 @@ from ecu_node.core.status import Reason, State
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
 from ecu_node.parameters import check_fit, decode_parameters
-from ecu_node.update.trial import begin_trial
+from ecu_node.update.trial import ParameterTrial
 from tests.ecu_node.vehicles import LAYOUT, SMALL_LAYOUT, Frame, answers
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
@@ -93,7 +93,7 @@ def test_all_branches_stand_in_it_with_names_and_digests(make_database: Callable
     assert tuple(parameters.branches) == database.layout.branch_names
     assert (parameters.layout.name, parameters.dbc.name) == ("small.toml", "small.dbc")
     assert (parameters.provenance.method, parameters.provenance.created) == ("by hand", "2026-06-01T12:00:00Z")
-    assert begin_trial(parameters, database, []) is not None
+    assert ParameterTrial(parameters, database, []) is not None
 
 
 @pytest.mark.parametrize("vehicle", ["", " ", "v" * 65, "a\nb", "\udcff"])

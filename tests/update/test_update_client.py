@@ -9,8 +9,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
+import tuf.api.serialization.json as tuf_json
 from msgspec.structs import replace
 from securesystemslib.dsse import Envelope
+from securesystemslib.formats import encode_canonical
+from tuf.api.metadata import Metadata
 
 from ecu_node.core.status import TrustError
 from ecu_node.database import VehicleDatabase
@@ -205,6 +208,21 @@ def test_time_of_an_update_is_kept(
         update(state, str(repo.path), database, now + timedelta(days=2))
     with pytest.raises(TrustError, match="the latest time seen here is"):
         update(state, str(repo.path), database, now)
+
+
+def test_canonical_json_is_that_of_securesystemslib(offered: Repo) -> None:
+    """What is signed is written quickly here; keys, numbers, escapes and odd letters come out the same."""
+    documents = [Metadata.from_file(str(path)).signed.to_dict() for path in offered.metadata.glob("*.json")]
+    odd = {
+        "b": [],
+        "a": {},
+        "é": "\x7f€\U0001f697/<&'",
+        "": [None, True, False, 0, -1, 2**63],
+        "A": [[{"z": "", "y": 1}]],
+    }
+    for document in (*documents, odd, {**odd, "c": 'a "b"\\\n\x00'}):
+        assert tuf_json.encode_canonical(document) == encode_canonical(document)
+    assert tuf_json.encode_canonical is not encode_canonical
 
 
 OLD = {

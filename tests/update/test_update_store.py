@@ -56,7 +56,7 @@ def ended(
     correcting: Path, other: VehicleParameters, database: VehicleDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> Running:
     """A node whose trial of set 301 ends well as soon as it is looked at."""
-    monkeypatch.setattr("ecu_node.update.trial.ParameterTrial", _Ended)
+    monkeypatch.setattr("ecu_node.update.store.ParameterTrial", _Ended)
     put_on_trial(correcting, other)
     running = Running(correcting, database)
     monkeypatch.setattr(running.corrector.watch, "is_whole", lambda _: True)

@@ -16,7 +16,7 @@ from ecu_node.errors import UserError
 from ecu_node.parameters import BranchParameters, VehicleParameters
 from ecu_node.update.client import provision, update
 from ecu_node.update.store import ParameterStore
-from ecu_node.update.trial import ParameterTrial, TrialResult, begin_trial
+from ecu_node.update.trial import ParameterTrial, TrialResult
 
 __all__ = ["VehicleOutcome", "WrongSet", "drive_vehicle"]
 
@@ -122,7 +122,7 @@ def drive_vehicle(
     store = ParameterStore(state, database, mode=Mode.OVERLAY, say=said.append, now=lambda: datetime.now(UTC))
     corrector = wire(database, store.in_force, 0.0)
     sets = {"signs turned": _turned(parameters), "of another vehicle": replace(others, vehicle=name)}
-    trials = {kind: _WrongTrial(begin_trial(found, database, corrector.branches)) for kind, found in sets.items()}
+    trials = {kind: _WrongTrial(ParameterTrial(found, database, corrector.branches)) for kind, found in sets.items()}
     in_force_s = float("inf")
 
     def look(time_s: float) -> None:
