@@ -8,10 +8,17 @@ import msgspec
 import typer
 
 from calibrator.errors import ContradictionError, ExportError
-from calibrator.export.checked import Checked, read_checked
-from calibrator.export.core import c_text, find_image, foreign_protection, image_bytes, intel_hex, s_records
-from calibrator.export.csv_table import csv_text
-from calibrator.export.tool_formats import a2l_text, cdfx_document, dcm_text
+from calibrator.export.core import (
+    Checked,
+    c_text,
+    find_image,
+    foreign_protection,
+    image_bytes,
+    intel_hex,
+    read_checked,
+    s_records,
+)
+from calibrator.export.tool_formats import a2l_text, cdfx_document, csv_text, dcm_text
 from calibrator.files.folders import (
     made_folder,
     remove_abandoned,

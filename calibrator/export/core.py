@@ -19,16 +19,28 @@ from elftools.elf.elffile import ELFFile
 from elftools.elf.sections import SymbolTableSection
 
 from calibrator.errors import ExportError
-from calibrator.export.checked import Checked
-from ecu_node.bus.wiring import InForce, Mode, branch_signals, key_of, received, rewritten, wire
+from ecu_node.bus.wiring import (
+    InForce,
+    Mode,
+    branch_signals,
+    key_of,
+    received,
+    rewritten,
+    sensor_fault,
+    wire,
+)
 from ecu_node.core.correction import SensorFault, correction_plan
 from ecu_node.core.signals import BitPlace, Codes, PlacedSignal, placed_signal, writable_range
 from ecu_node.database import VehicleDatabase
+from ecu_node.documents import text_digest
+from ecu_node.errors import ParameterError
 from ecu_node.layout import Branch, ProfileP01, ProfileP02
+from ecu_node.parameters import VehicleParameters, check_fit, decode_parameters, parameter_bytes
 
 __all__ = [
     "FRACTION_BITS",
     "BranchValues",
+    "Checked",
     "Image",
     "branch_values",
     "c_text",
@@ -36,6 +48,7 @@ __all__ = [
     "foreign_protection",
     "image_bytes",
     "intel_hex",
+    "read_checked",
     "s_records",
     "scaled_plan",
 ]
@@ -46,6 +59,80 @@ _BRANCHES, _DATA_IDS = 16, 16
 _SYMBOL = "hv_calibration"
 _LEAST, _GREATEST = -(1 << 63), (1 << 63) - 1
 _WIDE = 1 << 127
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checked:
+    """Parameters that fit, and what they fit.
+
+    Attributes
+    ----------
+    name : str
+        Name of the parameter file.
+    digest : str
+        SHA-256 of the file as it was read, line ends counted as LF.
+    parameters : VehicleParameters
+        What it says.
+    database : VehicleDatabase
+        Layout and DBC that it was made for.
+    """
+
+    name: str
+    digest: str
+    parameters: VehicleParameters
+    database: VehicleDatabase
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """Where it comes from, by short names that are the same in all formats."""
+        parameters = self.parameters
+        return {
+            "vehicle": parameters.vehicle,
+            "parameter_set": str(parameters.number),
+            "verdict": parameters.verdict,
+            "tool": parameters.provenance.tool,
+            "method": parameters.provenance.method,
+            "created": parameters.provenance.created,
+            "fleet": parameters.provenance.fleet,
+            "parameters_sha256": self.digest,
+            "layout_sha256": parameters.layout.sha256,
+            "dbc_sha256": parameters.dbc.sha256,
+        }
+
+    def fault(self, branch: str) -> SensorFault:
+        """What the node corrects on a branch; :data:`~ecu_node.core.correction.NO_FAULT` where it passes it through."""
+        return sensor_fault(InForce(parameters=self.parameters), branch)
+
+
+def read_checked(path: Path, database: VehicleDatabase, vehicle: str | None) -> Checked:
+    """Read a parameter file and refuse what the node would not apply.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    database : VehicleDatabase
+        Layout and DBC in use.
+    vehicle : str or None
+        Identity of the vehicle; None: not checked.
+
+    Returns
+    -------
+    Checked
+        Parameters that fit.
+
+    Raises
+    ------
+    ParameterError
+        If the file cannot be read, or its parameters are for another vehicle, layout or DBC, or implausible.
+    """
+    content = parameter_bytes(path)
+    parameters = decode_parameters(content, str(path))
+    try:
+        check_fit(parameters, database, vehicle)
+    except ParameterError as error:
+        raise ParameterError(f"{path}: {error}") from None
+    return Checked(name=path.name, digest=text_digest(content), parameters=parameters, database=database)
 
 
 class BranchValues(NamedTuple):

@@ -3,6 +3,7 @@
 import json
 import os
 import socket
+import subprocess
 import urllib.request
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from tests.package.clean_venv import CleanVenv
 from tests.package.conftest import VEHICLE, Installed
 from tests.package.processes import started, until
 
-EXTRAS = ("bench", "calibrator", "cluster", "demo", "docs", "metrics", "mf4")
+EXTRAS = ("bench", "calibrator", "cluster", "demo", "docs", "metrics", "mf4", "update")
 LAYOUT = ("--layout", "my_car.toml")
 
 
@@ -60,13 +61,37 @@ def test_calibrator_takes_a_fleet_from_logs_to_reports_and_exports(
     assert " frames in " in played
 
 
-def test_calibrator_makes_keys_and_signs(installed: Installed, car: Path, tmp_path: Path) -> None:
+def test_vehicle_takes_what_the_calibrator_publishes(installed: Installed, car: Path, tmp_path: Path) -> None:
+    off_board, on_board = installed("calibrator"), installed("update")
+    calibrator(off_board, tmp_path, "repository", "key", "anna", "--no-passphrase", "--out", ".")
+    roles = [word for role in ("root", "targets", "snapshot", "timestamp") for word in (f"--{role}", "anna.pub")]
+    for words in (["init", *roles], ["add", car / "V001.json"], ["publish", "--key", "anna.key"], ["bundle", VEHICLE]):
+        more = ["--out", "."] if words[0] == "bundle" else []
+        calibrator(off_board, tmp_path, "repository", words[0], "repo", *words[1:], *more)
+    root = ("--root", tmp_path / "repo" / "metadata" / "1.root.json")
+    state, layout = ("--state", tmp_path / "state"), ("--layout", car / "my_car.toml")
+    for command in (
+        ("provision", "--vehicle", VEHICLE, *root, *state),
+        ("update", tmp_path / f"{VEHICLE}.json.xz", *state, *layout),
+        ("report", "--key", tmp_path / "anna.key", *state),
+    ):
+        done = on_board.run("ecu-node", *command, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+    without = installed().run("ecu-node", "update", "x", *state, *layout, folder=tmp_path)
+    assert (without.returncode, without.stderr) == (
+        1,
+        "ecu-node: updates need the package tuf: pip install 'hv-current-correction[update]'\n",
+    )
+
+
+def test_c_core_of_the_wheel_compiles_with_its_export(installed: Installed, car: Path, tmp_path: Path) -> None:
     venv = installed("calibrator")
-    calibrator(venv, tmp_path, "keys", "new", "anna", "--no-passphrase", "--out", ".")
-    calibrator(venv, tmp_path, "keys", "set", "anna.pub", "--threshold", 1, "--out", "keys-1.json")
-    calibrator(venv, tmp_path, "sign", car / "V001.json", "--key", "anna.key", "--out", "signed")
-    done = venv.run("ecu-node", "inspect", "signed/V001.json", "--keys", "keys-1.json", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    layout = ("--layout", car / "my_car.toml")
+    calibrator(venv, tmp_path, "export", car / "V001.json", *layout, "--format", "c", "--out", "hv_calibration.c")
+    code = "import ecu_node; print(ecu_node.__path__[0])"
+    core = Path(venv.run("python", "-c", code, folder=tmp_path).stdout.strip()) / "c"
+    sources = (str(core / "hv_correction.c"), "hv_calibration.c")
+    subprocess.run(["gcc", "-std=c99", f"-I{core}", "-c", *sources], cwd=tmp_path, check=True)
 
 
 def test_demo_has_vehicles_of_its_own(fleet: Path) -> None:

@@ -23,8 +23,7 @@ from bench.node_fuzz_vehicles import draw_vehicle
 from bench.row import Row
 from bench.true_parameters import true_parameters
 from calibrator.errors import ExportError
-from calibrator.export.checked import Checked
-from calibrator.export.core import c_text
+from calibrator.export.core import Checked, c_text
 from ecu_node.bus.wiring import InForce, Mode, branch_signals, received, wire
 from ecu_node.core.correction import correction_plan
 from ecu_node.core.e2e import protection_of

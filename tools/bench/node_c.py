@@ -6,8 +6,7 @@ from pathlib import Path
 
 from bench.c_core import CORE
 from bench.node_vehicle import BenchVehicle
-from calibrator.export.checked import Checked
-from calibrator.export.core import c_text
+from calibrator.export.core import Checked, c_text
 
 __all__ = ["compile_gateway"]
 

@@ -84,6 +84,7 @@ def measured(folder: Path, vehicles: Iterable[int]) -> dict[str, float]:
         write_parameters(database, params, vehicles, drift)
         found[f"{name}: add [s]"] = calibrator("add", repository, params)
         found[f"{name}: publish [s]"] = calibrator("publish", repository, *private)
+        print(found, file=sys.stderr)
         if name == "first":
             provision(folder / "state", "V0000000", repository / "metadata" / "1.root.json", datetime.now(UTC))
             update(folder / "state", str(repository), database, datetime.now(UTC))

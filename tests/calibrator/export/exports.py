@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from typer.testing import CliRunner, Result
 
 from calibrator.cli import app
-from calibrator.export.checked import Checked, read_checked
+from calibrator.export.core import Checked, read_checked
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.parameters import BranchParameters, VehicleParameters, write_parameters

@@ -13,7 +13,7 @@ import pytest
 from msgspec.structs import replace
 
 from calibrator.errors import ContradictionError, ExportError, FleetError
-from calibrator.export.checked import read_checked
+from calibrator.export.core import read_checked
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import ParameterError, UserError
 from ecu_node.layout import file_digest

@@ -13,9 +13,8 @@ from dcmReader.dcm_reader import DcmReader
 from msgspec.structs import replace
 
 from calibrator.errors import ExportError
-from calibrator.export.checked import Checked
-from calibrator.export.csv_table import csv_text
-from calibrator.export.tool_formats import cdfx_document, dcm_text
+from calibrator.export.core import Checked
+from calibrator.export.tool_formats import cdfx_document, csv_text, dcm_text
 from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from tests.calibrator.export.exports import checked_with, held_back, parameters_for

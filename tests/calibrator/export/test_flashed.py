@@ -17,8 +17,7 @@ from pya2l.parser import A2lParser
 
 from bench.c_core import build, check_frames, vehicle
 from calibrator.errors import ExportError
-from calibrator.export.checked import Checked, read_checked
-from calibrator.export.core import find_image, image_bytes, intel_hex, s_records
+from calibrator.export.core import Checked, find_image, image_bytes, intel_hex, read_checked, s_records
 from ecu_node.parameters import write_parameters
 from tests.calibrator.export.exports import MakeDatabase, checked_with, export, needs, parameters_for, refused
 
