@@ -84,7 +84,7 @@ def test_commands_of_the_document_and_recovery_from_each_stolen_key(place: Repo)
     publish(place, "anna", "ben", "online")
     place.updated(state)
     pass_trial(state)
-    assert commands(recovery) == [*section("online"), *section("targets"), *section("root")]
+    assert commands(recovery) == [line for name in ("online", "targets", "root", "anew") for line in section(name)]
 
     fast_forward(place, "online")
     number(place, 302)
@@ -101,6 +101,9 @@ def test_commands_of_the_document_and_recovery_from_each_stolen_key(place: Repo)
     recover(place, "root", 303)
     place.forge("root", lambda _: None, "anna", "emil")  # anna's key is the stolen one
     place.refused(state, "root was signed by ")
+
+    run(place, section("anew"))
+    assert read_state(place.folder / "state-2").on_trial is not None
 
 
 def fast_forward(
