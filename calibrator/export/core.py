@@ -243,8 +243,7 @@ def _layout_digest(database: VehicleDatabase) -> int:
     return int.from_bytes(sha256(text.encode()).digest()[:8])
 
 
-@dataclass(frozen=True, kw_only=True)
-class Image:
+class Image(NamedTuple):
     """Where the calibration stands in a compiled program."""
 
     address: int

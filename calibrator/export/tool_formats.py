@@ -10,7 +10,6 @@ import io
 import itertools
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -56,8 +55,7 @@ def _fields(branch: Branch) -> list[str]:
     return [name for name in _FIELDS if name != "voltage_gain" or branch.voltage is not None]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Characteristic:
+class Characteristic(NamedTuple):
     """One number or truth value.
 
     Attributes
@@ -76,8 +74,8 @@ class Characteristic:
 
     name: str
     text: str
-    branch: str = ""
-    unit: str = "-"
+    branch: str
+    unit: str
     value: float | bool
 
 
@@ -99,9 +97,7 @@ def characteristics(checked: Checked) -> list[Characteristic]:
     ExportError
         If a number of the C core is not exact in floating point, in which tools hold it.
     """
-    found = [
-        Characteristic(name="HV.parameter_set", text="number of the parameter set", value=checked.parameters.number)
-    ]
+    found = [Characteristic("HV.parameter_set", "number of the parameter set", "", "-", checked.parameters.number)]
     for branch in checked.database.layout.branch:
         found += _flashed(checked, branch)
         found += _for_people(checked, branch.name)
@@ -119,8 +115,7 @@ def _flashed(checked: Checked, branch: Branch) -> Iterator[Characteristic]:
                 f"{checked.name}: branch {branch.name}: {field} has more digits than the floating-point numbers of "
                 f"calibration tools; flash it with --format hex"
             )
-        name = f"HV.{branch.name}.{field}"
-        yield Characteristic(name=name, text=text, branch=branch.name, unit=unit, value=value)
+        yield Characteristic(f"HV.{branch.name}.{field}", text, branch.name, unit, value)
 
 
 def _for_people(checked: Checked, branch: str) -> Iterator[Characteristic]:
@@ -139,7 +134,7 @@ def _for_people(checked: Checked, branch: str) -> Iterator[Characteristic]:
         ]
     for name, text, unit, value in rows:
         if value is not None:
-            yield Characteristic(name=f"HV.{branch}.{name}", text=text, branch=branch, unit=unit, value=value)
+            yield Characteristic(f"HV.{branch}.{name}", text, branch, unit, value)
 
 
 def _notes(checked: Checked) -> dict[str, str]:

@@ -37,7 +37,7 @@ from tuf.api.serialization.json import JSONSerializer
 from calibrator.errors import RepositoryStateError
 from calibrator.files.folders import write_files
 from ecu_node.parameters import decode_parameters, parameter_bytes
-from ecu_node.update.client import TargetFacts, target_path
+from ecu_node.update.client import TargetFacts, expiry_of, target_path
 from ecu_node.update.sources import bundle_bytes
 
 __all__ = ["BIN_BITS", "ROLES", "NewKeys", "Repository"]
@@ -59,16 +59,6 @@ class NewKeys(NamedTuple):
 
     keys: Sequence[SSlibKey]
     threshold: int
-
-
-class _SignedExpiry(msgspec.Struct):
-    expires: datetime
-
-
-class _OnlyExpiry(msgspec.Struct):
-    """Metadata of which nothing else is read, as there are many bins."""
-
-    signed: _SignedExpiry
 
 
 class _File(NamedTuple):
@@ -270,13 +260,9 @@ class Repository:
         if not (self._staged / "root.json").exists() and self._root().expires < soon:
             self._stage("root", self._root())
         for role in self._versions:
-            if not (self._staged / f"{role}.json").exists() and self._expires(role) < soon:
+            live = self._metadata / f"{self._versions[role]}.{role}.json"
+            if not (self._staged / f"{role}.json").exists() and expiry_of(live.read_bytes()) < soon:
                 self._restage(role)
-
-    def _expires(self, role: str) -> datetime:
-        """Expiry of live metadata."""
-        content = (self._metadata / f"{self._versions[role]}.{role}.json").read_bytes()
-        return msgspec.json.decode(content, type=_OnlyExpiry).signed.expires
 
     def publish(self, signers: Sequence[Signer]) -> Iterator[str]:
         """Sign what is staged; where all signatures are there, let vehicles see it.

@@ -40,7 +40,7 @@ from ecu_node.update.state import (
     write_state,
 )
 
-__all__ = ["TargetFacts", "provision", "target_path", "update"]
+__all__ = ["TargetFacts", "expiry_of", "provision", "target_path", "update"]
 
 _CONFIG = UpdaterConfig(max_delegations=4, targets_max_length=2_000_000)
 """Other limits are TUF's own: 16 kB for a timestamp, 500 kB for a root, 2 MB for a snapshot."""
@@ -76,14 +76,12 @@ class TargetFacts(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
     revoked: Annotated[list[_Digest], msgspec.Meta(description="SHA-256 of files that must not be used any more")] = []
 
 
-class _SignedExpiry(msgspec.Struct):
+class _Signed(msgspec.Struct):
     expires: datetime
 
 
-class _OnlyExpiry(msgspec.Struct):
-    """Verified metadata, of which only the expiry is read again."""
-
-    signed: _SignedExpiry
+class _Metadata(msgspec.Struct):
+    signed: _Signed
 
 
 class _Offer(msgspec.Struct, frozen=True):
@@ -98,6 +96,11 @@ class _Offer(msgspec.Struct, frozen=True):
 def target_path(vehicle: str) -> str:
     """Path of a vehicle's parameter file in the repository, such as ``V001.json``; it never leads anywhere else."""
     return f"{quote(vehicle, safe='')}.json"
+
+
+def expiry_of(metadata: bytes) -> datetime:
+    """Expiry of metadata, of which nothing else is read, as it may be large."""
+    return msgspec.json.decode(metadata, type=_Metadata).signed.expires
 
 
 def provision(folder: Path, vehicle: str, root: Path, now: datetime) -> int:
@@ -126,16 +129,15 @@ def provision(folder: Path, vehicle: str, root: Path, now: datetime) -> int:
     """
     try:
         content = root.read_bytes()[: _LARGEST_ROOT_BYTES + 1]
-        metadata = Metadata[Root].from_bytes(content)
+        metadata, text = Metadata[Any].from_bytes(content), content.decode()
+        if not isinstance(metadata.signed, Root):
+            raise ValueError("metadata of another role")
         metadata.signed.verify_delegate("root", metadata.signed_bytes, metadata.signatures)
-        text = content.decode()
     except OSError as error:
         raise UserError(f"{root}: cannot read the root: {error.strerror}") from None
-    except (exceptions.RepositoryError, ValueError, AttributeError, UnicodeDecodeError):
+    except (exceptions.RepositoryError, ValueError):
         hint = "a key set of version 1.0; " if content.startswith(b'{"keys":') else ""
         raise UserError(f"{root}: {hint}1.root.json of 'calibrator repository init' is expected") from None
-    if not isinstance(metadata.signed, Root):
-        raise UserError(f"{root}: metadata, but not a root; 1.root.json is expected")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -244,7 +246,7 @@ def _verified_offer(state: State, source: str, now: datetime) -> _Offer:
 
 def _require_fresh(path: Path, source: str, now: datetime) -> None:
     """Check the expiry of verified metadata against the time that is believed: TUF's client asks the clock alone."""
-    expires = msgspec.json.decode(path.read_bytes(), type=_OnlyExpiry).signed.expires
+    expires = expiry_of(path.read_bytes())
     if now >= expires:
         raise TrustError(
             Reason.NOT_VALID_NOW,
