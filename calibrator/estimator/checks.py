@@ -65,6 +65,8 @@ RIDGE = 1e-10
 """On normalised moments: a branch that stands still gets no gain. [1]"""
 TINY = 1e-12
 """Instead of zero in denominators."""
+LEAST_STRETCH = 0.1
+"""A gain that falls by more is that of another sensor that is clipped. [1]"""
 ALONE = 1e-6
 """Least share of a column that gains and offsets do not explain. [1]"""
 MAD_TO_SD = 1.4826
@@ -151,6 +153,9 @@ class _Residual:
         Columns of the law.
     law, weights : ndarray of shape (N, K)
         g: gain ratios and constant [A]; weight of each branch in r [1].
+    noise : ndarray of shape (N, K)
+        Product of the noise of each branch with itself that a column of it has in common with r, per sample; 0 for y.
+        [A^2]
     with_z : ndarray of shape (B, K)
         Sums of z r, without the product of the noise of z with itself.
     square_a2, n_eff : ndarray of shape (N,)
@@ -163,6 +168,7 @@ class _Residual:
     z: NDArray[np.int64]
     law: Array
     weights: Array
+    noise: Array
     with_z: Array
     square_a2: Array
     n_eff: Array
@@ -187,16 +193,20 @@ class _Residual:
         explained_a2: Array,
         parameters: float,
         *,
+        stretch: ArrayLike = 0.0,
         place: ArrayLike,
         pattern: Array,
         square: Array,
         size: ArrayLike = 0.0,
         level_branch: ArrayLike = -1,
     ) -> _Causes:
-        """Make a cause whose fit is that with noise of unknown size, less what its parameters cost (BIC)."""
+        """Make a cause whose fit is that with noise of unknown size, less what its parameters cost (BIC).
+
+        `stretch` is the mean logarithm of what a transformed variable is stretched by.
+        """
         explained_a2, N = np.maximum(explained_a2, 0.0), len(explained_a2)
         left = np.maximum(1.0 - explained_a2 / self.square_a2, RIDGE)
-        fit = -0.5 * self.n_eff * np.log(left) - 0.5 * parameters * np.log(self.n_eff)
+        fit = self.n_eff * (np.asarray(stretch) - 0.5 * np.log(left)) - 0.5 * parameters * np.log(self.n_eff)
         size, place, level_branch = (np.broadcast_to(each, N) for each in (size, place, level_branch))
         return _Causes(explained_a2, fit, size, place, level_branch, pattern, square)
 
@@ -372,6 +382,7 @@ def _junction_residual(fleet: FleetMoments, fast: Array) -> _Residual:
         z=z,
         law=law,
         weights=weights,
+        noise=np.insert((noise * law)[:, :-1], y - M, 0.0, axis=1),
         with_z=scores[:, z - M] + own[:, None] * (noise * law)[blocks.vehicle],
         square_a2=np.maximum(squares, TINY),
         n_eff=samples / repeated,
@@ -411,35 +422,49 @@ def _over_fleet_model(residual: _Residual, read_out: Array) -> _OverModel:
 
 
 def _by_level(residual: _Residual, levels: Array, *, zero_a: Array, full_scale_a: float) -> list[_Causes]:
-    """Quadratic, cubic, two gains by sign, a bend: a column that depends on the level of one of the currents."""
+    """Quadratic, cubic, two gains by sign, a bend: a column h that depends on the level of one of the currents.
+
+    The current at which h is taken has noise n in it, which is in r, too: E[h n] = var(n) E[h'] if normal (Stein).
+    Of y everything is noise that z does not explain, as the current of a branch without a sensor: the likelihood of
+    y - b h(y) = g^T z has the factor prod |1 - b h'(y)| of a transformed variable, which a straight h leaves alone.
+    """
     fleet, z, (N, K) = residual.fleet, residual.z, zero_a.shape
     count = levels[..., -2]
     x = np.stack([levels[:, k, :, fleet.inputs + k] for k in range(K)], axis=1) / np.maximum(count, 1.0)
     from_zero = x - zero_a[:, :, None]
     above, below = (np.stack([np.maximum(sign * x - bend, 0.0) for bend in BENDS_A], axis=2) for sign in (1.0, -1.0))
-    shapes = {
-        "quadratic": (from_zero**2 / full_scale_a)[:, :, None],
-        "cubic": (from_zero**3 / full_scale_a**2)[:, :, None],
-        "sign": np.maximum(from_zero, 0.0)[:, :, None],
-        "bend": np.concatenate([above, -below, above - below], axis=2),
+    bent_there = 1.0 * (np.concatenate([above, below, above + below], axis=2) > 0.0)
+    shapes = {  # h and its derivative
+        "quadratic": ((from_zero**2 / full_scale_a)[:, :, None], (2.0 * from_zero / full_scale_a)[:, :, None]),
+        "cubic": ((from_zero**3 / full_scale_a**2)[:, :, None], (3.0 * from_zero**2 / full_scale_a**2)[:, :, None]),
+        "sign": (np.maximum(from_zero, 0.0)[:, :, None], 1.0 * (from_zero > 0.0)[:, :, None]),
+        "bend": (np.concatenate([above, -below, above - below], axis=2), bent_there),
     }
     moving = fleet.variance_a2[:, :, None] > (MOVING * full_scale_a) ** 2
-    gram, found = residual.gram[:, None, None], []
-    for cause, h in shapes.items():  # h: (N, K, S, L), constant within a level
+    gram, found, own = residual.gram[:, None, None], [], residual.y - fleet.inputs
+    for cause, (h, slope) in shapes.items():  # (N, K, S, L), constant within a level
         with_all = np.einsum("nksl,nkli->nksi", h, levels[..., :-1])
         square = np.einsum("nksl,nkl->nks", h**2, count)
         alone = square - _dot(_solve(gram, with_all[..., z]), with_all[..., z])
         with_r = with_all[..., residual.y] - np.einsum("nksi,ni->nks", with_all[..., z], residual.law)
+        with_r += residual.noise[:, :, None] * np.einsum("nksl,nkl->nks", slope, count)
         beyond = np.einsum("nksl,nkl->nks", h != 0.0, count)
         usable = moving & (alone > ALONE * square) & (beyond >= FEWEST)
         size = np.where(usable, with_r, 0.0) / np.where(usable, alone, 1.0)
-        explained_a2 = (size * with_r).reshape(N, -1)
-        at = (np.arange(N), *np.unravel_index(explained_a2.argmax(axis=1), size.shape[1:]))
+        explained_a2 = size * with_r
+        stretch = np.zeros((N, K, h.shape[2]))
+        factor = np.maximum(np.abs(1.0 - size[:, own, :, None] * slope[:, own]), LEAST_STRETCH)
+        stretch[:, own] = np.minimum(np.einsum("nsl,nl->ns", np.log(factor), count[:, own]), 0.0)
+        stretch /= residual.samples[:, None, None]
+        left = 1.0 - explained_a2 / residual.square_a2[:, None, None]
+        best = (stretch - 0.5 * np.log(np.maximum(left, RIDGE))).reshape(N, -1).argmax(axis=1)
+        at = (np.arange(N), *np.unravel_index(best, size.shape[1:]))
         weight, bent = residual.weights[at[:2]], cause == "bend"
         found.append(
             residual.cause(
-                explained_a2.max(axis=1),
+                explained_a2[at],
                 2.0 if bent else 1.0,
+                stretch=stretch[at],
                 size=size[at] / np.where(weight, weight, 1.0),
                 place=BENDS_A[at[2] % len(BENDS_A)] if bent else 0.0,
                 level_branch=at[1],
@@ -656,7 +681,9 @@ class _Vehicle:
         misfits, usual, j = self.misfits, self.usual, self.j
         fit = misfits.causes.fit[j]
         c = int(fit.argmax())
-        share = 1.0 / np.exp(fit - fit[c]).sum()
+        weight, level = np.exp(fit - fit[c]), misfits.causes.level_branch[j]
+        alike = level == level[c] if level[c] >= 0 else fit == fit[c]  # the shapes of one curve are one cause
+        share = weight[alike].sum() / weight.sum()
         probability = float(shape[c] * share) if fit[c] > 0.0 else 0.0
         at = c if probability >= LEAST_PROBABILITY else -1
         found, left = [], misfits.residual_a2[j]
@@ -671,8 +698,10 @@ class _Vehicle:
             at < 0 or left[-1] - left[c] < EXPLAINED * (left[-1] - usual.residual_a2)
         ):
             rms_a, usual_a = np.sqrt(left[-1]), np.sqrt(usual.residual_a2)
-            text = f"the sum of the currents wanders by {rms_a:.1f} A RMS, usual are {usual_a:.1f} A; look for a load "
-            text += "without a sensor that is switched on and off, or a loose contact"
+            text = (
+                f"the sum of the currents wanders by {rms_a:.1f} A RMS, usual are {usual_a:.1f} A; look for a branch "
+            )
+            text += "or load without a sensor, or a loose contact"
             return [_finding(None, "switching", unusual[at], text)]
         return [*found, self._worded(c, probability)] if at >= 0 else found
 

@@ -229,11 +229,29 @@ def test_sensor_that_is_not_linear_is_found_and_not_corrected(change: Any, cause
     assert set(calibrator.parameters_.verdict) == {"cannot tell"}
 
 
-def test_linear_sensors_have_no_finding() -> None:
-    for seed in range(10):
+@pytest.mark.parametrize(
+    ("branch", "more_a", "causes"),
+    [
+        ("motor", lambda rng, n: np.zeros(n), set()),
+        ("motor", lambda rng, n: rng.normal(0.0, 5.0, n), set()),
+        ("motor", lambda rng, n: rng.normal(0.0, 10.0, n), set()),
+        ("battery", lambda rng, n: rng.normal(0.0, 10.0, n), set()),
+        (
+            "battery",
+            lambda rng, n: 30.0 * np.convolve(rng.normal(size=n + 19), np.full(20, 0.22), "valid"),
+            {"switching"},
+        ),
+    ],
+    ids=["nothing", "noise", "more noise", "noise of the battery", "second motor"],
+)
+def test_no_sensor_is_blamed_for_noise_or_for_a_branch_that_is_not_measured(
+    branch: str, more_a: Any, causes: set[str]
+) -> None:
+    for seed in range(5):
         frame = recording(seed, gain=(0.0, 0.1, -0.2), offset_a=(0.0, 3.0, 0.0))
+        frame[branch] += more_a(np.random.default_rng(seed + 100), len(frame))
         calibrator = JunctionCalibrator(trusted=["battery"]).fit(frame, JUNCTION)
-        assert not calibrator.vehicles_["vehicle"].parameters.findings
+        assert {each.cause for each in calibrator.vehicles_["vehicle"].parameters.findings} == causes
 
 
 def test_branch_that_is_off_keeps_its_gain_open() -> None:
