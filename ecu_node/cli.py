@@ -177,6 +177,8 @@ def _add_run(commands: _Commands) -> None:
     )
     words = "a line of JSON per second, added to a file or sent to udp://HOST:PORT"
     run.add_argument("--telemetry", type=_TARGET, metavar="TARGET", help=words)
+    words = "sum up each drive for the calibrator, in FOLDER/VEHICLE: kilobytes per hour in place of logs"
+    run.add_argument("--summary", type=Path, metavar="FOLDER", help=words)
     words = "run as a real-time process: SCHED_FIFO, locked memory, one processor"
     run.add_argument("--realtime", action="store_true", help=words)
     run.set_defaults(command=_run)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 from calibrator.doctor.facts import MOST_MINUTES, Facts
 from calibrator.drive import Drive
-from calibrator.drives.align import TIME_RESOLUTION_S, base_inputs, choose_inputs
+from calibrator.drives.align import base_inputs, choose_inputs
 from calibrator.errors import DriveError
 from calibrator.estimator.junction import summarise_junction
 from calibrator.findings import Finding, worst_first
@@ -16,6 +16,7 @@ from calibrator.summaries.vehicle_summary import LEAST_DURATION_S
 from calibrator.terminal.text import counted, figure
 from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.errors import UserError
+from ecu_node.summary import TIME_RESOLUTION_S
 
 __all__ = ["CHECKS", "findings_of", "readiness"]
 

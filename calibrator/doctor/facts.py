@@ -11,7 +11,7 @@ import numpy as np
 from cantools.database.can import Signal
 
 from calibrator.drive import Array, Channel, Drive
-from calibrator.drives.align import TIME_RESOLUTION_S, align, base_inputs, choose_inputs
+from calibrator.drives.align import align, base_inputs, choose_inputs
 from calibrator.errors import DriveError, LogError
 from calibrator.kirchhoff.findings import Junction, look_at_junction
 from calibrator.kirchhoff.signs import multiplied
@@ -30,6 +30,7 @@ from calibrator.recordings.tables import is_table, read_table
 from ecu_node.database import VehicleDatabase, look_everything_up, read_database
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import Branch, Input, Layout
+from ecu_node.summary import TIME_RESOLUTION_S
 
 __all__ = ["MOST_MINUTES", "ChannelFacts", "ExaminedLog", "Facts", "facts_of"]
 

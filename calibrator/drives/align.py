@@ -8,9 +8,9 @@ itself. An instant is valid if all its values are, and if every derived input ha
 are not valid stay in place with NaN in all columns.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,20 @@ from numpy.typing import NDArray
 from calibrator.compiled import compiled, inner
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.errors import DriveError
-from calibrator.files.formulas import evaluate_formula, formula_names, parse_formula
+from ecu_node.formulas import FUNCTIONS, base_inputs, formula_value, parse_formula
 from ecu_node.layout import Layout
+from ecu_node.summary import TIME_RESOLUTION_S
 
-__all__ = ["Samples", "align", "align_channels", "at_instants", "base_inputs", "choose_inputs"]
+__all__ = [
+    "Samples",
+    "align",
+    "align_channels",
+    "at_instants",
+    "base_inputs",
+    "choose_inputs",
+    "evaluate_formula",
+]
 
-TIME_RESOLUTION_S = 1e-3
-"""Logs round time stamps up to this; samples exactly one limit apart must pass. [s]"""
 MAX_SAMPLES = 20_000_000
 """23 days at 0.1 s; a drive that claims more has a wrong time."""
 
@@ -93,22 +100,32 @@ def choose_inputs(
     return kept, tuple(name for name in wanted if name not in kept)
 
 
-def base_inputs(layout: Layout, names: Collection[str]) -> set[str]:
-    """Recorded inputs that inputs and derived inputs of these names are made of."""
-    found = set(names)
-    for item in reversed(layout.derived):
-        if item.name in found:
-            found.remove(item.name)
-            found.update(_names_in(item.formula))
-    return found
+_ARRAY_FUNCTIONS: Mapping[str, Callable[..., Any]] = {
+    **FUNCTIONS,
+    "/": np.divide,
+    "**": np.power,
+    "positive": lambda x: np.maximum(x, 0.0),
+    "negative": lambda x: np.minimum(x, 0.0),
+    "sqrt": np.sqrt,
+}
 
 
-_parsed = cache(parse_formula)
+def evaluate_formula(formula: str, values: Mapping[str, Array]) -> Array:
+    """Evaluate a formula of the layout at each sample; NaN or infinite where it has no value.
 
-
-@cache
-def _names_in(formula: str) -> frozenset[str]:
-    return frozenset(formula_names(_parsed(formula)))
+    Parameters
+    ----------
+    formula : str
+        As :func:`ecu_node.formulas.parse_formula` takes it.
+    values : mapping of str to ndarray of shape (T,)
+        Inputs by name; all that the formula names.
+    """
+    shape = np.broadcast_shapes(*(value.shape for value in values.values()))
+    arrays = {name: np.asarray(value, np.float64) for name, value in values.items()}
+    with np.errstate(all="ignore"):
+        return np.array(
+            np.broadcast_to(formula_value(parse_formula(formula), arrays, _ARRAY_FUNCTIONS), shape), np.float64
+        )
 
 
 def align(drive: Drive, layout: Layout, branches: Sequence[str], *, inputs: Sequence[str] | None = None) -> Samples:
@@ -147,7 +164,7 @@ def align(drive: Drive, layout: Layout, branches: Sequence[str], *, inputs: Sequ
     recorded_inputs = {name: value for name, value in values.items() if name not in branches}
     for item in layout.derived:
         if base_inputs(layout, [item.name]) <= recorded_inputs.keys():
-            recorded_inputs[item.name] = evaluate_formula(_parsed(item.formula), recorded_inputs)
+            recorded_inputs[item.name] = evaluate_formula(item.formula, recorded_inputs)
     matrix = np.column_stack([np.zeros((len(time_s), 0)), *(recorded_inputs[name] for name in names)])
     reasons[_UNDEFINED] = ~np.all(np.isfinite(matrix), axis=1) & ~(reasons[_STALE] | reasons[_NOT_GOOD])
     valid = ~np.any(list(reasons.values()), axis=0)

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from calibrator.drive import Array, Channel, Drive
-from calibrator.drives.align import TIME_RESOLUTION_S, base_inputs, choose_inputs
+from calibrator.drives.align import base_inputs, choose_inputs
 from calibrator.drives.store import require_plain_name, write_drive
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.settings import FEWEST_VEHICLES
@@ -25,6 +25,7 @@ from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.vehicle_summary import summarise_drives
 from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase
+from ecu_node.summary import TIME_RESOLUTION_S
 
 if TYPE_CHECKING:
     from calibrator.estimator.fleet import Junction

@@ -17,7 +17,7 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.artificial.trips import read_recorded_trips
 from calibrator.artificial.vehicle import Disturbances, Vehicle, vehicle_drive
 from calibrator.drive import Array
-from calibrator.drives.align import Samples, align, base_inputs, choose_inputs
+from calibrator.drives.align import Samples, align, base_inputs, choose_inputs, evaluate_formula
 from calibrator.drives.delays import estimate_delays, without_delays
 from calibrator.errors import FleetError
 from calibrator.estimator.published_fleet import identify_vehicle
@@ -25,7 +25,6 @@ from calibrator.experiments.attacks import WORLDS, Attack, draw_attack
 from calibrator.experiments.methods import POSTERIOR
 from calibrator.experiments.trial import Trial, UnseenDrive, drawn_distribution
 from calibrator.faults import Faults, measured_currents, true_currents
-from calibrator.files.formulas import evaluate_formula, parse_formula
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.summaries.moments import DriveSummary
@@ -133,7 +132,7 @@ class RecordedFleet:
         values = dict(trip.inputs)
         for item in layout.derived:
             if base_inputs(layout, [item.name]) <= values.keys():
-                values[item.name] = evaluate_formula(parse_formula(item.formula), values)
+                values[item.name] = evaluate_formula(item.formula, values)
         return {name: values[name] for name in names}
 
 

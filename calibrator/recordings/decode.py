@@ -10,7 +10,6 @@ as on the node, any name and the layout's ``no_value``.
 """
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -23,14 +22,13 @@ from calibrator.drive import Array, Mask
 from ecu_node.core.e2e import protection_of
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import DatabaseError
-from ecu_node.layout import ProfileP01, SignalName
+from ecu_node.layout import ProfileP01
+from ecu_node.summary import RANGE_SLACK, means_not_available
 
 __all__ = [
     "Decoded",
     "SignalRange",
-    "codes_of_no_value",
     "decode_signal",
-    "means_not_available",
     "message_is_sound",
     "p01_is_sound",
     "raw_values",
@@ -39,15 +37,8 @@ __all__ = [
 
 Raw = NDArray[np.int64] | NDArray[np.uint64] | NDArray[np.float64]
 
-SLACK = 1e-6
-"""Rounding of decimal scales must not push a value out of its range. [steps of the signal]"""
 _WORD_BITS = 64
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
-_NOT_AVAILABLE = re.compile(
-    r"(signal |value |data )?"
-    r"(sna|snv|na|n a|not available|unavailable|invalid|not valid|error|not defined|undefined|init)"
-    r"( signal| value| data| indicator)?"
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,31 +64,6 @@ class Decoded:
     def good(self) -> Mask:
         """Whether each value is there and may be used, shape (n,)."""
         return np.asarray(self.present & ~np.logical_or.reduce(list(self.bad.values())))
-
-
-def codes_of_no_value(database: VehicleDatabase, name: SignalName) -> frozenset[int]:
-    """Raw codes of a signal that are no values.
-
-    Parameters
-    ----------
-    database : VehicleDatabase
-        DBC and layout.
-    name : str
-        The signal, as MESSAGE.SIGNAL.
-
-    Returns
-    -------
-    frozenset of int
-        Of a branch's current, power, voltage or corrected signal: every code with a name and, of the measured one, its
-        ``no_value``, as :mod:`ecu_node.core.signals` has it. Of other signals with named values (a gear selector):
-        codes with a name that :func:`means_not_available`.
-    """
-    signal = database.signal(name)[1]
-    branches = [item for item in database.layout.branch if name in {item.source, item.voltage, item.corrected}]
-    if not branches:
-        return _named_bad(signal)
-    extra = [code for item in branches if item.source == name for code in item.no_value]
-    return frozenset([*map(int, signal.choices or {}), *extra])
 
 
 def decode_signal(
@@ -222,27 +188,7 @@ def signal_range(signal: Signal, factor: float = 1.0) -> SignalRange:
     if not signal.minimum and not signal.maximum:
         low, high = -math.inf, math.inf
     ends = sorted((factor * low, factor * high))
-    return SignalRange(low=ends[0], high=ends[1], slack=abs(factor * float(signal.scale)) * SLACK)
-
-
-def means_not_available(name: str) -> bool:
-    """Whether a name of a value table says that the value is not one.
-
-    Such names are SNA, "Signal not available", "Invalid", "Error", "Not_Defined" or "Init", in any spelling, with or
-    without "signal", "value" or "data". Names that only contain such words ("No error") are values.
-
-    Parameters
-    ----------
-    name : str
-        The name that the DBC gives to a raw value.
-
-    Returns
-    -------
-    bool
-        True where the raw value stands for "not available".
-    """
-    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+", " ", name)
-    return _NOT_AVAILABLE.fullmatch(spaced.strip().lower()) is not None
+    return SignalRange(low=ends[0], high=ends[1], slack=abs(factor * float(signal.scale)) * RANGE_SLACK)
 
 
 def _bit_run(signal: Signal) -> tuple[list[int], int]:

@@ -16,17 +16,18 @@ from cantools.database.can import Message
 from numpy.typing import NDArray
 
 from calibrator.drive import Array, Channel, Drive, Mask
-from calibrator.drives.align import at_instants, base_inputs
+from calibrator.drives.align import at_instants, base_inputs, evaluate_formula
 from calibrator.errors import LogError
-from calibrator.files.formulas import evaluate_formula, formula_names, parse_formula
-from calibrator.recordings.decode import codes_of_no_value, decode_signal, message_is_sound, signal_range
+from calibrator.recordings.decode import decode_signal, message_is_sound, signal_range
 from calibrator.recordings.frame_arrays import CLOCK_GAP_S, EXTENDED_BIT, Frames, frame_key, repaired_time
 from calibrator.recordings.frames import read_frames
 from calibrator.recordings.tables import Table, is_table, read_table
 from calibrator.terminal.text import Notice
 from ecu_node.core.signals import AMPERE, VOLT, WATT, factor_of, usual_unit
 from ecu_node.database import VehicleDatabase
+from ecu_node.formulas import formula_names, parse_formula
 from ecu_node.layout import Branch, split_signal
+from ecu_node.summary import codes_of_no_value
 
 __all__ = [
     "ChannelReport",
@@ -263,9 +264,9 @@ class SignalSource(ABC):
 
     def _computed(self, branch: Branch, formula: str) -> Channel:
         """A branch by its formula, at the instants of what comes most often in it."""
-        layout, tree = self.database.layout, parse_formula(formula)
+        layout, names = self.database.layout, formula_names(parse_formula(formula))
         signals = {item.name: item.signal for item in layout.input}
-        channels = {name: self.samples(signals.get(name, name))[0] for name in base_inputs(layout, formula_names(tree))}
+        channels = {name: self.samples(signals.get(name, name))[0] for name in base_inputs(layout, names)}
         if not channels or not all(channel.good.any() for channel in channels.values()):
             return Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_))
         time_s = max(channels.values(), key=lambda channel: len(channel.time_s)).time_s
@@ -275,8 +276,8 @@ class SignalSource(ABC):
             good &= known
         for item in layout.derived:
             if base_inputs(layout, [item.name]) <= values.keys():
-                values[item.name] = evaluate_formula(parse_formula(item.formula), values)
-        value = branch.sign * evaluate_formula(tree, values)
+                values[item.name] = evaluate_formula(item.formula, values)
+        value = branch.sign * evaluate_formula(formula, values)
         return Channel(time_s=time_s, value=value, good=good & np.isfinite(value))
 
 

@@ -23,7 +23,7 @@ import pyarrow as pa
 from calibrator.drive import Array, Mask
 from calibrator.drives.charge import GAP_PERIODS
 from calibrator.errors import LogError
-from calibrator.files.formulas import check_formulas
+from calibrator.files.layout_files import check_formulas
 from calibrator.recordings.candump import is_candump
 from calibrator.recordings.frame_arrays import repaired_time
 from calibrator.recordings.log_files import (

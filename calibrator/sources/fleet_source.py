@@ -18,7 +18,7 @@ from calibrator.drive import Drive, DriveFile
 from calibrator.drives.align import choose_inputs
 from calibrator.drives.fleet_id import read_fleet_ids
 from calibrator.drives.store import DRIVES_FOLDER, is_drive_file, is_plain_name, read_drive_file, require_plain_name
-from calibrator.errors import FleetError, LogError
+from calibrator.errors import DriveError, FleetError, LogError
 from calibrator.files.storage import Entry, Storage, is_url, local_copy, open_storage, walk
 from calibrator.processes.run_many import Failed, Workers, try_many
 from calibrator.recordings.frames import LOG_SUFFIXES, is_log
@@ -30,8 +30,19 @@ from calibrator.terminal.text import few, few_reasons
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout
+from ecu_node.summary import SUFFIX, SummaryFile, decode_summary
 
-__all__ = ["Equipment", "FleetSource", "find_fleet", "find_logs", "load_drive", "probe_equipment", "read_vehicles"]
+__all__ = [
+    "Equipment",
+    "FleetSource",
+    "find_fleet",
+    "find_logs",
+    "is_onboard",
+    "load_drive",
+    "probe_equipment",
+    "read_onboard_record",
+    "read_vehicles",
+]
 
 _Vehicle = TypeVar("_Vehicle")
 LOGS_FOLDER = "logs"
@@ -280,7 +291,9 @@ class _Search:
 
 def _is_log(folder: Storage, name: str) -> bool:
     """Whether a file is a log: by its suffix; a text file of this machine also by what is in it."""
-    return is_log(Path(folder.url) / name) if folder.is_local else not name.endswith(".txt") and is_log(Path(name))
+    if folder.is_local:
+        return name.endswith(SUFFIX) or is_log(Path(folder.url) / name)
+    return name.endswith(SUFFIX) or (not name.endswith(".txt") and is_log(Path(name)))
 
 
 def _folder_name(url: str) -> str:
@@ -321,8 +334,32 @@ def _without_twins(drives: Sequence[DriveFile]) -> tuple[list[DriveFile], list[s
     return kept, problems
 
 
+def is_onboard(entry: DriveFile) -> bool:
+    """Whether a file is the record of a node's own summary, which has no samples."""
+    return entry.place.endswith(SUFFIX)
+
+
+def read_onboard_record(path: Path, database: VehicleDatabase) -> SummaryFile:
+    """Read the record of a node; DriveError if it is damaged, or was made with another layout or DBC."""
+    try:
+        record = decode_summary(path.read_bytes())
+    except OSError as error:
+        raise DriveError(f"{path}: cannot be read: {error.strerror}; copy it again from the vehicle") from None
+    except ValueError as error:
+        raise DriveError(f"{path}: not a node's summary, or damaged: {error}; copy it again") from None
+    for what, its, mine in (
+        ("layout", record.layout_sha256, database.layout.digest),
+        ("DBC", record.dbc_sha256, database.digest),
+    ):
+        if its != mine:
+            raise DriveError(f"{path}: made with another {what} than {database.layout.path}; use the vehicle's own")
+    return record
+
+
 def load_drive(entry: DriveFile, database: VehicleDatabase) -> Drive:
     """Load one drive from its store file or its log; UserError if the file cannot be used, which it names."""
+    if is_onboard(entry):
+        raise DriveError(f"{entry.place}: a summary that was made on board, without samples; give the log")
     with local_copy(entry.place) as path:
         if is_drive_file(path):
             return read_drive_file(path, database.layout)
@@ -503,6 +540,10 @@ def _probed(fleet: FleetSource, database: VehicleDatabase, limit_s: float) -> tu
 
 
 def _names(entry: DriveFile, database: VehicleDatabase) -> _Names:
+    if is_onboard(entry):
+        with local_copy(entry.place) as path:
+            record = read_onboard_record(path, database)
+        return _Names(branches=tuple(record.branches), inputs=tuple(record.recorded))
     return _names_in(load_drive(entry, database))
 
 

@@ -12,32 +12,24 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from calibrator.drive import Array, Mask
+from ecu_node.summary import (
+    FEWEST_FOR_GAINS,
+    LEAST_EDGE,
+    LEAST_SPIKE_A,
+    LEVELS_A,
+    MAD_TO_SD,
+    OTHERS_MOVE,
+    SPIKE_SDS,
+    SPIKE_WINDOW,
+    STEP_OF_SPIKE,
+)
 
 __all__ = ["LEVEL_EDGES_A", "LEVEL_OF_AMPERE", "FitSums", "find_spikes", "second_differences"]
 
-_POSITIVE_A = (2, 5, 10, 20, 30, 45, 65, 90, 120, 160, 210, 280, 370, 500, 700, 1000)
-LEVEL_EDGES_A: Array = np.array([*(-a for a in reversed(_POSITIVE_A)), *_POSITIVE_A], np.float64)
+LEVEL_EDGES_A: Array = np.array([*(-a for a in reversed(LEVELS_A)), *LEVELS_A], np.float64)
 """Edges of the L = 33 levels of a measured current: symmetric, denser near zero, whole amperes. [A]"""
-LEVEL_OF_AMPERE: NDArray[np.int64] = np.searchsorted(_POSITIVE_A, np.arange(_POSITIVE_A[-1] + 1), side="right")
+LEVEL_OF_AMPERE: NDArray[np.int64] = np.searchsorted(LEVELS_A, np.arange(LEVELS_A[-1] + 1), side="right")
 """Distance of the level of so many whole amperes from the middle one."""
-
-SPIKE_SDS = 8.0
-"""Distance from the running median, in robust standard deviations, from which a sample may be a spike. [1]"""
-STEP_OF_SPIKE = 6.0
-"""Least change from sample to sample at a spike, over the median change. [1]"""
-LEAST_SPIKE_A = 2.5
-"""Spikes below this do no harm; where there is no noise, the steps of a signal are none. [A]"""
-OTHERS_MOVE = 0.4
-"""Largest change of the other branches around a spike, as a share of it: a current that really flows, and a delay
-that is left, show in two branches. [1]"""
-LEAST_EDGE = 0.6
-"""Least step up to a spike, and down from it, as a share of it: the peak of a current has none. [1]"""
-WINDOW = 9
-"""Samples of the running median: spikes of up to four samples are found. [1]"""
-FEWEST = 10
-"""Samples per branch that tell the gains. [1]"""
-MAD_TO_SD = 1.4826
-"""Of the normal distribution."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,24 +140,27 @@ def find_spikes(currents_a: Array, used: Mask) -> NDArray[np.int8]:
     K = currents_a.shape[1]
     kept = used
     for _ in range(2):  # the second time with gains that the spikes did not bend
-        if kept.sum() < FEWEST * K:
+        if kept.sum() < FEWEST_FOR_GAINS * K:
             return found
         weights = _junction_weights(currents_a, kept)
         residual = currents_a @ weights
         change = np.abs(np.diff(residual))[used[1:] & used[:-1]]
         if not change.max(initial=0.0) > max(STEP_OF_SPIKE * float(np.median(change)), LEAST_SPIKE_A):
             return found  # mostly: what follows takes longer
-        far = residual - median_filter(residual, WINDOW, mode="nearest")
+        far = residual - median_filter(residual, SPIKE_WINDOW, mode="nearest")
         spread = MAD_TO_SD * float(np.median(np.abs(far[kept])))
         suspects = used & (np.abs(far) > max(SPIKE_SDS * spread, LEAST_SPIKE_A))
         kept = used & ~suspects
     at = np.flatnonzero(suspects)
-    near = np.clip(at[:, None] + np.arange(-(WINDOW // 2), WINDOW // 2 + 1), 0, len(used) - 1)
+    near = np.clip(at[:, None] + np.arange(-(SPIKE_WINDOW // 2), SPIKE_WINDOW // 2 + 1), 0, len(used) - 1)
     around = (currents_a * weights)[near]  # (spikes, window, K)
     moves = around - np.median(around, axis=1, keepdims=True)
-    own, nearby = moves[:, WINDOW // 2], np.abs(moves[:, WINDOW // 2 - 1 : WINDOW // 2 + 2]).max(axis=1)
+    own, nearby = (
+        moves[:, SPIKE_WINDOW // 2],
+        np.abs(moves[:, SPIKE_WINDOW // 2 - 1 : SPIKE_WINDOW // 2 + 2]).max(axis=1),
+    )
     steps = np.diff(moves, axis=1) * np.sign(own)[:, None]
-    edge = np.minimum(steps[:, : WINDOW // 2].max(axis=1), -steps[:, WINDOW // 2 :].min(axis=1))
+    edge = np.minimum(steps[:, : SPIKE_WINDOW // 2].max(axis=1), -steps[:, SPIKE_WINDOW // 2 :].min(axis=1))
     for k in range(K):
         height = np.abs(own[:, k])
         alone = (nearby.sum(axis=1) - nearby[:, k] < OTHERS_MOVE * height) & (edge[:, k] > LEAST_EDGE * height)

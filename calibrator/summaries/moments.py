@@ -12,11 +12,9 @@ import numpy as np
 from calibrator.drive import Array
 from calibrator.errors import DriveError
 from calibrator.summaries.fit_sums import FitSums
+from ecu_node.summary import BLOCK_S
 
 __all__ = ["BLOCK_S", "DriveSummary", "common_bank"]
-
-BLOCK_S = 30.0
-"""Length of a block: model errors of different blocks hardly depend on each other. [s]"""
 
 
 @dataclass(frozen=True, kw_only=True)

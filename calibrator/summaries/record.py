@@ -25,6 +25,7 @@ __all__ = [
     "Known",
     "Outline",
     "Record",
+    "added_summaries",
     "drives_digest",
     "joined_records",
     "name_problem",
@@ -34,6 +35,8 @@ __all__ = [
 
 IMPOSSIBLE = "its summary holds impossible numbers; look at its recordings, and summarise them again"
 """Why a vehicle is left out."""
+FEWEST_BLOCKS = 4
+"""Fewer do not tell how sure anything is; a node's own are of several minutes. [1]"""
 MOST_MOMENT, MOST_VARIANCE_A2 = 1e30, 1e10
 """Far beyond what any vehicle's recordings give: sums of products in any unit, variance of a current [A^2]."""
 
@@ -170,7 +173,12 @@ def joined_records(records: Sequence[Record]) -> VehicleSummary:
     usable = [record.found for record in records if record.found is not None]
     if not usable:
         raise DriveError(records[-1].problem)
-    found = usable[0] if len(usable) == 1 else _added(usable)
+    found = added_summaries(usable)
+    if len(found.summary.moments) < FEWEST_BLOCKS:
+        raise DriveError(
+            f"{counted(len(found.summary.moments), 'block')} in {counted(len(found.drives), 'drive')}; at least "
+            f"{FEWEST_BLOCKS} are needed"
+        )
     if problem := _too_short(found.summary.duration_s, found.drives):
         raise DriveError(problem)
     if not np.abs(found.summary.moments).max() < MOST_MOMENT or found.summary.variance_a2.max() > MOST_VARIANCE_A2:
@@ -178,7 +186,8 @@ def joined_records(records: Sequence[Record]) -> VehicleSummary:
     return found
 
 
-def _added(parts: Sequence[VehicleSummary]) -> VehicleSummary:
+def added_summaries(parts: Sequence[VehicleSummary]) -> VehicleSummary:
+    """Summary of all drives of several summaries of one vehicle, at least one."""
     return VehicleSummary(
         vehicle=parts[0].vehicle,
         drives=tuple(name for part in parts for name in part.drives),

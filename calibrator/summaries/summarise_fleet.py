@@ -4,6 +4,7 @@ The store is its own checkpoint: a bucket whose vehicles are read is written, an
 A recording counts once. One that two vehicles have counts for neither, as it cannot be told whose it is.
 """
 
+import hashlib
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -11,16 +12,24 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from calibrator.drive import DriveFile
+from calibrator.drive import Drive, DriveFile
 from calibrator.drives.store import recording_digest
-from calibrator.files.storage import open_storage
+from calibrator.files.storage import local_copy, open_storage
 from calibrator.processes.run_many import Failed, Workers, try_many
-from calibrator.sources.fleet_source import MEGABYTE, FleetSource, find_fleet, load_drive, probe_equipment
+from calibrator.sources.fleet_source import (
+    MEGABYTE,
+    FleetSource,
+    find_fleet,
+    is_onboard,
+    load_drive,
+    probe_equipment,
+)
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity
-from calibrator.summaries.record import Known, Record
+from calibrator.summaries.onboard import read_onboard
+from calibrator.summaries.record import Known, Record, added_summaries
 from calibrator.summaries.store import SummaryStore, open_store, require_store_or_nothing
-from calibrator.summaries.vehicle_summary import summarise_drives
+from calibrator.summaries.vehicle_summary import VehicleSummary, summarise_drives
 from calibrator.terminal.options import TIME_LIMIT_S
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import counted, dumps, left_out_text
@@ -248,19 +257,28 @@ def _read_record(
 ) -> Record:
     """Record of some drives of one vehicle, which has others with these digests already."""
     entries, known = work
-    drives = [load_drive(entry, database) for entry in entries]
-    digests = tuple(recording_digest(drive) for drive in drives)
-    unique = {digest: drive for digest, drive in zip(digests, drives, strict=True) if digest not in known}
-    if not unique:
-        return _unusable(entries, f"{COPY} one that this vehicle has already; it counts once", digests)
-    found = summarise_drives(list(unique.values()), store.equipment, database, bank=store.bank)
+    made, drives, digests = dict[str, VehicleSummary](), dict[str, Drive](), list[str]()
+    for entry in entries:
+        if is_onboard(entry):
+            with local_copy(entry.place) as path:
+                digests.append(hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest())
+                made[digests[-1]] = read_onboard(path, store, database, vehicle=entry.vehicle, name=entry.name)
+        else:
+            drive = load_drive(entry, database)
+            digests.append(recording_digest(drive))
+            drives[digests[-1]] = drive
+    new = [drive for digest, drive in drives.items() if digest not in known]
+    parts = [summarise_drives(new, store.equipment, database, bank=store.bank)] if new else []
+    parts += [summary for digest, summary in made.items() if digest not in known]
+    if not parts:
+        return _unusable(entries, f"{COPY} one that this vehicle has already; it counts once", tuple(digests))
     names = tuple(entry.name for entry in entries)
     return Record(
         vehicle=entries[0].vehicle,
         drives=names,
         sources=tuple(entry.version for entry in entries),
-        digests=digests,
-        found=replace(found, vehicle=entries[0].vehicle, drives=names),
+        digests=tuple(digests),
+        found=replace(added_summaries(parts), vehicle=entries[0].vehicle, drives=names),
     )
 
 

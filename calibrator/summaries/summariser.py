@@ -11,20 +11,17 @@ from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank, plain_bank
 from calibrator.summaries.fit_sums import LEVEL_EDGES_A, LEVEL_OF_AMPERE, FitSums, find_spikes, second_differences
-from calibrator.summaries.moments import BLOCK_S, DriveSummary
+from calibrator.summaries.moments import DriveSummary
+from ecu_node.summary import (
+    BATCH_SAMPLES,
+    BLOCK_S,
+    DIFFERENCE_GAIN,
+    LEAST_SHARE,
+    MEDIAN_EXCESS,
+    NORMAL_MEDIAN,
+)
 
 __all__ = ["Summariser", "summarise"]
-
-BATCH_SAMPLES = 1500
-"""Samples whose products are formed at a time: as many as the processor's cache holds. [1]"""
-LEAST_SHARE = 0.2
-"""Least share of valid samples of a block that is used. [1]"""
-DIFFERENCE_GAIN = 20.0
-"""Variance of the third difference of white noise of variance 1."""
-NORMAL_MEDIAN = 0.6745
-"""Median magnitude of a standard normal variable."""
-MEDIAN_EXCESS = 3.8
-"""The squared median of n third differences of white noise is too large by this over n (simulated, n = 9 to 300)."""
 
 
 class Summariser:

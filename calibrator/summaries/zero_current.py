@@ -9,17 +9,9 @@ import numpy as np
 from calibrator.drive import Array, Channel, Drive
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Contactor, Layout
+from ecu_node.summary import FEWEST_ZERO_SAMPLES, ZERO_PIECE_S, ZERO_RESOLUTION_A, ZERO_SETTLING_S
 
 __all__ = ["ZeroCurrent", "weighted_mean", "zero_current_offsets"]
-
-SETTLING_S = 2.0
-"""After the contactors open and before they close, capacitors still charge and discharge. [s]"""
-FEWEST_SAMPLES = 10
-"""Of a branch, for its reading to count."""
-RESOLUTION_A = 0.02
-"""Least standard deviation of a reading: sensors drift within a window by about so much. [A]"""
-PIECE_S = 5.0
-"""Of a window: what wanders within it moves the medians of its pieces. [s]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,19 +48,19 @@ def zero_current_offsets(drives: Sequence[Drive], branches: Sequence[str], datab
     offset, sd = np.full(len(branches), np.nan), np.full(len(branches), np.nan)
     for k, name in enumerate(branches):
         windows = [window for drive in drives for window in _shown(drive, name, database.layout)]
-        if sum(len(current.value) for current in windows) >= FEWEST_SAMPLES:
+        if sum(len(current.value) for current in windows) >= FEWEST_ZERO_SAMPLES:
             medians = [np.median(current.value) for current in windows]
             pieces = np.concatenate([_medians_of_pieces(current) for current in windows])
             noise = np.concatenate([current.value - middle for current, middle in zip(windows, medians, strict=True)])
             white = np.sqrt(np.pi / 2.0) * noise.std() / np.sqrt(len(noise))
             wander = pieces.std(ddof=1) / np.sqrt(len(windows)) if len(pieces) > 1 else 0.0
             step_a = database.current_step_a(name) / np.sqrt(12.0)
-            offset[k], sd[k] = np.mean(medians), np.sqrt(RESOLUTION_A**2 + step_a**2 + max(white, wander) ** 2)
+            offset[k], sd[k] = np.mean(medians), np.sqrt(ZERO_RESOLUTION_A**2 + step_a**2 + max(white, wander) ** 2)
     return ZeroCurrent(offset_a=offset, sd_a=sd)
 
 
 def _medians_of_pieces(current: Channel) -> Array:
-    number = ((current.time_s - current.time_s[0]) / PIECE_S).astype(np.int64)
+    number = ((current.time_s - current.time_s[0]) / ZERO_PIECE_S).astype(np.int64)
     return np.array([np.median(current.value[number == piece]) for piece in np.unique(number)])
 
 
@@ -83,7 +75,7 @@ def _shown(drive: Drive, branch: str, layout: Layout) -> Iterator[Channel]:
     number = np.where(_is_open(state, layout.contactor), 2 * number + 1, 0)
     edges = np.append(np.flatnonzero(np.diff(number, prepend=0)), len(number))
     for start, stop in pairwise(edges.tolist()):
-        first, last = state.time_s[start] + SETTLING_S, state.time_s[stop - 1] - SETTLING_S
+        first, last = state.time_s[start] + ZERO_SETTLING_S, state.time_s[stop - 1] - ZERO_SETTLING_S
         inside = (current.time_s >= first) & (current.time_s <= last) & current.good
         if number[start] and inside.any():
             yield Channel(time_s=current.time_s[inside], value=current.value[inside], good=current.good[inside])

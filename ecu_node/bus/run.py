@@ -23,6 +23,7 @@ from ecu_node.bus.adapters import acknowledgement, bus_config, carries_fd, confi
 from ecu_node.bus.faults import FaultMemory
 from ecu_node.bus.kernel_routes import kernel_routes
 from ecu_node.bus.node import GatewayNode, NodeSettings, OverlayNode
+from ecu_node.bus.on_board_summary import on_board_summary
 from ecu_node.bus.service import Log, Requests, ServiceManager, be_real_time
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.telemetry import Latency, Telemetry, serve_metrics
@@ -188,7 +189,7 @@ _GARBAGE = 10_000
 """Objects that were made and not freed, after which garbage is looked for among them, in about a millisecond."""
 
 
-def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:
+def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noqa: PLR0915 (in the order of a run)
     """Run a node until SIGTERM or SIGINT.
 
     Parameters
@@ -254,6 +255,9 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:
             looks.append(FaultMemory(corrector, options.state, say, ThreadPoolExecutor(1, "faults")))
         if options.telemetry is not None:
             looks.append(Telemetry(options.telemetry, corrector, database.layout, latency, buses, say))
+        if options.summary is not None:
+            summing = on_board_summary(options, bus, database, source.in_force.parameters, say)
+            looks.append(closed_at_end.enter_context(closing(summing)))
         closed_at_end.callback(lambda: say(f"ended: {corrector.counters.text()}"))
         closed_at_end.callback(manager.stopping)
         if routes is not None:

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrator.files.formulas import evaluate_formula, formula_names, parse_formula
+from calibrator.drives.align import evaluate_formula
 from calibrator.files.layout_files import chosen_layout
 from ecu_node.errors import LayoutError
+from ecu_node.formulas import formula_names, parse_formula
 from tests.ecu_node.vehicles import SMALL_LAYOUT
 
 VALUES = {"a": np.array([1.0, -2.0, 4.0]), "b": np.array([2.0, 0.0, -1.0])}
@@ -28,12 +29,12 @@ VALUES = {"a": np.array([1.0, -2.0, 4.0]), "b": np.array([2.0, 0.0, -1.0])}
     ],
 )
 def test_a_formula_is_evaluated_at_each_sample(formula: str, expected: list[float]) -> None:
-    np.testing.assert_allclose(evaluate_formula(parse_formula(formula), VALUES), expected)
+    np.testing.assert_allclose(evaluate_formula(formula, VALUES), expected)
 
 
 @pytest.mark.parametrize("formula", ["a / b", "sqrt(a)", "a ** 0.5", "sqrt(b - 1)", "1e200 * 1e200 * b"])
 def test_where_a_formula_has_no_value_the_result_is_not_finite_and_nothing_is_printed(formula: str) -> None:
-    result = evaluate_formula(parse_formula(formula), VALUES)
+    result = evaluate_formula(formula, VALUES)
     assert np.isfinite(result[0]) == (formula != "1e200 * 1e200 * b")
     assert not np.isfinite(result[1])
 
@@ -41,7 +42,7 @@ def test_where_a_formula_has_no_value_the_result_is_not_finite_and_nothing_is_pr
 def test_a_missing_value_stays_missing() -> None:
     values = {"a": np.array([np.nan, 1.0])}
     for formula in ("a + 1", "positive(a)", "negative(a)", "a * 0"):
-        assert np.isnan(evaluate_formula(parse_formula(formula), values)).tolist() == [True, False]
+        assert np.isnan(evaluate_formula(formula, values)).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from calibrator.recordings.decode import decode_signal, means_not_available, p01_is_sound, raw_values, signal_range
+from calibrator.recordings.decode import decode_signal, p01_is_sound, raw_values, signal_range
 from ecu_node.errors import DatabaseError
+from ecu_node.summary import means_not_available
 
 MULTIPLEXED = """VERSION ""
 BU_: A

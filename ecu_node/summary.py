@@ -1,0 +1,203 @@
+"""What is kept of a drive: what a block is, for the calibrator and for a node that sums on board, and the node's file.
+
+Branches and inputs are taken at whole multiples of the layout's period since the start of the drive, each interpolated
+between its good samples. Of every :data:`BLOCK_S` the sums of the products of (inputs, measured currents, 1) are kept,
+without spikes, which are looked for in :data:`BATCH_SAMPLES` at a time. A block of which less than
+:data:`LEAST_SHARE` is valid does not count. :mod:`calibrator.summaries` does so with arrays, and
+:mod:`ecu_node.bus.on_board_summary` in plain Python; a test compares them.
+"""
+
+import re
+import zlib
+from array import array
+from collections.abc import Mapping, Sequence
+
+import msgspec
+
+from ecu_node.database import VehicleDatabase
+from ecu_node.layout import SignalName
+
+# ---- what a block is
+
+BLOCK_S = 30.0
+"""Length of a block: model errors of different blocks hardly depend on each other. [s]"""
+BATCH_SAMPLES = 1500
+"""Samples in which spikes are looked for together, in whole blocks: as many as a processor's cache holds. [1]"""
+LEAST_SHARE = 0.2
+"""Least share of valid samples of a block that is used. [1]"""
+TIME_RESOLUTION_S = 1e-3
+"""Logs round time stamps up to this; samples exactly one limit apart must pass. [s]"""
+RANGE_SLACK = 1e-6
+"""Rounding of decimal scales must not push a value out of its range. [steps of the signal]"""
+
+LEVELS_A = (2, 5, 10, 20, 30, 45, 65, 90, 120, 160, 210, 280, 370, 500, 700, 1000)
+"""Positive edges of the levels of a measured current; those below zero are alike. [A]"""
+DIFFERENCE_GAIN = 20.0
+"""Variance of the third difference of white noise of variance 1."""
+NORMAL_MEDIAN = 0.6745
+"""Median magnitude of a standard normal variable."""
+MEDIAN_EXCESS = 3.8
+"""The squared median of n third differences of white noise is too large by this over n (simulated, n = 9 to 300)."""
+
+SPIKE_SDS = 8.0
+"""Distance from the running median, in robust standard deviations, from which a sample may be a spike. [1]"""
+STEP_OF_SPIKE = 6.0
+"""Least change from sample to sample at a spike, over the median change. [1]"""
+LEAST_SPIKE_A = 2.5
+"""Spikes below this do no harm; where there is no noise, the steps of a signal are none. [A]"""
+OTHERS_MOVE = 0.4
+"""Largest change of the other branches around a spike, as a share of it: a current that really flows, and a delay
+that is left, show in two branches. [1]"""
+LEAST_EDGE = 0.6
+"""Least step up to a spike, and down from it, as a share of it: the peak of a current has none. [1]"""
+SPIKE_WINDOW = 9
+"""Samples of the running median: spikes of up to four samples are found. [1]"""
+FEWEST_FOR_GAINS = 10
+"""Samples per branch that tell the gains. [1]"""
+MAD_TO_SD = 1.4826
+"""Of the normal distribution."""
+
+ZERO_SETTLING_S = 2.0
+"""After the contactors open and before they close, capacitors still charge and discharge. [s]"""
+FEWEST_ZERO_SAMPLES = 10
+"""Of a branch in windows with open contactors, for its reading to count."""
+ZERO_RESOLUTION_A = 0.02
+"""Least standard deviation of such a reading: sensors drift within a window by about so much. [A]"""
+ZERO_PIECE_S = 5.0
+"""Of a window: what wanders within it moves the medians of its pieces. [s]"""
+
+_NOT_AVAILABLE = re.compile(
+    r"(signal |value |data )?"
+    r"(sna|snv|na|n a|not available|unavailable|invalid|not valid|error|not defined|undefined|init)"
+    r"( signal| value| data| indicator)?"
+)
+
+
+def means_not_available(name: str) -> bool:
+    """Whether a name of a value table says that the value is not one.
+
+    Such names are SNA, "Signal not available", "Invalid", "Error", "Not_Defined" or "Init", in any spelling, with or
+    without "signal", "value" or "data". Names that only contain such words ("No error") are values.
+
+    Parameters
+    ----------
+    name : str
+        The name that the DBC gives to a raw value.
+    """
+    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|[^A-Za-z0-9]+", " ", name)
+    return _NOT_AVAILABLE.fullmatch(spaced.strip().lower()) is not None
+
+
+def codes_of_no_value(database: VehicleDatabase, name: SignalName) -> frozenset[int]:
+    """Raw codes of a signal that are no values.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        DBC and layout.
+    name : str
+        The signal, as MESSAGE.SIGNAL.
+
+    Returns
+    -------
+    frozenset of int
+        Of a branch's current, power, voltage or corrected signal: every code with a name and, of the measured one, its
+        ``no_value``, as :mod:`ecu_node.core.signals` has it. Of other signals with named values (a gear selector):
+        codes with a name that :func:`means_not_available`.
+    """
+    named: Mapping[int, object] = database.signal(name)[1].choices or {}
+    branches = [item for item in database.layout.branch if name in {item.source, item.voltage, item.corrected}]
+    if not branches:
+        return frozenset(int(code) for code, text in named.items() if means_not_available(str(text)))
+    extra = [code for item in branches if item.source == name for code in item.no_value]
+    return frozenset([*map(int, named), *extra])
+
+
+# ---- on board
+
+SUFFIX = ".summary"
+SCHEMA_VERSION = 1
+
+
+class SummaryFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A record: B batches of K branches and M inputs, p = M + K + 1 columns. Numbers are little-endian float32.
+
+    Moments of a batch are kept as mean and covariance, which lose nothing in short numbers: the sums of products are
+    n (covariance + mean mean'), those of a column n mean.
+    """
+
+    schema_version: int
+    vehicle: str
+    layout_sha256: str
+    dbc_sha256: str
+    branches: list[str]
+    inputs: list[str]
+    recorded: list[str]
+    """Inputs that were recorded, of which ``inputs`` are made."""
+    period_s: float
+    block_s: float
+    delay_s: list[float]
+    """That were taken out, by branch. [s]"""
+    delay_sd_s: list[float | None]
+    """Null: not known. [s]"""
+    zero_offset_a: list[float | None]
+    zero_sd_a: list[float | None]
+    starts: list[bool]
+    """Whether a drive starts with the batch."""
+    count: list[int]
+    """Samples of each batch."""
+    mean: bytes
+    """(B, p - 1)"""
+    covariance: bytes
+    """Lower triangles, row by row (B, (p - 1) p / 2)."""
+    noise_a2: bytes
+    """(B, K)"""
+    fast_a2: bytes
+    """Lower triangles (B, K (K + 1) / 2)."""
+    spikes: bytes
+    """(B, K, 2)"""
+    temperature_c: bytes
+    """(B,)"""
+    levels: list[list[int]]
+    """By branch the levels that were visited, see ``level_sums``."""
+    level_sums: bytes
+    """Of each of these: sums of (inputs, currents, 1) and of the square of the branch's own current, p + 1 numbers."""
+
+
+def encode_summary(record: SummaryFile) -> bytes:
+    """Content of a file."""
+    return zlib.compress(msgspec.msgpack.encode(record), 9)
+
+
+def decode_summary(content: bytes) -> SummaryFile:
+    """Record of a file; ValueError if it is damaged, or of another version."""
+    try:
+        unpacker = zlib.decompressobj()
+        plain = unpacker.decompress(content, 1 << 24)
+        if not unpacker.eof:
+            raise ValueError("it is cut, or too large")
+        record = msgspec.msgpack.decode(plain, type=SummaryFile)
+    except (zlib.error, msgspec.DecodeError) as error:
+        raise ValueError(str(error)) from None
+    if record.schema_version != SCHEMA_VERSION:
+        raise ValueError(f"schema version {record.schema_version}, expected {SCHEMA_VERSION}")
+    return record
+
+
+def packed(values: Sequence[float]) -> bytes:
+    """Numbers as float32, all first bytes first: what is alike stands together and packs well."""
+    raw = array("f", values)
+    content = raw.tobytes()
+    return b"".join(content[place::4] for place in range(4))
+
+
+def unpacked(content: bytes) -> "array[float]":
+    """Numbers of :func:`packed`; ValueError if it is none."""
+    if len(content) % 4:
+        raise ValueError("numbers are cut")
+    count, plain = len(content) // 4, bytearray(len(content))
+    for place in range(4):
+        plain[place::4] = content[place * count : (place + 1) * count]
+    values = array("f")
+    values.frombytes(bytes(plain))
+    return values

@@ -1,0 +1,174 @@
+"""A node's own summary of a drive against that of its log, over a bus and through ``calibrator summarise``."""
+
+import argparse
+from pathlib import Path
+
+import can
+import msgspec
+import numpy as np
+import pytest
+
+from calibrator.drive import Channel, Drive
+from calibrator.files.storage import open_storage
+from calibrator.recordings.canlog import write_drive_log
+from calibrator.recordings.frames import read_frames
+from calibrator.summaries.identity import read_identity
+from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.vehicle_summary import VehicleSummary
+from ecu_node.bus.on_board_summary import OnBoardSummary, on_board_summary
+from ecu_node.database import VehicleDatabase
+from ecu_node.errors import UserError
+from ecu_node.parameters import BranchParameters
+from ecu_node.summary import decode_summary
+from tests.calibrator.conftest import run_command
+from tests.ecu_node.vehicles import LAYOUT, parameters_for
+
+MINUTES = 13.0
+OPEN_S = 14.0
+"""So long the contactors are open first."""
+BATCH = 5
+"""Blocks that the node adds."""
+
+
+def recorded_drive(seed: int = 1) -> Drive:
+    """Thirteen minutes with spikes, samples that are not good, and a gap."""
+    rng = np.random.default_rng(seed)
+
+    def channel(period_s: float, values: object) -> Channel:
+        time_s = np.arange(0.0, 60.0 * MINUTES, period_s) + rng.uniform(0.0, 0.3 * period_s)
+        value = np.asarray(values(time_s), np.float64)  # type: ignore[operator]
+        return Channel(time_s=time_s, value=value, good=rng.random(len(time_s)) > 0.002)
+
+    steps = 80.0 * rng.normal(size=1000)
+
+    def current(time_s: np.ndarray[tuple[int], np.dtype[np.float64]]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        flows = time_s > OPEN_S
+        return np.asarray(flows * (steps[(time_s / 2.0).astype(int)] + 20.0 * np.sin(0.7 * time_s)))
+
+    battery = channel(0.05, lambda t: current(t) + 5.0 + rng.normal(scale=0.5, size=len(t)))
+    motor = channel(0.02, lambda t: -current(t) + rng.normal(scale=0.5, size=len(t)))
+    auxiliary = channel(0.1, lambda t: -5.0 * (t > OPEN_S) + rng.normal(scale=0.2, size=len(t)))
+    battery.value[2000:14000:1511] += 60.0
+    motor.good[9000:10000] = False
+    inputs = {
+        "speed": channel(0.1, lambda t: 60.0 + 20.0 * np.sin(0.1 * t)),
+        "torque": channel(0.05, lambda t: 0.5 * current(t)),
+        "contactor_state": channel(0.1, lambda t: 2.0 * (t > OPEN_S)),
+        "junction_box_temperature": channel(1.0, lambda t: 20.0 + 0.01 * t),
+        "voltage": channel(0.1, lambda t: 350.0 - 0.05 * current(t)),
+    }
+    return Drive(
+        vehicle="V1",
+        name="drive",
+        branches={"battery": battery, "motor": motor, "auxiliary": auxiliary},
+        inputs=inputs,
+    )
+
+
+def stored(place: Path, database: VehicleDatabase) -> VehicleSummary:
+    storage = open_storage(place)
+    identity = read_identity(storage, database)
+    assert identity is not None
+    store = SummaryStore(storage=storage, identity=identity)
+    (record,) = store.read(store.bucket_of("V1"))["V1"]
+    assert record.found is not None, record.problem
+    return record.found
+
+
+def from_log(folder: Path, database: VehicleDatabase) -> VehicleSummary:
+    write_drive_log(folder / "logs" / "V1" / "drive.log.gz", recorded_drive(), database)
+    arguments = ["summarise", str(folder / "logs"), "--layout", str(LAYOUT), "--out", str(folder / "of_log")]
+    assert run_command([*arguments, "--workers", "1"]) == 0
+    return stored(folder / "of_log", database)
+
+
+def replay(log: Path, summary: OnBoardSummary, bus: can.BusABC) -> None:
+    """Play a log onto the bus with its own time stamps; the node looks at it every 20 ms of the log."""
+    looked_s = 0.0
+    for message in read_frames(log).messages():
+        bus.send(message)
+        if message.timestamp - looked_s >= 0.02:
+            looked_s = message.timestamp
+            summary.look(looked_s)
+    summary.look(looked_s)
+
+
+def node_on(folder: Path, database: VehicleDatabase, delays: dict[str, float]) -> OnBoardSummary:
+    parameters = parameters_for(database)
+    branches = {
+        name: BranchParameters(drift=0.0, offset_a=0.0, apply=False, delay_s=delay_s, delay_sd_s=0.001)
+        for name, delay_s in delays.items()
+    }
+    options = argparse.Namespace(summary=folder, vehicle="V1")
+    bus = {"interface": "virtual", "channel": "on_board", "fd": False, "listen_only": False, "bitrates": {}}
+    return on_board_summary(options, bus, database, msgspec.structs.replace(parameters, branches=branches), print)
+
+
+def test_summary_made_on_board_is_that_of_the_log(tmp_path: Path, database: VehicleDatabase) -> None:
+    of_log = from_log(tmp_path, database)
+    summary = node_on(tmp_path / "vehicle", database, of_log.delays.by_branch())
+    log = tmp_path / "logs" / "V1" / "drive.log.gz"
+    with can.Bus(interface="virtual", channel="on_board", preserve_timestamps=True) as bus:
+        replay(log, summary, bus)
+        written = [decode_summary(path.read_bytes()) for path in (tmp_path / "vehicle" / "V1").glob("*.summary")]
+        assert [len(record.count) for record in written] == [5]  # what a power cut leaves: all but the last batch
+        summary.close()
+    size = sum(path.stat().st_size for path in (tmp_path / "vehicle" / "V1").iterdir())
+    assert size < 20_000 * MINUTES / 60.0 + 5000  # besides the levels, which are there once per file
+    arguments = ["summarise", str(tmp_path / "vehicle"), "--layout", str(LAYOUT), "--out", str(tmp_path / "on_board")]
+    assert run_command(arguments) == 0
+    on_board = stored(tmp_path / "on_board", database)
+    full, samples = of_log.summary, of_log.summary.moments[:, -1, -1]
+    first = np.arange(0, len(full.moments), BATCH)
+    moments = np.add.reduceat(full.moments, first)
+    size = np.sqrt(np.maximum(np.einsum("bii->bi", moments), 1e-9))
+    scaled = (on_board.summary.moments - moments) / (size[:, :, None] * size[:, None, :])
+    assert np.abs(scaled).max() < 1e-6
+    assert full.fit is not None
+    assert on_board.summary.fit is not None
+    joined = full.fit.joined(first, samples)
+    for name in ("fast_a2", "spikes"):
+        ours, theirs = getattr(on_board.summary.fit, name), getattr(joined, name)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5 * np.abs(theirs).max())
+    sums = [fit.levels.sum(axis=1) for fit in (on_board.summary.fit, joined)]
+    np.testing.assert_allclose(sums[0], sums[1], rtol=1e-5, atol=1e-3)
+    moved = np.abs(on_board.summary.fit.levels - joined.levels)[..., -2].sum()
+    assert moved <= 6  # samples whose rounding decides on which side of an edge they are
+    assert joined.spikes.sum() > 3
+    assert on_board.summary.fit.starts.tolist() == joined.starts.tolist()
+    noise = np.add.reduceat(full.noise_a2 * samples[:, None], first) / np.add.reduceat(samples, first)[:, None]
+    np.testing.assert_allclose(on_board.summary.noise_a2, noise, rtol=1e-5)
+    for name in ("offset_a", "sd_a"):
+        reading = getattr(of_log.zero_current, name)
+        assert np.isfinite(reading).all()
+        np.testing.assert_allclose(getattr(on_board.zero_current, name), reading, rtol=1e-6)
+    np.testing.assert_allclose(on_board.summary.fit.temperature_c, joined.temperature_c, atol=0.02)  # a sample behind
+
+
+@pytest.mark.parametrize("damage", ["cut", "other vehicle", "text"])
+def test_unusable_record_leaves_its_vehicle_out(
+    tmp_path: Path, database: VehicleDatabase, damage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_drive_log(tmp_path / "V1" / "drive.log.gz", recorded_drive(), database)
+    summary = node_on(tmp_path / "vehicle", database, {})
+    with can.Bus(interface="virtual", channel="on_board", preserve_timestamps=True) as bus:
+        replay(tmp_path / "V1" / "drive.log.gz", summary, bus)
+        summary.close()
+    (path,) = (tmp_path / "vehicle" / "V1").iterdir()
+    other = tmp_path / "vehicle" / "V2" / "x.summary"
+    other.parent.mkdir()
+    content = path.read_bytes()
+    other.write_bytes({"cut": content[:300], "other vehicle": content, "text": b"summary"}[damage])
+    arguments = ["summarise", str(tmp_path / "vehicle"), "--layout", str(LAYOUT), "--out", str(tmp_path / "store")]
+    assert run_command(arguments) == 0
+    words = {"cut": "damaged", "other vehicle": "a record of vehicle V1", "text": "damaged"}[damage]
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "V2" in shown
+    assert words in shown
+    assert len(stored(tmp_path / "store", database).summary.moments) == 6
+
+
+def test_unknown_vehicle_is_refused(tmp_path: Path, database: VehicleDatabase) -> None:
+    options = argparse.Namespace(summary=tmp_path, vehicle=None)
+    with pytest.raises(UserError, match="--summary: it is not known which vehicle this is; give --vehicle"):
+        on_board_summary(options, {}, database, None, print)
