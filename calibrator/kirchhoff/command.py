@@ -103,7 +103,10 @@ def kirchhoff(
     elif log is not None and (is_table(log) or not log.exists()):
         database = layout_from_branches(str(branches), full_scale_a=full_scale, table=read_table(log))
     else:
-        raise typer.BadParameter("--branches names columns of a table; a log of frames and a bus need --layout")
+        raise typer.BadParameter(
+            "--branches names columns of a table; a log of frames and a bus need --layout, which 'calibrator layout "
+            "init DATABASE --log LOG --out my_car.toml' makes"
+        )
     found = None
     if parameters is not None:
         check_fit(found := read_parameters(parameters), database, None)
