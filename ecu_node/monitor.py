@@ -19,20 +19,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ecu_node.bus.adapters import acknowledgement, open_bus
+from ecu_node.bus.adapters import acknowledgement
 from ecu_node.bus.node import steady_time_s
 from ecu_node.bus.service import Log, Requests
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.telemetry import Latency
-from ecu_node.bus.wiring import Mode, branch_signals, key_of, received, transmitted
-from ecu_node.core.branch import REMEMBERED_FRAMES, Auxiliary, Frames, LiveBranch
+from ecu_node.bus.wiring import Mode, branch_signals, key_of, open_bus, received, transmitted
 from ecu_node.core.e2e import Check, Protection, Receiver, protection_of
-from ecu_node.core.junction import aligned_currents
+from ecu_node.core.junction import REMEMBERED_FRAMES, Auxiliary, Frames, LiveBranch, aligned_currents
 from ecu_node.core.signals import AMPERE, bit_place, placed_signal, read_codes
-from ecu_node.core.status import Counters, Quality, Reason, State
+from ecu_node.core.status import Counters, Latency, Quality, Reason, State
 from ecu_node.database import VehicleDatabase, node_database
 from ecu_node.layout import Branch
-from ecu_node.program import say_error, write_output, write_text
+from ecu_node.program import say_error, write_output
 
 View = dict[str, Any]
 """What is shown of one instant; its keys are those of ``monitor --json``, see :meth:`BusMonitor.look`."""
@@ -454,7 +452,7 @@ def run_monitor(layout: Path, bus: Mapping[str, Any], *, once_s: float | None, a
             elif as_json:
                 write_output(json.dumps(view, indent=2))
             else:
-                write_text("\n".join(lines) if once_s else "\n".join([*lines, ""]))
+                write_output("\n".join(lines) if once_s else "\n".join([*lines, ""]))
     if once_s is not None and not any(branch["is_seen"] for branch in view["branches"]):
         say_error(f"ecu-node: {where}: no branch of {layout} was seen; see that the bus is the right one")
         return 1

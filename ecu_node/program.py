@@ -1,7 +1,7 @@
 """How a program starts, prints, fails and ends, the same for the node and whoever builds on it.
 
 Results go to standard output, which may be closed, full, or read no more; what happens goes to standard error, one line
-each, which a terminal gets broken at words. Errors of a user say what to do. Any other exception is a fault of the
+each. Errors of a user say what to do. Any other exception is a fault of the
 program itself: its line names the place, for a report.
 """
 
@@ -10,13 +10,12 @@ import json
 import os
 import signal
 import sys
-import textwrap
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from ecu_node.errors import UserError, printable
 
@@ -24,59 +23,12 @@ if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
 
-_MORE_INDENT = 4
-"""Columns by which what follows of a line stands farther right than its beginning."""
-_NARROWEST = 20
-"""Columns; a terminal that says it has fewer does not know, and breaks lines itself."""
-
-
-def fitted(text: str, stream: TextIO | None) -> str:
-    """A text as a stream is to get it.
-
-    Parameters
-    ----------
-    text : str
-        Lines.
-    stream : file or None
-        Where it goes.
-
-    Returns
-    -------
-    str
-        Broken at words where the stream is a terminal that is narrower; else as it is.
-    """
-    try:
-        if stream is None or not stream.isatty():
-            return text
-        columns = int(os.environ.get("COLUMNS") or os.get_terminal_size(stream.fileno()).columns)
-    except (OSError, ValueError):
-        return text
-    return wrapped(text, columns) if columns >= _NARROWEST else text
-
-
-def wrapped(text: str, columns: int) -> str:
-    """Lines of at most so many columns, broken at spaces; a word that is longer stays whole."""
-    lines = []
-    for line in text.split("\n"):
-        words = line.lstrip()
-        indent = " " * (len(line) - len(words))
-        more = indent + " " * _MORE_INDENT
-        wrapper = textwrap.TextWrapper(columns, indent, more, break_long_words=False, break_on_hyphens=False)
-        lines += wrapper.wrap(words) or [line]
-    return "\n".join(lines)
-
-
-def write_text(text: str) -> None:
-    """Print a text for people, which a terminal gets broken at words; errors as for :func:`write_output`."""
-    write_output(fitted(text, sys.stdout))
-
-
 def write_result(document: Any, text: str, *, as_json: bool) -> None:
     """Print what was found: as JSON, or as a text for people; errors as for :func:`write_output`."""
     if as_json:
         write_output(json.dumps(document, indent=2))
     else:
-        write_text(text)
+        write_output(text)
 
 
 def write_output(text: str, end: str = "\n") -> None:
@@ -182,9 +134,9 @@ def end_of(program: str, error: Exception, *, debug: bool, packages: Sequence[st
 
 
 def say_error(text: str) -> None:
-    """Say something on standard error in one line, which a terminal gets broken at words."""
+    """Say something on standard error in one line."""
     if sys.stderr is not None:  # closed by who started the program
-        print(fitted(printable(" ".join(text.splitlines())), sys.stderr), file=sys.stderr, flush=True)
+        print(printable(" ".join(text.splitlines())), file=sys.stderr, flush=True)
 
 
 def _place(error: Exception, packages: Sequence[str]) -> str:

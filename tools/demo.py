@@ -29,10 +29,9 @@ from calibrator.recordings.frames import read_frames
 from calibrator.recordings.live import play_frames
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import progress_bar
-from ecu_node.bus.adapters import open_bus
 from ecu_node.bus.node import OverlayNode
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.wiring import Mode, choose_parameters, wire
+from ecu_node.bus.wiring import Mode, choose_parameters, open_bus, wire
 from ecu_node.database import read_database
 from ecu_node.errors import UserError
 from ecu_node.layout import read_layout
@@ -214,7 +213,7 @@ def node_thread(parameters: Path, vehicle: str, interface: str, channel: str) ->
     )
     try:
         at_work = threading.Event()
-        run = OverlayNode(bus, corrector, database, period_s=0.1).run
+        run = OverlayNode(bus, corrector, period_s=0.1).run
         node = threading.Thread(target=run, args=(stop.is_set, at_work.set))
         node.start()
         at_work.wait()

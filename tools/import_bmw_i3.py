@@ -44,7 +44,7 @@ from ecu_node.core.signals import AMPERE, unit_factor
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError, UserError
 from ecu_node.layout import read_layout
-from ecu_node.program import say_error, write_output, write_text
+from ecu_node.program import say_error, write_output
 
 COLUMNS = {
     "speed": "Velocity [km/h]",
@@ -214,7 +214,7 @@ def _print_account(account: Account, *, as_json: bool) -> None:
             f"{len(failed)} left out"
         )
         origin = "motor is minus the sum of battery and auxiliary: not independent of the battery's sensor"
-        write_text("\n".join([*lines, summary, origin]))
+        write_output("\n".join([*lines, summary, origin]))
     for text in failed.values():
         say_error(f"import_bmw_i3: {text}")
 

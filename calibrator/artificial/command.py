@@ -32,7 +32,7 @@ from calibrator.terminal.options import (
 )
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import dumps
-from ecu_node.program import write_output, write_text
+from ecu_node.program import write_output
 
 if TYPE_CHECKING:
     from calibrator.fleet_truth import FleetTruth
@@ -100,4 +100,4 @@ def _print_fleet(truth: "FleetTruth", out: Path, notices: Sequence[str], *, json
     if json:
         write_output(dumps(figures))
     else:
-        write_text("\n".join([*lines, *(f"notice: {notice}" for notice in notices)]))
+        write_output("\n".join([*lines, *(f"notice: {notice}" for notice in notices)]))

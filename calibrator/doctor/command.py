@@ -12,7 +12,7 @@ from calibrator.files.layout_files import chosen_layout
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import DbcOption, JsonOption, LayoutOption
 from calibrator.terminal.text import counted, dumps, figure, table
-from ecu_node.program import write_output, write_text
+from ecu_node.program import write_output
 
 if TYPE_CHECKING:
     from calibrator.doctor.facts import ChannelFacts, Facts
@@ -47,7 +47,7 @@ def doctor(
     if json:
         write_output(doctor_json(facts, findings, steps))
     else:
-        write_text(doctor_text(facts, findings, steps))
+        write_output(doctor_text(facts, findings, steps))
     if any(finding.severity == "error" for finding in findings):
         raise typer.Exit(1)
 

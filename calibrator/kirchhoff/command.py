@@ -12,7 +12,7 @@ from calibrator.files.layout_files import vehicle_database
 from calibrator.processes.interrupts import importing
 from calibrator.terminal.options import DbcOption, JsonOption, number_option
 from calibrator.terminal.text import dumps
-from ecu_node.program import say_error, write_output, write_text
+from ecu_node.program import say_error, write_output
 
 __all__ = ["kirchhoff"]
 
@@ -134,7 +134,7 @@ def kirchhoff(
         each.text if each.subject == "sum" and each.code in TOLD else f"{each.severity}: {each.line}"
         for each in findings
     ]
-    write_text(kirchhoff_text(comparison, [*notices, *said]))
+    write_output(kirchhoff_text(comparison, [*notices, *said]))
     _say_next(log if "after" not in comparison.currents_a else None, layout, branches)
 
 

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from types import FrameType
 
-from ecu_node.program import ending_at_interrupt, fitted
+from ecu_node.program import ending_at_interrupt
 
 __all__ = ["TERMINATED", "ending_at_sigterm", "importing", "interrupted_message", "terminated_message"]
 
@@ -48,7 +48,7 @@ def ending_at_sigterm() -> None:
 
     def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
         shown = f"{SHOW_CURSOR}\n" if os.isatty(sys.stderr.fileno()) else ""
-        os.write(sys.stderr.fileno(), f"{shown}{fitted(terminated_message(sys.argv[1:]), sys.stderr)}\n".encode())
+        os.write(sys.stderr.fileno(), f"{shown}{terminated_message(sys.argv[1:])}\n".encode())
         for process in _descendants():
             with suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)  # a worker that lost its parent would wait, or print a traceback

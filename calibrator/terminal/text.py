@@ -9,7 +9,7 @@ import msgspec
 import typer
 
 from calibrator.errors import INTERNAL_ERROR as INTERNAL
-from ecu_node.program import INTERNAL_ERROR, say_error, write_output, write_text
+from ecu_node.program import INTERNAL_ERROR, say_error, write_output
 
 __all__ = [
     "Notice",
@@ -48,7 +48,7 @@ def print_report(report: Report, *, json: bool) -> None:
     if json:
         write_output(report.as_json())
     else:
-        write_text(report.as_text())
+        write_output(report.as_text())
 
 
 def dumps(value: Any) -> str:

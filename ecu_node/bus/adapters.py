@@ -15,8 +15,6 @@ import can
 from can.typechecking import BitTimingDict, BitTimingFdDict, CanFilter
 from can.util import load_config
 
-from ecu_node.bus.wiring import Mode, needs_fd, received, transmitted
-from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError
 
 _SPEED_SET_ELSEWHERE = frozenset({"serial", "socketcan", "socketcand", "udp_multicast", "virtual"})
@@ -51,58 +49,6 @@ class Settings(TypedDict, total=False):
     """Whether to send nothing, acknowledgements included where the adapter can do without."""
     bitrates: Mapping[str, int | None]
     """``bitrate`` and ``data_bitrate`` of the command line, or None. [bit/s]"""
-
-
-def open_bus(
-    database: VehicleDatabase,
-    *,
-    interface: str,
-    channel: str | None,
-    mode: Mode,
-    routed: bool = False,
-    own: bool = True,
-    **settings: Unpack[Settings],
-) -> can.BusABC:
-    """Open a bus for the node.
-
-    Parameters
-    ----------
-    database : VehicleDatabase
-        Layout and DBC.
-    mode : Mode
-        An overlay node receives what it needs, a gateway everything.
-    routed : bool
-        Whether the kernel carries what a gateway does not need.
-    own : bool
-        Whether an overlay node also receives what only one node may send, as sent by others.
-    interface, channel, **settings :
-        As for :func:`bus_config`.
-
-    Returns
-    -------
-    can.BusABC
-        The bus; it does not receive what it sends.
-
-    Raises
-    ------
-    BusError
-        If there is no such bus, or the DBC needs CAN FD and ``fd`` is not given.
-    """
-    require_fd(database, mode, fd=settings.get("fd", False))
-    filters = receive_filters(database, mode, own=own) if mode is Mode.OVERLAY or routed else None
-    return connect(interface, channel, filters=filters, **settings)
-
-
-def require_fd(database: VehicleDatabase, mode: Mode, *, fd: bool) -> None:
-    """Raise BusError if the DBC needs CAN FD and ``fd`` is not given."""
-    if not fd and (names := needs_fd(database, mode)):
-        raise BusError(f"{database.layout.dbc_path}: CAN FD messages ({', '.join(names)}); start with --fd")
-
-
-def receive_filters(database: VehicleDatabase, mode: Mode, *, own: bool = True) -> list[CanFilter]:
-    """Filters for the kernel to apply: what the node needs of the vehicle, and its own messages as sent by others."""
-    keys = (*received(database), *(transmitted(database, mode) if own else ()))
-    return [{"can_id": key, "can_mask": 0x1FFFFFFF if long else 0x7FF, "extended": long} for key, long in keys]
 
 
 def connect(

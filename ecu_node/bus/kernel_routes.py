@@ -15,8 +15,6 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from typing import NamedTuple, Self
 
-from ecu_node.bus.wiring import Mode, rewritten, transmitted
-from ecu_node.database import VehicleDatabase
 from ecu_node.errors import BusError, UserError
 
 _NEW, _DELETE, _GET = 24, 25, 26
@@ -214,13 +212,13 @@ def _route(payload: bytes) -> _Route | None:
 
 
 def kernel_routes(
-    channels: tuple[str, str], database: VehicleDatabase, *, fd: bool, say: Callable[[str], None]
+    channels: tuple[str, str], ours: Collection[tuple[int, bool]], *, fd: bool, say: Callable[[str], None]
 ) -> KernelRoutes | None:
-    """Rules for a gateway of this vehicle; None, and a line in the log, if the node must carry all frames itself."""
+    """Rules for all identifiers but ours; None, and a line in the log, if the node must carry all frames itself."""
     if set(channels) - {name for _, name in socket.if_nameindex()}:
         return None  # opening the bus says so
     try:
-        return KernelRoutes(channels, {*rewritten(database), *transmitted(database, Mode.GATEWAY)}, fd=fd, say=say)
+        return KernelRoutes(channels, ours, fd=fd, say=say)
     except OSError as error:
         needed = {errno.EPERM: "CAP_NET_ADMIN is needed", errno.EOPNOTSUPP: "its module can-gw is needed"}
         say(

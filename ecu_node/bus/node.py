@@ -15,11 +15,8 @@ from typing import Required, TypedDict, Unpack
 import can
 
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.telemetry import Latency
-from ecu_node.bus.wiring import Mode, rewritten, transmitted
 from ecu_node.core.corrector import Corrector
-from ecu_node.core.status import Counters
-from ecu_node.database import VehicleDatabase
+from ecu_node.core.status import Counters, Latency
 from ecu_node.errors import BusError
 
 _OLDEST_FRAME_S = 10.0
@@ -164,8 +161,6 @@ class _Node:
     ----------
     heard, told : SteadyBus
         Where the sensors are heard, and where the node answers and tells its status.
-    own : iterable of tuple
-        Identifiers that only this node may send there.
     corrector : Corrector
         The core.
     """
@@ -174,14 +169,14 @@ class _Node:
         self,
         heard: SteadyBus,
         told: SteadyBus,
-        own: Iterable[_Key],
         corrector: Corrector,
         *,
         period_s: float,
         on_tick: OnTick = lambda _, __: None,
         latency: Latency | None = None,
     ) -> None:
-        self._heard, self._told, self._own, self._corrector = heard, told, OwnFrames(own), corrector
+        self._heard, self._told, self._corrector = heard, told, corrector
+        self._own = OwnFrames(corrector.own_keys)
         self._period_s, self._on_tick, self._latency = period_s, on_tick, latency or Latency()
         self._time_of_day = TimeOfDay(corrector.counters)
         self._heard_s = self._due_s = float("-inf")
@@ -288,16 +283,12 @@ class OverlayNode(_Node):
         The bus.
     corrector : Corrector
         The core.
-    database : VehicleDatabase
-        Layout and DBC.
     **settings : NodeSettings
         By keyword.
     """
 
-    def __init__(
-        self, bus: SteadyBus, corrector: Corrector, database: VehicleDatabase, **settings: Unpack[NodeSettings]
-    ) -> None:
-        super().__init__(bus, bus, transmitted(database, Mode.OVERLAY), corrector, **settings)
+    def __init__(self, bus: SteadyBus, corrector: Corrector, **settings: Unpack[NodeSettings]) -> None:
+        super().__init__(bus, bus, corrector, **settings)
 
     def run(self, stop: Callable[[], bool], ready: Callable[[], None] = lambda: None) -> None:
         """Correct until told to stop.
@@ -361,7 +352,7 @@ class GatewayNode(_Node):
         The bus on which the sensors are.
     vehicle : SteadyBus
         The bus on which the corrected values are needed; the status goes there too.
-    corrector, database, **settings :
+    corrector, **settings :
         As for :class:`~ecu_node.bus.node.OverlayNode`.
     routed : bool
         Whether the kernel carries all identifiers but those that only the gateway may send to the vehicle.
@@ -372,14 +363,12 @@ class GatewayNode(_Node):
         sensors: SteadyBus,
         vehicle: SteadyBus,
         corrector: Corrector,
-        database: VehicleDatabase,
         *,
         routed: bool = False,
         **settings: Unpack[NodeSettings],
     ) -> None:
-        own = transmitted(database, Mode.GATEWAY)
-        super().__init__(sensors, vehicle, own, corrector, **settings)
-        self._not_from_vehicle = OwnFrames([*own, *rewritten(database)], _REMEMBERED_COPIES)
+        super().__init__(sensors, vehicle, corrector, **settings)
+        self._not_from_vehicle = OwnFrames(corrector.own_keys | corrector.branch_keys, _REMEMBERED_COPIES)
         self._routed, self._back_s = routed, float("-inf")
         self._copies: deque[float] = deque(maxlen=_COPIES)
         """When copies of one bus's frames came from the other one. [s]"""

@@ -19,22 +19,24 @@ from typing import Any, Protocol
 
 from cantools.database.can import Message
 
-from ecu_node.bus.adapters import acknowledgement, bus_config, carries_fd, config_text, open_bus, require_fd
+from ecu_node.bus.adapters import acknowledgement, bus_config, carries_fd, config_text
 from ecu_node.bus.faults import FaultMemory
 from ecu_node.bus.kernel_routes import kernel_routes
 from ecu_node.bus.node import GatewayNode, NodeSettings, OverlayNode
 from ecu_node.bus.on_board_summary import on_board_summary
 from ecu_node.bus.service import Log, Requests, ServiceManager, be_real_time
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.telemetry import Latency, Telemetry, serve_metrics
+from ecu_node.bus.telemetry import Telemetry, serve_metrics
 from ecu_node.bus.wiring import (
     InForce,
     Mode,
     branch_plan,
     choose_parameters,
     needs_fd,
+    open_bus,
     put_in_force,
     received,
+    require_fd,
     rewritten,
     sensor_fault,
     transmitted,
@@ -43,12 +45,12 @@ from ecu_node.bus.wiring import (
 )
 from ecu_node.core.corrector import OF_ONE_DRIVE, Corrector
 from ecu_node.core.signals import FrameKey
-from ecu_node.core.status import Reason
+from ecu_node.core.status import Latency, Reason
 from ecu_node.database import VehicleDatabase, node_database
 from ecu_node.documents import signature
 from ecu_node.errors import printable
 from ecu_node.layout import Branch
-from ecu_node.program import write_text
+from ecu_node.program import write_output
 
 _LOOK_EVERY_S = 1.0
 """Between looks whether the parameter file has changed. [s]"""
@@ -220,11 +222,13 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
     source = _source(options, database, mode, say)
     corrector = wire(database, source.in_force, time.monotonic(), mode=mode, shadow=options.shadow)
     if options.dry_run:
-        write_text(_dry_run(bus_settings, database, mode))
+        write_output(_dry_run(bus_settings, database, mode))
         return 0
     routes = None
     if is_gateway and options.interface == "socketcan":
-        routes = kernel_routes((options.channel, options.gateway), database, fd=options.fd, say=say)
+        routes = kernel_routes(
+            (options.channel, options.gateway), corrector.own_keys | corrector.branch_keys, fd=options.fd, say=say
+        )
     routed, latency = routes is not None, Latency()
     with ExitStack() as closed_at_end:
         # A node that only listens may stand beside the one that sends.
@@ -269,9 +273,9 @@ def run_node(options: argparse.Namespace, bus: Mapping[str, Any]) -> int:  # noq
         }
         node: OverlayNode | GatewayNode
         if is_gateway:
-            node = GatewayNode(buses[0], buses[1], corrector, database, routed=routed, **how)
+            node = GatewayNode(buses[0], buses[1], corrector, routed=routed, **how)
         else:
-            node = OverlayNode(buses[0], corrector, database, **how)
+            node = OverlayNode(buses[0], corrector, **how)
         _freeze()
         node.run(requests.stop, ready)
     return 0

@@ -16,57 +16,11 @@ from typing import Any
 import msgspec
 
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.core.branch import LiveBranch
 from ecu_node.core.corrector import Corrector
-from ecu_node.core.status import Quality
+from ecu_node.core.junction import LiveBranch
+from ecu_node.core.status import Latency, Quality
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout
-
-
-class Latency:
-    """Histogram of the time from when a branch's frame came until its answer was sent.
-
-    Answers that are sent with one call count as the one that waited longest: a fifth of the cost, and never too little.
-
-    Attributes
-    ----------
-    counts : list of int
-        Frames whose latency in whole microseconds has so many bits: number n counts those below 2^n us.
-    largest_s : float
-        Largest one. [s]
-    came : callable
-        Takes when a frame came, on the steady clock [s]; its answer is sent next.
-    """
-
-    def __init__(self) -> None:
-        self.counts = [0] * 48
-        self.largest_s = 0.0
-        self._waiting: list[float] = []
-        self.came = self._waiting.append
-
-    def sent(self, not_sent: int) -> None:
-        """Count the frames that came since the last time, unless the bus did not take some of their answers."""
-        waiting = self._waiting
-        if waiting and not not_sent:
-            self.add(time.monotonic() - waiting[0], len(waiting))
-        waiting.clear()
-
-    def add(self, latency_s: float, frames: int = 1) -> None:
-        """Count frames of this latency. [s]"""
-        self.counts[int(max(latency_s, 0.0) * 1e6).bit_length()] += frames
-        self.largest_s = max(self.largest_s, latency_s)
-
-    def at_most_s(self, share: float) -> float:
-        """Latency that this share of the frames does not exceed, up to a factor of 2 more than it is. [s]"""
-        wanted = share * sum(self.counts)
-        bits = next(n for n, below in enumerate(accumulate(self.counts)) if below >= wanted)
-        return min(1e-6 * 2.0**bits, self.largest_s)
-
-    def microseconds(self) -> dict[str, int]:
-        """Median, 99.9 % and largest. [us]"""
-        found_s = {"p50": self.at_most_s(0.5), "p99.9": self.at_most_s(0.999), "max": self.largest_s}
-        return {name: round(1e6 * value_s) for name, value_s in found_s.items()}
-
 
 _PERIOD_S = 1.0
 

@@ -12,16 +12,17 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Unpack
 
+import can
+from can.typechecking import CanFilter
 from cantools.database.can import Message, Signal
 
-from ecu_node.core.branch import Auxiliary, LiveBranch
+from ecu_node.bus.adapters import Settings, connect
 from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault, Signals, correction_plan
-from ecu_node.core.corrector import Corrector, StatusFields
+from ecu_node.core.corrector import Corrector, Reader, Source, StatusFields, Target, TargetField
 from ecu_node.core.e2e import protection_of
-from ecu_node.core.frames import Reader, Source, Target, TargetField
-from ecu_node.core.junction import ExpectedSum, JunctionWatch
+from ecu_node.core.junction import Auxiliary, ExpectedSum, JunctionWatch, LiveBranch
 from ecu_node.core.signals import (
     AMPERE,
     VOLT,
@@ -40,11 +41,9 @@ from ecu_node.core.signals import (
 )
 from ecu_node.core.status import Counters, Quality, Reason, State, UnfitError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import DatabaseError, LayoutError
+from ecu_node.errors import BusError, DatabaseError, LayoutError
 from ecu_node.layout import Branch, SignalName, split_signal
 from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
-
-__all__ = ["InForce", "Mode", "branch_plan", "choose_parameters", "put_in_force", "sensor_fault", "wire"]
 
 PARAMETER_SETS = 256
 """The status publishes the number of the parameter set modulo this."""
@@ -466,3 +465,55 @@ def _status_fields(database: VehicleDatabase) -> StatusFields | None:
         places=places,
         sums=sums,
     )
+
+
+def open_bus(
+    database: VehicleDatabase,
+    *,
+    interface: str,
+    channel: str | None,
+    mode: Mode,
+    routed: bool = False,
+    own: bool = True,
+    **settings: Unpack[Settings],
+) -> can.BusABC:
+    """Open a bus for the node.
+
+    Parameters
+    ----------
+    database : VehicleDatabase
+        Layout and DBC.
+    mode : Mode
+        An overlay node receives what it needs, a gateway everything.
+    routed : bool
+        Whether the kernel carries what a gateway does not need.
+    own : bool
+        Whether an overlay node also receives what only one node may send, as sent by others.
+    interface, channel, **settings :
+        As for :func:`ecu_node.bus.adapters.bus_config`.
+
+    Returns
+    -------
+    can.BusABC
+        The bus; it does not receive what it sends.
+
+    Raises
+    ------
+    BusError
+        If there is no such bus, or the DBC needs CAN FD and ``fd`` is not given.
+    """
+    require_fd(database, mode, fd=settings.get("fd", False))
+    filters = receive_filters(database, mode, own=own) if mode is Mode.OVERLAY or routed else None
+    return connect(interface, channel, filters=filters, **settings)
+
+
+def require_fd(database: VehicleDatabase, mode: Mode, *, fd: bool) -> None:
+    """Raise BusError if the DBC needs CAN FD and ``fd`` is not given."""
+    if not fd and (names := needs_fd(database, mode)):
+        raise BusError(f"{database.layout.dbc_path}: CAN FD messages ({', '.join(names)}); start with --fd")
+
+
+def receive_filters(database: VehicleDatabase, mode: Mode, *, own: bool = True) -> list[CanFilter]:
+    """Filters for the kernel to apply: what the node needs of the vehicle, and its own messages as sent by others."""
+    keys = (*received(database), *(transmitted(database, mode) if own else ()))
+    return [{"can_id": key, "can_mask": 0x1FFFFFFF if long else 0x7FF, "extended": long} for key, long in keys]

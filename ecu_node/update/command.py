@@ -11,7 +11,7 @@ import msgspec
 from ecu_node import __version__
 from ecu_node.core.status import TrustError
 from ecu_node.errors import UserError, printable
-from ecu_node.program import say_error, write_output, write_result, write_text
+from ecu_node.program import say_error, write_output, write_result
 
 if TYPE_CHECKING:
     from ecu_node.update.state import ParameterSet, State
@@ -163,7 +163,7 @@ def _inspect(options: argparse.Namespace) -> int:
     if options.json:
         write_output(msgspec.json.encode({**facts, "problems": problems}).decode())
     else:
-        write_text("\n".join(map(printable, lines)))
+        write_output("\n".join(map(printable, lines)))
     for problem in problems:
         say_error(f"ecu-node: {problem}")
     return 1 if problems else 0

@@ -18,8 +18,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from ecu_node.bus.wiring import InForce, sensor_fault
-from ecu_node.core.branch import LiveBranch
-from ecu_node.core.junction import aligned_currents
+from ecu_node.core.junction import LiveBranch, aligned_currents
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
 

@@ -15,10 +15,9 @@ import pytest
 from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
-from ecu_node.bus.adapters import open_bus
 from ecu_node.bus.node import GatewayNode
 from ecu_node.bus.steady_bus import SocketCanLink, SteadyBus
-from ecu_node.bus.wiring import InForce, Mode, wire
+from ecu_node.bus.wiring import InForce, Mode, open_bus, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase
@@ -58,7 +57,7 @@ def gateway(
     stop = threading.Event()
     with ThreadPoolExecutor(1) as pool:
         ready = threading.Event()
-        node = GatewayNode(*buses, corrector, database, period_s=0.02, routed=routed)
+        node = GatewayNode(*buses, corrector, period_s=0.02, routed=routed)
         running = pool.submit(node.run, stop.is_set, ready.set)
         while not ready.wait(0.01) and not running.done():
             pass
@@ -185,7 +184,7 @@ def test_a_frame_is_passed_on_at_once_when_an_error_frame_came_with_it(
     source, target = [SocketCanLink(far) for _, far in pairs][:: 1 if to_vehicle else -1]
     stop, ready = threading.Event(), threading.Event()
     with ThreadPoolExecutor(1) as pool:
-        node = GatewayNode(buses[0], buses[1], corrector, database, period_s=30.0)
+        node = GatewayNode(buses[0], buses[1], corrector, period_s=30.0)
         running = pool.submit(node.run, stop.is_set, ready.set)
         try:
             assert ready.wait(LONGEST_WAIT_S)
@@ -277,7 +276,7 @@ def test_the_watchdog_is_not_fed_while_the_way_back_is_stuck(
     sensors = SteadyBus(lambda: near, corrector.counters)
     vehicle = SteadyBus(lambda: VirtualBus(f"{name} b"), corrector.counters)
     with ThreadPoolExecutor(1) as pool:
-        node = GatewayNode(sensors, vehicle, corrector, database, period_s=0.02, on_tick=feed)
+        node = GatewayNode(sensors, vehicle, corrector, period_s=0.02, on_tick=feed)
         running = pool.submit(node.run, stop.is_set)
         try:
             fed.get(timeout=LONGEST_WAIT_S)

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from ecu_node.bus.telemetry import Latency, serve_metrics
+from ecu_node.bus.telemetry import serve_metrics
 from ecu_node.bus.wiring import InForce, wire
 from ecu_node.cli import main
 from ecu_node.core.signals import FrameKey
-from ecu_node.core.status import Counters, Reason, State
+from ecu_node.core.status import Counters, Latency, Reason, State
 from ecu_node.database import VehicleDatabase
 from tests.ecu_node.vehicles import LAYOUT, Frame, answers, parameters_for, protected
 

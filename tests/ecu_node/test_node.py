@@ -14,10 +14,9 @@ import pytest
 from can.interfaces.virtual import VirtualBus
 from e2e.p01 import e2e_p01_check
 
-from ecu_node.bus.adapters import open_bus, receive_filters
 from ecu_node.bus.node import GatewayNode, OverlayNode, TimeOfDay
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.wiring import InForce, Mode, wire
+from ecu_node.bus.wiring import InForce, Mode, open_bus, receive_filters, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Counters, Reason, State
 from ecu_node.database import VehicleDatabase
@@ -34,7 +33,7 @@ def node_on(
     corrector = wire(database, InForce(parameters=parameters_for(database, battery=(0.25, 5.0))), time.monotonic())
     bus = SteadyBus(opened or (lambda: overlay_bus(database, channel)), corrector.counters)
     try:
-        with at_work(OverlayNode(bus, corrector, database, period_s=period_s)):
+        with at_work(OverlayNode(bus, corrector, period_s=period_s)):
             yield corrector
     finally:
         bus.close()
@@ -165,7 +164,7 @@ def gateway_between(database: VehicleDatabase, sensors: can.BusABC, vehicle: can
     corrector = wire(database, in_force, time.monotonic(), mode=Mode.GATEWAY)
     buses = [SteadyBus(lambda bus=bus: bus, corrector.counters) for bus in (sensors, vehicle)]  # type: ignore[misc]
     try:
-        with at_work(GatewayNode(buses[0], buses[1], corrector, database, period_s=0.02)):
+        with at_work(GatewayNode(buses[0], buses[1], corrector, period_s=0.02)):
             yield corrector
     finally:
         for bus in buses:

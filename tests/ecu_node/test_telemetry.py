@@ -22,11 +22,11 @@ import pytest
 from ecu_node.bus import service
 from ecu_node.bus.node import GatewayNode, OverlayNode
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.telemetry import Latency, Telemetry
+from ecu_node.bus.telemetry import Telemetry
 from ecu_node.bus.wiring import InForce, wire
 from ecu_node.cli import main
 from ecu_node.core.signals import FrameKey
-from ecu_node.core.status import Counters
+from ecu_node.core.status import Counters, Latency
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import LayoutError
 from tests.ecu_node.test_node import FullBus, at_work, wait_until
@@ -240,9 +240,9 @@ def test_every_answer_is_in_the_histogram(kind: str, database: VehicleDatabase, 
 
     corrector, latency = wire(database, InForce(parameters=parameters_for(database)), 0.0), Latency()
     near, far = opened("near"), opened("far")
-    node: OverlayNode | GatewayNode = OverlayNode(near, corrector, database, period_s=0.1, latency=latency)
+    node: OverlayNode | GatewayNode = OverlayNode(near, corrector, period_s=0.1, latency=latency)
     if kind == "gateway":
-        node = GatewayNode(near, far, corrector, database, period_s=0.1, latency=latency)
+        node = GatewayNode(near, far, corrector, period_s=0.1, latency=latency)
     with can.Bus(f"{request.node.name}near", "virtual") as peer, at_work(node):
         for k in range(50):
             data = protected(database, "HV_Battery", k % 15)

@@ -214,9 +214,9 @@ def _passed(
     corrector.watch.is_whole = lambda _: False  # random currents do not sum to zero
     near, far = SteadyBus(lambda: script, Counters()), SteadyBus(lambda: silent, Counters())
     node = (
-        OverlayNode(near, corrector, database, period_s=_FOREVER_S, on_tick=begin)
+        OverlayNode(near, corrector, period_s=_FOREVER_S, on_tick=begin)
         if mode is Mode.OVERLAY
-        else GatewayNode(near, far, corrector, database, period_s=_FOREVER_S, on_tick=begin)
+        else GatewayNode(near, far, corrector, period_s=_FOREVER_S, on_tick=begin)
     )
     node.run(lambda: script.done)
     near.close()

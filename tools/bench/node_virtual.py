@@ -21,10 +21,9 @@ import can
 from bench.node_plain import plain_job
 from bench.node_vehicle import IDENTIFIER, NUMBERS, OUT_IDENTIFIER, BenchVehicle, make_vehicle
 from bench.row import Row
-from ecu_node.bus.adapters import open_bus
 from ecu_node.bus.node import GatewayNode, OverlayNode
 from ecu_node.bus.steady_bus import SteadyBus
-from ecu_node.bus.wiring import Mode
+from ecu_node.bus.wiring import Mode, open_bus
 from ecu_node.core.status import Counters
 
 __all__ = ["BUS_LOAD_HZ", "load_rows", "rows"]
@@ -307,7 +306,7 @@ def gateway_node(vehicle: BenchVehicle, channels: Channels) -> Iterator[None]:
         _node_bus(vehicle, channels[0], Mode.GATEWAY) as sensors,
         _node_bus(vehicle, channels[1], Mode.GATEWAY) as far_side,
     ):
-        node = GatewayNode(sensors, far_side, corrector, vehicle.database, period_s=PERIOD_S)
+        node = GatewayNode(sensors, far_side, corrector, period_s=PERIOD_S)
         with _running(node.run):
             yield
 
@@ -318,7 +317,7 @@ def overlay_node(vehicle: BenchVehicle, channels: Channels) -> Iterator[None]:
     corrector = vehicle.corrector(Mode.OVERLAY)
     with (
         _node_bus(vehicle, channels[0], Mode.OVERLAY) as bus,
-        _running(OverlayNode(bus, corrector, vehicle.database, period_s=PERIOD_S).run),
+        _running(OverlayNode(bus, corrector, period_s=PERIOD_S).run),
     ):
         yield
 
