@@ -261,7 +261,10 @@ class _FrameByFrame:
 
     def receive(self, timeout_s: float) -> can.Message | None:
         asked_s = time.monotonic()
-        message = self._bus.recv(timeout_s)
+        try:
+            message = self._bus.recv(timeout_s)
+        except (ValueError, TypeError, struct.error) as error:  # of python-can's serial driver, on a disturbed line
+            raise can.CanOperationError(f"the adapter sends what is no frame: {error}") from None
         now_s = time.monotonic()
         self.asked_s = now_s if timeout_s > 0.0 else asked_s
         if message is not None:

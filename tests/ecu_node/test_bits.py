@@ -66,11 +66,6 @@ def test_a_frame_too_short_gives_none_and_is_left_alone(case: tuple[Message, Sig
     assert payload == before
 
 
-def test_longer_frames_are_read_too() -> None:
-    place = bit_place(Signal("S", start=0, length=8))
-    assert place.extract(bytes([5, 1, 2, 3])) == 5
-
-
 def test_a_code_beyond_the_width_is_refused_and_never_wraps() -> None:
     place = bit_place(Signal("S", start=0, length=8, is_signed=True))
     with pytest.raises(ValueError, match="128 does not fit into 8 bits"):

@@ -14,7 +14,7 @@ import pytest
 from ecu_node import __version__
 from ecu_node.cli import main
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import parameter_schema, write_parameters
+from ecu_node.parameters import write_parameters
 from tests.ecu_node.vehicles import LAYOUT, SMALL_DBC, SMALL_LAYOUT, as_document, parameters_for
 
 
@@ -158,26 +158,6 @@ def test_an_empty_name_of_a_bus_is_wrong_use(params: Path, more: list[str], caps
     assert "a name is expected, such as can0, found none" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["run", "check"])
-@pytest.mark.parametrize("vehicle", ["", " "])
-def test_an_empty_vehicle_is_wrong_use(
-    params: Path, command: str, vehicle: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main([command, *check(params)[1:], "--vehicle", vehicle])
-    assert caught.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    expected = "the identity of the vehicle is expected, printable and of at most 64 characters"
-    assert f"--vehicle: {expected}, found none; see 'ecu-node " in line
-
-
-def test_a_vehicle_with_control_characters_is_wrong_use(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(check(params, "--vehicle", "v\x1b[2J"))
-    assert caught.value.code == 2
-    assert r"printable and of at most 64 characters, found 'v\x1b[2J'" in capsys.readouterr().err
-
-
 def test_a_gateway_needs_two_buses(params: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--interface", "virtual", "--channel", "c0", "--gateway", "c0"]
     assert main(["run", "--unsigned", "--params", str(params), "--layout", str(LAYOUT), *options]) == 2
@@ -215,11 +195,6 @@ def test_the_vehicle_can_come_from_the_environment(
     monkeypatch.setenv("ECU_NODE_VEHICLE", "v2")
     assert main(check(params)) == 1
     assert capsys.readouterr().out.startswith(f"NOT FIT (WRONG_VEHICLE): {params}: parameters are for vehicle 'v1'")
-
-
-def test_the_schema_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["schema"]) == 0
-    assert json.loads(capsys.readouterr().out) == parameter_schema()
 
 
 @pytest.mark.parametrize(

@@ -67,35 +67,12 @@ def test_a_branch_frame_is_answered_by_its_corrected_frame(database: VehicleData
     assert e2e_p01_check(bytearray(answer.data), 1296)
 
 
-def test_answers_count_whether_or_not_they_are_corrected(database: VehicleDatabase) -> None:
-    corrector = corrector_for(database, battery=(0.25, 5.0))
-    for frame in (battery(database, 0), motor(database, 0), battery(database, 1)):
-        answers(corrector, frame, 0.0)
-    assert (corrector.counters.answers, corrector.counters.rewritten) == (3, 0)
-
-
 def test_a_consumer_is_corrected_with_its_offset_into_the_junction(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, motor=(0.25, 5.0))
     (answer,) = answers(corrector, motor(database, 0), 0.0)
     assert decoded(database, "HV_MotorCorrected", answer.data)["MotorCurrentCorrected"] == pytest.approx(
         -(-100.0 - 5.0) / 1.25
     )
-
-
-def test_corrected_frames_count_on_their_own(database: VehicleDatabase) -> None:
-    corrector = corrector_for(database, battery=(0.1, 0.0))
-    found = [answers(corrector, battery(database, counter % 15), 0.0)[0] for counter in range(7, 27)]
-    assert [decoded(database, "HV_BatteryCorrected", answer.data)["AliveCounter"] for answer in found] == [
-        *range(15),
-        *range(5),
-    ]
-
-
-def test_without_parameters_every_branch_is_passed_through(database: VehicleDatabase) -> None:
-    corrector = corrector_for(database)
-    (answer,) = answers(corrector, battery(database, 3, 123.5), 0.0)
-    values = decoded(database, "HV_BatteryCorrected", answer.data)
-    assert (values["BatteryCurrentCorrected"], values["BatteryCurrentQuality"]) == (123.5, Quality.PASSED_THROUGH)
 
 
 def test_a_branch_that_the_parameters_do_not_name_is_passed_through(database: VehicleDatabase) -> None:
@@ -116,13 +93,6 @@ def test_codes_that_are_no_values_come_out_as_not_available(
     assert sums_at(corrector, 0.0) == (None, None)
 
 
-def test_a_branch_without_a_fault_is_passed_through(database: VehicleDatabase) -> None:
-    corrector = corrector_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
-    (answer,) = answers(corrector, motor(database, 0), 0.0)
-    values = decoded(database, "HV_MotorCorrected", answer.data)
-    assert (values["MotorCurrentCorrected"], values["MotorCurrentQuality"]) == (100.0, Quality.PASSED_THROUGH)
-
-
 def test_parameters_without_any_fault_pass_everything_through(database: VehicleDatabase) -> None:
     corrector = corrector_for(database, battery=(0.0, 0.0))
     answers(corrector, battery(database, 0), 0.0)
@@ -138,32 +108,6 @@ def test_a_result_beyond_the_signal_is_clamped_and_counted(database: VehicleData
     assert {value["BatteryCurrentQuality"] for value in values} == {Quality.CORRECTED}
     assert corrector.counters.saturated == 2
     assert corrector.counters.text().endswith(", saturated 2")
-
-
-def test_nothing_is_made_of_a_corrupt_frame(database: VehicleDatabase) -> None:
-    corrector = corrector_for(database, battery=(0.1, 0.0))
-    good = battery(database, 3)
-    for bit in range(64):
-        damaged = (int.from_bytes(good.data, "little") ^ 1 << bit).to_bytes(8, "little")
-        assert answers(corrector, Frame(BATTERY, damaged), 0.0) == []
-    assert answers(corrector, Frame(BATTERY, b""), 0.0) == []
-    assert (corrector.counters.corrupt, corrector.counters.answers) == (65, 0)
-    assert len(answers(corrector, good, 0.0)) == 1
-
-
-def test_a_repeated_frame_is_counted_and_not_answered_and_a_gap_is_counted(database: VehicleDatabase) -> None:
-    corrector = corrector_for(database, battery=(0.1, 0.0))
-    found = [len(answers(corrector, battery(database, counter), 0.0)) for counter in (1, 1, 2, 4)]
-    assert found == [1, 0, 1, 1]
-    assert (corrector.counters.repeated, corrector.counters.gaps) == (1, 1)
-
-
-def test_foreign_frames_and_own_output_are_not_looked_at(database: VehicleDatabase) -> None:
-    corrector = corrector_for(database, battery=(0.1, 0.0))
-    (own,) = answers(corrector, battery(database, 0), 0.0)
-    for frame in (own, Frame(FrameKey(0x110, True), own.data), Frame(FrameKey(0x7FF, False), b"x")):
-        assert answers(corrector, frame, 0.0) == []
-    assert corrector.counters.frames_in == 1
 
 
 def test_the_status_says_starting_then_correcting(database: VehicleDatabase) -> None:
@@ -373,16 +317,6 @@ def test_a_value_that_the_input_cannot_have_is_refused(
         make_database(text, database.layout.dbc_path.read_text())
 
 
-@pytest.mark.parametrize("value", ["4", "-1", "0.5"])
-def test_a_contactor_state_that_can_never_be_is_refused(
-    make_database: MakeDatabase, database: VehicleDatabase, value: str
-) -> None:
-    text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
-    words = rf"small\.toml: \[contactor\] open: {value} is no value of HV_Battery\.ContactorState, which has 2 bits"
-    with pytest.raises(LayoutError, match=words):
-        make_database(text.replace("open = [0]", f"open = [0, {value}]"), database.layout.dbc_path.read_text())
-
-
 def test_a_set_of_which_the_calibrator_expects_no_better_sum_is_kept(database: VehicleDatabase) -> None:
     parameters = parameters_for(database, battery=(0.02, 0.0), motor=(0.0, 0.0))
     expected = replace(parameters, junction_residual=JunctionResidual(measured_a=0.0, corrected_a=3.0))
@@ -451,24 +385,6 @@ def test_a_motor_at_rest_is_not_stuck(database: VehicleDatabase) -> None:
     assert corrector.latched is not Reason.BRANCH_STUCK
 
 
-def test_what_is_still_published_is_of_the_quality_that_is_told_of_it(make_database: MakeDatabase) -> None:
-    layout = SMALL_LAYOUT.replace(
-        'corrected = "PairOut.Motor" }', 'corrected = "PairOut.Motor", timeout_s = 60.0 }'
-    ).replace("Pair.Motor", "Other.Motor")
-    dbc = SMALL_DBC.replace(' SG_ Motor : 23|16@0- (-0.05,0) [-1600|1600] "A" Node\n', "", 1).replace(
-        "BO_ 258", 'BO_ 257 Other: 2 Node\n SG_ Motor : 7|16@0- (-0.05,0) [-1600|1600] "A" Node\nBO_ 258', 1
-    )
-    database = make_database(layout, dbc)
-    corrector = corrector_for(database, battery=(0.5, 3.0), motor=(0.25, 0.0))
-    pair = Frame(PAIR, database.message("Pair").encode({"Battery": 153.0}))
-    answers(corrector, pair, 0.0)
-    answers(corrector, Frame(FrameKey(257, False), database.message("Other").encode({"Motor": 50.0})), 0.0)
-    for branch, active, motor_a in ((corrector.branches[1], False, 50.0), (corrector.branches[1], True, 40.0)):
-        branch.activate(active=active)
-        (answer,) = answers(corrector, pair, 0.1)
-        assert decoded(database, "PairOut", answer.data)["Motor"] == motor_a
-
-
 def test_shadow_mode_computes_and_changes_nothing(database: VehicleDatabase) -> None:
     parameters = parameters_for(database, battery=(0.25, 5.0), motor=(0.0, 0.0))
     corrector = wire(database, InForce(parameters=parameters), start_s=0.0, shadow=True)
@@ -520,14 +436,6 @@ def test_the_reason_for_passing_through_comes_before_a_stale_branch(database: Ve
     assert status["ParameterSet"] == 0
 
 
-def test_two_branches_share_source_and_target(make_database: MakeDatabase) -> None:
-    database = make_database()
-    corrector = corrector_for(database, battery=(0.5, 3.0), motor=(0.0, -2.0))
-    data = database.message("Pair").encode({"Battery": 153.0, "Motor": 40.0})
-    (answer,) = answers(corrector, Frame(PAIR, data), 0.0)
-    assert decoded(database, "PairOut", answer.data) == {"Battery": 100.0, "Motor": 38.0, "Quality": Quality.CORRECTED}
-
-
 def test_a_power_counts_in_the_sum_as_power_over_voltage(make_database: MakeDatabase) -> None:
     database = make_database()
     corrector = corrector_for(database, battery=(0.0, 0.0), motor=(0.0, 0.0), heater=(0.25, 0.0))
@@ -549,15 +457,6 @@ def test_a_power_is_divided_by_the_voltage_of_its_own_instant(make_database: Mak
     for now_s, volts in ((0.0, 400.0), (0.2, 500.0)):
         answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": volts})), now_s)
     assert corrector.branches[2].currents_at(0.1) == pytest.approx((-10.0, -10.0))
-
-
-def test_a_frame_cut_off_before_the_voltage_leaves_it_as_it_was(make_database: MakeDatabase) -> None:
-    database = make_database()
-    corrector = corrector_for(database, heater=(0.25, 0.0))
-    answers(corrector, Frame(NET, database.message("Net").encode({"Voltage": 400.0})), 0.0)
-    answers(corrector, Frame(NET, bytes(1)), 0.1)
-    answers(corrector, Frame(HEATER, database.message("Heater").encode({"Power": 4000})), 0.1)
-    assert sums_at(corrector, 0.1) == pytest.approx((-10.0, -8.0))
 
 
 def test_a_voltage_near_zero_is_not_divided_by(make_database: MakeDatabase) -> None:

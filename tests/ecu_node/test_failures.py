@@ -35,19 +35,6 @@ def test_parameters_that_are_unfit_are_so_for_another_process_too() -> None:
     assert (type(found), found.reason, str(found)) == (TrustError, Reason.REVOKED, "number 5 was revoked")
 
 
-def main_of_nothing() -> None:
-    raise UserError("wrong")
-
-
-def test_debug_shows_the_traceback_before_the_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(UserError) as raised:
-        main_of_nothing()
-    assert end_of("prog", raised.value, debug=True) == FAILED
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "Traceback (most recent call last):"
-    assert lines[-1] == "prog: wrong"
-
-
 def test_debug_is_taken_from_anywhere_before_two_dashes() -> None:
     assert split_debug(["run", "--debug", "x"]) == (["run", "x"], True)
     assert split_debug(["--debug", "run", "--", "--debug"]) == (["run", "--", "--debug"], True)

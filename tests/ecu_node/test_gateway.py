@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 from e2e.p01 import e2e_p01_check
 
-from ecu_node.bus.wiring import InForce, Mode, transmitted, wire
+from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.core.corrector import Corrector
 from ecu_node.core.signals import FrameKey
 from ecu_node.core.status import Reason, State
@@ -15,7 +15,6 @@ from tests.ecu_node.vehicles import SMALL_DBC, SMALL_LAYOUT, Frame, decoded, par
 
 MakeDatabase = Callable[..., VehicleDatabase]
 BATTERY, PAIR, HEATER, NET = FrameKey(0x110, False), FrameKey(256, False), FrameKey(512, True), FrameKey(258, False)
-INVALID = ("full_scale_a = 400.0", 'full_scale_a = 400.0\non_bad_frame = "invalid"')
 
 
 def gateway_for(database: VehicleDatabase, *, shadow: bool = False, **faults: tuple[float, float]) -> Corrector:
@@ -50,17 +49,6 @@ def test_frames_whose_current_is_changed_are_counted_and_no_others(
     assert (corrector.counters.frames_in, corrector.counters.rewritten, corrector.counters.answers) == (3, rewritten, 0)
 
 
-def test_bits_that_no_signal_covers_survive(make_database: MakeDatabase) -> None:
-    database = make_database()
-    corrector = gateway_for(database, battery=(0.5, 3.0))
-    data = bytearray(database.message("Pair").encode({"Battery": 153.0, "Motor": 40.0}))
-    data[4:] = b"\xde\xad\xbe\xef"
-    out = passed_on(corrector, Frame(PAIR, bytes(data)), 0.0)
-    assert out is not None
-    assert out[4:] == b"\xde\xad\xbe\xef"
-    assert decoded(database, "Pair", out) == {"Battery": 100.0, "Motor": 40.0}
-
-
 @pytest.mark.parametrize("code", [-32768, 32501, -32501])
 def test_codes_that_are_no_values_are_passed_on_untouched(database: VehicleDatabase, code: int) -> None:
     corrector = gateway_for(database, battery=(0.25, 5.0))
@@ -80,25 +68,12 @@ def test_codes_that_the_layout_calls_no_value_are_passed_on_untouched(make_datab
     assert found == [False, True, True]
 
 
-def test_a_code_amid_the_values_that_the_layout_calls_no_value_is_refused(make_database: MakeDatabase) -> None:
-    layout = SMALL_LAYOUT.replace('signal = "Pair.Motor"', 'signal = "Pair.Motor", no_value = [77]')
-    with pytest.raises(DatabaseError, match="branch motor: code 77 of signal Motor means 'no value', so that"):
-        gateway_for(make_database(layout))
-
-
 def test_a_code_that_the_signal_cannot_have_is_refused(make_database: MakeDatabase) -> None:
     layout = SMALL_LAYOUT.replace('signal = "Pair.Motor"', 'signal = "Pair.Motor", no_value = [32768, -5]')
     with pytest.raises(
         LayoutError, match=r"branch motor: no_value: Pair\.Motor has no code 32768; it has -32768 to 32767"
     ):
         gateway_for(make_database(layout))
-
-
-def test_other_frames_pass_as_they_are(database: VehicleDatabase) -> None:
-    corrector = gateway_for(database, battery=(0.25, 5.0))
-    for key in (FrameKey(0x110, True), FrameKey(0x111, False), FrameKey(0x510, False)):
-        assert passed_on(corrector, Frame(key, b"\x01\x02"), 0.0) == b"\x01\x02"
-    assert corrector.counters.frames_in == 0
 
 
 def test_bad_frames_are_held_back(database: VehicleDatabase) -> None:
@@ -128,15 +103,6 @@ def test_bad_frames_are_passed_on_so_that_they_are_seen_to_be_bad(
     assert jumped is not None
     assert decoded(own, "HV_Battery", jumped)["AliveCounter"] == 13
     assert corrector.counters.held_back == 0
-
-
-def test_shadow_mode_passes_all_on_as_it_is(database: VehicleDatabase) -> None:
-    corrector = gateway_for(database, shadow=True, battery=(0.25, 5.0))
-    frame = battery(database, 3)
-    assert passed_on(corrector, frame, 0.0) == frame.data
-    sums = corrector.watch.look(0.0)
-    assert sums is not None
-    assert (sums.measured_a, sums.corrected_a) == pytest.approx((100.0, 76.0))
 
 
 def test_a_power_is_written_back_as_a_power(make_database: MakeDatabase) -> None:
@@ -209,27 +175,11 @@ def test_a_multiplexed_branch_is_rewritten_where_it_is(make_database: MakeDataba
     assert found == {1: 1000, 2: 1224, 3: 1530}
 
 
-def test_a_multiplexer_may_have_another_byte_order(make_database: MakeDatabase) -> None:
-    database = make_database(dbc=MULTIPLEXED.replace("Which M : 0|8", "Which M : 28|12"))
-    corrector = gateway_for(database, battery=(0.5, 3.0))
-    found = []
-    for which in (1, 0x101):
-        data = bytes(1) + (1530).to_bytes(2, "big") + (which << 4).to_bytes(2, "little") + bytes(3)
-        out = passed_on(corrector, Frame(PAIR, data), 0.0)
-        assert out is not None
-        found.append(int.from_bytes(out[1:3], "big"))
-    assert found == [1000, 1530]
-
-
 def test_a_frame_too_short_for_one_signal_keeps_it_out(make_database: MakeDatabase) -> None:
     database = make_database()
     corrector = gateway_for(database, battery=(0.5, 0.0), motor=(0.5, 0.0))
     assert passed_on(corrector, Frame(PAIR, b"\x01\x2c\x01"), 0.0) == b"\x00\xc8\x01"
     assert passed_on(corrector, Frame(PAIR, b"\x01"), 0.0) == b"\x01"
-
-
-def test_a_gateway_sends_nothing_in_its_own_name_but_the_status(database: VehicleDatabase) -> None:
-    assert [key.identifier for key in transmitted(database, Mode.GATEWAY)] == [0x5F0]
 
 
 @pytest.mark.parametrize(

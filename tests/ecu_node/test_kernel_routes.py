@@ -24,11 +24,6 @@ def test_all_other_identifiers_of_29_bits_are_covered_once() -> None:
         assert covered == int(identifier not in taken), hex(identifier)
 
 
-def test_few_rules_are_needed() -> None:
-    assert len(list(complement((0x110, 0x120, 0x130, 0x5F0), 11))) == 27
-    assert list(complement((), 29)) == [(0, 0)]
-
-
 def test_an_interface_that_is_not_there_is_told_by_opening_the_bus_alone() -> None:
     said: list[str] = []
     assert kernel_routes(("lo", "no_such_bus"), {(0x110, False)}, fd=False, say=said.append) is None

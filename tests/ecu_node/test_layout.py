@@ -23,10 +23,6 @@ def test_the_projects_own_layout_is_read() -> None:
     assert layout.digest == file_digest(LAYOUT)
 
 
-def test_the_projects_own_layout_names_its_temperature() -> None:
-    assert read_layout(LAYOUT).temperature == "junction_box_temperature"
-
-
 def test_a_temperature_that_is_no_input_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "layout.toml"
     path.write_text(LAYOUT.read_text().replace('temperature = "junction_box_temperature"', 'temperature = "oil"'))

@@ -106,17 +106,6 @@ def test_the_status_comes_again_and_again_without_any_frame(
     assert all(e2e_p01_check(frame.data, 0x5F0) for frame in frames)
 
 
-def test_a_node_that_starts_beside_another_one_refuses_and_leaves_it_alone(
-    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
-) -> None:
-    with node_on(database, request.node.name):
-        receive(peer, 0x5F0, 1)
-        words = r"another node sends frames 0x5F0, which only this one may send there; two nodes on one bus"
-        with pytest.raises(BusError, match=words), node_on(database, request.node.name):
-            receive(peer, 0x5F0, 20)
-        receive(peer, 0x5F0, 3)
-
-
 def test_a_node_listens_as_long_as_another_one_may_be_silent(
     database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
 ) -> None:
@@ -171,27 +160,6 @@ def gateway_between(database: VehicleDatabase, sensors: can.BusABC, vehicle: can
             bus.close()
 
 
-def test_a_gateway_passes_frames_on_in_both_directions(
-    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
-) -> None:
-    other = f"{request.node.name} vehicle"
-    data = protected(database, "HV_Battery", 0, BatteryCurrent=100.0)
-    with (
-        can.Bus(interface="virtual", channel=other) as vehicle,
-        gateway_between(database, VirtualBus(request.node.name), VirtualBus(other)) as corrector,
-    ):
-        receive(vehicle, 0x5F0, 1)
-        peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=data))
-        peer.send(can.Message(arbitration_id=0x111, is_extended_id=False, data=data))
-        vehicle.send(can.Message(arbitration_id=0x222, is_extended_id=False, data=data))
-        (rewritten,) = receive(vehicle, 0x110, 1)
-        (passed,) = receive(vehicle, 0x111, 1)
-        (returned,) = receive(peer, 0x222, 1)
-    assert decoded(database, "HV_Battery", bytes(rewritten.data))["BatteryCurrent"] == pytest.approx(76.0)
-    assert passed.data == returned.data == data
-    assert corrector.counters.forwarded == 2
-
-
 class DefectBus(VirtualBus):
     """A bus with an adapter whose software is defect as soon as the node is at work."""
 
@@ -225,17 +193,6 @@ class BrokenBus(VirtualBus):
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         raise can.CanOperationError("Network is down", errno.ENETDOWN)
-
-
-def test_frames_that_the_bus_does_not_take_are_dropped_and_counted(
-    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
-) -> None:
-    with node_on(database, "", lambda: FullBus(request.node.name)) as corrector:
-        peer.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=protected(database, "HV_Battery", 0)))
-        give_up = time.monotonic() + LONGEST_WAIT_S
-        while corrector.counters.answers == 0 or corrector.counters.send_errors < 3:
-            assert time.monotonic() < give_up
-            time.sleep(0.01)
 
 
 def test_a_send_queue_that_stays_full_is_told_and_when_it_opens_again(
@@ -379,24 +336,6 @@ def wait_until(done: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
-def test_a_bus_that_goes_away_is_opened_again(
-    database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
-) -> None:
-    channel, opened = request.node.name, 0
-
-    def reopen() -> can.BusABC:
-        nonlocal opened
-        opened += 1
-        if opened == 2:
-            raise BusError("no such interface")
-        return BrokenBus(channel) if opened == 1 else overlay_bus(database, channel)
-
-    with node_on(database, "", reopen) as corrector:
-        receive(peer, 0x5F0, 3)
-    assert opened == 3
-    assert corrector.counters.reopened == 1
-
-
 def test_a_bus_that_can_be_opened_but_is_down_is_not_said_to_be_open(
     database: VehicleDatabase, peer: can.BusABC, request: pytest.FixtureRequest
 ) -> None:
@@ -517,11 +456,6 @@ def test_the_kernel_is_asked_for_the_branches_only(
         (258, 0x7FF, False),
         (512, 0x7FF, False),
     }
-
-
-def test_an_unknown_interface_is_one_line(database: VehicleDatabase) -> None:
-    with pytest.raises(BusError, match=r"^carrier_pigeon c0: cannot open the bus: .*carrier_pigeon"):
-        open_bus(database, interface="carrier_pigeon", channel="c0", fd=False, mode=Mode.OVERLAY)
 
 
 def test_a_can_fd_database_needs_fd(make_database: Callable[..., VehicleDatabase]) -> None:

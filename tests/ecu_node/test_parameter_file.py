@@ -108,13 +108,6 @@ def test_a_new_file_of_the_same_size_and_time_is_noticed(path: Path, database: V
     assert running.drift == 0.15
 
 
-def test_a_file_that_can_be_read_after_all_is_noticed(path: Path, database: VehicleDatabase) -> None:
-    running = Running(path, database)
-    before = path.stat()
-    path.chmod(0o600 if before.st_mode & 0o077 else 0o644)
-    assert running.file.look(running.corrector, 2.0), "its times of content are the same"
-
-
 @pytest.mark.parametrize("mode", [Mode.OVERLAY, Mode.GATEWAY])
 def test_after_a_change_all_is_as_after_a_start(
     make_database: Callable[..., VehicleDatabase], path: Path, mode: Mode
@@ -129,16 +122,6 @@ def test_after_a_change_all_is_as_after_a_start(
     for live, new in zip(running.corrector.branches, fresh.branches, strict=True):
         assert (live.plan, live.fault) == (new.plan, new.fault)
         assert live.deadline_s == new.deadline_s
-
-
-def test_every_change_and_every_failure_is_counted(path: Path, database: VehicleDatabase) -> None:
-    running = Running(path, database)
-    whole = path.read_bytes()
-    for time_s, content in ((2.0, b"{"), (4.0, whole), (6.0, b"[]"), (8.0, whole)):
-        path.write_bytes(content)
-        running.file.look(running.corrector, time_s)
-    counters = running.corrector.counters
-    assert (counters.reloads, counters.reload_failures) == (2, 2)
 
 
 def test_at_start_parameters_of_another_vehicle_are_not_used_and_the_reason_is_published(

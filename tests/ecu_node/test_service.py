@@ -65,14 +65,6 @@ def managed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager
     manager.socket.close()
 
 
-def test_the_manager_is_told_ready_status_and_stopping(managed: Manager) -> None:
-    service = ServiceManager()
-    service.ready("correcting battery")
-    service.status("passing through")
-    service.stopping()
-    assert managed.told() == ["READY=1\nSTATUS=correcting battery", "STATUS=passing through", "STOPPING=1"]
-
-
 def test_the_watchdog_is_fed_at_half_its_time(managed: Manager) -> None:
     service = ServiceManager()
     fed_s = []
@@ -204,16 +196,6 @@ def test_the_same_line_comes_once_in_ten_seconds(
         *2 * ["ecu-node: bus gone"],
         "ecu-node: bus gone (and 97 times before)",
     ]
-
-
-def test_a_line_that_comes_and_goes_is_seen_to(
-    clock: Callable[[float], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    clock(0.0)
-    log = Log()
-    for text in ("a", "b", "a", "c"):
-        log.say(text)
-    assert capsys.readouterr().err.splitlines() == ["ecu-node: a", "ecu-node: b", "ecu-node: a", "ecu-node: c"]
 
 
 def test_of_more_lines_than_it_remembers_each_is_said(

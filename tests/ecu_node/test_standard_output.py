@@ -9,7 +9,7 @@ import pytest
 
 from ecu_node import __version__
 from ecu_node.errors import UserError
-from ecu_node.program import drop_output, write_output
+from ecu_node.program import write_output
 from tests.ecu_node.vehicles import LAYOUT
 
 FULL = "import resource, runpy, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
@@ -76,13 +76,3 @@ def test_a_full_disk_that_shows_when_the_output_is_written_out_is_told_and_leave
         with pytest.raises(UserError, match=r"^standard output: cannot write the result: No space left on device;"):
             write_output("x")
         write_output("what follows is dropped")
-
-
-def test_a_reader_that_has_left_is_no_error_of_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    reading, writing = os.pipe()
-    os.close(reading)
-    with os.fdopen(writing, "w") as left:
-        monkeypatch.setattr(sys, "stdout", left)
-        with pytest.raises(BrokenPipeError):
-            write_output("x")
-        drop_output()

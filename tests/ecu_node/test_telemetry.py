@@ -103,15 +103,6 @@ def test_line_has_currents_by_vss_name_sums_state_and_counters(make_outlet: Any,
     assert abs((datetime.now(UTC) - datetime.fromisoformat(line["time"])).total_seconds()) < 60.0
 
 
-def test_measured_value_is_told_where_it_is_published(make_outlet: Any, tmp_path: Path) -> None:
-    outlet = make_outlet(tmp_path / "node.jsonl")
-    outlet.corrector.latch(outlet.corrector.latched.SUM_IMPLAUSIBLE, ["battery"])
-    outlet.second()
-    (line,) = lines_of(tmp_path / "node.jsonl", 1)
-    assert line["branches"][VSS] == {"measured_a": 80.0, "corrected_a": 80.0, "quality": "IMPLAUSIBLE"}
-    assert line["sum_corrected_a"] == -20.0  # as the status has it
-
-
 def test_one_line_per_second_whatever_the_looks(make_outlet: Any, tmp_path: Path) -> None:
     outlet = make_outlet(tmp_path / "node.jsonl")
     start_s = time.monotonic()
@@ -227,10 +218,6 @@ def test_latency_is_counted_by_bits_of_microseconds(monkeypatch: pytest.MonkeyPa
     latency.sent(1)  # an answer that the bus did not take is none
     latency.sent(0)
     assert sum(latency.counts) == 1000
-
-
-def test_latency_before_any_frame_is_0() -> None:
-    assert Latency().at_most_s(0.999) == 0.0
 
 
 @pytest.mark.parametrize("kind", ["overlay", "gateway"])

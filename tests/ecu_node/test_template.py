@@ -1,8 +1,6 @@
 """``ecu-node template``: what it prints fits at once, and once filled in it is applied."""
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -104,28 +102,3 @@ def test_a_vehicle_that_no_parameter_file_can_name_is_wrong_use(
         main(["template", "--layout", str(LAYOUT), "--vehicle", vehicle])
     assert caught.value.code == 2
     assert "--vehicle: the identity of the vehicle is expected" in capsys.readouterr().err
-
-
-def test_a_layout_that_cannot_be_read_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["template", "--layout", str(tmp_path / "none.toml"), "--vehicle", "v"]) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith(f"ecu-node: {tmp_path}/none.toml")
-    assert captured.err.count("\n") == 1
-
-
-def test_a_full_disk_is_told() -> None:
-    command = [sys.executable, "-m", "ecu_node", "template", "--layout", str(LAYOUT), "--vehicle", "v"]
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
-    assert "standard output: cannot write the result: No space left on device" in done.stderr
-
-
-def test_help_says_what_to_fill_in(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["template", "--help"])
-    assert caught.value.code == 0
-    words = " ".join(capsys.readouterr().out.split())
-    assert '"apply": true' in words
-    assert "Take out branches that this vehicle does not have" in words
