@@ -1,6 +1,7 @@
 """The node's core, frame by frame: what is answered, what is counted, what the status says."""
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -306,13 +307,16 @@ def test_sums_of_any_window_are_judged_at_ten_looks_per_second(
     assert corrector.state()[1] == Reason.CORRECTION_WORSE
 
 
-@pytest.mark.parametrize("valid", ["7", "0.5"])
-def test_a_value_that_the_input_cannot_have_is_refused(
-    make_database: MakeDatabase, database: VehicleDatabase, valid: str
+@pytest.mark.parametrize("value", ["4", "-1", "0.5"])
+@pytest.mark.parametrize("key", ["[watch] valid", "[contactor] open"])
+def test_a_value_that_an_input_cannot_have_is_refused(
+    make_database: MakeDatabase, database: VehicleDatabase, key: str, value: str
 ) -> None:
     text = database.layout.path.read_text().replace("hv_powertrain.dbc", "small.dbc")
-    text += f'\n[watch]\ninput = "contactor_state"\nvalid = [2, {valid}]\n'
-    words = rf"small\.toml: \[watch\] valid: {valid} is no value of HV_Battery\.ContactorState, which has 2 bits"
+    text = text.replace("open = [0]", "open = [0, 2]") + '\n[watch]\ninput = "contactor_state"\nvalid = [2]\n'
+    name = key.partition(" ")[2]
+    text = re.sub(rf"{name} = \[.*\]", f"{name} = [2, {value}]", text)
+    words = rf"{re.escape(key)}: {value} is no value of HV_Battery\.ContactorState, which has 2 bits"
     with pytest.raises(LayoutError, match=words):
         make_database(text, database.layout.dbc_path.read_text())
 

@@ -67,14 +67,10 @@ SOUND = BranchParameters(drift=0.1, offset_a=-2.5, apply=True)
     ("field", "change", "words"),
     [
         ("branches", lambda x: {"battery": replace(SOUND, drift=x)}, r"branches\[\.\.\.\]\.drift"),
-        ("branches", lambda x: {"battery": replace(SOUND, offset_a=x)}, r"branches\[\.\.\.\]\.offset_a"),
         ("branches", lambda x: {"battery": replace(SOUND, drift_sd=x)}, "a standard deviation .* is not finite"),
-        ("branches", lambda x: {"battery": replace(SOUND, offset_sd_a=x)}, "a standard deviation .* is not finite"),
         ("confidence", lambda x: x, "the confidence is not finite"),
-        ("hardware_fault", lambda x: HardwareFault(suspected=True, drift=x), r"hardware_fault\.drift"),
         ("hardware_fault", lambda x: HardwareFault(suspected=True, offset_a={"motor": x}), r"hardware_fault\.offset_a"),
         ("junction_residual", lambda x: JunctionResidual(measured_a=x, corrected_a=0), r"residual\.measured_a"),
-        ("junction_residual", lambda x: JunctionResidual(measured_a=0, corrected_a=x), r"residual\.corrected_a"),
     ],
 )
 def test_numbers_that_json_lacks_are_not_written(
@@ -192,20 +188,7 @@ def test_schema_and_reader_agree_wherever_any_value_is_put(
         b"not json at all\nsecond line",
         b" " * (MAX_FILE_BYTES + 1),
     ],
-    ids=[
-        "nothing",
-        "half a table",
-        "list",
-        "null",
-        "UTF-16",
-        "BOM",
-        "Latin-1",
-        "deep lists",
-        "deep lists in a table",
-        "deep tables",
-        "two lines",
-        "too long",
-    ],
+    ids=range(12),
 )
 def test_what_is_no_parameter_file_is_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "p.json"
