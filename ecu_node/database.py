@@ -15,6 +15,8 @@ from ecu_node.documents import read_user_file, text_digest
 from ecu_node.errors import DatabaseError, LayoutError
 from ecu_node.layout import Layout, joint_digest, read_layout, split_signal
 
+__all__ = ["MAX_DBC_BYTES", "VehicleDatabase", "look_everything_up", "node_database", "read_database"]
+
 MAX_DBC_BYTES = 16_000_000
 """The largest DBCs have some megabytes; to read one takes a hundred times its size in memory."""
 

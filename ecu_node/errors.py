@@ -3,6 +3,8 @@
 The command line turns every :class:`UserError` into that line and an exit code; nothing else is caught.
 """
 
+__all__ = ["BusError", "DatabaseError", "LayoutError", "ParameterError", "UserError", "printable", "shown_name"]
+
 _LONGEST_NAME = 64
 """Characters of a name that are shown."""
 

@@ -25,6 +25,26 @@ from ecu_node.documents import (
 )
 from ecu_node.errors import ParameterError, printable, shown_name
 
+__all__ = [
+    "BranchParameters",
+    "Explanation",
+    "FileReference",
+    "Finding",
+    "HardwareFault",
+    "HeldBack",
+    "JunctionResidual",
+    "Provenance",
+    "VehicleParameters",
+    "Verdict",
+    "check_fit",
+    "decode_parameters",
+    "encode_parameters",
+    "parameter_bytes",
+    "parameter_schema",
+    "read_parameters",
+    "write_parameters",
+]
+
 MAX_FILE_BYTES = 1_000_000
 """A parameter file has some kilobytes; a larger one is not one."""
 

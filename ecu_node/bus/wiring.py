@@ -45,6 +45,8 @@ from ecu_node.errors import BusError, DatabaseError, LayoutError
 from ecu_node.layout import Branch, SignalName, split_signal
 from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
 
+__all__ = ["InForce", "Mode", "branch_plan", "choose_parameters", "open_bus", "put_in_force", "sensor_fault", "wire"]
+
 PARAMETER_SETS = 256
 """The status publishes the number of the parameter set modulo this."""
 _NOBODY = "Vector__XXX"

@@ -26,6 +26,8 @@ from fractions import Fraction
 
 from ecu_node.core.signals import Codes, as_written, writable_range
 
+__all__ = ["AS_IT_IS", "LARGEST_ERROR", "NO_FAULT", "IntegerPlan", "SensorFault", "Signals", "correction_plan"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class SensorFault:

@@ -21,6 +21,8 @@ from ecu_node.core.junction import REMEMBERED_FRAMES, Auxiliary, ExpectedSum, Fr
 from ecu_node.core.signals import BitPlace, Codes, FrameKey, Order, PlacedSignal, as_written
 from ecu_node.core.status import Counters, Quality, Reason, State
 
+__all__ = ["OF_ONE_DRIVE", "Corrector", "StatusFields"]
+
 _OK, _LAST_USABLE, _CORRUPT = Check.OK, Check.LOST, Check.CORRUPT  # looking up members of an enumeration is slow
 _INVALID, _from_bytes = E2EState.INVALID, int.from_bytes
 _BITS_PER_BYTE = 8

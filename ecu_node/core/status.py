@@ -8,6 +8,8 @@ from typing import Self
 
 from ecu_node.errors import ParameterError
 
+__all__ = ["Counters", "Latency", "Quality", "Reason", "State", "TrustError", "UnfitError"]
+
 
 class _WithWords(IntEnum):
     """Codes, each with words for people."""
