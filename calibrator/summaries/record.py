@@ -174,13 +174,13 @@ def joined_records(records: Sequence[Record]) -> VehicleSummary:
     if not usable:
         raise DriveError(records[-1].problem)
     found = added_summaries(usable)
+    if problem := _too_short(found.summary.duration_s, found.drives):
+        raise DriveError(problem)
     if len(found.summary.moments) < FEWEST_BLOCKS:
         raise DriveError(
             f"{counted(len(found.summary.moments), 'block')} in {counted(len(found.drives), 'drive')}; at least "
             f"{FEWEST_BLOCKS} are needed"
         )
-    if problem := _too_short(found.summary.duration_s, found.drives):
-        raise DriveError(problem)
     if not np.abs(found.summary.moments).max() < MOST_MOMENT or found.summary.variance_a2.max() > MOST_VARIANCE_A2:
         raise DriveError(IMPOSSIBLE)
     return found
