@@ -38,8 +38,6 @@ SOURCES = (
     "drives/align.py",
     "drives/charge.py",
     "drives/delays.py",
-    "estimator/decision.py",
-    "estimator/explanations.py",
     "estimator/posterior.py",
     "estimator/prior.py",
     "recordings/asc.py",

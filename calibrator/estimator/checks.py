@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import t as student_t
 
 from calibrator.drive import Array
-from calibrator.estimator.moments import MOST_NOISE, NOISE_ROUNDS, FleetMoments, products, stack_summaries
+from calibrator.estimator.evidence import MOST_NOISE, NOISE_ROUNDS, FleetMoments, products, stack_summaries
 from calibrator.summaries.moments import DriveSummary
 from ecu_node.parameters import Finding
 
-__all__ = ["UsualMisfits", "check_fit", "learn_usual_misfits"]
+__all__ = ["UsualMisfits", "find_misfits", "learn_usual_misfits"]
 
 PRIOR = 0.01
 """Probability of each cause in a vehicle, before anything is seen. [1]"""
@@ -565,7 +565,7 @@ def learn_usual_misfits(
     )
 
 
-def check_fit(
+def find_misfits(
     summaries: Sequence[DriveSummary],
     read_out: Array,
     usual: UsualMisfits | None,

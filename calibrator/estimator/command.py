@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 __all__ = ["calibrate", "identify", "params"]
 
 OWN_OPTIONS = {
-    Method.POSTERIOR: (
+    Method.POSTERIOR: [
         "harm_limit",
         "trusted",
         "readings",
@@ -51,8 +51,8 @@ OWN_OPTIONS = {
         "expected_faults",
         "scheduler",
         "since",
-    ),
-    Method.PUBLISHED: ("classifier", "truth", "sparsity", "magnitude", "symmetric", "unity", "seed"),
+    ],
+    Method.PUBLISHED: ["classifier", "truth", "sparsity", "magnitude", "symmetric", "unity", "seed"],
 }
 """What only one method heeds."""
 SHORTEST_POLE_S, LONGEST_POLE_S = 0.01, 600.0

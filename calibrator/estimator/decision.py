@@ -1,7 +1,7 @@
 """What to say of vehicles: estimate, confidence, and whether correction could make a branch worse.
 
-:func:`estimate_rows` does it for N vehicles: laws of the fleet -> weighted draws (:class:`Explained`) -> one posterior
-per vehicle (:class:`Points`) -> :class:`RowsEstimate`.
+:func:`estimate_rows` does it for N vehicles: fault models of the fleet -> weighted draws (:class:`Explained`) -> one
+posterior per vehicle (:class:`Points`) -> :class:`RowsEstimate`.
 
 The estimate is the point near which, within the tolerance of "recovered", most of the posterior lies; that share is
 the confidence (M18). Correction with d_hat, o_hat makes a branch worse on a drive with the moments E[i], E[i^2] where
@@ -12,18 +12,16 @@ with alpha = (1 + d) / (1 + d_hat) - 1 and beta = (o - o_hat) / (1 + d_hat); its
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import sqrt
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.compiled import compiled_with_notice
 from calibrator.drive import Array, Mask
-from calibrator.estimator.learning import Law, explain, weigh_law
+from calibrator.estimator.evidence import EvidenceRows, ParameterPlaces
+from calibrator.estimator.learning import FaultModel, explain, weigh_draws
 from calibrator.estimator.posterior import Draws
-from calibrator.estimator.rows import EvidenceRows, parameter_places
 from calibrator.score import TOLERANCE
 
 __all__ = [
@@ -34,6 +32,7 @@ __all__ = [
     "estimate_rows",
     "harm_probability",
     "posterior_points",
+    "recovered",
 ]
 
 NEGLIGIBLE = 1e-8
@@ -58,12 +57,12 @@ an explanation are those of the estimate. [1]"""
 
 
 class Explained(NamedTuple):
-    """Weighted draws of N vehicles under one law of the fleet.
+    """Weighted draws of N vehicles under one fault model of the fleet.
 
     Attributes
     ----------
     probability : float
-        Of this law.
+        Of this model.
     draws : Draws
         Of the vehicles.
     weight : ndarray of shape (N, Q, M, 1 + g)
@@ -89,28 +88,28 @@ class Points(NamedTuple):
         Sums to 1, but for what is negligible.
     explanation : ndarray of int of shape (n,)
         Number of the explanation that a point comes from.
-    law, fit : ndarray of int of shape (e,)
-        Of each explanation: its law, and its place among the fits of the vehicle.
+    model, fit : ndarray of int of shape (e,)
+        Of each explanation: its model, and its place among the fits of the vehicle.
     """
 
     faults: Array
     weight: Array
     explanation: NDArray[np.int64]
-    law: NDArray[np.int64]
+    model: NDArray[np.int64]
     fit: NDArray[np.int64]
 
 
-def posterior_points(laws: Sequence[Explained]) -> list[Points]:
-    """Posterior of each vehicle over all laws that explain its fleet."""
+def posterior_points(models: Sequence[Explained]) -> list[Points]:
+    """Posterior of each vehicle over all models that explain its fleet."""
     faults, weight, number, vehicle = [], [], [], []
-    for i, law in enumerate(laws):
-        shared, feed, K = law.draws.shared, law.draws.feed, law.draws.values.shape[3] // 3
-        j, q, m, g = np.nonzero(law.weight > NEGLIGIBLE)
-        x = law.draws.values[j, q, m]
+    for i, model in enumerate(models):
+        shared, feed, K = model.draws.shared, model.draws.feed, model.draws.values.shape[3] // 3
+        j, q, m, g = np.nonzero(model.weight > NEGLIGIBLE)
+        x = model.draws.values[j, q, m]
         gain = np.exp(x[:, 1 : K + 1] + shared[K : 2 * K])
         offset = x[:, 2 * K : 3 * K] * gain
         # An offset that a group shares belongs to the sensor; a load that it shares does not, and is taken out.
-        alone, of_group = offset[:, feed] == 0.0, np.append(0.0, law.group_centre)[g]
+        alone, of_group = offset[:, feed] == 0.0, np.append(0.0, model.group_centre)[g]
         if shared[-1]:
             offset[:, feed] += np.where(alone, of_group, 0.0)
         else:
@@ -118,17 +117,17 @@ def posterior_points(laws: Sequence[Explained]) -> list[Points]:
         total = offset + shared[:K]
         cancel = (x[:, 2 * K : 3 * K] == 0.0) & (np.abs(total) <= SAME)  # what a group and all sensors share
         faults.append(np.hstack([gain - 1.0, np.where(cancel, 0.0, total)]))
-        weight.append(law.weight[j, q, m, g] * law.probability)
-        number.append((q * law.weight.shape[3] + g) * len(laws) + i)
+        weight.append(model.weight[j, q, m, g] * model.probability)
+        number.append((q * model.weight.shape[3] + g) * len(models) + i)
         vehicle.append(j)
     order = np.argsort(np.concatenate(vehicle), kind="stable")
-    ends = np.cumsum(np.bincount(np.concatenate(vehicle), minlength=len(laws[0].weight)))[:-1]
+    ends = np.cumsum(np.bincount(np.concatenate(vehicle), minlength=len(models[0].weight)))[:-1]
     parts = [np.split(np.concatenate(each)[order], ends) for each in (faults, weight, number)]
-    groups, found = np.array([law.weight.shape[3] for law in laws]), []
+    groups, found = np.array([model.weight.shape[3] for model in models]), []
     for some, w, which in zip(*parts, strict=True):
         kinds, explanation = np.unique(which, return_inverse=True)
-        of_law = kinds % len(laws)
-        found.append(Points(some, w, explanation, of_law, kinds // len(laws) // groups[of_law]))
+        of_model = kinds % len(models)
+        found.append(Points(some, w, explanation, of_model, kinds // len(models) // groups[of_model]))
     return found
 
 
@@ -159,28 +158,36 @@ def best_estimate(points: Points, smallest: Array) -> tuple[Array, float]:
         tried += [points.faults[i] for i in own[np.argsort(-points.weight[own], kind="stable")[:2]]]
     candidates = np.array(tried)
     candidates[np.abs(candidates) < RESOLUTION] = 0.0
-    covered = np.zeros(len(candidates))
-    _cover(points.faults, points.weight, candidates, smallest, covered)
+    covered = recovered(points, candidates, smallest)
     best = int(np.argmax(covered >= covered.max() - EQUALLY_GOOD))
     return candidates[best], float(min(covered[best], 1.0))
 
 
-@compiled_with_notice
-def _cover(faults: Array, weight: Array, candidates: Array, smallest: Array, covered: Array) -> None:
-    K = faults.shape[1] // 2
-    for c in range(len(candidates)):
-        for i in range(len(faults)):
-            near = True
-            for part in range(2):
-                distance, size = 0.0, 0.0
-                for k in range(part * K, (part + 1) * K):
-                    distance += (faults[i, k] - candidates[c, k]) ** 2
-                    size += faults[i, k] ** 2
-                if distance > (TOLERANCE * max(sqrt(size), smallest[part])) ** 2:
-                    near = False
-                    break
-            if near:
-                covered[c] += weight[i]
+def recovered(points: Points, candidates: Array, smallest: Sequence[float] | Array) -> Array:
+    """Find how much of a posterior is within the tolerance of "recovered" of each candidate.
+
+    Parameters
+    ----------
+    points : Points
+        Of one vehicle.
+    candidates : ndarray of shape (C, 2K)
+        Drifts [1] and offsets in fractions of full scale.
+    smallest : sequence of float or ndarray of shape (2,)
+        Least norms that drifts and offsets are counted with. [1]
+
+    Returns
+    -------
+    ndarray of shape (C,)
+        Probability that both are within 10 % of the truth in the Euclidean norm.
+    """
+    K = candidates.shape[1] // 2
+    near = np.ones((len(candidates), len(points.weight)), bool)
+    for part, least in zip((slice(0, K), slice(K, 2 * K)), smallest, strict=True):
+        true, estimate = points.faults[:, part], candidates[:, part]
+        size = np.linalg.norm(true, axis=1)
+        square = (estimate**2).sum(axis=1)[:, None] - 2.0 * estimate @ true.T + size**2  # of their distance
+        near &= square <= (TOLERANCE * np.maximum(size, least)) ** 2
+    return np.asarray(near @ points.weight)
 
 
 def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: Array) -> Array:
@@ -200,27 +207,13 @@ def harm_probability(points: Points, estimate: Array, mean: Array, mean_square: 
     ndarray of shape (K,)
         That it does so on any of the drives; 0 where nothing would be corrected.
     """
-    harm = np.zeros(len(estimate) // 2)
-    _harm(points.faults, points.weight, estimate, mean, mean_square, harm)
-    return np.minimum(harm, 1.0)
-
-
-@compiled_with_notice
-def _harm(faults: Array, weight: Array, estimate: Array, mean: Array, square: Array, harm: Array) -> None:
-    K = len(harm)
-    for k in range(K):
-        d_hat, o_hat = estimate[k], estimate[K + k]
-        if d_hat == 0.0 and o_hat == 0.0:
-            continue
-        for i in range(len(faults)):
-            d, o = faults[i, k], faults[i, K + k]
-            alpha, beta = (1.0 + d) / (1.0 + d_hat) - 1.0, (o - o_hat) / (1.0 + d_hat)
-            for s in range(len(mean)):
-                with_it = alpha * alpha * square[s, k] + 2.0 * alpha * beta * mean[s, k] + beta * beta
-                without = d * d * square[s, k] + 2.0 * d * o * mean[s, k] + o * o
-                if with_it > without:
-                    harm[k] += weight[i]
-                    break
+    K, (d_hat, o_hat) = len(estimate) // 2, estimate.reshape(2, -1)
+    d, o = points.faults[:, None, :K], points.faults[:, None, K:]  # (n, 1, K), beside moments (D, K)
+    alpha, beta = (1.0 + d) / (1.0 + d_hat) - 1.0, (o - o_hat) / (1.0 + d_hat)
+    with_it = alpha**2 * mean_square + 2.0 * alpha * beta * mean + beta**2
+    without = d**2 * mean_square + 2.0 * d * o * mean + o**2
+    worse = (with_it > without).any(axis=1) & ((d_hat != 0.0) | (o_hat != 0.0))
+    return np.asarray(np.minimum(points.weight @ worse, 1.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,13 +259,13 @@ class RowsEstimate:
     fault_probability: Array
     harm_probability: Array
     identifiable: Mask
-    load_probability: Array
-    load_a: Array
-    group_probability: Array
-    supports: Sequence[Sequence[tuple[float, Array]]]
     points: Sequence[Points]
     order: tuple[int, ...]
     full_scale_a: float
+    supports: Sequence[Sequence[tuple[float, Array]]] = ()
+    load_probability: Array = field(default_factory=lambda: np.zeros(0))
+    load_a: Array = field(default_factory=lambda: np.zeros(0))
+    group_probability: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def faulty(self) -> Mask:
@@ -282,7 +275,7 @@ class RowsEstimate:
 
 def estimate_rows(
     rows: EvidenceRows,
-    laws: Sequence[Law],
+    models: Sequence[FaultModel],
     *,
     feed: int,
     mean: Array,
@@ -297,7 +290,7 @@ def estimate_rows(
     ----------
     rows : EvidenceRows
         Of the vehicles.
-    laws : sequence of Law
+    models : sequence of FaultModel
         That explain their fleet.
     feed : int
         Branch that carries loads without a sensor.
@@ -319,10 +312,10 @@ def estimate_rows(
     order = tuple(range(K) if order is None else order)
     place = np.argsort(order)
     explained = []
-    for law in laws:
-        draws = explain(rows, law, feed=feed)
-        explained.append(Explained(law.probability, draws, weigh_law(draws, law), law.prior.group_centre))
-    smallest = np.array([laws[0].prior.gain.smallest, laws[0].prior.offset.smallest])
+    for model in models:
+        draws = explain(rows, model, feed=feed)
+        explained.append(Explained(model.probability, draws, weigh_draws(draws, model), model.prior.group_centre))
+    smallest = np.array([models[0].prior.gain.smallest, models[0].prior.offset.smallest])
     estimate, sd, confidence, harm = np.zeros((N, 2 * K)), np.zeros((N, 2 * K)), np.zeros(N), np.zeros((N, K))
     fault, hardware, points, supports = np.zeros((N, K)), np.zeros(N), posterior_points(explained), []
     for j, found in enumerate(points):
@@ -362,15 +355,15 @@ def estimate_rows(
     )
 
 
-def _unmeasured(laws: Sequence[Explained]) -> tuple[Array, Array, Array]:
-    """Probability and size of a load without a sensor, probabilities of the groups, over all laws; these share them."""
+def _unmeasured(models: Sequence[Explained]) -> tuple[Array, Array, Array]:
+    """Probability and size of a load without a sensor, probabilities of the groups, over all fault models."""
     own, size, groups = [], [], []
-    for law in laws:
-        place = parameter_places(law.draws.values.shape[3] // 3).load
-        alone = law.weight[..., 0] * law.draws.fits.support[:, :, None, place]
-        own.append(law.probability * _total(alone))
-        size.append(law.probability * _total(alone * law.draws.values[..., place]))
-        groups.append(law.probability * _total(law.weight[..., 1:]))
+    for model in models:
+        place = ParameterPlaces(model.draws.values.shape[3] // 3).load
+        alone = model.weight[..., 0] * model.draws.fits.support[:, :, None, place]
+        own.append(model.probability * _total(alone))
+        size.append(model.probability * _total(alone * model.draws.values[..., place]))
+        groups.append(model.probability * _total(model.weight[..., 1:]))
     most = max(group.shape[1] for group in groups)
     load = np.sum(own, axis=0)
     everywhere = [np.pad(group, [(0, 0), (0, most - group.shape[1])]) for group in groups]
@@ -395,13 +388,13 @@ def _central_sd(points: Points, estimate: Array) -> Array:
     return sd
 
 
-def _supports(laws: Sequence[Explained], points: Points, j: int) -> list[tuple[float, Array]]:
-    """Supports of a vehicle with the signs of their parameters, over all laws; each with its mean parameters."""
+def _supports(models: Sequence[Explained], points: Points, j: int) -> list[tuple[float, Array]]:
+    """Supports of a vehicle with the signs of their parameters, over all models; each with its mean parameters."""
     K = points.faults.shape[1] // 2
-    at, share = parameter_places(K), np.bincount(points.explanation, points.weight)
+    at, share = ParameterPlaces(K), np.bincount(points.explanation, points.weight)
     order = np.argsort(-share, kind="stable")
     order = order[share[order] >= LEAST_EXPLANATION]
-    theta = np.array([laws[points.law[i]].draws.fits.theta[j, points.fit[i]] for i in order.tolist()])
+    theta = np.array([models[points.model[i]].draws.fits.theta[j, points.fit[i]] for i in order.tolist()])
     values = np.zeros((len(order), 4, K))
     values[:, 0, 0] = np.expm1(theta[:, at.eta])
     values[:, 1, :-1] = theta[:, at.hardware_offsets]

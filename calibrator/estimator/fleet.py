@@ -1,50 +1,63 @@
-"""The calibrator in Python: a junction, a fleet of recordings, and :class:`FleetCalibrator`, which learns from them.
+"""The calibrator in Python: a fleet of recordings, and :class:`FleetCalibrator`, which learns from them.
 
 What it learned stands in attributes that end in ``_``, as in scikit-learn. It goes the way of ``calibrator calibrate``:
 drives are summarised into a store, of which a run makes a result folder (:mod:`calibrator.estimator.run`); data frames
-become drives first (:mod:`calibrator.estimator.frames`). Imports that take time stand in functions.
+become drives first (:mod:`calibrator.estimator.frames`).
 """
 
-import hashlib
 import html
-import inspect
-import math
 import os
+import re
 import shutil
-import sys
 import warnings
 import weakref
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
-from numbers import Integral, Real
+from numbers import Integral
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeAlias
 
-from calibrator.errors import ContradictionError, FleetError
+import pandas as pd
+from sklearn.base import BaseEstimator
+
+from calibrator.drive import Drive
+from calibrator.drives.align import align, choose_inputs
+from calibrator.errors import FleetError
+from calibrator.estimator.frames import (
+    Junction,
+    column_values,
+    is_number,
+    named_columns,
+    names_of,
+    path_of,
+    require,
+    require_columns,
+    store_frames,
+    summarise_frames,
+)
+from calibrator.estimator.results import CalibrationReport, internal_errors, read_part
+from calibrator.estimator.run import calibrate_fleet, require_fleet
+from calibrator.estimator.settings import CalibrationSettings
+from calibrator.estimator.vehicle_report import explained
+from calibrator.files.folders import whole_folder
+from calibrator.files.layout_files import vehicle_database
+from calibrator.files.storage import open_storage
+from calibrator.processes.run_many import Workers
+from calibrator.recordings.readers import read_drive
+from calibrator.terminal.progress import no_progress
+from calibrator.terminal.text import told_once
+from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
-from ecu_node.layout import Branch, Input, Layout
+from ecu_node.layout import Layout, UnmeasuredLoad
+from ecu_node.parameters import VehicleParameters, decode_parameters
 
-if TYPE_CHECKING:
-    from typing import Self, TypeAlias
+__all__ = ["CalibratedVehicle", "Fleet", "FleetCalibrator", "Junction", "JunctionCalibrator", "RecordedLog", "read_log"]
 
-    import pandas as pd
+Frames: TypeAlias = pd.DataFrame | Sequence[pd.DataFrame]
+Recordings: TypeAlias = Frames | Mapping[str, Frames] | str | Path
 
-    from calibrator.drive import Drive
-    from calibrator.estimator.results import CalibrationReport
-    from calibrator.estimator.settings import CalibrationSettings
-    from ecu_node.database import VehicleDatabase
-    from ecu_node.parameters import VehicleParameters
-
-    Frames: TypeAlias = pd.DataFrame | Sequence[pd.DataFrame]
-    Recordings: TypeAlias = Frames | Mapping[str, Frames] | str | Path
-
-__all__ = ["Fleet", "FleetCalibrator", "Junction", "JunctionCalibrator", "Log", "Vehicle", "read_log"]
-
-MOST_BRANCHES = 16
-MOST_MISSED, LEAST_AGE_S = 2.5, 0.5
-"""Rows of a data frame farther apart than so many periods, and than this, leave a gap. [1], [s]"""
 NODE_FILES = "params"
 NAMES = {
     "drift": "gain_error",
@@ -74,47 +87,18 @@ NO_NODE_FILES = (
 )
 
 
-def _require(good: Any, what: str, given: Any, expected: str) -> None:
-    """Refuse an argument, showing it if it is short."""
-    if not good:
-        shown = text if len(text := repr(given)) < 80 and "\n" not in text else f"of type {type(given).__name__}"
-        raise FleetError(f"{what} {shown}: expected {expected}")
-
-
-def _path(given: Any, what: str, expected: str = "the path of a layout (TOML)") -> Path:
-    """An argument that names a file or folder."""
-    _require(isinstance(given, (str, os.PathLike)) and os.fspath(given), what, given, expected)
-    return Path(given)
-
-
-def _is_number(given: Any, low: float, high: float, kind: Any = Real) -> bool:
-    return isinstance(given, kind) and not isinstance(given, bool) and low <= float(given) <= high
-
-
-def _names(given: Any, what: str, *, sets: bool = False) -> tuple[str, ...]:
-    """Names of anything like a list, numbers as strings; a set has no order, so it does for some arguments only."""
-    no_list = (str, bytes, Mapping) if sets else (str, bytes, Mapping, set, frozenset)
-    names: list[Any] = [None]
-    with suppress(TypeError):
-        names = names if isinstance(given, no_list) else [*given]
-    named = (not isinstance(name, bool) and isinstance(name, (str, Integral)) and str(name).strip() for name in names)
-    _require(all(named), what, given, "a list of names, such as ['one', 'other']")
-    return tuple(map(str, names))
-
-
 def _with_sd(given: Any, what: str, least: float = -1e6) -> tuple[float, float]:
     """A value with its standard deviation."""
-    good = isinstance(given, Sequence) and len(given) == 2 and _is_number(given[0], least, 1e6)
+    good = isinstance(given, Sequence) and len(given) == 2 and is_number(given[0], least, 1e6)
     above = " from 0" if least == 0.0 else ""
-    _require(good and _is_number(given[1], 0.0, 1e6), what, given, f"a value{above} with its standard deviation")
+    require(good and is_number(given[1], 0.0, 1e6), what, given, f"a value{above} with its standard deviation")
     return float(given[0]), float(given[1])
 
 
 def _in_python(text: str) -> str:
     """A text of the command with arguments instead of its options."""
-    for name in (*inspect.signature(FleetCalibrator).parameters, "load", "meter"):
-        text = text.replace(f"--{name.replace('_', '-')}", name)
-    return text.replace("--charge", "charge_ah").replace("another --out", "another folder")
+    text = text.replace("--charge", "charge_ah").replace("another --out", "another folder")
+    return re.sub("--([a-z]+)-?([a-z]*)", lambda found: "_".join(filter(None, found.groups())), text)
 
 
 @contextmanager
@@ -124,99 +108,6 @@ def _errors_in_python() -> Iterator[None]:
     except UserError as error:
         error.args = (_in_python(str(error)),)
         raise
-
-
-@dataclass(frozen=True)
-class Junction:
-    """Where the high-voltage currents of a vehicle meet; the sum of the K branch currents is 0 A (Kirchhoff).
-
-    Parameters
-    ----------
-    branches : sequence of str
-        Names of the K branches, two or more.
-    full_scale_a : float
-        Nominal maximum current; offsets are compared in fractions of it. [A]
-
-    Examples
-    --------
-    >>> Junction(branches=["battery", "motor", "heater"], full_scale_a=400.0).branches
-    ('battery', 'motor', 'heater')
-    """
-
-    branches: Sequence[str]
-    full_scale_a: float
-    database: "VehicleDatabase | None" = field(default=None, repr=False, compare=False)
-    """Layout and DBC, set by :meth:`from_layout`."""
-
-    def __post_init__(self) -> None:
-        names = _names(self.branches, "branches")
-        _require(
-            len(set(names)) == len(names), "branches", self.branches, "different names, such as ['battery', 'motor']"
-        )
-        if not 2 <= len(names) <= MOST_BRANCHES:
-            raise FleetError(
-                f"branches {self.branches!r}: a junction has 2 to {MOST_BRANCHES} branches; name all currents that are "
-                f"measured, as nothing tells what a single sensor does wrong"
-            )
-        good = _is_number(self.full_scale_a, math.ulp(0.0), sys.float_info.max)
-        _require(good, "full_scale_a", self.full_scale_a, "the nominal maximum current in A, such as 400.0")
-        object.__setattr__(self, "branches", names)
-
-    @classmethod
-    def from_layout(cls, path: str | Path, *, branches: Sequence[str] | None = None) -> "Junction":
-        """Junction of a layout (TOML), with its limits and derived inputs, and the DBC that the node needs.
-
-        Parameters
-        ----------
-        path : str or Path
-            The layout.
-        branches : sequence of str or None
-            Those of its branches that the vehicles have; None: all.
-
-        Returns
-        -------
-        Junction
-            For :meth:`Fleet.from_frames`.
-
-        Raises
-        ------
-        LayoutError, DatabaseError
-            If layout or DBC cannot be used, or the layout has no such branch.
-        """
-        from calibrator.files.layout_files import vehicle_database
-
-        database = vehicle_database(_path(path, "path"))
-        layout = database.layout
-        chosen = layout.branch_names if branches is None else _names(branches, "branches")
-        for name in chosen:
-            layout.find_branch(name)
-        return cls(branches=chosen, full_scale_a=layout.full_scale_a, database=database)
-
-    @property
-    def layout(self) -> Layout | None:
-        """The layout; None if there is none."""
-        return None if self.database is None else self.database.layout
-
-    def as_database(self, inputs: Sequence[str], period_s: float) -> "VehicleDatabase":
-        """Layout and DBC; without a layout one that stands for data frames, whose signals are on no bus."""
-        if self.database is not None:
-            return self.database
-        from ecu_node.database import VehicleDatabase
-
-        age_s = max(MOST_MISSED * period_s, LEAST_AGE_S)
-        layout = Layout(
-            schema=1,
-            name="frames",
-            full_scale_a=float(self.full_scale_a),
-            branch=[Branch(name=name, sign=1, timeout_s=age_s) for name in self.branches],
-            input=[Input(name=name, signal=f"frame.{name}") for name in inputs],
-            model_inputs=list(inputs),
-            period_s=period_s,
-            max_age_s=age_s,
-            path=Path("the junction"),
-            digest=hashlib.sha256(repr(self).encode()).hexdigest(),
-        )
-        return VehicleDatabase(layout=layout, databases={}, digest=hashlib.sha256(b"").hexdigest())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,7 +127,7 @@ class Fleet:
     """
 
     place: str
-    database: "VehicleDatabase" = field(repr=False)
+    database: VehicleDatabase = field(repr=False)
     has_layout: bool
     in_memory: bool = False
 
@@ -261,19 +152,15 @@ class Fleet:
         UserError
             If there is no such place, or the layout cannot be used.
         """
-        from calibrator.estimator.run import require_fleet
-        from calibrator.files.layout_files import vehicle_database
-        from calibrator.files.storage import open_storage
-
-        _path(path, "path", "a drive store, a folder of logs, or summaries")
-        database, storage = vehicle_database(_path(layout, "layout")), open_storage(path)
+        path_of(path, "path", "a drive store, a folder of logs, or summaries")
+        database, storage = vehicle_database(path_of(layout, "layout")), open_storage(path)
         require_fleet(storage, path, database)
         return cls(place=storage.url, database=database, has_layout=True)
 
     @classmethod
     def from_frames(
         cls,
-        frames: "Mapping[str, pd.DataFrame | Sequence[pd.DataFrame]]",
+        frames: Mapping[str, pd.DataFrame | Sequence[pd.DataFrame]],
         junction: Junction,
         *,
         inputs: Sequence[str] | None = None,
@@ -301,10 +188,8 @@ class Fleet:
         FleetError, DriveError
             If the frames are no recordings of such a fleet; the message names vehicle and column.
         """
-        from calibrator.estimator.frames import summarise_frames
-
-        _require(isinstance(junction, Junction), "junction", junction, "a Junction")
-        inputs = None if inputs is None else _names(inputs, "inputs")
+        require(isinstance(junction, Junction), "junction", junction, "a Junction")
+        inputs = None if inputs is None else names_of(inputs, "inputs")
         with ExitStack() as stack:
             folder = mkdtemp(prefix="calibrator-")
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
@@ -320,7 +205,7 @@ class Fleet:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Vehicle:
+class CalibratedVehicle:
     """What was found for one vehicle.
 
     Attributes
@@ -329,9 +214,9 @@ class Vehicle:
         Content of its parameter file.
     """
 
-    parameters: "VehicleParameters"
+    parameters: VehicleParameters
 
-    def correct(self, frame: "pd.DataFrame") -> "pd.DataFrame":
+    def correct(self, frame: pd.DataFrame) -> pd.DataFrame:
         """Correct the currents of a recording of this vehicle: i = (i_m - o) / (1 + d) on its corrected branches.
 
         Parameters
@@ -349,8 +234,6 @@ class Vehicle:
         DriveError
             If a corrected branch is missing or holds no numbers.
         """
-        from calibrator.estimator.frames import column_values, named_columns, require_columns
-
         where = f"vehicle {self.parameters.vehicle}"
         named = named_columns(frame, where)
         corrected = {name: branch for name, branch in self.parameters.branches.items() if branch.apply}
@@ -362,65 +245,39 @@ class Vehicle:
 
     def explain(self) -> str:
         """What was found for each sensor and why, other explanations, findings, and what would decide."""
-        from calibrator.estimator.vehicle_report import explained
-
         return _in_python(explained(self.parameters))
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(self.explain())}</pre>"
 
 
-class _Calibrator:
-    """What both calibrators share: scikit-learn's conventions, and what was learned in attributes that end in ``_``."""
+class _Calibrator(BaseEstimator):  # type: ignore[misc] # scikit-learn has no types
+    """What both calibrators share: what was learned stands in attributes that end in ``_``."""
 
-    parameters_: "pd.DataFrame"
-    vehicles_: dict[str, Vehicle]
+    parameters_: pd.DataFrame
+    vehicles_: dict[str, CalibratedVehicle]
     left_out_: dict[str, str]
     notices_: list[str]
 
-    # scikit-learn's BaseEstimator does the next three as well, but takes more than a second to import
-
-    def get_params(self, deep: bool = True) -> dict[str, Any]:  # noqa: ARG002 (scikit-learn's signature)
-        """Parameters of the constructor by name."""
-        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
-
-    def set_params(self, **parameters: Any) -> "Self":
-        """Set parameters of the constructor, and return the calibrator."""
-        for name, value in parameters.items():
-            if name not in self.get_params():
-                raise ContradictionError(f"no parameter {name!r}; there are {', '.join(self.get_params())}")
-            setattr(self, name, value)
-        return self
-
-    def __repr__(self) -> str:
-        defaults = {name: item.default for name, item in inspect.signature(type(self)).parameters.items()}
-        changed = (
-            f"{name}={value!r}" for name, value in self.get_params().items() if repr(value) != repr(defaults[name])
-        )
-        return f"{type(self).__name__}({', '.join(changed)})"
-
-    def _settings(self, *, alone: bool) -> "CalibrationSettings":
+    def _settings(self, *, alone: bool) -> CalibrationSettings:
         """Parameters of the constructor as the command takes them; FleetError if one makes no sense."""
-        from calibrator.estimator.settings import CalibrationSettings
-        from ecu_node.layout import UnmeasuredLoad
-
         given = self.get_params()
         for name in sorted(given.keys() & {"harm_limit", "expected_faults"}):
-            good = _is_number(given[name], 0, 1) or (given[name] is None and name == "expected_faults")
-            _require(good, name, given[name], "a number from 0 to 1")
+            good = is_number(given[name], 0, 1) or (given[name] is None and name == "expected_faults")
+            require(good, name, given[name], "a number from 0 to 1")
         for name in sorted(given.keys() & {"trusted", "hold_out"}):
             names = [given[name]] if isinstance(given[name], str) else () if given[name] is None else given[name]
-            given[name] = frozenset(_names(names, name, sets=True))
+            given[name] = frozenset(names_of(names, name, sets=True))
         readings = given["readings"]
         if hasattr(readings, "to_csv"):
             given["readings"] = str(readings.to_csv(index=False))
         elif readings is not None:
-            given["readings"] = _path(readings, "readings", "a DataFrame or the path of a CSV table")
-            _require(given["readings"].is_file(), "readings", readings, "a file that exists")
+            given["readings"] = path_of(readings, "readings", "a DataFrame or the path of a CSV table")
+            require(given["readings"].is_file(), "readings", readings, "a file that exists")
         if alone:
             meter, charge_ah = given["meter"], given["charge_ah"] or {}
-            _require(meter is None or isinstance(meter, str), "meter", meter, "the name of a branch")
-            _require(isinstance(charge_ah, Mapping), "charge_ah", charge_ah, "charges by branch")
+            require(meter is None or isinstance(meter, str), "meter", meter, "the name of a branch")
+            require(isinstance(charge_ah, Mapping), "charge_ah", charge_ah, "charges by branch")
             given["charge_ah"] = {str(name): _with_sd(pair, "charge_ah") for name, pair in charge_ah.items()}
             if given["load"] is not None:
                 mean_a, sd_a = _with_sd(given["load"], "load", least=0.0)
@@ -429,26 +286,17 @@ class _Calibrator:
         return CalibrationSettings(alone=alone, **{name: given[name] for name in used})
 
     def _calibrate(
-        self, place: str | Path, database: "VehicleDatabase", *, alone: bool, has_layout: bool, **workers: Any
+        self, place: str | Path, database: VehicleDatabase, *, alone: bool, has_layout: bool, **workers: Any
     ) -> None:
         """Calibrate as the command does, and take over what stands in the result folder."""
-        from calibrator.estimator.run import calibrate_fleet
-        from calibrator.processes.run_many import Workers
-
         with TemporaryDirectory(prefix="calibrator-") as folder:
             out = Path(folder) / "result"
             settings = self._settings(alone=alone)
             report = calibrate_fleet(place, database, out, settings, workers=Workers(**workers))
             self._keep(out, report, has_layout=has_layout)
 
-    def _keep(self, out: Path, report: "CalibrationReport", *, has_layout: bool) -> None:
+    def _keep(self, out: Path, report: CalibrationReport, *, has_layout: bool) -> None:
         """Take over what stands in a result folder."""
-        import pandas as pd
-
-        from calibrator.estimator.results import internal_errors, read_part
-        from calibrator.terminal.text import told_once
-        from ecu_node.parameters import decode_parameters
-
         paths = [path for path in sorted(out.rglob("*")) if path.is_file()]
         self._files = {
             str(path.relative_to(out)): path.read_bytes()
@@ -460,7 +308,7 @@ class _Calibrator:
             name: item for path in paths if path.parent.name == "parameters" for name, item in read_part(path).items()
         }
         self.vehicles_ = {
-            name: Vehicle(parameters=decode_parameters(written[name].text, f"parameters of {name}"))
+            name: CalibratedVehicle(parameters=decode_parameters(written[name].text, f"parameters of {name}"))
             for name in sorted(written)
         }
         rows = pd.read_parquet(out / "results.parquet")
@@ -509,10 +357,8 @@ class _Calibrator:
         FleetError
             If nothing was learned yet, or the folder is not empty or cannot be made.
         """
-        from calibrator.files.folders import whole_folder
-
         self._require_fitted()
-        with _errors_in_python(), whole_folder(_path(folder, "folder", "the path of a new folder")) as partial:
+        with _errors_in_python(), whole_folder(path_of(folder, "folder", "the path of a new folder")) as partial:
             for name, content in self._files.items():
                 (partial / name).parent.mkdir(parents=True, exist_ok=True)
                 (partial / name).write_bytes(content)
@@ -550,7 +396,7 @@ class FleetCalibrator(_Calibrator):
         One row per vehicle and branch: ``vehicle``, ``branch``, ``gain_error`` and ``gain_error_sd`` [1], ``offset_a``
         and ``offset_sd_a`` [A], ``fault_probability``, ``harm_probability``, ``corrected``, ``reason_not_corrected``,
         and of the vehicle ``verdict``, ``confidence``, ``hardware_probability``.
-    vehicles_ : dict of str to Vehicle
+    vehicles_ : dict of str to CalibratedVehicle
         By name: corrects recordings, explains what was found.
     left_out_ : dict of str to str
         Vehicles that could not be calibrated, and why.
@@ -565,7 +411,7 @@ class FleetCalibrator(_Calibrator):
 
     harm_limit: float = 0.001
     trusted: Collection[str] = ()
-    readings: "str | Path | pd.DataFrame | None" = None
+    readings: str | Path | pd.DataFrame | None = None
     hold_out: Collection[str] = ()
     expected_faults: float | None = None
     workers: int = 2
@@ -592,11 +438,9 @@ class FleetCalibrator(_Calibrator):
         UserError
             If the fleet as a whole cannot be calibrated, or a parameter makes no sense.
         """
-        from calibrator.terminal.progress import no_progress
-
-        _require(isinstance(fleet, Fleet), "fleet", fleet, "Fleet.from_frames(...) or Fleet.from_folder(...)")
-        _require(_is_number(self.workers, 1, 256, Integral), "workers", self.workers, "a whole number from 1 to 256")
-        _require(isinstance(self.scheduler, str | None), "scheduler", self.scheduler, "the address of a Dask scheduler")
+        require(isinstance(fleet, Fleet), "fleet", fleet, "Fleet.from_frames(...) or Fleet.from_folder(...)")
+        require(is_number(self.workers, 1, 256, Integral), "workers", self.workers, "a whole number from 1 to 256")
+        require(isinstance(self.scheduler, str | None), "scheduler", self.scheduler, "the address of a Dask scheduler")
         # frames are so few that another process takes longer to start than they take here
         workers: dict[str, Any] = {"processes": 1 if fleet.in_memory else self.workers, "scheduler": self.scheduler}
         with nullcontext() if self.verbose else no_progress(), _errors_in_python():
@@ -638,13 +482,13 @@ class JunctionCalibrator(_Calibrator):
     """
 
     trusted: Collection[str] = ()
-    readings: "str | Path | pd.DataFrame | None" = None
+    readings: str | Path | pd.DataFrame | None = None
     load: tuple[float, float] | None = None
     charge_ah: Mapping[str, tuple[float, float]] | None = None
     meter: str | None = None
     harm_limit: float = 0.001
 
-    def fit(self, recordings: "Recordings", junction: Junction | str | Path, y: None = None) -> "JunctionCalibrator":  # noqa: ARG002 (scikit-learn's signature)
+    def fit(self, recordings: Recordings, junction: Junction | str | Path, y: None = None) -> "JunctionCalibrator":  # noqa: ARG002 (scikit-learn's signature)
         """Estimate the sensor faults of one junction, or of several, each by itself.
 
         Parameters
@@ -667,16 +511,11 @@ class JunctionCalibrator(_Calibrator):
         UserError
             If the recordings are none of this junction, or a parameter makes no sense.
         """
-        import pandas as pd
-
-        from calibrator.estimator.frames import store_frames
-        from calibrator.terminal.progress import no_progress
-
         if not isinstance(junction, Junction):
-            junction = Junction.from_layout(_path(junction, "junction", "a Junction, or the path of a layout (TOML)"))
+            junction = Junction.from_layout(path_of(junction, "junction", "a Junction, or the path of a layout (TOML)"))
         with TemporaryDirectory(prefix="calibrator-") as folder, no_progress(), _errors_in_python():
             if isinstance(recordings, (str, os.PathLike)):
-                _require(junction.database is not None, "junction", junction, "a layout, as the recordings are on disk")
+                require(junction.database is not None, "junction", junction, "a layout, as the recordings are on disk")
                 place, database = Path(recordings), junction.as_database((), 0.1)
             else:
                 several = isinstance(recordings, Mapping) and not isinstance(recordings, pd.DataFrame)
@@ -688,7 +527,7 @@ class JunctionCalibrator(_Calibrator):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Log:
+class RecordedLog:
     """One log of a vehicle, as its layout reads it.
 
     Attributes
@@ -699,10 +538,10 @@ class Log:
         Of the log.
     """
 
-    drive: "Drive"
+    drive: Drive
     layout: Layout
 
-    def to_frame(self) -> "pd.DataFrame":
+    def to_frame(self) -> pd.DataFrame:
         """All signals on one time base, as :meth:`Fleet.from_frames` takes them.
 
         Returns
@@ -716,10 +555,6 @@ class Log:
         DriveError
             If the signals have no instant in common.
         """
-        import pandas as pd
-
-        from calibrator.drives.align import align, choose_inputs
-
         branches = [name for name, channel in self.drive.branches.items() if channel.good.any()]
         recorded = [name for name, channel in self.drive.inputs.items() if channel.good.any()]
         derived = choose_inputs(self.layout, recorded, names=[item.name for item in self.layout.derived])[0]
@@ -730,10 +565,10 @@ class Log:
 
     def __repr__(self) -> str:
         channels = ", ".join([*self.drive.branches, *self.drive.inputs])
-        return f"Log({self.drive.vehicle} {self.drive.name}, {self.drive.duration_s:.0f} s: {channels})"
+        return f"RecordedLog({self.drive.vehicle} {self.drive.name}, {self.drive.duration_s:.0f} s: {channels})"
 
 
-def read_log(path: str | Path, layout: str | Path) -> Log:
+def read_log(path: str | Path, layout: str | Path) -> RecordedLog:
     """Read one CAN log (candump, BLF, ASC, TRC, MF4).
 
     Parameters
@@ -745,7 +580,7 @@ def read_log(path: str | Path, layout: str | Path) -> Log:
 
     Returns
     -------
-    Log
+    RecordedLog
         With ``to_frame()``.
 
     Raises
@@ -753,10 +588,7 @@ def read_log(path: str | Path, layout: str | Path) -> Log:
     LogError, LayoutError, DatabaseError
         If the log, the layout or its DBC cannot be used.
     """
-    from calibrator.files.layout_files import vehicle_database
-    from calibrator.recordings.readers import read_drive
-
-    log = _path(path, "path", "the path of a log")
-    database = vehicle_database(_path(layout, "layout"))
+    log = path_of(path, "path", "the path of a log")
+    database = vehicle_database(path_of(layout, "layout"))
     drive = read_drive(log, database, vehicle=log.absolute().parent.name, name=log.name.partition(".")[0])
-    return Log(drive=drive, layout=database.layout)
+    return RecordedLog(drive=drive, layout=database.layout)

@@ -1,6 +1,6 @@
 """Estimate the sensor faults of a fleet: learn what its vehicles have in common, then each vehicle by itself.
 
-    summaries -> fleet model, evidence rows (learn_fleet) -> laws of the fleet -> FleetReference
+    summaries -> fleet model, evidence rows (learn_fleet) -> fault models of the fleet -> FleetReference
     summaries of any vehicles + FleetReference (estimate_vehicles) -> explanations -> decision, checks -> FleetEstimate
 
 What is said of a vehicle does not depend on which others are estimated with it.
@@ -14,21 +14,23 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
-from calibrator.estimator.checks import UsualMisfits, check_fit, learn_usual_misfits
+from calibrator.estimator.checks import UsualMisfits, find_misfits, learn_usual_misfits
 from calibrator.estimator.decision import RowsEstimate, estimate_rows
-from calibrator.estimator.fleet_model import FleetModel, densest_clusters, fit_fleet_model
-from calibrator.estimator.learning import LEAST_SHARED, Law, centre_rows, learn_laws
-from calibrator.estimator.moments import FleetMoments, stack_summaries
-from calibrator.estimator.prior import Prior
-from calibrator.estimator.readings import FEWEST_TRUSTED, Readings, untrusted_vehicles, with_readings
-from calibrator.estimator.rows import (
+from calibrator.estimator.evidence import (
     EvidenceRows,
+    FleetMoments,
+    RowPlaces,
     VehicleEvidence,
     collect_rows,
+    densest_clusters,
     evidence_names,
+    fit_fleet_model,
     reported_evidence,
-    row_places,
+    stack_summaries,
 )
+from calibrator.estimator.learning import LEAST_SHARED, FaultModel, centre_rows, learn_fault_models
+from calibrator.estimator.prior import Prior
+from calibrator.estimator.readings import FEWEST_TRUSTED, Readings, untrusted_vehicles, with_readings
 from calibrator.estimator.settings import FEWEST_VEHICLES, HARM_LIMIT
 from calibrator.summaries.moments import DriveSummary
 from ecu_node.layout import UnmeasuredLoad
@@ -64,11 +66,11 @@ class FleetReference:
         Branches as they are worked with, the most moving first: position of each in their own order.
     feed : int
         Place in that order of the branch that feeds the others, and any load without a sensor.
-    model : FleetModel
-        Ideal currents over the inputs, branches in the order worked with.
+    ordered_read_out : ndarray of shape (M + 1, K)
+        Of the fleet model: ideal currents over the inputs, branches in the order worked with. [A]
     usual_correlation : ndarray of shape (3K, 3K)
         Of the evidence rows. [1]
-    laws : tuple of Law
+    models : tuple of FaultModel
         Of the faults.
     usual : ndarray of shape (2, K)
         Mean and mean square of the measured currents on the fleet's usual drive, over full scale.
@@ -95,9 +97,9 @@ class FleetReference:
     branches: tuple[str, ...]
     order: tuple[int, ...]
     feed: int
-    model: FleetModel
+    ordered_read_out: Array
     usual_correlation: Array
-    laws: tuple[Law, ...]
+    models: tuple[FaultModel, ...]
     usual: Array
     misfits: UsualMisfits | None
     full_scale_a: float
@@ -122,23 +124,23 @@ class FleetReference:
     @property
     def expected_a(self) -> float:
         """Mean junction sum that right sensors show: the load that none of them sees. [A]"""
-        spread, K = self.laws[0].spread, len(self.branches)
-        return float((spread.mean[row_places(K).junction] - spread.shared[:K].sum()) * self.full_scale_a)
+        spread, K = self.models[0].spread, len(self.branches)
+        return float((spread.mean[RowPlaces(K).junction] - spread.shared[:K].sum()) * self.full_scale_a)
 
     @property
     def read_out(self) -> Array:
         """Read-outs of the fleet model (M + 1, K), branches in their own order. [A]"""
-        return self.model.read_out[:, np.argsort(self.order)]
+        return self.ordered_read_out[:, np.argsort(self.order)]
 
     def details(self) -> dict[str, object]:
         """What the run records of it."""
-        ordered, law = self.ordered, self.laws[0]
-        prior, spread = law.prior, np.sqrt(np.diag(law.spread.covariance))
+        ordered, model = self.ordered, self.models[0]
+        prior, spread = model.prior, np.sqrt(np.diag(model.spread.covariance))
         return {
             "reference": {
                 "agreeing_share": dict(zip(self.branches, self.agreeing, strict=True)),
                 "unmeasured_a": self.expected_a,
-                "read_out": {name: self.model.read_out[:, k].tolist() for k, name in enumerate(ordered)},
+                "read_out": {name: self.ordered_read_out[:, k].tolist() for k, name in enumerate(ordered)},
             },
             "evidence": evidence_names(ordered),
             "hyperparameters": {
@@ -146,8 +148,8 @@ class FleetReference:
                 "drift_magnitude": [prior.gain.low, prior.gain.high],
                 "offset_magnitude": [prior.offset.low, prior.offset.high],
                 "model_spread": dict(zip(ordered, spread[: len(ordered)].tolist(), strict=True)),
-                "log_evidence": law.log_evidence,
-                "laws": [law.probability for law in self.laws],
+                "log_evidence": model.log_evidence,
+                "models": [model.probability for model in self.models],
             },
         }
 
@@ -162,23 +164,23 @@ class FleetReference:
                 f"{self.vehicles} vehicles are few for a fleet that is compared with itself: nothing is corrected; at "
                 f"least {FEWEST_VEHICLES} are needed, or {FEWEST_TRUSTED} bench-checked vehicles (--trusted)"
             )
-        best = self.laws[0]
-        constant = best.spread.mean[row_places(K).junction]
+        best = self.models[0]
+        constant = best.spread.mean[RowPlaces(K).junction]
         if self.load is None and abs(constant) > LEAST_SHARED:
             notices.append(
-                f"the currents of most vehicles sum to {constant * scale_a:+.1f} A: " + _causes(self.laws, ordered)
+                f"the currents of most vehicles sum to {constant * scale_a:+.1f} A: " + _causes(self.models, ordered)
             )
         for share, centre in zip(best.prior.group_share, best.prior.group_centre, strict=True):
-            sensor = sum(law.probability for law in self.laws if law.spread.shared[-1])
+            sensor = sum(model.probability for model in self.models if model.spread.shared[-1])
             notices.append(
                 f"about {share:.0%} of the vehicles share {centre * scale_a:+.1f} A in branch {feed} beside the others:"
                 f" a load without a sensor ({1.0 - sensor:.0%}), or an offset of a batch of sensors ({sensor:.0%})"
             )
-        batches = [law for law in self.laws if law.spread.shared[K : 2 * K].any()]
-        gains = sum(law.probability for law in batches)
+        batches = [model for model in self.models if model.spread.shared[K : 2 * K].any()]
+        gains = sum(model.probability for model in batches)
         if gains > LEAST_SAID:
             size = np.abs(batches[0].spread.shared[K : 2 * K]).max()
-            which = [name for k, name in enumerate(ordered) if any(law.spread.shared[K + k] for law in batches)]
+            which = [name for k, name in enumerate(ordered) if any(model.spread.shared[K + k] for model in batches)]
             notices.append(
                 f"most vehicles break the junction law by {size:.1%}: a gain error that a batch of sensors shares "
                 f"({gains:.0%}), in branch {' or '.join(which)}"
@@ -196,7 +198,7 @@ class FleetReference:
         """Evidence of some vehicles, with what is known of single sensors and of loads without one."""
         fleet = stack_summaries(summaries, self.order)
         rows, _ = collect_rows(
-            fleet, self.model, full_scale_a=self.full_scale_a, usual_correlation=self.usual_correlation
+            fleet, self.ordered_read_out, full_scale_a=self.full_scale_a, usual_correlation=self.usual_correlation
         )
         known = _with_knowledge(
             rows, readings, trusted, order=self.order, full_scale_a=self.full_scale_a, load=self.load
@@ -295,8 +297,8 @@ def learn_fleet(
     fleet, ordered = stack_summaries(summaries, order), [branches[k] for k in order]
     _require_balance(fleet, ordered)
     feed = int(np.argmax(np.median(fleet.mean_a, axis=0)))
-    model = fit_fleet_model(fleet)
-    measured, usual_correlation = collect_rows(fleet, model, full_scale_a=full_scale_a)
+    read_out = fit_fleet_model(fleet)
+    measured, usual_correlation = collect_rows(fleet, read_out, full_scale_a=full_scale_a)
     carriers = np.zeros(len(fleet), bool) if trusted is None else trusted.copy()
     distrusted = untrusted_vehicles(measured, carriers, ordered, full_scale_a=full_scale_a, load=load)
     carriers[list(distrusted)] = False
@@ -305,8 +307,8 @@ def learn_fleet(
     mean, square = fleet.mean_a / full_scale_a, fleet.mean_square_a2 / full_scale_a**2
     usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
 
-    def learn() -> tuple[list[Law], RowsEstimate]:
-        laws = learn_laws(
+    def learn() -> tuple[list[FaultModel], RowsEstimate]:
+        models = learn_fault_models(
             rows,
             feed=feed,
             fixed=_carried_centre(rows, carriers),
@@ -314,23 +316,23 @@ def learn_fleet(
             known=known,
             expected_faults=expected_faults,
         )
-        return laws, estimate_rows(rows, laws, feed=feed, mean=mean, mean_square=square, usual=usual)
+        return models, estimate_rows(rows, models, feed=feed, mean=mean, mean_square=square, usual=usual)
 
-    laws, everyone = learn()
+    models, everyone = learn()
     differing = carriers & (everyone.hardware_probability > SUSPECTED) & (carriers.sum() >= FEWEST_TRUSTED)
     if differing.any():
         carriers &= ~differing
-        laws, everyone = learn()
+        models, everyone = learn()
     place = np.argsort(order)
     return FleetReference(
         branches=tuple(branches),
         order=order,
         feed=feed,
-        model=model,
+        ordered_read_out=read_out,
         usual_correlation=usual_correlation,
-        laws=tuple(laws),
+        models=tuple(models),
         usual=usual,
-        misfits=learn_usual_misfits(summaries, model.read_out[:, place], full_scale_a=full_scale_a),
+        misfits=learn_usual_misfits(summaries, read_out[:, place], full_scale_a=full_scale_a),
         full_scale_a=full_scale_a,
         load=load,
         vehicles=len(fleet),
@@ -415,15 +417,15 @@ def _variants(hardware_drift: Array) -> tuple[float, ...]:
     return tuple(sorted(centres))
 
 
-def _causes(laws: Sequence[Law], branches: Sequence[str]) -> str:
+def _causes(models: Sequence[FaultModel], branches: Sequence[str]) -> str:
     """Causes of what most vehicles share, with their probabilities."""
     share = {"a load without a sensor": 0.0}
-    for law in laws:
-        offsets = law.spread.shared[: len(branches)]
+    for model in models:
+        offsets = model.spread.shared[: len(branches)]
         cause = "a load without a sensor"
         if np.abs(offsets).max() > LEAST_SHARED:
             cause = f"an offset that the sensors of branch {branches[int(np.argmax(np.abs(offsets)))]} share"
-        share[cause] = share.get(cause, 0.0) + law.probability
+        share[cause] = share.get(cause, 0.0) + model.probability
     said = sorted(((p, cause) for cause, p in share.items() if p > LEAST_SAID), reverse=True)
     return " or ".join(f"{cause} ({p:.0%})" for p, cause in said) + "; declare the load if it is known"
 
@@ -464,7 +466,7 @@ def estimate_vehicles(
     rows, fleet = reference.rows_of(summaries, readings, trusted)
     found = estimate_rows(
         rows,
-        reference.laws,
+        reference.models,
         feed=reference.feed,
         mean=fleet.mean_a / scale_a,
         mean_square=fleet.mean_square_a2 / scale_a**2,
@@ -472,7 +474,7 @@ def estimate_vehicles(
         order=order,
         full_scale_a=scale_a,
     )
-    unfit = check_fit(
+    unfit = find_misfits(
         summaries, reference.read_out, reference.misfits, full_scale_a=scale_a, branches=reference.branches
     )
     drift_limit, offset_limit_a = (np.inf, np.inf) if limits is None else limits
@@ -490,7 +492,7 @@ def estimate_vehicles(
     linear = [
         1.0 - max((each.probability for each in mine if each.cause not in LINEAR_CAUSES), default=0.0) for mine in unfit
     ]
-    law = reference.laws[0]
+    model = reference.models[0]
     return FleetEstimate(
         **{**vars(found), "confidence": found.confidence * linear},
         corrected=corrected,
@@ -500,8 +502,8 @@ def estimate_vehicles(
         findings=[(*each, *others) for each, others in zip(unfit, _shared_findings(found, reference), strict=True)],
         evidence=reported_evidence(
             rows,
-            centre=law.spread.mean,
-            covariance=rows.dispersed(law.spread.dispersion)[0] + law.spread.covariance,
+            centre=model.spread.mean,
+            covariance=rows.dispersed(model.spread.dispersion)[0] + model.spread.covariance,
             drift=found.drift[:, order],
             offset_a=found.offset_a[:, order],
             hardware_drift=found.hardware_drift,
@@ -514,10 +516,12 @@ def estimate_vehicles(
 def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[list[Finding]]:
     """Loads without a sensor, batches and variants, of each vehicle: explained, and nothing of them is corrected."""
     scale_a, feed = reference.full_scale_a, reference.ordered[reference.feed]
-    sensor = sum(law.probability for law in reference.laws if law.spread.shared[-1])
+    sensor = sum(model.probability for model in reference.models if model.spread.shared[-1])
     cause, rival = ("batch", "load") if sensor > SUSPECTED else ("load", "batch")
     what = {"load": "a load without a sensor", "batch": "an offset of a batch of sensors"}
-    groups = max((law.prior.group_centre for law in reference.laws), key=len)  # those of the first law, if it has any
+    groups = max(
+        (model.prior.group_centre for model in reference.models), key=len
+    )  # those of the first model, if it has any
     findings: list[list[Finding]] = [[] for _ in found.load_probability]
     for j, mine in enumerate(findings):
         for g in np.flatnonzero(found.group_probability[j] > SUSPECTED):

@@ -1,5 +1,7 @@
 """All that it takes to calibrate the vehicles of a fleet: its reference, learned once, and what the user knows.
 
+It goes to other processes, which calibrate a bucket of vehicles each (:func:`calibrate_bucket`).
+
 Only the project's own errors about data leave a vehicle out with advice. Any other exception is a fault of the program:
 its vehicle is left out by name, and the others go on.
 """
@@ -7,35 +9,40 @@ its vehicle is left out by name, and the others go on.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import compress
-from typing import cast
+from pathlib import Path
 
 import numpy as np
 
-from calibrator.drives.delays import BranchDelays
-from calibrator.errors import internal_error
-from calibrator.estimator.fleet_estimate import (
-    CONFIDENT,
-    SUSPECTED,
-    FleetEstimate,
-    FleetReference,
-    estimate_vehicles,
-    learn_fleet,
+from calibrator.errors import DriveError, FleetError, internal_error
+from calibrator.estimator.evidence import VehicleEvidence
+from calibrator.estimator.fleet_estimate import FleetEstimate, FleetReference, estimate_vehicles, learn_fleet
+from calibrator.estimator.readings import (
+    CONTRADICTION,
+    TRUSTED_DRIFT_SD,
+    TRUSTED_OFFSET_SD,
+    BenchTable,
+    Readings,
+    merge_readings,
+    trust_notices,
 )
-from calibrator.estimator.readings import CONTRADICTION, BenchTable, Readings, merge_readings, trust_notices
-from calibrator.estimator.rows import VehicleEvidence
+from calibrator.estimator.results import PARTS, encode_chunk, part_file, read_part
 from calibrator.estimator.settings import CalibrationSettings, require_learning
-from calibrator.estimator.vehicle_report import deciding_evidence, faults_of, impossible
-from calibrator.files.parameter_files import RunIdentity, by_branch, junction_residual
+from calibrator.estimator.vehicle_report import explained_faults, impossible, parameters_of
+from calibrator.files.parameter_files import RunIdentity
+from calibrator.summaries.record import Record, drives_digest, joined_records
+from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from ecu_node.errors import UserError
-from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, HeldBack, VehicleParameters, Verdict
+from ecu_node.parameters import VehicleParameters, decode_parameters
 
-__all__ = ["Calibrated", "FleetTask", "learn_task", "parameters_of"]
+__all__ = ["Calibrated", "FleetTask", "calibrate_bucket", "learn_task"]
 
-MOST_REPORTED, LEAST_REPORTED = 3, 0.02
-"""Explanations that are reported, and the least probability of one after the first. [1]"""
 LEAST_PROBABILITY = 1e-4
 """Of the explanations near a bench reading: below, the drives contradict it. [1]"""
+MOVED_SD, MOVED_PROBABILITY = 4.0, 1e-3
+"""Standard deviations within which earlier and new faults of a sensor are the same [1]; a sensor has moved if the
+explanations near the earlier faults are less probable than this. [1]"""
+NOT_THERE = "it is not in this store; its earlier parameters are in the earlier result"
 
 
 @dataclass(kw_only=True)
@@ -123,107 +130,6 @@ class FleetTask:
                 return
             advice = f"its evidence cannot be used: {error}; look at its recordings"
             found.left_out[vehicles[0].vehicle] = advice if isinstance(error, UserError) else internal_error(error)
-
-
-def parameters_of(
-    vehicle: VehicleSummary,
-    estimate: FleetEstimate,
-    j: int,
-    *,
-    identity: RunIdentity,
-    branches: Sequence[str],
-    expected_a: float,
-    fleet_size: int,
-    decisive: str | None = None,
-) -> VehicleParameters:
-    """Write down what was found for vehicle j of an estimate.
-
-    Parameters
-    ----------
-    vehicle, estimate, j : VehicleSummary, FleetEstimate, int
-        The vehicle, and which of the estimate it is.
-    identity : RunIdentity
-        Of the run.
-    branches : sequence of str
-        Names of the K branches.
-    expected_a : float
-        Mean junction sum that right sensors show. [A]
-    fleet_size : int
-        Vehicles that can be used.
-    decisive : str or None
-        What would decide; None: found from the explanations.
-
-    Returns
-    -------
-    VehicleParameters
-        Content of its parameter file.
-    """
-    corrected = estimate.corrected[j]
-    reported: list[Explanation] = []
-    deciding = decisive or ""
-    if (
-        estimate.verdicts[j] == "cannot tell"
-        or not estimate.confidence[j] >= CONFIDENT
-        or (estimate.held_back[j] != "").any()
-    ):
-        first, *others = estimate.explanations[j][:MOST_REPORTED]
-        reported = [first, *(each for each in others if each.probability >= LEAST_REPORTED)]
-        layout = identity.database.layout
-        if decisive is None:
-            deciding, rival = deciding_evidence(
-                estimate, j, branches, full_scale_a=layout.full_scale_a, layout=layout.path.name
-            )
-            reported += [rival] if rival is not None and rival not in reported else []
-    hardware = _probability(estimate.hardware_probability[j])
-    return VehicleParameters(
-        vehicle=vehicle.vehicle,
-        layout=identity.layout,
-        dbc=identity.dbc,
-        verdict=cast("Verdict", estimate.verdicts[j]),
-        confidence=_probability(estimate.confidence[j]),
-        branches={name: _branch(vehicle.delays, estimate, (j, k), name) for k, name in enumerate(branches)},
-        hardware_fault=HardwareFault(
-            suspected=hardware is not None and hardware > SUSPECTED,
-            drift=float(estimate.hardware_drift[j]),
-            offset_a=by_branch(branches, estimate.hardware_offset_a[j]),
-            probability=hardware,
-        ),
-        explanations=reported,
-        deciding_evidence=deciding,
-        findings=list(estimate.findings[j]),
-        junction_residual=junction_residual(
-            vehicle.summary.moments[:, vehicle.summary.inputs :, vehicle.summary.inputs :],
-            gain=np.where(corrected, 1.0 + estimate.drift[j], 1.0)[None],
-            offset_a=np.where(corrected, estimate.offset_a[j], 0.0),
-            expected_a=expected_a,
-        ),
-        provenance=identity.provenance(
-            fleet_size=fleet_size, drives=vehicle.drives, duration_s=vehicle.summary.duration_s
-        ),
-    )
-
-
-def _branch(delays: BranchDelays, estimate: FleetEstimate, place: tuple[int, int], name: str) -> BranchParameters:
-    k = delays.branches.index(name)
-    delay_s, delay_sd_s = (float(values[k]) if delays.known[k] else None for values in (delays.delay_s, delays.sd_s))
-    return BranchParameters(
-        drift=float(estimate.drift[place]),
-        offset_a=float(estimate.offset_a[place]),
-        drift_sd=float(estimate.drift_sd[place]),
-        offset_sd_a=float(estimate.offset_sd_a[place]),
-        apply=bool(estimate.corrected[place]),
-        held_back=cast("HeldBack | None", str(estimate.held_back[place]) or None),
-        delay_s=delay_s,
-        delay_sd_s=delay_sd_s,
-        fault_probability=_probability(estimate.fault_probability[place]),
-        harm_probability=_probability(estimate.harm_probability[place]),
-        identifiable=bool(estimate.identifiable[place]),
-    )
-
-
-def _probability(value: float) -> float | None:
-    """A probability free of rounding beyond its range; None where it is not known (NaN)."""
-    return None if np.isnan(value) else float(np.clip(value, 0.0, 1.0))
 
 
 def learn_task(
@@ -316,7 +222,7 @@ def _contradicted(task: FleetTask, vehicles: Sequence[VehicleSummary], bench: Be
     found, wrong = task.estimate(checked), set[tuple[str, str]]()
     value, sd = Readings.of_bench(bench, [vehicle.vehicle for vehicle in checked], branches).values
     for j, vehicle in enumerate(checked):
-        faults = np.array([faults_of(each, branches) for each in found.explanations[j]])
+        faults = np.array([explained_faults(each, branches) for each in found.explanations[j]])
         apart = np.abs(value[:, j] - faults) / np.hypot(sd[:, j], [found.drift_sd[j], found.offset_sd_a[j]])
         near = ~(apart > CONTRADICTION).any(axis=1)  # what was not read is not far
         probability = np.array([each.probability for each in found.explanations[j]]) @ near
@@ -326,4 +232,100 @@ def _contradicted(task: FleetTask, vehicles: Sequence[VehicleSummary], bench: Be
         f"and is not used; check it again, and whether it is of this vehicle"
         for vehicle, branch in bench
         if (vehicle, branch) in wrong
+    }
+
+
+def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previous: Path | None = None) -> bytes:
+    """Calibrate the vehicles of a bucket; one bad vehicle never stops the others.
+
+    Parameters
+    ----------
+    bucket : int
+        Which.
+    store, task : SummaryStore, FleetTask
+        The store, and what was learnt from it.
+    previous : Path or None
+        Earlier result to go on from.
+
+    Returns
+    -------
+    bytes
+        Part of the result: parameters, and who was left out and why.
+    """
+    if previous is not None and not (previous / PARTS).is_dir():
+        raise FleetError(
+            f"{previous / PARTS}: the earlier result cannot be reached from here; put it where every worker reaches it "
+            f"by this path"
+        )
+    records, before = store.read(bucket), {} if previous is None else read_part(part_file(previous, bucket))
+    digests = {name: drives_digest(items) for name, items in records.items()}
+    found = Calibrated(left_out=dict.fromkeys(before.keys() - records.keys(), NOT_THERE))
+    todo: list[VehicleSummary] = []
+    for name, items in records.items():
+        earlier = decode_parameters(before[name].text, f"earlier parameters of {name}") if name in before else None
+        if earlier is not None and before[name].drives == digests[name]:
+            found.parameters[name] = earlier  # its evidence was found against another reference, and is not kept
+            continue
+        try:
+            todo.append(_what_holds(items, earlier, task, found))
+        except DriveError as error:
+            found.left_out[name] = str(error)
+        except UserError:
+            raise
+        except Exception as error:  # noqa: BLE001 (a fault of the program is reported with its vehicle)
+            found.left_out[name] = internal_error(error)
+    task.calibrate(todo, found)
+    return encode_chunk(
+        found.parameters.values(), found.left_out, moved=found.moved, drives=digests, evidence=found.evidence
+    )
+
+
+def _what_holds(
+    records: Sequence[Record], earlier: VehicleParameters | None, task: FleetTask, found: Calibrated
+) -> VehicleSummary:
+    """Summary of all drives of a vehicle, or of the new ones alone if they show that a sensor has moved.
+
+    Records stand in the order in which they came. Those before the first one that the earlier parameters were found
+    from are of a time before a sensor moved.
+    """
+    drives = set() if earlier is None else set(earlier.provenance.drives)
+    known = [place for place, record in enumerate(records) if record.drives and set(record.drives) <= drives]
+    if earlier is None or not known:
+        return joined_records(records)
+    everything, new = joined_records(records[known[0] :]), records[known[-1] + 1 :]
+    if not any(record.found for record in new):
+        return everything
+    try:
+        recent = joined_records(new)
+        changes = _moved_sensors(earlier, task.estimate([recent]), task)
+    except UserError:  # the new drives alone do not suffice
+        return everything
+    found.moved |= {(earlier.vehicle, branch): text for branch, text in changes.items()}
+    return recent if changes else everything
+
+
+def _moved_sensors(before: VehicleParameters, now: FleetEstimate, task: FleetTask) -> dict[str, str]:
+    """Sensors that have moved, from where to where, by branch: no explanation of the new drives has the earlier faults.
+
+    ``now`` is the estimate of the vehicle from drives that came since ``before``, and from these alone.
+    """
+    branches, scale_a = task.branches, task.identity.database.layout.full_scale_a
+    old = [before.branches[name] for name in branches]
+    was = np.array([[item.drift for item in old], [item.offset_a for item in old]])
+    was_sd = np.array([[item.drift_sd or 0.0 for item in old], [item.offset_sd_a or 0.0 for item in old]])
+    is_now, now_sd = np.array([now.drift[0], now.offset_a[0]]), np.array([now.drift_sd[0], now.offset_sd_a[0]])
+    accuracy = np.array([[TRUSTED_DRIFT_SD], [TRUSTED_OFFSET_SD * scale_a]])
+    same = MOVED_SD * np.sqrt(now_sd**2 + was_sd**2 + accuracy**2)
+    near = (
+        each.probability
+        for each in now.explanations[0]
+        if (np.abs(explained_faults(each, branches) - was) <= same).all()
+    )
+    if sum(near) >= MOVED_PROBABILITY:
+        return {}
+    return {
+        branches[k]: (
+            f"drift {was[0, k]:+.2%} -> {is_now[0, k]:+.2%}, offset {was[1, k]:+.2f} A -> {is_now[1, k]:+.2f} A"
+        )
+        for k in np.flatnonzero((np.abs(is_now - was) > same).any(axis=0)).tolist()
     }

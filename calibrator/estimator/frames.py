@@ -1,12 +1,18 @@
-"""Data frames of a fleet become drives, and the drives a store of summaries, as that of ``calibrator summarise``.
+"""Data frames of a junction become drives, and those of a fleet a store of summaries as of ``calibrator summarise``.
 
 Whatever cannot be a recording of such a fleet is refused, with the vehicle and the column: nothing is guessed.
 """
 
 import hashlib
+import math
+import os
+import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from numbers import Integral, Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,6 +22,7 @@ from calibrator.drives.align import base_inputs, choose_inputs
 from calibrator.drives.store import require_plain_name, write_drive
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.settings import FEWEST_VEHICLES
+from calibrator.files.layout_files import vehicle_database
 from calibrator.files.storage import open_storage
 from calibrator.recordings.frame_arrays import CLOCK_GAP_S
 from calibrator.sources.fleet_source import Equipment
@@ -25,13 +32,25 @@ from calibrator.summaries.store import SummaryStore
 from calibrator.summaries.vehicle_summary import summarise_drives
 from calibrator.terminal.text import few
 from ecu_node.database import VehicleDatabase
+from ecu_node.layout import Branch, Input, Layout
 from ecu_node.summary import TIME_RESOLUTION_S
 
-if TYPE_CHECKING:
-    from calibrator.estimator.fleet import Junction
+__all__ = [
+    "Junction",
+    "column_values",
+    "is_number",
+    "named_columns",
+    "names_of",
+    "path_of",
+    "require",
+    "require_columns",
+    "store_frames",
+    "summarise_frames",
+]
 
-__all__ = ["column_values", "named_columns", "require_columns", "store_frames", "summarise_frames"]
-
+MOST_BRANCHES = 16
+MOST_MISSED, LEAST_AGE_S = 2.5, 0.5
+"""Rows of a data frame farther apart than so many periods, and than this, leave a gap. [1], [s]"""
 FINEST_PERIOD_S, COARSEST_PERIOD_S = 0.1, 5.0
 """Time base of data frames without a layout: that of logs, or slower; still several rows per block of 30 s. [s]"""
 LEAST_OF_SCALE, MOST_OF_SCALE = 0.002, 10.0
@@ -42,8 +61,127 @@ OTHER_UNIT = 100.0
 """Largest current of the median vehicle over that of this one, from which on the latter is in another unit. [1]"""
 
 
+def require(good: Any, what: str, given: Any, expected: str) -> None:
+    """Refuse an argument, showing it if it is short."""
+    if not good:
+        shown = text if len(text := repr(given)) < 80 and "\n" not in text else f"of type {type(given).__name__}"
+        raise FleetError(f"{what} {shown}: expected {expected}")
+
+
+def path_of(given: Any, what: str, expected: str = "the path of a layout (TOML)") -> Path:
+    """An argument that names a file or folder."""
+    require(isinstance(given, (str, os.PathLike)) and os.fspath(given), what, given, expected)
+    return Path(given)
+
+
+def is_number(given: Any, low: float, high: float, kind: Any = Real) -> bool:
+    """Whether an argument is a number within bounds."""
+    return isinstance(given, kind) and not isinstance(given, bool) and low <= float(given) <= high
+
+
+def names_of(given: Any, what: str, *, sets: bool = False) -> tuple[str, ...]:
+    """Names of anything like a list, numbers as strings; a set has no order, so it does for some arguments only."""
+    no_list = (str, bytes, Mapping) if sets else (str, bytes, Mapping, set, frozenset)
+    names: list[Any] = [None]
+    with suppress(TypeError):
+        names = names if isinstance(given, no_list) else [*given]
+    named = (not isinstance(name, bool) and isinstance(name, (str, Integral)) and str(name).strip() for name in names)
+    require(all(named), what, given, "a list of names, such as ['one', 'other']")
+    return tuple(map(str, names))
+
+
+@dataclass(frozen=True)
+class Junction:
+    """Where the high-voltage currents of a vehicle meet; the sum of the K branch currents is 0 A (Kirchhoff).
+
+    Parameters
+    ----------
+    branches : sequence of str
+        Names of the K branches, two or more.
+    full_scale_a : float
+        Nominal maximum current; offsets are compared in fractions of it. [A]
+
+    Examples
+    --------
+    >>> Junction(branches=["battery", "motor", "heater"], full_scale_a=400.0).branches
+    ('battery', 'motor', 'heater')
+    """
+
+    branches: Sequence[str]
+    full_scale_a: float
+    database: VehicleDatabase | None = field(default=None, repr=False, compare=False)
+    """Layout and DBC, set by :meth:`from_layout`."""
+
+    def __post_init__(self) -> None:
+        names = names_of(self.branches, "branches")
+        require(
+            len(set(names)) == len(names), "branches", self.branches, "different names, such as ['battery', 'motor']"
+        )
+        if not 2 <= len(names) <= MOST_BRANCHES:
+            raise FleetError(
+                f"branches {self.branches!r}: a junction has 2 to {MOST_BRANCHES} branches; name all currents that are "
+                f"measured, as nothing tells what a single sensor does wrong"
+            )
+        good = is_number(self.full_scale_a, math.ulp(0.0), sys.float_info.max)
+        require(good, "full_scale_a", self.full_scale_a, "the nominal maximum current in A, such as 400.0")
+        object.__setattr__(self, "branches", names)
+
+    @classmethod
+    def from_layout(cls, path: str | Path, *, branches: Sequence[str] | None = None) -> "Junction":
+        """Junction of a layout (TOML), with its limits and derived inputs, and the DBC that the node needs.
+
+        Parameters
+        ----------
+        path : str or Path
+            The layout.
+        branches : sequence of str or None
+            Those of its branches that the vehicles have; None: all.
+
+        Returns
+        -------
+        Junction
+            For :meth:`Fleet.from_frames`.
+
+        Raises
+        ------
+        LayoutError, DatabaseError
+            If layout or DBC cannot be used, or the layout has no such branch.
+        """
+        database = vehicle_database(path_of(path, "path"))
+        layout = database.layout
+        chosen = layout.branch_names if branches is None else names_of(branches, "branches")
+        for name in chosen:
+            layout.find_branch(name)
+        return cls(branches=chosen, full_scale_a=layout.full_scale_a, database=database)
+
+    @property
+    def layout(self) -> Layout | None:
+        """The layout; None if there is none."""
+        return None if self.database is None else self.database.layout
+
+    def as_database(self, inputs: Sequence[str], period_s: float) -> VehicleDatabase:
+        """Layout and DBC; without a layout one that stands for data frames, whose signals are on no bus."""
+        if self.database is not None:
+            return self.database
+
+        age_s = max(MOST_MISSED * period_s, LEAST_AGE_S)
+        layout = Layout(
+            schema=1,
+            name="frames",
+            full_scale_a=float(self.full_scale_a),
+            branch=[Branch(name=name, sign=1, timeout_s=age_s) for name in self.branches],
+            input=[Input(name=name, signal=f"frame.{name}") for name in inputs],
+            model_inputs=list(inputs),
+            period_s=period_s,
+            max_age_s=age_s,
+            path=Path("the junction"),
+            digest=hashlib.sha256(repr(self).encode()).hexdigest(),
+        )
+        return VehicleDatabase(layout=layout, databases={}, digest=hashlib.sha256(b"").hexdigest())
+
+
 def summarise_frames(
-    folder: Path, frames: Mapping[str, Any], junction: "Junction", *, inputs: Sequence[str] | None
+    folder: Path, frames: Mapping[str, Any], junction: Junction, *, inputs: Sequence[str] | None
 ) -> VehicleDatabase:
     """Make a store of summaries of data frames.
 
@@ -79,7 +217,7 @@ def summarise_frames(
     return database
 
 
-def store_frames(folder: Path, frames: Mapping[str, Any], junction: "Junction") -> VehicleDatabase:
+def store_frames(folder: Path, frames: Mapping[str, Any], junction: Junction) -> VehicleDatabase:
     """Make a drive store of data frames of single junctions.
 
     Parameters
@@ -153,7 +291,7 @@ def _vehicles(frames: Mapping[str, Any], *, fewest: int = 2) -> dict[str, list[p
 
 
 def _chosen_inputs(
-    labelled: Mapping[str, pd.DataFrame], junction: "Junction", inputs: Sequence[str] | None
+    labelled: Mapping[str, pd.DataFrame], junction: Junction, inputs: Sequence[str] | None
 ) -> tuple[str, ...]:
     """Names of the inputs; every frame has the columns that it takes."""
     branches, layout = list(junction.branches), junction.layout
@@ -231,7 +369,7 @@ def _seconds(frame: pd.DataFrame, where: str) -> Array:
     return np.asarray(time_s - time_s[0])
 
 
-def _period_s(times: Mapping[str, Array], junction: "Junction") -> float:
+def _period_s(times: Mapping[str, Array], junction: Junction) -> float:
     """Time base of the fleet: that of the layout, or of the rows, which are about as far apart in every frame."""
     layout = junction.layout
     spacing_s = {where: float(np.median(np.diff(time_s))) for where, time_s in times.items()}
@@ -268,7 +406,7 @@ def column_values(frame: pd.DataFrame, name: str, where: str) -> Array:
 
 def _drives(
     vehicles: Mapping[str, Sequence[pd.DataFrame]],
-    junction: "Junction",
+    junction: Junction,
     columns: Sequence[str],
     inputs: Sequence[str] = (),
 ) -> tuple[dict[str, list[Drive]], VehicleDatabase]:
@@ -298,7 +436,7 @@ def _drives(
     return found, database
 
 
-def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: "Junction", *, alone: bool = False) -> None:
+def _require_amperes(drives: Mapping[str, Sequence[Drive]], junction: Junction, *, alone: bool = False) -> None:
     """Refuse values that cannot be amperes, and in a fleet branches that stand still; alone, a heater may be off."""
     branches, scale_a = list(junction.branches), float(junction.full_scale_a)
     largest = np.zeros((len(drives), len(branches)))

@@ -28,11 +28,10 @@ from calibrator.drives.align import Samples, align
 from calibrator.drives.charge import GAP_PERIODS
 from calibrator.drives.delays import MAX_DELAY_S, estimate_delays, without_delays
 from calibrator.errors import DriveError, FleetError
-from calibrator.estimator.checks import CAUSES, UsualMisfits, check_fit
-from calibrator.estimator.decision import Points, harm_probability
+from calibrator.estimator.checks import CAUSES, UsualMisfits, find_misfits
+from calibrator.estimator.decision import Points, harm_probability, recovered
+from calibrator.estimator.evidence import junction_regression, stack_summaries
 from calibrator.estimator.fleet_estimate import SUSPECTED, FleetEstimate
-from calibrator.estimator.fleet_task import parameters_of
-from calibrator.estimator.moments import junction_law, stack_summaries
 from calibrator.estimator.readings import (
     CONTRADICTION,
     TRUSTED_DRIFT_SD,
@@ -41,12 +40,11 @@ from calibrator.estimator.readings import (
     check_bench_table,
     read_bench_table,
 )
-from calibrator.estimator.results import ChunkResult, encode_chunk
+from calibrator.estimator.results import encode_chunk
 from calibrator.estimator.settings import CalibrationSettings
-from calibrator.estimator.vehicle_report import sensor_text
+from calibrator.estimator.vehicle_report import parameters_of, sensor_text
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.processes.run_many import Workers
-from calibrator.score import TOLERANCE
 from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, read_vehicles
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
 from calibrator.summaries.summariser import summarise
@@ -56,7 +54,14 @@ from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout, UnmeasuredLoad
 from ecu_node.parameters import Explanation, Finding, VehicleParameters
 
-__all__ = ["JunctionEstimate", "Known", "Reading", "calibrate_junctions", "estimate_junction", "read_junction"]
+__all__ = [
+    "JunctionEstimate",
+    "JunctionKnowledge",
+    "Reading",
+    "calibrate_junctions",
+    "estimate_junction",
+    "read_junction",
+]
 
 LEAST_DURATION_S, SHORTEST_BLOCK_S, BLOCKS, FEWEST_BLOCKS = 5.0, 0.5, 16, 5
 """Least valid data, shortest block, number of blocks of a short recording, and least number beyond that of branches:
@@ -114,7 +119,7 @@ class Charge(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Known:
+class JunctionKnowledge:
     """What is known of a junction beside its recordings.
 
     Attributes
@@ -250,7 +255,7 @@ class _Law(NamedTuple):
 
 def _law(summary: DriveSummary, branches: Sequence[str], where: str, scale_a: float) -> _Law:
     order = np.argsort(-summary.variance_a2, kind="stable").tolist()
-    fit = junction_law(stack_summaries([summary], order))
+    fit = junction_regression(stack_summaries([summary], order))
     covariance = fit.influence.T @ fit.influence + fit.prior_covariance[0]
     sign = np.append(-np.ones(len(order) - 1), 1.0)
     if summary.variance_a2.max() < (STILL * scale_a) ** 2:  # the ratios are open, and the sum tells the constant
@@ -298,7 +303,7 @@ def _system(
     vehicles: Sequence[VehicleSummary],
     places: NDArray[np.int64],
     branches: Sequence[str],
-    known: Known,
+    known: JunctionKnowledge,
     *,
     laws: Sequence[_Law],
     full_scale_a: float,
@@ -340,7 +345,7 @@ def _system(
 
 
 def _readings(
-    sensor: Sequence[tuple[VehicleSummary, int]], branches: Sequence[str], known: Known
+    sensor: Sequence[tuple[VehicleSummary, int]], branches: Sequence[str], known: JunctionKnowledge
 ) -> list[tuple[Array, Array]]:
     """What is known of one sensor: (gain error, offset [A]) and standard deviations, NaN where not known."""
     found: list[tuple[Array, Array]] = []
@@ -460,7 +465,7 @@ def _contradictions(system: _System, names: Sequence[str], scale_a: float) -> li
 def estimate_junction(
     vehicles: Sequence[VehicleSummary],
     branches: Sequence[str],
-    known: Known,
+    known: JunctionKnowledge,
     *,
     full_scale_a: float,
     harm_limit: float,
@@ -475,7 +480,7 @@ def estimate_junction(
         N recordings of the same sensors in K branches, all but the meter; without a meter one.
     branches : sequence of str
         Names of the K branches.
-    known : Known
+    known : JunctionKnowledge
         What is known beside the recordings.
     full_scale_a : float
         Full scale of the junction. [A]
@@ -524,7 +529,7 @@ def estimate_junction(
         true = own[None], (own**2 + spread)[None]
         harm[j] = harm_probability(points[j], estimate, *true)
         harm_of_gain[j] = harm_probability(points[j], np.append(drift[j], np.zeros(K)), *true)
-        confidence[j] = _recovered(points[j], estimate)
+        confidence[j] = recovered(points[j], estimate[None], (LEAST_FAULT, LEAST_FAULT))[0]
     vague = bool(gain_sd.min() > KNOWN_GAIN_SD)
     known_well = (gain_sd <= SOUND_GAIN_SD) & (offset_sd <= SOUND_OFFSET_SD)
     # Where it is open whose an offset is, the gain alone may be corrected.
@@ -575,10 +580,6 @@ def estimate_junction(
             fault_probability=fault,
             harm_probability=harm,
             identifiable=gain_sd <= KNOWN_GAIN_SD,
-            load_probability=np.zeros(N),
-            load_a=np.zeros(N),
-            group_probability=np.zeros((N, 0)),
-            supports=[[] for _ in vehicles],
             points=points,
             order=tuple(range(K)),
             full_scale_a=scale_a,
@@ -613,17 +614,8 @@ def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a
         model_error_a=np.full(K, scale_a),
         spike_rate=1.0,
     )
-    found = check_fit(summaries, np.zeros((1, K)), usual, full_scale_a=scale_a, branches=branches)
+    found = find_misfits(summaries, np.zeros((1, K)), usual, full_scale_a=scale_a, branches=branches)
     return [[each for each in mine if each.cause != "noise"] for mine in found]
-
-
-def _recovered(points: Points, estimate: Array) -> float:
-    """Probability that the estimate (2K,) is within the tolerance of "recovered" of the truth."""
-    K, near = len(estimate) // 2, np.ones(len(points.weight), bool)
-    for part in (slice(0, K), slice(K, 2 * K)):
-        size = np.maximum(np.linalg.norm(points.faults[:, part], axis=1), LEAST_FAULT)
-        near &= np.linalg.norm(points.faults[:, part] - estimate[part], axis=1) <= TOLERANCE * size
-    return float(points.weight @ near)
 
 
 def _named_ratios(law: _Law, branches: Sequence[str]) -> dict[str, Reading]:
@@ -708,24 +700,24 @@ def _same_error(parameters: VehicleParameters, trusted: Collection[str]) -> list
 
 
 def calibrate_junctions(
-    fleet: FleetSource,
     drives: Mapping[str, Sequence[Drive]],
-    branches: tuple[str, ...],
+    fleet: FleetSource,
+    equipment: Equipment,
     identity: RunIdentity,
     settings: CalibrationSettings,
     *,
     workers: Workers,
-) -> tuple[ChunkResult, dict[str, object], tuple[str, ...]]:
+) -> tuple[bytes, dict[str, object], tuple[str, ...]]:
     """Calibrate each vehicle by itself; with a meter all together, as they are recordings of one car.
 
     Parameters
     ----------
-    fleet : FleetSource
-        The recordings.
     drives : mapping of str to sequence of Drive
         Those that were read already, by vehicle: all of a few vehicles, or none.
-    branches : tuple of str
-        Names of the K branches.
+    fleet : FleetSource
+        The recordings.
+    equipment : Equipment
+        Has the K branches.
     identity : RunIdentity
         For the parameter files.
     settings : CalibrationSettings
@@ -735,8 +727,8 @@ def calibrate_junctions(
 
     Returns
     -------
-    chunk : ChunkResult
-        Parameters of every vehicle that could be used, and why the others could not.
+    part : bytes
+        Of the result: parameters of every vehicle that could be used, and why the others could not.
     details : dict of str to JSON values
         Gain ratios and constants, for the record of the run.
     notices : tuple of str
@@ -747,7 +739,7 @@ def calibrate_junctions(
     UserError
         If no vehicle can be used, or something is said to be known that is not there.
     """
-    layout = identity.database.layout
+    layout, branches = identity.database.layout, equipment.branches
     vehicles, left_out = _summaries(fleet, drives, branches, identity.database, settings.time_limit_s, workers=workers)
     known = _known(settings, layout, branches, [each.vehicle for each in vehicles], left_out)
     if settings.charge_ah:
@@ -860,7 +852,7 @@ def _known(
     branches: Sequence[str],
     vehicles: Sequence[str],
     left_out: Mapping[str, str],
-) -> Known:
+) -> JunctionKnowledge:
     """What the user knows; FleetError if it is of something that is not there."""
     scale_a, meter = layout.full_scale_a, [settings.meter] if settings.meter else []
     for option, names in {"--trusted": settings.trusted, "--charge": settings.charge_ah, "--meter": meter}.items():
@@ -873,7 +865,7 @@ def _known(
     if settings.readings is not None:
         bench = read_bench_table(settings.readings, branches, full_scale_a=scale_a)
         check_bench_table(bench, vehicles, left_out=left_out, trusted=(), full_scale_a=scale_a)
-    return Known(
+    return JunctionKnowledge(
         trusted={
             name: (max(TRUSTED_DRIFT_SD, layout.find_branch(name).uncertainty), TRUSTED_OFFSET_SD * scale_a)
             for name in settings.trusted

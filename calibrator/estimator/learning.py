@@ -1,14 +1,16 @@
-"""What a fleet says of its faults, and of vehicles without faults: the laws that explain it, with their probabilities.
+"""What a fleet says of its faults, and of vehicles without faults: the fault models that explain it.
 
-A law is a prior of the faults and a model spread, by expectation maximisation on the fleet's own evidence (M14):
+A fault model is a prior of the faults and a model spread (what vehicles without faults differ by). It is learnt by
+expectation maximisation on the fleet's own evidence (M14):
 
-    expectation    explanations of each vehicle under the present law, weighed
+    expectation    explanations of each vehicle under the present model, weighed
     maximisation   numbers and sizes of faults, groups of vehicles that share a constant, centre and covariance of what
                    vehicles without faults differ by
 
 The likelihood has several maxima, as a cluster of faulty vehicles can stand for the reference. So it is climbed from
-clusters of the evidence, and all laws that explain the fleet about as well are kept. What a whole fleet shares in the
-junction's constant may be a load without a sensor or an offset of the sensors of a branch: each is a law of its own.
+clusters of the evidence, and all models that explain the fleet about as well are kept, with their probabilities. What a
+whole fleet shares in the junction's constant may be a load without a sensor or an offset of the sensors of a branch:
+each is a model of its own.
 """
 
 from collections.abc import Sequence
@@ -18,9 +20,18 @@ from itertools import product
 import numpy as np
 
 from calibrator.drive import Array, Mask
-from calibrator.estimator.explanations import evidence_of, fit_explanations, row_residuals
-from calibrator.estimator.fleet_model import densest_clusters
-from calibrator.estimator.posterior import GAIN, OFFSET, Draws, draw_explanations, size_evidence, weigh
+from calibrator.estimator.evidence import EvidenceRows, ParameterPlaces, RowPlaces, densest_clusters, row_design
+from calibrator.estimator.posterior import (
+    GAIN,
+    OFFSET,
+    Draws,
+    draw_explanations,
+    evidence_of,
+    fit_explanations,
+    row_residuals,
+    size_evidence,
+    weigh,
+)
 from calibrator.estimator.prior import (
     LARGEST_SHARED,
     TAIL_DENSITY,
@@ -32,12 +43,11 @@ from calibrator.estimator.prior import (
     uniform_density,
     with_slabs,
 )
-from calibrator.estimator.rows import EvidenceRows, parameter_places, row_design, row_places
 
-__all__ = ["LEAST_SHARED", "Law", "Spread", "centre_rows", "explain", "learn_laws", "weigh_law"]
+__all__ = ["LEAST_SHARED", "FaultModel", "Spread", "centre_rows", "explain", "learn_fault_models", "weigh_draws"]
 
 MOST_LEARNT, MOST_STARTED = 200, 60
-"""Vehicles that a law is learnt from, and that decide between its starts; more change it less than the faults. [1]"""
+"""Vehicles that a model is learnt from, and that decide between its starts; more change it less than the faults. [1]"""
 START_ROUNDS, ROUNDS, PRIOR_STEPS = 2, 5, 6
 """Rounds of each start, of the best ones after that, and steps of the prior in each round."""
 MOST_COMMON = 3
@@ -47,7 +57,7 @@ KEPT_STARTS = 2
 SAME_DENSITY = 0.2
 """Logarithm of densities of sizes up to which two priors count as one."""
 KEPT_LOG_ODDS = 7.0
-"""Logarithm of the odds against the best law up to which another one is kept."""
+"""Logarithm of the odds against the best model up to which another one is kept."""
 SAME_START = 0.001
 """Difference of two starts in every row, in fractions of full scale, below which they are one."""
 LEAST_SHARED = 0.001
@@ -67,7 +77,7 @@ FIRST_DISPERSION = 4.0
 TAIL_DEGREES = 8.0
 """Degrees of freedom of Student's t, as which the vehicles differ in each row: what is far off counts less. [1]"""
 COUNT_VEHICLES = 2.5
-"""Weight of the law of sparse faults against the fleet's own numbers of faults, in vehicles."""
+"""Weight of the distribution (20) of sparse faults against the fleet's own numbers of faults, in vehicles."""
 USED_FITS = 16
 """Explanations of each vehicle that the model spread is learnt from, the most probable ones."""
 MISFIT_SD = 4.0
@@ -99,7 +109,7 @@ class Spread:
     dispersion : ndarray of shape (K,)
         Variance of each intercept over what its blocks show, at least 1: a model errs alike for longer than a block.
     shared : ndarray of shape (2K + 1,)
-        See :class:`calibrator.estimator.explanations.Evidence`.
+        See :class:`calibrator.estimator.posterior.Evidence`.
     """
 
     mean: Array
@@ -109,13 +119,13 @@ class Spread:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Law:
-    """One law that explains a fleet.
+class FaultModel:
+    """One fault model that explains a fleet.
 
     Attributes
     ----------
     probability : float
-        Of this law, over all that are kept.
+        Of this model, over all that are kept.
     spread : Spread
         Of vehicles without faults.
     priors : tuple of (float, Prior)
@@ -137,12 +147,12 @@ class Law:
 
 def centre_rows(branches: int) -> Mask:
     """Rows whose centre the fleet shows, shape (5K,): slopes, intercepts, junction constant; ratios have none."""
-    free, at = np.zeros(5 * branches, bool), row_places(branches)
+    free, at = np.zeros(5 * branches, bool), RowPlaces(branches)
     free[at.slopes] = free[at.intercepts] = free[at.junction] = True
     return free
 
 
-def learn_laws(
+def learn_fault_models(
     rows: EvidenceRows,
     *,
     feed: int,
@@ -150,8 +160,8 @@ def learn_laws(
     load: float | None = None,
     known: Prior | None = None,
     expected_faults: float | None = None,
-) -> list[Law]:
-    """Learn the laws that explain a fleet.
+) -> list[FaultModel]:
+    """Learn the fault models that explain a fleet.
 
     Parameters
     ----------
@@ -170,7 +180,7 @@ def learn_laws(
 
     Returns
     -------
-    list of Law
+    list of FaultModel
         By falling probability.
     """
     fixed = np.full(rows.values.shape[1], np.nan) if fixed is None else fixed.copy()
@@ -184,19 +194,19 @@ def learn_laws(
 
     learner, starter = learner_of(MOST_LEARNT), learner_of(MOST_STARTED)
     climbed = [starter.climb(starter.start(centre), START_ROUNDS) for centre in learner.centres()]
-    climbed = sorted(climbed, key=lambda law: -law.log_evidence)[:KEPT_STARTS]
-    best = max((learner.climb(law, ROUNDS, begun=True) for law in climbed), key=lambda law: law.log_evidence)
-    laws = learner.variants(best)
-    return [learner.with_modes(law) for law in sorted(laws, key=lambda law: -law.probability)]
+    climbed = sorted(climbed, key=lambda model: -model.log_evidence)[:KEPT_STARTS]
+    best = max((learner.climb(model, ROUNDS, begun=True) for model in climbed), key=lambda model: model.log_evidence)
+    models = learner.variants(best)
+    return [learner.with_modes(model) for model in sorted(models, key=lambda model: -model.probability)]
 
 
-def explain(rows: EvidenceRows, law: Law, *, feed: int) -> Draws:
-    """Explain vehicles under the best prior and the model spread of a law; their draws are not weighed yet.
+def explain(rows: EvidenceRows, model: FaultModel, *, feed: int) -> Draws:
+    """Explain vehicles under the best prior and the model spread of a model; their draws are not weighed yet.
 
     A vehicle that even its best explanation leaves too much of has a wider covariance, in proportion to its chi square
     (Birge ratio): something about it is not in the model, and nothing about it is known as well as it seems.
     """
-    prior, spread = law.prior, law.spread
+    prior, spread = model.prior, model.spread
     n_h, n_s = np.indices(prior.counts.shape)
     rough = prior.log_supports + 0.5 * (n_h + n_s)  # a slab is about that much denser than the wide Gaussian
     log_load = float(np.log(prior.load_share + prior.group_share.sum())) + 2.0
@@ -219,9 +229,9 @@ def explain(rows: EvidenceRows, law: Law, *, feed: int) -> Draws:
     return fitted(np.where(bad[:, None, None], wider, 1.0) * covariance)
 
 
-def weigh_law(draws: Draws, law: Law) -> Array:
-    """Weights of draws averaged over the priors of a law; see :func:`calibrator.estimator.posterior.weigh`."""
-    return np.asarray(sum(share * weigh(draws, prior)[0] for share, prior in law.priors))
+def weigh_draws(draws: Draws, model: FaultModel) -> Array:
+    """Weights of draws averaged over the priors of a model; see :func:`calibrator.estimator.posterior.weigh`."""
+    return np.asarray(sum(share * weigh(draws, prior)[0] for share, prior in model.priors))
 
 
 class _Learner:
@@ -232,7 +242,7 @@ class _Learner:
     ) -> None:
         K = rows.branches
         self.rows, self.feed, self.fixed, self.known = rows, feed, fixed, known
-        self.at, self.parameters = rows.places, parameter_places(K)
+        self.at, self.parameters = rows.places, ParameterPlaces(K)
         self.expected_faults = expected_faults
         self.free = centre_rows(K) & np.isnan(fixed)
         least_sd = np.empty(5 * K)
@@ -291,8 +301,8 @@ class _Learner:
                 found.append(start)
         return found
 
-    def start(self, centre: Array) -> Law:
-        """Law before anything is known but a centre."""
+    def start(self, centre: Array) -> FaultModel:
+        """FaultModel before anything is known but a centre."""
         rows, K = self.rows, self.rows.branches
         covariance, junction = self.guess + self.least, self.at.junction
         clusters = densest_clusters(
@@ -304,35 +314,35 @@ class _Learner:
         spread = Spread(
             mean=centre, covariance=covariance, dispersion=np.full(K, FIRST_DISPERSION), shared=np.zeros(2 * K + 1)
         )
-        return Law(spread=spread, priors=((1.0, self.known or first_prior(K)),))
+        return FaultModel(spread=spread, priors=((1.0, self.known or first_prior(K)),))
 
-    def climb(self, law: Law, rounds: int, *, begun: bool = False) -> Law:
-        """Some rounds of expectation and maximisation; the best law that was met."""
-        best = replace(law, log_evidence=-np.inf)
+    def climb(self, model: FaultModel, rounds: int, *, begun: bool = False) -> FaultModel:
+        """Some rounds of expectation and maximisation; the best model that was met."""
+        best = replace(model, log_evidence=-np.inf)
         for n in range(rounds):
-            draws = explain(self.rows, law, feed=self.feed)
-            prior = self._next_prior(draws, law.prior, coarse=not begun, grouping=begun or n > 0)
+            draws = explain(self.rows, model, feed=self.feed)
+            prior = self._next_prior(draws, model.prior, coarse=not begun, grouping=begun or n > 0)
             weight, log_evidence = weigh(draws, prior)
-            met = Law(spread=law.spread, priors=((1.0, prior),), log_evidence=float(log_evidence.sum()))
+            met = FaultModel(spread=model.spread, priors=((1.0, prior),), log_evidence=float(log_evidence.sum()))
             centred = met.prior.group_share.max(initial=0.0) <= 1.0 - met.prior.group_share.sum()
             if met.log_evidence > best.log_evidence and (centred or met.spread.shared.any()):
                 best = met
-            law = self._recentred(replace(met, spread=self._next_spread(draws, weight, law.spread)))
-        return best if best.log_evidence > -np.inf else law
+            model = self._recentred(replace(met, spread=self._next_spread(draws, weight, model.spread)))
+        return best if best.log_evidence > -np.inf else model
 
-    def _recentred(self, law: Law) -> Law:
-        """The law about the largest group, if it is not the vehicles of no group that are most."""
-        prior, spread, at = law.prior, law.spread, self.at
+    def _recentred(self, model: FaultModel) -> FaultModel:
+        """The model about the largest group, if it is not the vehicles of no group that are most."""
+        prior, spread, at = model.prior, model.spread, self.at
         shares = prior.group_share
         if not shares.size or shares.max() <= 1.0 - shares.sum() or spread.shared.any() or not self.free[at.junction]:
-            return law
+            return model
         mean = spread.mean.copy()
         mean[[at.intercept(self.feed), at.junction]] += prior.group_centre[int(np.argmax(shares))]
         alone = replace(prior, group_share=np.zeros(0), group_centre=np.zeros(0), group_sd=np.zeros(0))
-        return replace(law, spread=replace(spread, mean=mean), priors=((1.0, alone),), log_evidence=-np.inf)
+        return replace(model, spread=replace(spread, mean=mean), priors=((1.0, alone),), log_evidence=-np.inf)
 
-    def variants(self, best: Law) -> list[Law]:
-        """The same law with each cause of what vehicles share: loads, offsets or gains of the sensors of a branch."""
+    def variants(self, best: FaultModel) -> list[FaultModel]:
+        """The same model with each cause of what vehicles share: loads, offsets or gains of the sensors of a branch."""
         K, prior, at = self.rows.branches, best.prior, self.at
         found = [
             (plausible, replace(best, spread=replace(best.spread, shared=shared)))
@@ -345,22 +355,22 @@ class _Learner:
             fresh = replace(self.start(mean), spread=replace(best.spread, mean=mean, shared=shared))
             found.append((0.0, self.climb(fresh, START_ROUNDS)))
         if len(found) > 1:
-            climbed = [(plausible, self.climb(law, START_ROUNDS, begun=True)) for plausible, law in found]
+            climbed = [(plausible, self.climb(model, START_ROUNDS, begun=True)) for plausible, model in found]
             # Where no vehicle is left in a group, its cause is no question.
             found = [
-                (p, law)
-                for p, law in climbed
-                if not law.spread.shared[-1] or law.prior.group_share.max() > 1.0 / len(self.rows)
+                (p, model)
+                for p, model in climbed
+                if not model.spread.shared[-1] or model.prior.group_share.max() > 1.0 / len(self.rows)
             ]
-        evidence = np.array([law.log_evidence for _, law in found])
-        of_gains = np.array([law.spread.shared[K : 2 * K].any() for _, law in found])
+        evidence = np.array([model.log_evidence for _, model in found])
+        of_gains = np.array([model.spread.shared[K : 2 * K].any() for _, model in found])
         if self.free[at.slopes].all() and of_gains.any():
             # Which branch it is shows in the noise of the constants alone, seen through the gain: that is no evidence.
             evidence[of_gains] = evidence[of_gains].max()
         log_odds = evidence + [plausible for plausible, _ in found]
         odds = np.where(log_odds > log_odds.max() - KEPT_LOG_ODDS, np.exp(log_odds - log_odds.max()), 0.0)
         kept = zip((odds / odds.sum()).tolist(), found, strict=True)
-        return [replace(law, probability=share) for share, (_, law) in kept if share]
+        return [replace(model, probability=share) for share, (_, model) in kept if share]
 
     def _shared_constants(self, c0: float, prior: Prior) -> list[tuple[float, Array]]:
         """What vehicles may share in the junction's constant, and how plausible it is, as a logarithm."""
@@ -398,14 +408,14 @@ class _Learner:
         alike = np.ptp(off[1:]) < LEAST_SHARED_GAIN[1]
         return [of_first] * bool(alike) + [of_others] * bool(K == 2 or not alike)
 
-    def with_modes(self, law: Law) -> Law:
-        """The same law with all priors that explain the fleet about as well; several starts, one set of draws."""
+    def with_modes(self, model: FaultModel) -> FaultModel:
+        """The same model with all priors that explain the fleet about as well; several starts, one set of draws."""
         if self.known is not None:
-            return law
-        draws = explain(self.rows, law, feed=self.feed)
+            return model
+        draws = explain(self.rows, model, feed=self.feed)
         found: list[tuple[float, Prior]] = []
         for bounds in (None, *SIZE_STARTS):
-            prior = law.prior
+            prior = model.prior
             if bounds is not None:
                 slab = Slab(low=bounds[0], high=bounds[1], tail=0.03)
                 prior = with_slabs(prior, slab, slab)
@@ -419,7 +429,7 @@ class _Learner:
             if value > found[0][0] - 0.5 * KEPT_LOG_ODDS and not any(same):
                 odds.append((float(np.exp(value - found[0][0])), prior))
         total = sum(share for share, _ in odds)
-        return replace(law, priors=tuple((share / total, prior) for share, prior in odds))
+        return replace(model, priors=tuple((share / total, prior) for share, prior in odds))
 
     def _next_prior(self, draws: Draws, prior: Prior, *, coarse: bool, grouping: bool) -> Prior:
         if self.known is not None:

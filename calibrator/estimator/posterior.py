@@ -1,12 +1,32 @@
-"""Posterior of a vehicle: explanations with their weights under the prior that is meant, by importance sampling.
+"""Posterior of a vehicle: which of its parameters are not zero, how well each choice fits, and how probable it is.
 
-Every explanation of :mod:`calibrator.estimator.explanations` is spread over draws from its fit. A draw weighs
+The P = 3K + 1 parameters of a vehicle with K branches, in the symbols of docs/method.md and with the names of
+:class:`calibrator.estimator.evidence.ParameterPlaces`:
+
+    0            eta               eta = log(1 + d_h)             hardware
+    1 .. K       gains             lambda_k = log(1 + d_k)        gain of sensor k
+    K+1 .. 2K-1  hardware_offsets  o_h,k, all k but the last      hardware
+    2K .. 3K-1   offsets           omega_k = o_k / (1 + d_k)      offset of sensor k as seen in true currents
+    3K           load              l                              load without a sensor, carried by the feeding branch
+
+The 5K rows, with the names of :class:`calibrator.estimator.evidence.RowPlaces`; branches are counted from 0:
+
+    0 .. K-1      slopes           3K-1 .. 4K-2  intercepts
+    K .. 2K-2     ratios           4K-1          junction
+    2K-1 .. 3K-2  gain_reads       4K .. 5K-1    offset_reads
+
+Offsets and loads are in fractions of full scale. A support is the set of parameters that are not zero: one explanation.
+Every support is fitted by Gauss-Newton steps on the evidence rows (M11), under a wide Gaussian prior (M12), and spread
+over draws from its fit. A draw weighs
 
     w = p(rows | draw) p(draw) / q(draw)                                                                      (M17)
 
 with the prior p of the fleet and the density q of the draws. So the prior may have any shape, and probabilities,
 confidence and harm are sums over the same draws. A constant of the feeding branch that vehicles share (a group of the
 prior) is one more thing that a draw may have; column 0 of the weights is a vehicle of no group.
+
+A vehicle has some ten thousand residuals to evaluate in a millisecond, so the loops are compiled by numba; in them rows
+and parameters go by these numbers.
 """
 
 from functools import cache
@@ -18,12 +38,33 @@ from numpy.typing import NDArray
 from scipy.stats import norm, qmc
 
 from calibrator.compiled import compiled_with_notice, inner
-from calibrator.drive import Array
-from calibrator.estimator.explanations import WIDE_SD, Evidence, Fits, Integers, residual
+from calibrator.drive import Array, Mask
+from calibrator.estimator.evidence import ParameterPlaces, RowPlaces
 from calibrator.estimator.prior import GRID, Prior
 
-__all__ = ["DRAWS", "Draws", "draw_explanations", "size_evidence", "weigh"]
+__all__ = [
+    "DRAWS", "GAIN", "OFFSET", "WIDE_SD", "Draws", "Evidence", "Fits", "draw_explanations", "evidence_of",
+    "fit_explanations", "residual", "row_residuals", "size_evidence", "weigh",
+]  # fmt: skip
 
+Integers = NDArray[np.int64]
+
+WIDE_SD = 0.4
+"""Standard deviation of the wide Gaussian under which every support is fitted. [1]"""
+MARGIN = 12.0
+"""Logarithm of the weight below the best one from which on a support is not fitted any further."""
+MOST_FITTED = 96
+"""Supports of a vehicle that are kept, the most probable ones."""
+MOST_PARAMETERS = 6
+"""Largest number of parameters of a support; 20 faults of a hundred parameters leave few vehicles with more."""
+MOST_TURN = 3.0
+"""Largest logarithm by which a measured ratio can be off. [1]"""
+LOWEST, HIGHEST, STEP = -2.5, 1.2, 0.5
+"""Range of a parameter, and the longest step of one iteration: gains from 0.08 to 3.3. [1]"""
+MOST_STEPS, LAST_STEP = 7, 1e-7
+"""Gauss-Newton steps, and the size of a step that is the last one: far below what any row shows. [1]"""
+DIFFERENCE = 1e-6
+"""Step by which residuals are differentiated: rounding and curvature leave 1e-9 of a derivative. [1]"""
 DRAWS = 64
 """Draws from each explanation; half of them mirror the others."""
 OPEN_SD = 0.02
@@ -34,6 +75,300 @@ GAIN, OFFSET, LOAD = 0, 1, 2
 """Rows of :attr:`Prior.log_density`."""
 LOG_FIRST, LOG_STEP = float(np.log(GRID[0])), float(np.log(GRID[1] / GRID[0]))
 LOG_ROOT_TAU = 0.5 * float(np.log(2.0 * np.pi))
+
+
+class Evidence(NamedTuple):
+    """Evidence rows of N vehicles, and those of a vehicle without faults.
+
+    Attributes
+    ----------
+    values : ndarray of shape (N, 5K)
+        Rows, relative ones first. [1]
+    means : ndarray of shape (N, 2, K)
+        Means of the fleet model's and of the measured currents, about which the lines of the constants pivot. [1]
+    centre : ndarray of shape (5K,)
+        Of the rows of vehicles without faults. [1]
+    shared : ndarray of shape (2K + 1,)
+        What all sensors of a branch share: offsets, in fractions of full scale, which the centre holds, and logarithms
+        of gains; last 1 if what a group of vehicles shares is an offset of the feeding sensor, 0 if it is a load. An
+        offset does not grow with the current: seen through a gain error it is another one, and a load is not (M16).
+    precision, precision_relative : ndarray of shape (N, 5K, 5K)
+        Inverse covariance of all rows, and of the relative rows alone; zero for the others.
+    log_scale : ndarray of shape (N,)
+        Logarithm of the probability density of the rows of a vehicle that are all at the centre.
+    feed : int
+        Branch that carries a load without a sensor.
+    """
+
+    values: Array
+    means: Array
+    centre: Array
+    shared: Array
+    precision: Array
+    precision_relative: Array
+    log_scale: Array
+    feed: int
+
+
+class Fits(NamedTuple):
+    """Explanations of N vehicles, Q each at most.
+
+    Attributes
+    ----------
+    number : ndarray of int of shape (N,)
+        Number of explanations of each vehicle; what stands behind them in the other arrays means nothing.
+    support : ndarray of bool of shape (N, Q, P)
+        Which parameters are not zero.
+    hardware, sensor : ndarray of int of shape (N, Q)
+        Numbers of hardware and sensor faults.
+    theta : ndarray of shape (N, Q, P)
+        Most probable parameters under the wide Gaussian. [1]
+    root : ndarray of shape (N, Q, P, P)
+        Root of their covariance: theta + root z, with z standard normal, is a draw. [1]
+    log_evidence : ndarray of shape (N, Q)
+        Logarithm of the probability density of the rows under the wide Gaussian.
+    chi2 : ndarray of shape (N, Q)
+        Sum of squares of the whitened residuals. [1]
+    """
+
+    number: Integers
+    support: Mask
+    hardware: Integers
+    sensor: Integers
+    theta: Array
+    root: Array
+    log_evidence: Array
+    chi2: Array
+
+
+def evidence_of(values: Array, covariance: Array, means: Array, *, centre: Array, shared: Array, feed: int) -> Evidence:
+    """Evidence with the inverses of its covariance (N, 5K, 5K); the other parameters as in :class:`Evidence`."""
+    rows = values.shape[1]
+    relative = RowPlaces(rows // 5).relative
+    precision, of_relative = np.linalg.inv(covariance), np.zeros_like(covariance)
+    of_relative[:, relative, relative] = np.linalg.inv(covariance[:, relative, relative])
+    return Evidence(
+        values=np.ascontiguousarray(values),
+        means=np.ascontiguousarray(means),
+        centre=centre,
+        shared=shared,
+        precision=precision,
+        precision_relative=of_relative,
+        log_scale=0.5 * (np.linalg.slogdet(precision)[1] - rows * np.log(2.0 * np.pi)),
+        feed=feed,
+    )
+
+
+def fit_explanations(evidence: Evidence, log_prior: Array, log_load: float) -> Fits:
+    """Fit the supports that may matter.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        Of N vehicles.
+    log_prior : ndarray of shape (K + 1, 2K + 1)
+        Logarithm of the prior probability of one support with so many hardware and sensor faults, roughly: it decides
+        which supports are looked at closely.
+    log_load : float
+        The same of a load without a sensor.
+
+    Returns
+    -------
+    Fits
+        The most probable supports of each vehicle.
+    """
+    N, rows = evidence.values.shape
+    K = rows // 5
+    P = 3 * K + 1
+    fits = Fits(
+        number=np.zeros(N, np.int64),
+        support=np.zeros((N, MOST_FITTED, P), bool),
+        hardware=np.zeros((N, MOST_FITTED), np.int64),
+        sensor=np.zeros((N, MOST_FITTED), np.int64),
+        theta=np.zeros((N, MOST_FITTED, P)),
+        root=np.zeros((N, MOST_FITTED, P, P)),
+        log_evidence=np.full((N, MOST_FITTED), -np.inf),
+        chi2=np.zeros((N, MOST_FITTED)),
+    )
+    _fit_all(evidence, log_prior, log_load, fits)
+    at, on = ParameterPlaces(K), fits.support
+    fits.hardware[:] = on[:, :, at.eta] + on[:, :, at.hardware_offsets].sum(axis=2)
+    fits.sensor[:] = on[:, :, at.gains].sum(axis=2) + on[:, :, at.offsets].sum(axis=2)
+    most = max(int(fits.number.max(initial=1)), 1)
+    kept = {name: np.ascontiguousarray(values[:, :most]) for name, values in fits._asdict().items() if name != "number"}
+    return fits._replace(**kept)
+
+
+def row_residuals(evidence: Evidence, theta: Array) -> Array:
+    """What parameters (N, Q, P) leave of the rows of N vehicles, shape (N, Q, 5K)."""
+    left = np.empty((*theta.shape[:2], evidence.values.shape[1]))
+    _all_residuals(evidence, theta, left)
+    return left
+
+
+@compiled_with_notice
+def _all_residuals(evidence: Evidence, theta: Array, left: Array) -> None:
+    for j in range(theta.shape[0]):
+        for q in range(theta.shape[1]):
+            residual(theta[j, q], evidence, j, left[j, q])
+
+
+@inner
+def residual(theta: Array, evidence: Evidence, j: int, e: Array) -> None:
+    """Fill e with the rows of vehicle j less what parameters make of them, (M11)."""
+    y, means, centre = evidence.values[j], evidence.means[j], evidence.centre
+    shared, feed, K = evidence.shared, evidence.feed, len(evidence.values[j]) // 5
+    c, oh_last = 3 * K - 1, 0.0  # first of the intercepts; hardware offset of the last branch
+    first = theta[1] + shared[K]
+    for k in range(K):
+        gain = theta[1 + k] + shared[K + k]
+        e[k] = y[k] - centre[k] - theta[0] - gain
+        e[2 * K - 1 + k] = y[2 * K - 1 + k] - centre[2 * K - 1 + k] - gain
+        if k:
+            e[K + k - 1] = y[K + k - 1] - centre[K + k - 1] - first + gain
+            oh_last -= theta[K + k]
+    junction = y[c + K] * exp(-first)
+    for k in range(K):
+        unit = exp(-theta[1 + k] - shared[K + k])  # true current per measured current
+        seen = y[c + k] * unit  # a constant as seen in true currents
+        seen += means[0, k] * (exp(theta[0]) * expm1(min(e[k], MOST_TURN)) - e[k])  # pivots with its slope
+        hardware = theta[K + 1 + k] if k < K - 1 else oh_last
+        batch = shared[k] * (unit - 1.0)  # of what the centre holds
+        e[c + k] = seen - centre[c + k] - hardware - theta[2 * K + k] - batch
+        e[c + K + 1 + k] = y[c + K + 1 + k] * unit - centre[c + K + 1 + k] - theta[2 * K + k]
+        junction -= theta[2 * K + k] + batch
+        if k:
+            x = e[K + k - 1]
+            junction -= means[1, k] * (unit * expm1(min(x, MOST_TURN)) - exp(-y[k]) * x)
+    load = theta[3 * K] * (exp(-theta[1 + feed] - shared[K + feed]) if shared[2 * K] else 1.0)
+    e[c + K] = junction - centre[c + K] - load
+    e[c + feed] -= load
+
+
+@compiled_with_notice
+def _fit_all(evidence: Evidence, log_prior: Array, log_load: float, fits: Fits) -> None:
+    for j in range(len(evidence.values)):
+        scores, codes = _rough_weights(evidence, j, log_prior, log_load)
+        kept = np.flatnonzero(scores > scores.max() - MARGIN)
+        kept = kept[np.argsort(-scores[kept])][: fits.theta.shape[1]]
+        fits.number[j] = len(kept)
+        for q in range(len(kept)):
+            for p in range(fits.theta.shape[2]):
+                fits.support[j, q, p] = (codes[kept[q]] >> p) & 1
+            fits.log_evidence[j, q], fits.chi2[j, q] = _refine(
+                evidence, j, np.flatnonzero(fits.support[j, q]), fits.theta[j, q], fits.root[j, q]
+            )
+            fits.log_evidence[j, q] += evidence.log_scale[j]
+
+
+@inner
+def _normal_equations(
+    evidence: Evidence, j: int, theta: Array, chosen: Integers, precision: Array
+) -> tuple[Array, Array, float]:
+    """H and g of the Gauss-Newton step H step = g of the chosen parameters at theta, prior included; and chi2 there."""
+    n, e = len(chosen), np.empty(evidence.values.shape[1])
+    A = np.empty((n, len(e)))  # minus the derivatives, a row per parameter
+    residual(theta, evidence, j, e)
+    for a in range(n):
+        before = theta[chosen[a]]
+        theta[chosen[a]] = before + DIFFERENCE
+        residual(theta, evidence, j, A[a])
+        theta[chosen[a]] = before
+        A[a] = (e - A[a]) / DIFFERENCE
+    weighted, H, g = A @ precision, np.empty((n, n)), np.empty(n)
+    for a in range(n):
+        for b in range(a + 1):
+            H[a, b] = H[b, a] = (weighted[a] * A[b]).sum()
+        H[a, a] += WIDE_SD**-2
+        g[a] = (weighted[a] * e).sum() - theta[chosen[a]] / WIDE_SD**2
+    return H, g, float(e @ (precision @ e))
+
+
+@inner
+def _without(H: Array, g: Array, i: int) -> tuple[Array, Array]:
+    """Normal equations of the parameters after number i once that one is fitted (Schur complement)."""
+    rest, right = H[i + 1 :, i + 1 :].copy(), g[i + 1 :].copy()
+    for a in range(len(right)):
+        share = H[i, i + 1 + a] / H[i, i]
+        right[a] -= share * g[i]
+        for b in range(len(right)):
+            rest[a, b] -= share * H[i, i + 1 + b]
+    return rest, right
+
+
+@inner
+def _rough_weights(evidence: Evidence, j: int, log_prior: Array, log_load: float) -> tuple[Array, Integers]:
+    """Rough log weights of the supports that may matter, and the supports as bits.
+
+    For each set of gains, which the relative rows tell, the constants are linear: one after the other is eliminated
+    from the normal equations, depth first. A branch of the search ends where even all constants together could not
+    make it matter.
+    """
+    K, log_wide = evidence.values.shape[1] // 5, log(WIDE_SD)
+    P, feeding_offset = 3 * K + 1, 2 * K + evidence.feed
+    best, scores, codes = -np.inf, [0.0 for _ in range(0)], [0 for _ in range(0)]
+    of_gains, of_relative, _ = _normal_equations(
+        evidence, j, np.zeros(P), np.arange(K + 1), evidence.precision_relative[j]
+    )
+    for mask in range(1 << (K + 1)):
+        gains = np.array([p for p in range(K + 1) if (mask >> p) & 1], np.int64)
+        n, theta = len(gains), np.zeros(P)
+        if n > MOST_PARAMETERS:
+            continue
+        if n:
+            fitted = np.linalg.solve(of_gains[gains][:, gains], of_relative[gains])
+            theta[gains] = np.minimum(np.maximum(fitted, LOWEST), HIGHEST)
+        columns = np.concatenate((gains, np.arange(K + 1, P)))
+        H, g, chi2 = _normal_equations(evidence, j, theta, columns, evidence.precision[j])
+        weight = -0.5 * chi2 - 0.5 * ((theta / WIDE_SD) ** 2).sum()
+        for _ in range(n):
+            weight += 0.5 * g[0] ** 2 / H[0, 0] - 0.5 * log(H[0, 0]) - log_wide
+            H, g = _without(H, g, 0)
+        possible = 0.5 * (g * np.linalg.solve(H, g)).sum()  # by all constants together
+        hardware = mask & 1
+        sensor = n - hardware
+        scores.append(weight + log_prior[hardware, sensor])
+        codes.append(mask)
+        best = max(best, scores[-1])
+        stack = [(K + 1, n, hardware, sensor, 0, mask, weight, possible, H, g)]
+        while stack:
+            first, size, hardware, sensor, load, code, weight, possible, H, g = stack.pop()
+            for p in range(first, P if size < MOST_PARAMETERS else first):
+                if p == 3 * K and (code >> feeding_offset) & 1:
+                    continue  # a load and an offset of the feeding sensor look the same
+                i, h, s, loads = p - first, hardware + (p < 2 * K), sensor + (2 * K <= p < 3 * K), load + (p == 3 * K)
+                gain = 0.5 * g[i] ** 2 / H[i, i]
+                value = weight + gain - 0.5 * log(H[i, i]) - log_wide
+                scores.append(value + log_prior[h, s] + log_load * loads)
+                codes.append(code | (1 << p))
+                best = max(best, scores[-1])
+                if scores[-1] + possible - gain > best - MARGIN - 3.0:
+                    rest, right = _without(H, g, i)
+                    stack.append((p + 1, size + 1, h, s, loads, codes[-1], value, possible - gain, rest, right))
+    return np.array(scores), np.array(codes)
+
+
+@inner
+def _refine(evidence: Evidence, j: int, chosen: Integers, theta: Array, root: Array) -> tuple[float, float]:
+    """Gauss-Newton on all rows; fills theta and root, returns log evidence and chi2."""
+    for _ in range(MOST_STEPS):
+        H, g, chi2 = _normal_equations(evidence, j, theta, chosen, evidence.precision[j])
+        if not len(chosen):
+            return -0.5 * chi2, chi2
+        step = np.linalg.solve(H, g)
+        if np.abs(step).max() < LAST_STEP:
+            break
+        theta[chosen] = np.minimum(
+            np.maximum(theta[chosen] + np.minimum(np.maximum(step, -STEP), STEP), LOWEST), HIGHEST
+        )
+    L = np.linalg.cholesky(H)
+    inverse = np.linalg.inv(L)  # its transpose is a root of the covariance
+    value = -0.5 * chi2
+    for a in range(len(chosen)):
+        value -= 0.5 * (theta[chosen[a]] / WIDE_SD) ** 2 + log(WIDE_SD) + log(L[a, a])
+        for b in range(a + 1):
+            root[chosen[b], chosen[a]] = inverse[a, b]
+    return value, chi2
 
 
 class Draws(NamedTuple):
@@ -52,7 +387,7 @@ class Draws(NamedTuple):
     feed : int
         Branch that carries loads without a sensor.
     shared : ndarray of shape (2K + 1,)
-        What all sensors of a branch share, see :class:`calibrator.estimator.explanations.Evidence`.
+        What all sensors of a branch share, see :class:`calibrator.estimator.posterior.Evidence`.
     """
 
     fits: Fits

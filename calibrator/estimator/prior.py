@@ -1,8 +1,8 @@
 """Prior of the faults of a fleet: how many a vehicle has, how large they are, and what several vehicles share.
 
 Sizes are uniform between two bounds (a slab), with a log-uniform tail far below and above them, so that no size is
-impossible. Numbers of faults follow the law of sparse faults (20) of [1]_: n of the 3K parameters are not zero, and in
-some vehicles none of the hardware (M13). Bounds, tail and numbers are learned: :mod:`calibrator.estimator.learning`.
+impossible. Numbers of faults are distributed as (20) of [1]_ has it: n of the 3K parameters are not zero, and in some
+vehicles none of the hardware (M13). Bounds, tail and numbers are learned: :mod:`calibrator.estimator.learning`.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
@@ -31,7 +31,7 @@ EDGE = 0.03
 GUESSED_LOAD_SHARE = 0.01
 """Share of vehicles with a load without a sensor of their own, before anything is known. [1]"""
 GUESS_WEIGHT = 2.0
-"""Weight of the guessed law of the number of faults, in vehicles."""
+"""Weight of the guessed distribution of the number of faults, in vehicles."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +128,7 @@ def first_prior(branches: int) -> Prior:
     """Prior before anything is known of a fleet: few faults, of any size."""
     n = np.arange(3 * branches + 1)
     total = np.array([comb(3 * branches, i) for i in n]) * 0.2**n * 0.8 ** (3 * branches - n)
-    counts = np.einsum("n,znhs->hs", total, _laws(branches)) / 2.0
+    counts = np.einsum("n,znhs->hs", total, _sparse(branches)) / 2.0
     slab = Slab(low=0.01, high=0.6, tail=0.03)
     return Prior(counts=counts, gain=slab, offset=slab)
 
@@ -144,21 +144,21 @@ def with_slabs(prior: Prior, gain: Slab, offset: Slab) -> Prior:
     return Prior(**{**vars(prior), "gain": gain, "offset": offset})
 
 
-def _laws(K: int) -> Array:
+def _sparse(K: int) -> Array:
     """Probability of (n_h, n_s) if n parameters are not zero, shape (2, 3K + 1, K + 1, 2K + 1).
 
     First of any vehicle, all supports of n parameters being equally likely; then of one whose hardware ones are zero.
     """
-    laws = np.zeros((2, 3 * K + 1, K + 1, 2 * K + 1))
+    given = np.zeros((2, 3 * K + 1, K + 1, 2 * K + 1))
     for h in range(K + 1):
         for s in range(2 * K + 1):
-            laws[0, h + s, h, s] = comb(K, h) * comb(2 * K, s) / comb(3 * K, h + s)
-    laws[1, :, 0] = laws[0].sum(axis=1)
-    return laws
+            given[0, h + s, h, s] = comb(K, h) * comb(2 * K, s) / comb(3 * K, h + s)
+    given[1, :, 0] = given[0].sum(axis=1)
+    return given
 
 
 def sparse_counts(tally: Array) -> Array:
-    """Most probable law of sparse faults for a fleet.
+    """Most probable distribution of sparse faults for a fleet.
 
     Parameters
     ----------
@@ -168,20 +168,20 @@ def sparse_counts(tally: Array) -> Array:
     Returns
     -------
     ndarray of shape (K + 1, 2K + 1)
-        Law with a free distribution of the number n of faults about a binomial, and a share of vehicles without
+        FaultModel with a free distribution of the number n of faults about a binomial, and a share of vehicles without
         hardware faults; by expectation maximisation.
     """
     K, N = len(tally) - 1, float(tally.sum())
-    laws, n = _laws(K), np.arange(3 * K + 1)
+    given, n = _sparse(K), np.arange(3 * K + 1)
     ways = np.array([comb(3 * K, i) for i in n])
     total, sound, each = np.full(3 * K + 1, 1.0 / (3 * K + 1)), 0.5, 0.25
     for _ in range(30):
-        joint = np.array([1.0 - sound, sound])[:, None, None, None] * total[:, None, None] * laws
+        joint = np.array([1.0 - sound, sound])[:, None, None, None] * total[:, None, None] * given
         share = joint / np.maximum(joint.sum(axis=(0, 1)), 1e-300) * tally
         guess = ways * each**n * (1.0 - each) ** (3 * K - n)
         total = (share.sum(axis=(0, 2, 3)) + GUESS_WEIGHT * guess) / (N + GUESS_WEIGHT)
         sound = (share[1].sum() + 0.5) / (N + 1.0)
         each = (N * float(total @ n) + 0.5 * K) / (3.0 * K * N + 2.0 * K)
-    return np.asarray(np.array([1.0 - sound, sound]) @ np.einsum("n,znhs->zhs", total, laws).reshape(2, -1)).reshape(
+    return np.asarray(np.array([1.0 - sound, sound]) @ np.einsum("n,znhs->zhs", total, given).reshape(2, -1)).reshape(
         tally.shape
     )

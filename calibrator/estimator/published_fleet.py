@@ -18,7 +18,7 @@ import numpy as np
 from calibrator.drive import Array, DriveFile, Mask
 from calibrator.drives.align import Samples, align
 from calibrator.errors import DriveError, FleetError
-from calibrator.estimator.results import ChunkResult, encode_chunk
+from calibrator.estimator.results import encode_chunk
 from calibrator.estimator.settings import CalibrationSettings, require_learning
 from calibrator.estimator.state_space import StateSpaceModel, bridged, identify, simulation_snr_db
 from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
@@ -201,7 +201,7 @@ def _identify_excited(inputs: Array, currents: Array, valid: Mask) -> StateSpace
 
 def calibrate_fleet_published(
     fleet: FleetSource, equipment: Equipment, identity: RunIdentity, settings: CalibrationSettings, *, workers: Workers
-) -> tuple[ChunkResult, dict[str, object], tuple[str, ...]]:
+) -> tuple[bytes, dict[str, object], tuple[str, ...]]:
     """Calibrate a fleet as published.
 
     Parameters
@@ -217,7 +217,7 @@ def calibrate_fleet_published(
 
     Returns
     -------
-    chunk : ChunkResult
+    part : bytes
         Parameters of every vehicle that could be used, and why the others could not.
     details : dict of str to JSON values
         For the record of the run.

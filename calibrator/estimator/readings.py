@@ -19,7 +19,7 @@ import numpy as np
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
-from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows
+from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows
 from calibrator.faults import Index
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.summaries.zero_current import weighted_mean

@@ -1,14 +1,20 @@
 """Result of a calibration: a folder, written once and read by the commands that come after.
 
 ``run.json`` says how it was made (:class:`RunRecord`). ``results.parquet`` has one row per vehicle and branch, and one
-without branch for each vehicle that was left out. ``parameters/NNNNN.parquet`` has the texts of the parameter files by
-bucket of the vehicle; for up to :data:`MOST_FILES` vehicles each is also a file ``params/VEHICLE.json``, as a folder of
-a million files is of no use.
+without branch for each vehicle that was left out. ``parameters/NNNNN.parquet`` has the same rows by bucket of the
+vehicle, and in the first of each vehicle the text of its parameter file; for up to :data:`MOST_FILES` vehicles each is
+also a file ``params/VEHICLE.json``, as a folder of a million files is of no use.
+
+While it is made, the folder stands in a hidden one beside it, ``.RESULT.unfinished/`` (:class:`Unfinished`), from which
+a run that was killed goes on.
 """
 
+import fcntl
 import io
+import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -22,11 +28,13 @@ import pyarrow.parquet as pq
 
 from calibrator.drive import Array, Mask
 from calibrator.errors import INTERNAL_ERROR, FleetError
-from calibrator.estimator.rows import VehicleEvidence
+from calibrator.estimator.evidence import VehicleEvidence
+from calibrator.files.storage import DISK_FULL
 from calibrator.summaries.identity import bucket_of
 from calibrator.terminal.text import dumps, left_out_text, reasons_text, table
 from ecu_node.documents import write_atomically
 from ecu_node.errors import ParameterError
+from ecu_node.layout import file_digest
 from ecu_node.parameters import VehicleParameters, encode_parameters
 
 __all__ = [
@@ -34,8 +42,8 @@ __all__ = [
     "PARTS",
     "SCHEMA",
     "CalibrationReport",
-    "ChunkResult",
     "RunRecord",
+    "Unfinished",
     "Written",
     "deployed_rms_a",
     "encode_chunk",
@@ -47,6 +55,7 @@ __all__ = [
     "read_results",
     "read_run",
     "report_of",
+    "unfinished_run",
     "write_parameter_files",
     "write_run",
     "written_of",
@@ -102,17 +111,17 @@ SCHEMA = pa.schema(
     ]
 )
 """Of ``results.parquet``."""
-PARAMETERS_SCHEMA = pa.schema(
+PART_SCHEMA = pa.schema(
     [
-        pa.field("vehicle", pa.string(), nullable=False),
-        pa.field("drives", pa.string(), nullable=False, metadata={"meaning": "digest of the drives' files"}),
-        pa.field("parameters", pa.string(), nullable=False, metadata={"meaning": "text of the parameter file"}),
+        *SCHEMA,
+        pa.field("drives", pa.string(), metadata={"meaning": "digest of the drives' files"}),
+        pa.field("parameters", pa.string(), metadata={"meaning": "text of the parameter file"}),
         pa.field("evidence_value", pa.list_(pa.float32()), metadata={"meaning": "rows named in run.json"}),
         pa.field("evidence_sd", pa.list_(pa.float32()), metadata={"meaning": "standard deviation of the same"}),
         pa.field("evidence_explained", pa.list_(pa.float32()), metadata={"meaning": "what the estimate makes of it"}),
     ]
 )
-"""Of the parts with the parameter files."""
+"""Of a part with the vehicles of one bucket; the last five only in the first row of each vehicle."""
 
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -154,13 +163,6 @@ class Written(NamedTuple):
     """What they were found from; None: not kept."""
 
 
-class ChunkResult(NamedTuple):
-    """Result of some vehicles of a fleet: their rows of ``results.parquet``, and their parameters, as files."""
-
-    rows: bytes
-    parameters: bytes
-
-
 def encode_chunk(
     parameters: Iterable[VehicleParameters],
     left_out: Mapping[str, str],
@@ -168,7 +170,7 @@ def encode_chunk(
     moved: Mapping[tuple[str, str], str] = {},
     drives: Mapping[str, str] = {},
     evidence: Mapping[str, VehicleEvidence] = {},
-) -> ChunkResult:
+) -> bytes:
     """Write down the result of some vehicles, in the order of their names.
 
     Parameters
@@ -186,11 +188,10 @@ def encode_chunk(
 
     Returns
     -------
-    ChunkResult
-        As files.
+    bytes
+        Content of a part of the result.
     """
     rows: Rows = []
-    texts: Rows = []
     reasons = dict(left_out)
     for item in sorted(parameters, key=lambda item: item.vehicle):
         name = item.vehicle
@@ -200,11 +201,12 @@ def encode_chunk(
             reasons[name] = f"{error}; look at its recordings"
             continue
         found = vars(evidence[name]) if name in evidence else {}
-        columns = {f"evidence_{key}": values for key, values in found.items()}
-        texts.append({"vehicle": name, "drives": drives.get(name, ""), "parameters": text, **columns})
-        rows += [{**row, "moved": moved.get((name, row["branch"]))} for row in _rows_of(item)]
-    rows += _left_out_rows(reasons)
-    return ChunkResult(_parquet(rows, SCHEMA), _parquet(texts, PARAMETERS_SCHEMA))
+        once = {"drives": drives.get(name, ""), "parameters": text}
+        once |= {f"evidence_{key}": values for key, values in found.items()}
+        for row in _rows_of(item):
+            rows.append({**row, "moved": moved.get((name, row["branch"])), **once})
+            once = {}
+    return _parquet(pa.Table.from_pylist(rows + _left_out_rows(reasons), schema=PART_SCHEMA))
 
 
 def _rows_of(item: VehicleParameters) -> Rows:
@@ -235,87 +237,74 @@ def _left_out_rows(left_out: Mapping[str, str]) -> Rows:
     return [{"vehicle": vehicle, "verdict": LEFT_OUT, "reason": left_out[vehicle]} for vehicle in sorted(left_out)]
 
 
-def _parquet(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes:
+def _parquet(rows: pa.Table) -> bytes:
     buffer = io.BytesIO()
-    pq.write_table(pa.Table.from_pylist(rows, schema=schema), buffer, compression="zstd")
+    pq.write_table(rows, buffer, compression="zstd")
     return buffer.getvalue()
 
 
-def join_rows(folder: Path, parts: Sequence[Path], left_out: Mapping[str, str]) -> int:
-    """Join the rows of all chunks to ``results.parquet``; up to :data:`MOST_SORTED` rows in order of the vehicles.
+def join_rows(folder: Path, left_out: Mapping[str, str]) -> int:
+    """Join the rows of all parts to ``results.parquet``; up to :data:`MOST_SORTED` rows in order of the vehicles.
 
     Parameters
     ----------
     folder : Path
-        Of the result; it must exist.
-    parts : sequence of Path
-        Files with the rows of each chunk.
+        Of the result, with its parts.
     left_out : mapping of str to str
-        Vehicles, or files of unclear vehicle, and why; those that are in a chunk are not written twice.
+        Vehicles, or files of unclear vehicle, and why; those that are in a part are not written twice.
 
     Returns
     -------
     int
         Number of vehicles that have parameters.
     """
-    path, calibrated, rows, others = folder / ROWS, 0, 0, dict(left_out)
+    path, calibrated, others = folder / ROWS, 0, dict(left_out)
     with pq.ParquetWriter(path, SCHEMA, compression="zstd") as writer:
-        for part in parts:
-            found = pq.read_table(part, schema=SCHEMA, use_threads=False)
+        for part in _parts(folder):
+            found = pq.read_table(part, columns=SCHEMA.names, use_threads=False)
             calibrated += len(pc.unique(found.filter(pc.field("branch").is_valid())["vehicle"]))
-            rows += found.num_rows
             for name in others.keys() & set(found["vehicle"].to_pylist()):
                 del others[name]
             writer.write_table(found)
         writer.write_table(pa.Table.from_pylist(_left_out_rows(others), schema=SCHEMA))
-    if rows <= MOST_SORTED:
-        found = pq.read_table(path, schema=SCHEMA, use_threads=False).to_pylist()
-        found.sort(key=lambda row: (row["verdict"] == LEFT_OUT, row["vehicle"]))  # stable: branches keep their order
-        path.write_bytes(_parquet(found, SCHEMA))
+    if pq.read_metadata(path).num_rows <= MOST_SORTED:
+        rows = pq.read_table(path, use_threads=False)
+        keys = list(zip(pc.equal(rows["verdict"], LEFT_OUT).to_pylist(), rows["vehicle"].to_pylist(), strict=True))
+        order = sorted(range(len(keys)), key=keys.__getitem__)  # stable: branches keep their order
+        path.write_bytes(_parquet(rows.take(order)))
     return calibrated
 
 
-def write_parameter_files(folder: Path, parts: Mapping[int, Path], *, vehicles: int) -> str:
-    """Write the parameter files of a result.
+def write_parameter_files(folder: Path, *, vehicles: int) -> str:
+    """Write a file for each of so many vehicles of a result, unless there are too many.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the result; it must exist.
-    parts : mapping of int to Path
-        Files with the parameters of each chunk, by its number.
-    vehicles : int
-        How many there are in all.
-
-    Returns
-    -------
-    str
-        Where they are for the user, within the folder.
+    Returned is where the user finds the parameters within the folder: these files, or its parts.
     """
-    (folder / PARTS).mkdir()
-    for number, part in parts.items():
-        shutil.copyfile(part, part_file(folder, number))
     if vehicles > MOST_FILES:
         return PARTS
-    (folder / FILES).mkdir()
-    for part in parts.values():
+    (folder / FILES).mkdir(exist_ok=True)
+    for part in _parts(folder):
         for vehicle, written in read_part(part).items():
             write_atomically(folder / FILES / f"{vehicle}.json", written.text)
     return FILES
 
 
+def _parts(result: Path) -> list[Path]:
+    return sorted((result / PARTS).glob("[0-9]*.parquet"))
+
+
 def part_file(result: Path, number: int) -> Path:
-    """File of a result with the parameters of a chunk."""
+    """File of a result with the vehicles of a bucket."""
     return result / PARTS / f"{number:05d}.parquet"
 
 
 def read_part(path: Path) -> dict[str, Written]:
-    """Parameters of a chunk by vehicle, none if there is no such file; FleetError if it is damaged."""
+    """Parameters of a part by vehicle, none if there is no such file; FleetError if it is damaged."""
     try:
-        rows = pq.ParquetFile(path).read(use_threads=False).to_pylist()
+        columns = pq.ParquetFile(path).read(["vehicle", *PART_SCHEMA.names[len(SCHEMA) :]], use_threads=False)
         found = {}
-        for row in rows:
-            value, sd, explained = (row.get(f"evidence_{name}") for name in ("value", "sd", "explained"))
+        for row in columns.filter(pc.field("parameters").is_valid()).to_pylist():
+            value, sd, explained = (row[f"evidence_{name}"] for name in ("value", "sd", "explained"))
             evidence = None if value is None else VehicleEvidence(value=value, sd=sd, explained=explained)
             found[row["vehicle"]] = Written(row["drives"], row["parameters"].encode(), evidence)
         return found
@@ -523,3 +512,154 @@ def _said(rows: pa.Table, which: pc.Expression, text: Callable[[Rows], str]) -> 
     names = pc.unique(rows["vehicle"]).slice(0, MOST_NAMED)
     found = rows.filter(pc.is_in(rows["vehicle"], value_set=names)).to_pylist()
     return {name: text(list(group)) for name, group in groupby(found, key=lambda row: str(row["vehicle"]))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unfinished:
+    """The hidden folder of a run that is not finished.
+
+    It holds the summaries of drives read so far, a plan (a digest of all that decides what is computed), and the result
+    as far as it is there. Parts of it count only for their plan: with other settings or summaries they are made anew.
+
+    Attributes
+    ----------
+    folder : Path
+        Where it is.
+    out : Path
+        Where the result will be.
+    shown : Path
+        The same, as the user named it.
+    """
+
+    folder: Path
+    out: Path
+    shown: Path
+
+    @property
+    def summaries(self) -> Path:
+        """Store of the summaries of drives that this run reads itself."""
+        return self.folder / "summaries"
+
+    @property
+    def result(self) -> Path:
+        """Folder of the result."""
+        return self.folder / "result"
+
+    def put(self, number: int, part: bytes) -> None:
+        """Keep the vehicles of a bucket."""
+        write_atomically(part_file(self.result, number), part)
+
+    def done(self) -> list[int]:
+        """Numbers of the parts that are there."""
+        return [int(path.stem) for path in _parts(self.result)]
+
+    def begin(self, plan: str | None, created: str) -> str:
+        """Keep the parts that are there if they were computed by the same plan, else remove them.
+
+        ``plan`` is a digest of what the run computes and from what, None to begin anew; ``created`` the time of this
+        run. Returned is the time of the first run of this plan.
+        """
+        path = self.folder / "plan"
+        before, _, noted = path.read_text().partition("\n") if path.exists() else ("", "", "")
+        if plan is not None and before == plan:
+            return noted
+        path.unlink(missing_ok=True)  # first, so that no other plan is ever taken for that of the parts
+        shutil.rmtree(self.result, ignore_errors=True)
+        (self.result / PARTS).mkdir(parents=True)
+        write_atomically(path, f"{plan or ''}\n{created}".encode())
+        return created
+
+    def summaries_since(self, earlier: Path | None) -> None:
+        """Begin the store of summaries with those of an earlier result, unless this was done before, or with none."""
+        mark = "" if earlier is None else f"{earlier.absolute()} {file_digest(earlier / 'run.json')}"
+        there = self._since.read_text() if self._since.exists() else ""
+        if there == mark and (earlier is None or self.summaries.exists()):
+            return
+        self._since.unlink(missing_ok=True)
+        shutil.rmtree(self.summaries, ignore_errors=True)
+        if earlier is None:
+            return
+        copy = self.folder / "summaries.copy"
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(earlier / "summaries", copy, ignore=shutil.ignore_patterns(".*"))
+        copy.rename(self.summaries)
+        write_atomically(self._since, mark.encode())
+
+    @property
+    def _since(self) -> Path:
+        """Which earlier result's summaries were copied; written after them."""
+        return self.folder / "since"
+
+    def worth_keeping(self) -> bool:
+        """Whether anything was computed: a part, or summaries of drives besides those of an earlier result."""
+        copied = self._since.stat().st_mtime_ns if self._since.exists() else 0
+        buckets = self.summaries.glob("buckets/[0-9]*.parquet")
+        return bool(self.done()) or any(path.stat().st_mtime_ns >= copied for path in buckets)
+
+    def finish(self) -> None:
+        """Put the result where it belongs, and remove the rest."""
+        try:
+            if self.out.exists():
+                self.out.rmdir()
+            self.result.rename(self.out)
+        except OSError as error:
+            why = f"cannot be replaced: {error.strerror}; what was made stands in {self.result}"
+            raise FleetError(f"{self.out}: {why}") from None
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+@contextmanager
+def unfinished_run(out: Path) -> Iterator[Unfinished]:
+    """Open the folder of a run; it is made if there is none, and removed if nothing worth keeping is in it.
+
+    Parameters
+    ----------
+    out : Path
+        New or empty folder of the result.
+
+    Yields
+    ------
+    Unfinished
+        Locked against a second run to the same place.
+
+    Raises
+    ------
+    FleetError
+        If another run writes there, the folder cannot be made, or the disk is full.
+    """
+    shown, out = out, out.absolute()
+    folder = out.with_name(f".{out.name}.unfinished")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise FleetError(f"{out}: cannot be made: {error.strerror}; choose another folder") from None
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            why = "another run is writing this result; wait for it or choose another --out"
+            raise FleetError(f"{out}: {why}") from None
+        unfinished = Unfinished(folder=folder, out=out, shown=shown)
+        try:
+            yield unfinished
+        except OSError as error:
+            raise _full_disk(error, folder) or error from None
+        finally:
+            if not unfinished.worth_keeping():
+                shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        os.close(lock)
+
+
+def _full_disk(error: OSError, folder: Path) -> FleetError | None:
+    """What to say of a disk without room; libraries leave out the name of the file. None: it is another error."""
+    where, reason = error.filename or folder, os.strerror(error.errno or 0)
+    if isinstance(error, shutil.Error):  # of a folder that was copied: the first of its files that was not
+        (_, where, reason), *_ = error.args[0]
+    elif error.errno not in DISK_FULL:
+        return None
+    return FleetError(
+        f"{where}: cannot write it: {reason}; make room, and run the same command again to go on, or choose another "
+        f"--out"
+    )

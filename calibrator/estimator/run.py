@@ -10,46 +10,35 @@ Faults of the program in single vehicles (:mod:`calibrator.estimator.fleet_task`
 
 import hashlib
 import shutil
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import msgspec
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calibrator.drive import Drive
 from calibrator.drives.store import DRIVES_FOLDER
-from calibrator.errors import ContradictionError, DriveError, FleetError, internal_error
-from calibrator.estimator.fleet_estimate import FleetEstimate
-from calibrator.estimator.fleet_task import Calibrated, FleetTask, learn_task
-from calibrator.estimator.readings import (
-    TRUSTED_DRIFT_SD,
-    TRUSTED_OFFSET_SD,
-    BenchTable,
-    check_bench_table,
-    read_bench_table,
-)
+from calibrator.errors import ContradictionError, DriveError, FleetError
+from calibrator.estimator.fleet_task import calibrate_bucket, learn_task
+from calibrator.estimator.readings import BenchTable, check_bench_table, read_bench_table
 from calibrator.estimator.results import (
     MOST_NAMED,
     PARTS,
     CalibrationReport,
-    ChunkResult,
     RunRecord,
-    encode_chunk,
+    Unfinished,
     join_rows,
     left_out_of,
-    part_file,
-    read_part,
     read_run,
     report_of,
+    unfinished_run,
     write_parameter_files,
     write_run,
 )
 from calibrator.estimator.settings import CalibrationSettings, require_learning
-from calibrator.estimator.unfinished import Unfinished, unfinished_run
-from calibrator.estimator.vehicle_report import faults_of
 from calibrator.files.folders import require_new_folder
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.files.storage import Storage, open_storage
@@ -64,7 +53,7 @@ from calibrator.sources.fleet_source import (
     probe_equipment,
 )
 from calibrator.summaries.identity import StoreIdentity, read_identity, store_identity
-from calibrator.summaries.record import Outline, Record, drives_digest, joined_records
+from calibrator.summaries.record import Outline, joined_records
 from calibrator.summaries.store import SummaryStore, open_store
 from calibrator.summaries.summarise_fleet import add_drives
 from calibrator.summaries.vehicle_summary import VehicleSummary
@@ -75,11 +64,9 @@ from ecu_node import __version__
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
 from ecu_node.layout import Layout, file_digest
-from ecu_node.parameters import VehicleParameters, decode_parameters
 
 __all__ = [
     "Census",
-    "calibrate_bucket",
     "calibrate_fleet",
     "read_sample",
     "require_fleet",
@@ -91,13 +78,8 @@ MOST_LEARNT = 2000
 differ by, so more would not tell any vehicle's faults better. [1]"""
 MOST_REASONS = 20
 """Reasons of vehicles left out that are kept for messages."""
-MOVED_SD = 4.0
-"""Standard deviations within which earlier and new faults of a sensor are the same. [1]"""
-LEAST_PROBABILITY = 1e-3
-"""Of the explanations near the earlier faults: below, a sensor has moved. [1]"""
 MOST_READ_HERE = 5
 """Vehicles of single junctions that are read in this process."""
-NOT_THERE = "it is not in this store; its earlier parameters are in the earlier result"
 
 
 def calibrate_fleet(
@@ -315,20 +297,21 @@ class _Run:
     since: Path | None
 
     def published(self, fleet: FleetSource) -> CalibrationReport:
-        """Calibrate by the published method, which needs all models at once; its result is one chunk."""
+        """Calibrate by the published method, which needs all models at once."""
         from calibrator.estimator.published_fleet import calibrate_fleet_published  # noqa: PLC0415 (takes a second to import)
 
-        equipment = self._equipment(fleet)
+        return self._at_once(fleet, self._equipment(fleet), calibrate_fleet_published)
+
+    def _at_once(self, fleet: FleetSource, equipment: Equipment, calibrate: Callable[..., Any]) -> CalibrationReport:
+        """Calibrate all vehicles in one piece, which is the only part of the result."""
         about = self._about(fleet, equipment)
         identity = self._identity(about, None)
-        chunk, details, notices = calibrate_fleet_published(
-            fleet, equipment, identity, self.settings, workers=self.workers
-        )
-        self.unfinished.put(0, chunk)
+        part, details, notices = calibrate(fleet, equipment, identity, self.settings, workers=self.workers)
+        self.unfinished.put(0, part)
         return self._result(about, identity, {}, details=details, notices=notices)
 
     def junctions(self, fleet: FleetSource) -> CalibrationReport:
-        """Calibrate each vehicle by what is known of its own junction; the result is one chunk."""
+        """Calibrate each vehicle by what is known of its own junction."""
         from calibrator.estimator.junction import calibrate_junctions  # noqa: PLC0415 (a fleet does not need it)
 
         drives: dict[str, list[Drive]] = {}
@@ -352,13 +335,7 @@ class _Run:
             modelled=False,
             drives=[mine[0] for mine in drives.values()],
         )
-        about = self._about(fleet, equipment)
-        identity = self._identity(about, None)
-        chunk, details, notices = calibrate_junctions(
-            fleet, drives, equipment.branches, identity, self.settings, workers=self.workers
-        )
-        self.unfinished.put(0, chunk)
-        return self._result(about, identity, {}, details=details, notices=notices)
+        return self._at_once(fleet, equipment, partial(calibrate_junctions, drives))
 
     def drives(self, fleet: FleetSource) -> CalibrationReport:
         """Summarise drives, and calibrate from the summaries."""
@@ -423,8 +400,8 @@ class _Run:
         seen = census.size - sum(census.usable[bucket] for bucket in todo)
         with progress_bar("calibrate", census.size, "vehicles", begun=seen) as progress:
             progress(seen)
-            for bucket, chunk in zip(todo, run_many(calibrate, todo, self.workers), strict=True):
-                self.unfinished.put(bucket, chunk)
+            for bucket, part in zip(todo, run_many(calibrate, todo, self.workers), strict=True):
+                self.unfinished.put(bucket, part)
                 seen += census.usable[bucket]
                 progress(seen)
         if store.versions() != versions:
@@ -469,19 +446,18 @@ class _Run:
         notices: Sequence[str],
         store: SummaryStore | None = None,
     ) -> CalibrationReport:
-        """Put the chunks together to the result; ``others`` are in none of them."""
+        """Put the parts together to the result; ``others`` are in none of them."""
         unfinished, layout = self.unfinished, self.database.layout
-        folder, numbers = unfinished.result(), unfinished.done()
-        vehicles = join_rows(folder, [unfinished.part(n, "rows") for n in numbers], others)
-        left_out = left_out_of(folder)
+        folder = unfinished.result
+        vehicles, left_out = join_rows(folder, others), left_out_of(folder)
         if not vehicles:
             why = next(iter(left_out.values()), "there is none")
             raise FleetError(f"{about.fleet}: no vehicle can be calibrated; the first: {why}")
-        parts = {n: unfinished.part(n, "parameters") for n in numbers}
         with progress_bar("write the result", None):
-            where = write_parameter_files(folder, parts, vehicles=vehicles)
+            where = write_parameter_files(folder, vehicles=vehicles)
         if unfinished.summaries.exists():
             copy = folder / unfinished.summaries.name
+            shutil.rmtree(copy, ignore_errors=True)  # of a run that was killed
             shutil.copytree(unfinished.summaries, copy, ignore=shutil.ignore_patterns(".*"))
         run = RunRecord(
             tool=identity.tool,
@@ -507,98 +483,6 @@ class _Run:
         report = report_of(folder, run, parameters=where, shown=unfinished.shown)
         unfinished.finish()
         return report
-
-
-def calibrate_bucket(bucket: int, *, store: SummaryStore, task: FleetTask, previous: Path | None = None) -> ChunkResult:
-    """Calibrate the vehicles of a bucket; one bad vehicle never stops the others.
-
-    Parameters
-    ----------
-    bucket : int
-        Which.
-    store, task : SummaryStore, FleetTask
-        The store, and what was learnt from it.
-    previous : Path or None
-        Earlier result to go on from.
-
-    Returns
-    -------
-    ChunkResult
-        Parameters, and who was left out and why.
-    """
-    if previous is not None and not (previous / PARTS).is_dir():
-        raise FleetError(
-            f"{previous / PARTS}: the earlier result cannot be reached from here; put it where every worker reaches it "
-            f"by this path"
-        )
-    records, before = store.read(bucket), {} if previous is None else read_part(part_file(previous, bucket))
-    digests = {name: drives_digest(items) for name, items in records.items()}
-    found = Calibrated(left_out=dict.fromkeys(before.keys() - records.keys(), NOT_THERE))
-    todo: list[VehicleSummary] = []
-    for name, items in records.items():
-        earlier = decode_parameters(before[name].text, f"earlier parameters of {name}") if name in before else None
-        if earlier is not None and before[name].drives == digests[name]:
-            found.parameters[name] = earlier  # its evidence was found against another reference, and is not kept
-            continue
-        try:
-            todo.append(_what_holds(items, earlier, task, found))
-        except DriveError as error:
-            found.left_out[name] = str(error)
-        except UserError:
-            raise
-        except Exception as error:  # noqa: BLE001 (a fault of the program is reported with its vehicle)
-            found.left_out[name] = internal_error(error)
-    task.calibrate(todo, found)
-    return encode_chunk(
-        found.parameters.values(), found.left_out, moved=found.moved, drives=digests, evidence=found.evidence
-    )
-
-
-def _what_holds(
-    records: Sequence[Record], earlier: VehicleParameters | None, task: FleetTask, found: Calibrated
-) -> VehicleSummary:
-    """Summary of all drives of a vehicle, or of the new ones alone if they show that a sensor has moved.
-
-    Records stand in the order in which they came. Those before the first one that the earlier parameters were found
-    from are of a time before a sensor moved.
-    """
-    drives = set() if earlier is None else set(earlier.provenance.drives)
-    known = [place for place, record in enumerate(records) if record.drives and set(record.drives) <= drives]
-    if earlier is None or not known:
-        return joined_records(records)
-    everything, new = joined_records(records[known[0] :]), records[known[-1] + 1 :]
-    if not any(record.found for record in new):
-        return everything
-    try:
-        recent = joined_records(new)
-        changes = _moved_sensors(earlier, task.estimate([recent]), task)
-    except UserError:  # the new drives alone do not suffice
-        return everything
-    found.moved |= {(earlier.vehicle, branch): text for branch, text in changes.items()}
-    return recent if changes else everything
-
-
-def _moved_sensors(before: VehicleParameters, now: FleetEstimate, task: FleetTask) -> dict[str, str]:
-    """Sensors that have moved, from where to where, by branch: no explanation of the new drives has the earlier faults.
-
-    ``now`` is the estimate of the vehicle from drives that came since ``before``, and from these alone.
-    """
-    branches, scale_a = task.branches, task.identity.database.layout.full_scale_a
-    old = [before.branches[name] for name in branches]
-    was = np.array([[item.drift for item in old], [item.offset_a for item in old]])
-    was_sd = np.array([[item.drift_sd or 0.0 for item in old], [item.offset_sd_a or 0.0 for item in old]])
-    is_now, now_sd = np.array([now.drift[0], now.offset_a[0]]), np.array([now.drift_sd[0], now.offset_sd_a[0]])
-    accuracy = np.array([[TRUSTED_DRIFT_SD], [TRUSTED_OFFSET_SD * scale_a]])
-    same = MOVED_SD * np.sqrt(now_sd**2 + was_sd**2 + accuracy**2)
-    near = (each.probability for each in now.explanations[0] if (np.abs(faults_of(each, branches) - was) <= same).all())
-    if sum(near) >= LEAST_PROBABILITY:
-        return {}
-    return {
-        branches[k]: (
-            f"drift {was[0, k]:+.2%} -> {is_now[0, k]:+.2%}, offset {was[1, k]:+.2f} A -> {is_now[1, k]:+.2f} A"
-        )
-        for k in np.flatnonzero((np.abs(is_now - was) > same).any(axis=0)).tolist()
-    }
 
 
 def _require_previous(folder: Path, database: VehicleDatabase, store: StoreIdentity) -> None:

@@ -1,15 +1,29 @@
-"""What is said of one vehicle: what would decide, and what was found in words."""
+"""What is said of one vehicle: its parameters, what would decide where they are in doubt, and all of it in words."""
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 
 from calibrator.drive import Array, Mask
-from calibrator.estimator.fleet_estimate import FleetEstimate
-from ecu_node.parameters import BranchParameters, Explanation, HeldBack, VehicleParameters
+from calibrator.drives.delays import BranchDelays
+from calibrator.estimator.fleet_estimate import CONFIDENT, SUSPECTED, FleetEstimate
+from calibrator.files.parameter_files import RunIdentity, by_branch, junction_residual
+from calibrator.summaries.vehicle_summary import VehicleSummary
+from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, HeldBack, VehicleParameters, Verdict
 
-__all__ = ["deciding_evidence", "explained", "explanation_text", "faults_of", "impossible", "sensor_text"]
+__all__ = [
+    "deciding_evidence",
+    "explained",
+    "explained_faults",
+    "explanation_text",
+    "impossible",
+    "parameters_of",
+    "sensor_text",
+]
 
+MOST_REPORTED, LEAST_REPORTED = 3, 0.02
+"""Explanations that are reported, and the least probability of one after the first. [1]"""
 LEAST_RIVAL, LEAST_IN_THE_WAY = 0.02, 1e-4
 """Probability from which on another explanation is a rival, and from which on it can hold a correction back. [1]"""
 RESOLVED = 0.002
@@ -36,9 +50,110 @@ def impossible(estimate: FleetEstimate, j: int, branches: Sequence[str]) -> str:
     )
 
 
-def faults_of(explanation: Explanation, branches: Sequence[str]) -> Array:
+def explained_faults(explanation: Explanation, branches: Sequence[str]) -> Array:
     """Drifts [1] and offsets [A] of the K sensors by an explanation, shape (2, K)."""
     return np.array([[part.get(name, 0.0) for name in branches] for part in (explanation.drift, explanation.offset_a)])
+
+
+def parameters_of(
+    vehicle: VehicleSummary,
+    estimate: FleetEstimate,
+    j: int,
+    *,
+    identity: RunIdentity,
+    branches: Sequence[str],
+    expected_a: float,
+    fleet_size: int,
+    decisive: str | None = None,
+) -> VehicleParameters:
+    """Write down what was found for vehicle j of an estimate.
+
+    Parameters
+    ----------
+    vehicle, estimate, j : VehicleSummary, FleetEstimate, int
+        The vehicle, and which of the estimate it is.
+    identity : RunIdentity
+        Of the run.
+    branches : sequence of str
+        Names of the K branches.
+    expected_a : float
+        Mean junction sum that right sensors show. [A]
+    fleet_size : int
+        Vehicles that can be used.
+    decisive : str or None
+        What would decide; None: found from the explanations.
+
+    Returns
+    -------
+    VehicleParameters
+        Content of its parameter file.
+    """
+    corrected = estimate.corrected[j]
+    reported: list[Explanation] = []
+    deciding = decisive or ""
+    if (
+        estimate.verdicts[j] == "cannot tell"
+        or not estimate.confidence[j] >= CONFIDENT
+        or (estimate.held_back[j] != "").any()
+    ):
+        first, *others = estimate.explanations[j][:MOST_REPORTED]
+        reported = [first, *(each for each in others if each.probability >= LEAST_REPORTED)]
+        layout = identity.database.layout
+        if decisive is None:
+            deciding, rival = deciding_evidence(
+                estimate, j, branches, full_scale_a=layout.full_scale_a, layout=layout.path.name
+            )
+            reported += [rival] if rival is not None and rival not in reported else []
+    hardware = _probability(estimate.hardware_probability[j])
+    return VehicleParameters(
+        vehicle=vehicle.vehicle,
+        layout=identity.layout,
+        dbc=identity.dbc,
+        verdict=cast("Verdict", estimate.verdicts[j]),
+        confidence=_probability(estimate.confidence[j]),
+        branches={name: _branch(vehicle.delays, estimate, (j, k), name) for k, name in enumerate(branches)},
+        hardware_fault=HardwareFault(
+            suspected=hardware is not None and hardware > SUSPECTED,
+            drift=float(estimate.hardware_drift[j]),
+            offset_a=by_branch(branches, estimate.hardware_offset_a[j]),
+            probability=hardware,
+        ),
+        explanations=reported,
+        deciding_evidence=deciding,
+        findings=list(estimate.findings[j]),
+        junction_residual=junction_residual(
+            vehicle.summary.moments[:, vehicle.summary.inputs :, vehicle.summary.inputs :],
+            gain=np.where(corrected, 1.0 + estimate.drift[j], 1.0)[None],
+            offset_a=np.where(corrected, estimate.offset_a[j], 0.0),
+            expected_a=expected_a,
+        ),
+        provenance=identity.provenance(
+            fleet_size=fleet_size, drives=vehicle.drives, duration_s=vehicle.summary.duration_s
+        ),
+    )
+
+
+def _branch(delays: BranchDelays, estimate: FleetEstimate, place: tuple[int, int], name: str) -> BranchParameters:
+    k = delays.branches.index(name)
+    delay_s, delay_sd_s = (float(values[k]) if delays.known[k] else None for values in (delays.delay_s, delays.sd_s))
+    return BranchParameters(
+        drift=float(estimate.drift[place]),
+        offset_a=float(estimate.offset_a[place]),
+        drift_sd=float(estimate.drift_sd[place]),
+        offset_sd_a=float(estimate.offset_sd_a[place]),
+        apply=bool(estimate.corrected[place]),
+        held_back=cast("HeldBack | None", str(estimate.held_back[place]) or None),
+        delay_s=delay_s,
+        delay_sd_s=delay_sd_s,
+        fault_probability=_probability(estimate.fault_probability[place]),
+        harm_probability=_probability(estimate.harm_probability[place]),
+        identifiable=bool(estimate.identifiable[place]),
+    )
+
+
+def _probability(value: float) -> float | None:
+    """A probability free of rounding beyond its range; None where it is not known (NaN)."""
+    return None if np.isnan(value) else float(np.clip(value, 0.0, 1.0))
 
 
 def deciding_evidence(
@@ -105,7 +220,7 @@ def _rival(
     """What would tell the most probable explanation from the one that stands most in its way; empty if none does."""
     least = LEAST_IN_THE_WAY if held.any() else LEAST_RIVAL
     others = [each for each in found[1:] if each.probability >= least]
-    best, *rivals = (faults_of(each, branches) / [[1.0], [full_scale_a]] for each in (found[0], *others))
+    best, *rivals = (explained_faults(each, branches) / [[1.0], [full_scale_a]] for each in (found[0], *others))
     apart = [np.hypot(*(rival - best))[held | ~held.any()] for rival in rivals]
     in_the_way = [each.probability * a[a > RESOLVED].sum() for each, a in zip(others, apart, strict=True)]
     if not any(in_the_way):

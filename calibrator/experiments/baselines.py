@@ -21,10 +21,16 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LassoLarsIC
 
 from calibrator.drive import Array, Mask
-from calibrator.estimator.explanations import evidence_of, row_residuals
-from calibrator.estimator.fleet_model import densest_clusters, fit_fleet_model
-from calibrator.estimator.moments import stack_summaries
-from calibrator.estimator.rows import EvidenceRows, collect_rows, parameter_places, row_design
+from calibrator.estimator.evidence import (
+    EvidenceRows,
+    ParameterPlaces,
+    collect_rows,
+    densest_clusters,
+    fit_fleet_model,
+    row_design,
+    stack_summaries,
+)
+from calibrator.estimator.posterior import evidence_of, row_residuals
 from calibrator.experiments.methods import Estimate
 from calibrator.experiments.trial import CommonEvidence, Trial
 from calibrator.faults import Faults
@@ -168,7 +174,7 @@ class _Linear:
         self.full_scale_a = trial.full_scale_a
         K = self.rows.branches
         told = self.rows.places.measured
-        self.design = row_design(K, feed=0)[told, : parameter_places(K).load]
+        self.design = row_design(K, feed=0)[told, : ParameterPlaces(K).load]
         covariance = self.rows.covariance[:, told[:, None], told]
         sd = np.sqrt(np.einsum("nii->ni", covariance))
         clusters = [densest_clusters(self.rows.values[:, row], sd[:, i])[0] for i, row in enumerate(told)]
@@ -199,7 +205,7 @@ class _Linear:
 
     def faults(self, theta: Array) -> Faults:
         """Faults of parameters (N, 3K), branches in the vehicles' own order."""
-        at, own = parameter_places(self.rows.branches), np.argsort(self.order)
+        at, own = ParameterPlaces(self.rows.branches), np.argsort(self.order)
         gain, hardware = np.exp(theta[:, at.gains]), theta[:, at.hardware_offsets]
         hardware = np.column_stack([hardware, -hardware.sum(axis=1)])
         return Faults(

@@ -23,8 +23,7 @@ from calibrator.artificial.ground_truth import with_branches
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.errors import DriveError
-from calibrator.estimator.fleet_model import densest_clusters
-from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows
+from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, densest_clusters
 from calibrator.estimator.state_space import choose_order, identify
 from calibrator.experiments.trial import CommonEvidence, Trial, UnseenDrive
 from calibrator.faults import Faults, slopes_and_intercepts

@@ -14,7 +14,7 @@ from calibrator.drive import Array, Mask
 from calibrator.errors import FleetError
 from calibrator.estimator.decision import RowsEstimate, estimate_rows
 from calibrator.estimator.fleet_estimate import HARM_LIMIT, estimate_vehicles, learn_fleet
-from calibrator.estimator.learning import learn_laws
+from calibrator.estimator.learning import learn_fault_models
 from calibrator.estimator.prior import Prior, known_prior
 from calibrator.experiments.trial import CommonEvidence, FaultDistribution, Trial
 from calibrator.faults import Faults
@@ -132,7 +132,7 @@ class Posterior:
         reference = learn_fleet(trial.recorded, full_scale_a=trial.full_scale_a, branches=names, known=prior)
         found = estimate_vehicles(trial.recorded, reference)
         return replace(
-            _estimated(found, found.corrected, reference.laws[0].prior),
+            _estimated(found, found.corrected, reference.models[0].prior),
             pit=lambda truth: found.pit(truth.drift, truth.offset_a),
             findings=[[finding.cause for finding in findings] for findings in found.findings],
         )
@@ -141,14 +141,14 @@ class Posterior:
 def _of_rows(recorded: CommonEvidence, known: Prior | None, full_scale_a: float) -> Estimate:
     """The same for vehicles that all make one drive: their rows are at hand, and nothing is checked."""
     feed = int(np.argmax(np.median(recorded.mean_a, axis=0)))
-    laws = learn_laws(recorded.rows, feed=feed, known=known)
+    models = learn_fault_models(recorded.rows, feed=feed, known=known)
     mean = recorded.mean_a / full_scale_a
     square = np.einsum("nkk->nk", recorded.covariance_a2) / full_scale_a**2 + mean**2
     usual = np.stack([np.median(mean, axis=0), np.median(square, axis=0)])
     found = estimate_rows(
-        recorded.rows, laws, feed=feed, mean=mean, mean_square=square, usual=usual, full_scale_a=full_scale_a
+        recorded.rows, models, feed=feed, mean=mean, mean_square=square, usual=usual, full_scale_a=full_scale_a
     )
-    return _estimated(found, found.faulty & found.identifiable & (found.harm_probability < HARM_LIMIT), laws[0].prior)
+    return _estimated(found, found.faulty & found.identifiable & (found.harm_probability < HARM_LIMIT), models[0].prior)
 
 
 def _estimated(found: RowsEstimate, corrected: Mask, prior: Prior) -> Estimate:

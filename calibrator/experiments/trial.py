@@ -9,7 +9,7 @@ import numpy as np
 
 from calibrator.artificial.random_fleet import nonzero_count
 from calibrator.drive import Array, Mask
-from calibrator.estimator.rows import EvidenceRows
+from calibrator.estimator.evidence import EvidenceRows
 from calibrator.faults import Faults
 from calibrator.published.evidence import FleetEvidence
 from calibrator.summaries.moments import DriveSummary

@@ -16,7 +16,7 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 from selenium.webdriver.support.wait import WebDriverWait
 
-from calibrator.estimator.rows import VehicleEvidence
+from calibrator.estimator.evidence import VehicleEvidence
 from calibrator.report.page import fleet_report, vehicle_report
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout

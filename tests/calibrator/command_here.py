@@ -1,12 +1,17 @@
 """The calibrator's command line in this process: starting Python takes longer than most commands that are tried."""
 
+import fcntl
+import os
 import subprocess
 from contextlib import redirect_stderr, redirect_stdout
 from io import BytesIO, TextIOWrapper
+from pathlib import Path
 
-from tests.calibrator.conftest import run_command
+import pytest
 
-__all__ = ["calibrator"]
+from tests.calibrator.conftest import LAYOUT, run_command
+
+__all__ = ["calibrator", "made_once"]
 
 
 def calibrator(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -22,3 +27,15 @@ def said(stream: TextIOWrapper) -> str:
     """All that was written."""
     stream.seek(0)
     return stream.read()
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, *arguments: object) -> Path:
+    """Folder that a command writes: the first worker of a test run makes it, and all of them read it."""
+    base = factory.getbasetemp()
+    out = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    with out.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not out.exists():
+            done = calibrator(*arguments, "--layout", LAYOUT, "--out", out)
+            assert done.returncode == 0, done.stderr
+    return out

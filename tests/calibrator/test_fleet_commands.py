@@ -14,43 +14,23 @@ from calibrator.fleet_truth import read_truth
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import check_fit, read_parameters
-from tests.calibrator.command_here import calibrator
+from tests.calibrator.command_here import calibrator, made_once
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Twelve vehicles on a common trip with few faults: three groups of four."""
-    out = tmp_path_factory.mktemp("fleet") / "fleet"
-    run = calibrator(
-        *(
-            "simulate",
-            "--vehicles",
-            12,
-            "--currents",
-            2,
-            "--sparsity",
-            80,
-            "--common-drive",
-            "--symmetric",
-            "--balanced",
-        ),
-        *("--minutes", 4, "--unseen-minutes", 1, "--seed", 3, "--layout", LAYOUT, "--out", out, "--workers", 1),
-    )
-    assert run.returncode == 0, run.stderr
-    return out
+    options = ("--vehicles", 12, "--currents", 2, "--sparsity", 80, "--common-drive", "--symmetric", "--balanced")
+    length = ("--minutes", 4, "--unseen-minutes", 1, "--seed", 3, "--workers", 1)
+    return made_once(tmp_path_factory, "symmetric_fleet", "simulate", *options, *length)
 
 
-@pytest.fixture(scope="module")
-def result(fleet: Path) -> Path:
-    out = fleet.parent / "result"
-    run = calibrator(
-        *("calibrate", fleet, "--layout", LAYOUT, "--method", "published", "--out", out, "--workers", 1),
-        *("--classifier", "perfect", "--truth", fleet / "truth.json"),
-    )
-    assert run.returncode == 0, run.stderr
-    return out
+@pytest.fixture(scope="session")
+def result(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    options = ("--method", "published", "--classifier", "perfect", "--truth", fleet / "truth.json", "--workers", 1)
+    return made_once(tmp_path_factory, "symmetric_result", "calibrate", fleet, *options)
 
 
 def test_fleet_is_a_folder_of_logs_per_vehicle_with_the_truth_beside(fleet: Path) -> None:
@@ -299,16 +279,11 @@ def test_truth_of_another_fleet_is_refused(fleet: Path, result: Path, tmp_path: 
     assert "truth of another fleet" in run.stderr
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def other_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Vehicles of the same names and branches as those of `fleet`, with other faults."""
-    out = tmp_path_factory.mktemp("other") / "fleet"
-    run = calibrator(
-        *("simulate", "--vehicles", 12, "--common-drive", "--minutes", 1, "--unseen-minutes", 1, "--seed", 4),
-        *("--layout", LAYOUT, "--out", out, "--workers", 1),
-    )
-    assert run.returncode == 0, run.stderr
-    return out
+    options = ("--vehicles", 12, "--common-drive", "--minutes", 1, "--unseen-minutes", 1, "--seed", 4, "--workers", 1)
+    return made_once(tmp_path_factory, "other_fleet", "simulate", *options)
 
 
 def test_score_refuses_the_truth_of_a_fleet_with_the_same_names(

@@ -10,29 +10,22 @@ from calibrator.fleet_truth import read_truth
 from ecu_node.database import read_database
 from ecu_node.layout import file_digest, read_layout
 from ecu_node.parameters import VehicleParameters, check_fit, read_parameters
-from tests.calibrator.command_here import calibrator
+from tests.calibrator.command_here import calibrator, made_once
 
 LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 DELAY_TOLERANCE_S = 0.005
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("fleet") / "fleet"
-    run = calibrator(
-        *("simulate", "--vehicles", 20, "--currents", 2, "--sparsity", 80, "--delay", 150, "--unmeasured", 3, 1),
-        *("--minutes", 6, "--unseen-minutes", 1, "--seed", 5, "--layout", LAYOUT, "--out", out),
-    )
-    assert run.returncode == 0, run.stderr
-    return out
+    options = ("--vehicles", 20, "--currents", 2, "--sparsity", 80, "--delay", 150, "--unmeasured", 3, 1)
+    length = ("--minutes", 6, "--unseen-minutes", 1, "--seed", 5)
+    return made_once(tmp_path_factory, "asymmetric_fleet", "simulate", *options, *length)
 
 
-@pytest.fixture(scope="module")
-def result(fleet: Path) -> Path:
-    out = fleet.parent / "result"
-    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out)
-    assert run.returncode == 0, run.stderr
-    return out
+@pytest.fixture(scope="session")
+def result(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_once(tmp_path_factory, "asymmetric_result", "calibrate", fleet)
 
 
 @pytest.fixture(scope="module")
@@ -77,13 +70,10 @@ def test_unmeasured_load_is_estimated_from_the_fleet_and_named(fleet: Path, resu
     assert any("load without a sensor" in notice for notice in run.notices)
 
 
-@pytest.fixture(scope="module")
-def strict(fleet: Path) -> Path:
+@pytest.fixture(scope="session")
+def strict(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nothing may do harm, so nothing is corrected and faulty vehicles stay undecided."""
-    out = fleet.parent / "strict"
-    run = calibrator("calibrate", fleet, "--layout", LAYOUT, "--out", out, "--harm-limit", 0)
-    assert run.returncode == 0, run.stderr
-    return out
+    return made_once(tmp_path_factory, "strict_result", "calibrate", fleet, "--harm-limit", 0)
 
 
 def test_a_stricter_harm_limit_corrects_no_more_branches(result: Path, strict: Path) -> None:

@@ -9,9 +9,8 @@ import pytest
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
-from calibrator.estimator.checks import check_fit, learn_usual_misfits
-from calibrator.estimator.fleet_model import fit_fleet_model
-from calibrator.estimator.moments import stack_summaries
+from calibrator.estimator.checks import find_misfits, learn_usual_misfits
+from calibrator.estimator.evidence import fit_fleet_model, stack_summaries
 from calibrator.experiments.recorded_trips import RecordedFleet, read_fleet
 from calibrator.faults import measured_currents, true_currents
 from calibrator.files.layout_files import vehicle_database
@@ -68,10 +67,10 @@ def checked(fleet: RecordedFleet, branches: int, seed: int, bends: dict[int, Ben
         ).with_inputs(fleet.database.layout.fleet_inputs)
         warm_c = 10.0 + 25.0 * np.sqrt(share)
         summaries.append(summarise([samples], period_s=fleet.period_s, temperatures_c=[warm_c]))
-    read_out = fit_fleet_model(stack_summaries(summaries)).read_out
+    read_out = fit_fleet_model(stack_summaries(summaries))
     usual = learn_usual_misfits(summaries, read_out, full_scale_a=fleet.full_scale_a)
     names = tuple(trips[0].currents_a)
-    return check_fit(summaries, read_out, usual, full_scale_a=fleet.full_scale_a, branches=names)
+    return find_misfits(summaries, read_out, usual, full_scale_a=fleet.full_scale_a, branches=names)
 
 
 @pytest.mark.parametrize("branches", [2, 3])

@@ -14,14 +14,15 @@ from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.support.wait import WebDriverWait
 
 from bench.row import Row
+from calibrator.estimator.evidence import VehicleEvidence, evidence_names
 from calibrator.estimator.results import (
+    PARTS,
     RunRecord,
     encode_chunk,
     join_rows,
-    write_parameter_files,
+    part_file,
     write_run,
 )
-from calibrator.estimator.rows import VehicleEvidence, evidence_names
 from calibrator.report.page import fleet_report
 from ecu_node.parameters import (
     BranchParameters,
@@ -94,16 +95,10 @@ def make_result(folder: Path, vehicles: int) -> Path:
     """Write a result as a calibration does, with faults drawn as in the paper."""
     rng = np.random.default_rng(0)
     items = [drawn_vehicle(rng, f"WVW{number:014d}", vehicles) for number in range(vehicles)]
-    folder.mkdir()
+    (folder / PARTS).mkdir(parents=True)
     evidence = {item.vehicle: drawn_evidence(rng, item) for item in items}
-    chunk = encode_chunk(items, {}, evidence=evidence)
-    rows_file, part = folder / "rows", folder / "part"
-    rows_file.write_bytes(chunk.rows)
-    part.write_bytes(chunk.parameters)
-    join_rows(folder, [rows_file], {})
-    write_parameter_files(folder, {0: part}, vehicles=10**9)  # in parts, as of every large fleet
-    rows_file.unlink()
-    part.unlink()
+    part_file(folder, 0).write_bytes(encode_chunk(items, {}, evidence=evidence))
+    join_rows(folder, {})  # no file per vehicle, as of every large fleet
     write_run(folder, replace(RUN, vehicles=vehicles))
     return folder
 

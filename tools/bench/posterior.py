@@ -17,8 +17,8 @@ from bench.row import Row
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.estimator.decision import estimate_rows
-from calibrator.estimator.learning import Law, learn_laws
-from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows, row_design, row_places
+from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, RowPlaces, row_design
+from calibrator.estimator.learning import FaultModel, learn_fault_models
 from calibrator.published.recovery import BasisPursuit
 
 __all__ = ["rows"]
@@ -127,19 +127,19 @@ def _slopes_and_intercepts(fleet: _Fleet) -> tuple[Array, Array]:
 
 
 def _posterior_s(fleet: _Fleet) -> float:
-    """Time per vehicle, once the laws of the fleet are known. [s]"""
-    laws = learn_laws(fleet.rows, feed=0)
-    return _best_s(lambda: _estimate(fleet.rows, laws)) / len(fleet.rows)
+    """Time per vehicle, once the fault models of the fleet are known. [s]"""
+    models = learn_fault_models(fleet.rows, feed=0)
+    return _best_s(lambda: _estimate(fleet.rows, models)) / len(fleet.rows)
 
 
-def _estimate(rows: EvidenceRows, laws: Sequence[Law]) -> None:
+def _estimate(rows: EvidenceRows, models: Sequence[FaultModel]) -> None:
     mean, square = np.full((len(rows), rows.branches), MEAN), np.full((len(rows), rows.branches), MEAN_SQUARE)
-    estimate_rows(rows, laws, feed=0, mean=mean, mean_square=square, usual=np.stack([mean[0], square[0]]))
+    estimate_rows(rows, models, feed=0, mean=mean, mean_square=square, usual=np.stack([mean[0], square[0]]))
 
 
 def _fleet_s(fleet: _Fleet) -> float:
     """Time of the whole fleet. [s]"""
-    return _best_s(lambda: _estimate(fleet.rows, learn_laws(fleet.rows, feed=0)))
+    return _best_s(lambda: _estimate(fleet.rows, learn_fault_models(fleet.rows, feed=0)))
 
 
 def _simulated(branches: int, vehicles: int, sparsity: float) -> _Fleet:
@@ -154,7 +154,7 @@ def _simulated(branches: int, vehicles: int, sparsity: float) -> _Fleet:
     unknown = [np.sqrt(UNKNOWN_VARIANCE)] * K
     sd = np.array([SLOPE_SD] * K + [RATIO_SD] * (K - 1) + unknown + [INTERCEPT_SD] * K + [JUNCTION_SD] + unknown)
     error = np.where(sd < 1.0, sd, 0.0) * rng.normal(size=(vehicles, 5 * K))
-    at = row_places(K)
+    at = RowPlaces(K)
     made = np.column_stack([np.log1p(relative), seen, np.zeros(vehicles)]) @ row_design(K, feed=0).T + error
     made[:, at.gain_reads] = made[:, at.offset_reads] = 0.0
     first, second = made[:, at.relative], made[:, at.constant]

@@ -12,8 +12,8 @@ import numpy as np
 
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
-from calibrator.estimator.explanations import WIDE_SD, Evidence, evidence_of
-from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows
+from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows
+from calibrator.estimator.posterior import WIDE_SD, Evidence, evidence_of
 from calibrator.faults import Faults
 
 SCALE_A = 1.0

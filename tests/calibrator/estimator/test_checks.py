@@ -9,7 +9,7 @@ import pytest
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
-from calibrator.estimator.checks import check_fit, learn_usual_misfits
+from calibrator.estimator.checks import find_misfits, learn_usual_misfits
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summariser import summarise
@@ -86,7 +86,7 @@ def read_out(K: int) -> Array:
 
 def checked(summaries: Sequence[DriveSummary], K: int) -> list[tuple[Finding, ...]]:
     usual = learn_usual_misfits(summaries, read_out(K), full_scale_a=FULL_SCALE_A)
-    return check_fit(summaries, read_out(K), usual, full_scale_a=FULL_SCALE_A, branches=BRANCHES[:K])
+    return find_misfits(summaries, read_out(K), usual, full_scale_a=FULL_SCALE_A, branches=BRANCHES[:K])
 
 
 @pytest.mark.parametrize("K", [2, 3])
@@ -138,7 +138,7 @@ def test_finding_does_not_depend_on_the_order_of_the_branches() -> None:
     turned = [summary.take_branches(order) for summary in summaries]
     usual = learn_usual_misfits(turned, read_out(3)[:, order], full_scale_a=FULL_SCALE_A)
     names = [BRANCHES[k] for k in order]
-    (second,) = check_fit(turned, read_out(3)[:, order], usual, full_scale_a=FULL_SCALE_A, branches=names)[BAD]
+    (second,) = find_misfits(turned, read_out(3)[:, order], usual, full_scale_a=FULL_SCALE_A, branches=names)[BAD]
     assert (second.cause, second.branch, second.text) == (first.cause, first.branch, first.text)
 
 

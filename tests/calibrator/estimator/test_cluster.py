@@ -26,7 +26,7 @@ def store(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -
 def test_cluster_that_loses_a_worker_gives_the_same_result(store: SummaryStore, tmp_path: Path) -> None:
     here = calibrate(store.url, tmp_path / "here", "--workers", 2)
     assert here.returncode == 0, here.stderr
-    chunks = tmp_path / ".there.unfinished" / "chunks"
+    chunks = tmp_path / ".there.unfinished" / "result" / "parameters"
     with ExitStack() as stack:
         cluster = stack.enter_context(DaskCluster(tmp_path, ENVIRONMENT))
         there = ("--out", tmp_path / "there", "--scheduler", cluster.address)
@@ -35,9 +35,9 @@ def test_cluster_that_loses_a_worker_gives_the_same_result(store: SummaryStore, 
             subprocess.Popen(line, stderr=subprocess.PIPE, stdout=subprocess.PIPE, env=ENVIRONMENT)
         )
         until = time.monotonic() + 300.0
-        while len(list(chunks.glob("*.rows.parquet"))) < 2 and run.poll() is None and time.monotonic() < until:
+        while len(list(chunks.glob("[0-9]*.parquet"))) < 2 and run.poll() is None and time.monotonic() < until:
             time.sleep(0.005)
-        left = len(store.buckets()) - len(list(chunks.glob("*.rows.parquet")))
+        left = len(store.buckets()) - len(list(chunks.glob("[0-9]*.parquet")))
         cluster.workers[0].send_signal(signal.SIGKILL)
         _, errors = run.communicate(timeout=300)
     assert left > 0, "the worker was to be killed in the middle"

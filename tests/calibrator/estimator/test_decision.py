@@ -11,8 +11,7 @@ from calibrator.estimator.decision import (
     harm_probability,
     posterior_points,
 )
-from calibrator.estimator.explanations import fit_explanations
-from calibrator.estimator.posterior import draw_explanations, weigh
+from calibrator.estimator.posterior import draw_explanations, fit_explanations, weigh
 from calibrator.estimator.prior import Prior, Slab, first_prior
 from calibrator.faults import Faults
 from calibrator.score import recovered
@@ -73,7 +72,7 @@ def test_small_faults_are_counted_with_the_smallest_of_the_fleet() -> None:
 
 def test_of_equally_good_estimates_the_more_probable_explanation_is_taken_whatever_its_place() -> None:
     found = points([(0.499, [0.1, 0, 0, 0]), (0.501, [0, 0.1, 0, 0])], sd=1e-6, draws=50)
-    reverse = Points(found.faults[::-1], found.weight[::-1], 1 - found.explanation[::-1], found.law, found.fit)
+    reverse = Points(found.faults[::-1], found.weight[::-1], 1 - found.explanation[::-1], found.model, found.fit)
     for each in (found, reverse):
         np.testing.assert_allclose(best_estimate(each, LEAST)[0], [0, 0.1, 0, 0], atol=1e-5)
 
@@ -116,7 +115,7 @@ def test_harm_on_any_drive_counts_once_and_a_branch_without_a_correction_has_non
 
 
 def explained(truth: Faults, prior: Prior, *, shared: Array | None = None, load: Array | float = 0.0) -> Explained:
-    """One law's draws of a fleet."""
+    """One model's draws of a fleet."""
     shared = np.zeros(2 * K + 1) if shared is None else shared
     centre = np.zeros(5 * K)
     centre[3 * K - 1 : 4 * K - 1], centre[4 * K - 1] = shared[:K], shared[:K].sum()
@@ -133,17 +132,20 @@ def group_prior() -> Prior:
     return Prior(counts=counts, gain=slab, offset=slab, group_share=share, group_centre=centre, group_sd=sd)
 
 
-def test_laws_are_averaged_by_their_probabilities() -> None:
+def test_fault_models_are_averaged_by_their_probabilities() -> None:
     truth = random_faults(3, vehicles=2, branches=K)
     shared = np.array([0.0, 0.01, 0.0, 0.02, 0.0])
-    laws = [
+    models = [
         explained(truth, first_prior(K))._replace(probability=0.7),
         explained(truth, first_prior(K), shared=shared)._replace(probability=0.3),
     ]
-    both, single = posterior_points(laws)[0], [posterior_points([law._replace(probability=1.0)])[0] for law in laws]
+    both, single = (
+        posterior_points(models)[0],
+        [posterior_points([model._replace(probability=1.0)])[0] for model in models],
+    )
     mean = 0.7 * single[0].weight @ single[0].faults + 0.3 * single[1].weight @ single[1].faults
     np.testing.assert_allclose(both.weight @ both.faults, mean, atol=1e-12)
-    assert np.bincount(both.law, np.bincount(both.explanation, both.weight)) == pytest.approx([0.7, 0.3], abs=1e-4)
+    assert np.bincount(both.model, np.bincount(both.explanation, both.weight)) == pytest.approx([0.7, 0.3], abs=1e-4)
 
 
 def test_what_the_sensors_share_is_part_of_every_fault() -> None:
@@ -172,8 +174,8 @@ def test_offset_beside_what_a_group_shares_is_that_of_the_sensor(of_sensor: bool
     truth = no_faults(1, K)
     truth.offset_a[0, 0], truth.drift[0, 0] = (0.18 if of_sensor else 0.15), 0.1
     prior, shared = group_prior(), np.append(np.zeros(4), of_sensor)
-    law = explained(truth, prior, shared=shared, load=0.0 if of_sensor else 0.03)
-    of_group = law.weight.copy()
+    model = explained(truth, prior, shared=shared, load=0.0 if of_sensor else 0.03)
+    of_group = model.weight.copy()
     of_group[..., 0] = 0.0  # of those who belong to the group
-    found = posterior_points([law._replace(weight=of_group / of_group.sum())])[0]
+    found = posterior_points([model._replace(weight=of_group / of_group.sum())])[0]
     np.testing.assert_allclose(found.weight @ found.faults, [0.1, 0.0, truth.offset_a[0, 0], 0.0], atol=0.004)

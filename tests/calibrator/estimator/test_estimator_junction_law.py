@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.estimator.moments import VehicleRegressions, junction_law, stack_summaries
-from calibrator.estimator.rows import LEAST_GAIN
+from calibrator.estimator.evidence import LEAST_GAIN, VehicleRegressions, junction_regression, stack_summaries
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summariser import summarise
 from tests.calibrator.estimator.simulated_drives import PERIOD_S, coloured, samples_of
 
 
 def law_of(*summaries: DriveSummary) -> VehicleRegressions:
-    return junction_law(stack_summaries(summaries))
+    return junction_regression(stack_summaries(summaries))
 
 
 def summary_of_currents(currents_a: Array) -> DriveSummary:

@@ -8,6 +8,7 @@ import pytest
 
 from calibrator.drives.delays import BranchDelays
 from calibrator.errors import FleetError
+from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows
 from calibrator.estimator.readings import (
     BenchReading,
     BenchTable,
@@ -19,7 +20,6 @@ from calibrator.estimator.readings import (
     untrusted_vehicles,
     with_readings,
 )
-from calibrator.estimator.rows import UNKNOWN_VARIANCE, EvidenceRows
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.summaries.zero_current import ZeroCurrent
 from ecu_node.layout import UnmeasuredLoad

@@ -8,27 +8,25 @@ import pytest
 
 from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array
-from calibrator.errors import FleetError
-from calibrator.estimator.explanations import row_residuals
-from calibrator.estimator.fleet_model import FleetModel
-from calibrator.estimator.moments import stack_summaries
-from calibrator.estimator.rows import (
+from calibrator.estimator.evidence import (
     UNKNOWN_VARIANCE,
     EvidenceRows,
+    RowPlaces,
     collect_rows,
     evidence_names,
     row_design,
-    row_places,
+    stack_summaries,
 )
+from calibrator.estimator.posterior import row_residuals
 from calibrator.faults import Faults
 from calibrator.summaries.moments import DriveSummary
 from tests.calibrator.estimator.simulated_drives import Conditions, no_faults, read_out_of, summaries_of
 from tests.calibrator.estimator.simulated_rows import parameters_of, plain_evidence, plain_residual
 
 K, FULL_SCALE_A = 3, 400.0
-AT = row_places(K)
+AT = RowPlaces(K)
 MEASURED = AT.measured
-TRUE_MODEL = FleetModel(read_out=np.vstack([read_out_of(K), np.zeros(K)]))
+TRUE_MODEL = np.vstack([read_out_of(K), np.zeros(K)])
 BRANCHES = pytest.mark.parametrize("branches", [2, 3, 5])
 
 
@@ -45,9 +43,9 @@ def random_faults(seed: int, vehicles: int) -> Faults:
 
 
 def rows_of(
-    summaries: Sequence[DriveSummary], model: FleetModel = TRUE_MODEL, scale_a: float = FULL_SCALE_A
+    summaries: Sequence[DriveSummary], read_out: Array = TRUE_MODEL, scale_a: float = FULL_SCALE_A
 ) -> EvidenceRows:
-    return collect_rows(stack_summaries(summaries), model, full_scale_a=scale_a)[0]
+    return collect_rows(stack_summaries(summaries), read_out, full_scale_a=scale_a)[0]
 
 
 def errors(rows: EvidenceRows, faults: Faults) -> Array:
@@ -86,7 +84,7 @@ def test_readings_and_reversed_branches_are_unknown() -> None:
 
 @BRANCHES
 def test_every_row_stands_where_its_name_says(branches: int) -> None:
-    at, names = row_places(branches), evidence_names([f"{k}" for k in range(branches)])
+    at, names = RowPlaces(branches), evidence_names([f"{k}" for k in range(branches)])
     assert names[at.slopes] == [f"slope {k}" for k in range(branches)]
     assert names[at.ratios] == [f"gain ratio 0 / {k}" for k in range(1, branches)]
     assert names[at.gain_reads] == [f"gain read {k}" for k in range(branches)]
@@ -163,11 +161,3 @@ def test_dispersion_widens_intercepts_at_their_means_alone_and_a_load_the_consta
     wider = rows.with_load_spread(0.01).covariance - rows.covariance
     np.testing.assert_allclose(wider[:, AT.junction, AT.junction], 1e-4)
     assert np.count_nonzero(wider) == len(rows)
-
-
-def test_rows_that_do_not_fit_or_are_not_finite_are_refused() -> None:
-    rows = rows_of(summaries_of(no_faults(2, K)))
-    with pytest.raises(FleetError, match=r"evidence of shapes \(2, 8\), \(1, 7\), .* expected relative rows of shape"):
-        replace(rows, constant=rows.constant[:1])
-    with pytest.raises(FleetError, match="evidence is not finite; leave out"):
-        replace(rows, covariance=rows.covariance + np.inf)

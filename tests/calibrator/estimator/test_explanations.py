@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibrator.drive import Array
-from calibrator.estimator.explanations import Evidence, Fits, fit_explanations, row_residuals
+from calibrator.estimator.posterior import Evidence, Fits, fit_explanations, row_residuals
 from calibrator.estimator.prior import first_prior
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_rows import (
@@ -94,51 +94,6 @@ def test_fits_of_two_branches_are_those_of_all_supports_one_by_one(errors: Error
             np.testing.assert_allclose((fits.root[j, q] @ fits.root[j, q].T)[np.ix_(on, on)], covariance, rtol=0.02)
         missed = [value for on, value in score.items() if on not in found]
         assert np.exp(np.array(missed) - max(score.values())).sum() < 1e-3
-
-
-@BRANCHES
-def test_true_support_is_fitted_and_fits(K: int) -> None:
-    faults = random_faults(5, vehicles=40, branches=K)
-    fits, truth = fitted(plain_evidence(rows_of(faults, seed=5))), parameters_of(faults)
-    chi2, z = [], []
-    for j in range(40):
-        on = tuple(np.flatnonzero(truth[j]).tolist())
-        q = supports(fits, j).index(on)
-        chi2.append(fits.chi2[j, q])
-        L = fits.root[j, q][np.ix_(on, on)]
-        z.append(np.linalg.solve(L, (fits.theta[j, q] - truth[j])[list(on)]))
-        assert (fits.hardware[j, q], fits.sensor[j, q]) == (
-            sum(p == 0 or K < p < 2 * K for p in on),
-            sum(1 <= p <= K or 2 * K <= p < 3 * K for p in on),
-        )
-    degrees = 3 * K - np.mean([len(values) for values in z])
-    assert np.mean(chi2) == pytest.approx(degrees, abs=3.5 * np.sqrt(2.0 * degrees / 40))
-    assert np.sqrt(np.mean(np.concatenate(z) ** 2)) == pytest.approx(1.0, abs=0.25)
-
-
-def test_order_of_the_consumers_does_not_matter() -> None:
-    """But for the first branch, which the gain ratios refer to, and the last, whose hardware offset is the others'."""
-    K, order = 4, [0, 2, 1, 3]
-    faults = random_faults(7, vehicles=12, branches=K)
-    swapped = Faults(
-        hardware_drift=faults.hardware_drift,
-        hardware_offset_a=faults.hardware_offset_a[:, order],
-        drift=faults.drift[:, order],
-        offset_a=faults.offset_a[:, order],
-    )
-    currents = np.append(0.1, np.full(K - 1, -0.1 / (K - 1)))
-    plain, other = (fitted(plain_evidence(rows_of(each, noise=0.0, currents=currents))) for each in (faults, swapped))
-    place = np.array([0, *(1 + np.array(order)), *(K + 1 + np.array(order[:-1])), *(2 * K + np.array(order)), 3 * K])
-    for j in range(12):
-        value = {
-            tuple(np.flatnonzero(on[place]).tolist()): log_evidence
-            for on, log_evidence in zip(plain.support[j, : plain.number[j]], plain.log_evidence[j], strict=False)
-        }
-        found = supports(other, j)
-        best = other.log_evidence[j, : len(found)].max()
-        for on, log_evidence in zip(found, other.log_evidence[j], strict=False):
-            if log_evidence > best - 5.0:
-                assert value[on] == pytest.approx(log_evidence, abs=1e-3)
 
 
 def test_offset_of_the_feeding_sensor_and_a_load_are_never_both_fitted() -> None:

@@ -88,8 +88,8 @@ def test_load_is_found_from_the_fleet_or_taken_as_declared() -> None:
 def test_expected_and_known_faults_are_used() -> None:
     summaries, counts = drives("drift"), np.zeros((3, 5))
     expected = learn_fleet(summaries, full_scale_a=FULL_SCALE_A, branches=NAMES, expected_faults=0.4)
-    assert expected.laws[0].prior.counts[:, 1:].sum() == pytest.approx(0.4, abs=0.02)
+    assert expected.models[0].prior.counts[:, 1:].sum() == pytest.approx(0.4, abs=0.02)
     counts[0, :2] = 0.75, 0.25
     prior = known_prior(counts, (0.05, 0.25))
     known = learn_fleet(summaries, full_scale_a=FULL_SCALE_A, branches=NAMES, known=prior)
-    assert known.laws[0].prior is prior
+    assert known.models[0].prior is prior

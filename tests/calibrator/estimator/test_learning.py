@@ -7,9 +7,9 @@ import pytest
 
 from calibrator.drive import Array
 from calibrator.estimator import learning
-from calibrator.estimator.learning import Law, Spread, explain, learn_laws
+from calibrator.estimator.evidence import EvidenceRows, RowPlaces
+from calibrator.estimator.learning import FaultModel, Spread, explain, learn_fault_models
 from calibrator.estimator.prior import Prior, first_prior
-from calibrator.estimator.rows import EvidenceRows, row_places
 from calibrator.faults import Faults
 from tests.calibrator.estimator.simulated_drives import no_faults
 from tests.calibrator.estimator.simulated_rows import Errors, random_faults, rows_of
@@ -21,25 +21,25 @@ def moved(rows: EvidenceRows, by: Array) -> EvidenceRows:
     return replace(rows, relative=rows.relative + by[:, :c], constant=rows.constant + by[:, c:])
 
 
-def learned(rows: EvidenceRows, **knowledge: float) -> Law:
-    """The most probable law."""
-    laws = learn_laws(rows, feed=0, **knowledge)  # type: ignore[arg-type]
-    assert sum(law.probability for law in laws) == pytest.approx(1.0)
-    assert [law.probability for law in laws] == sorted((law.probability for law in laws), reverse=True)
-    assert all(sum(share for share, _ in law.priors) == pytest.approx(1.0) for law in laws)
-    return laws[0]
+def learned(rows: EvidenceRows, **knowledge: float) -> FaultModel:
+    """The most probable model."""
+    models = learn_fault_models(rows, feed=0, **knowledge)  # type: ignore[arg-type]
+    assert sum(model.probability for model in models) == pytest.approx(1.0)
+    assert [model.probability for model in models] == sorted((model.probability for model in models), reverse=True)
+    assert all(sum(share for share, _ in model.priors) == pytest.approx(1.0) for model in models)
+    return models[0]
 
 
-def shared_by(laws: list[Law]) -> dict[tuple[int, ...], float]:
+def shared_by(models: list[FaultModel]) -> dict[tuple[int, ...], float]:
     """Probabilities of what all vehicles share: places of offsets, gains and of a group's offset."""
     found: dict[tuple[int, ...], float] = {}
-    for law in laws:
-        cause = tuple(np.flatnonzero(np.abs(law.spread.shared) > learning.LEAST_SHARED).tolist())
-        found[cause] = found.get(cause, 0.0) + law.probability
+    for model in models:
+        cause = tuple(np.flatnonzero(np.abs(model.spread.shared) > learning.LEAST_SHARED).tolist())
+        found[cause] = found.get(cause, 0.0) + model.probability
     return found
 
 
-def same(one: Law, other: Law, rtol: float) -> None:
+def same(one: FaultModel, other: FaultModel, rtol: float) -> None:
     np.testing.assert_allclose(one.spread.mean, other.spread.mean, rtol=rtol, atol=1e-9)
     np.testing.assert_allclose(one.spread.covariance, other.spread.covariance, rtol=rtol, atol=1e-12)
     np.testing.assert_allclose(one.prior.counts, other.prior.counts, rtol=rtol, atol=1e-9)
@@ -51,22 +51,22 @@ def same(one: Law, other: Law, rtol: float) -> None:
 @pytest.mark.parametrize("K", [2, 3])
 def test_sizes_and_numbers_are_those_that_the_fleet_was_drawn_with(K: int, magnitude: tuple[float, float]) -> None:
     faults = random_faults(1, vehicles=60, branches=K, magnitude=magnitude)
-    law = learned(rows_of(faults, seed=1))
-    for slab, values in ((law.prior.gain, faults.drift), (law.prior.offset, faults.offset_a)):
+    model = learned(rows_of(faults, seed=1))
+    for slab, values in ((model.prior.gain, faults.drift), (model.prior.offset, faults.offset_a)):
         sizes = np.abs(values[values != 0.0])
         assert 0.8 * magnitude[0] < slab.low < 1.05 * sizes.min()
         assert 0.95 * sizes.max() < slab.high < 1.3 * magnitude[1]
-    assert law.prior.counts[1:].sum() == pytest.approx(faults.has_hardware_fault.mean(), abs=0.08)
+    assert model.prior.counts[1:].sum() == pytest.approx(faults.has_hardware_fault.mean(), abs=0.08)
     many = np.count_nonzero(np.hstack([faults.drift, faults.offset_a]), axis=1)
     expected = np.bincount(many, minlength=2 * K + 1) / 60.0
-    np.testing.assert_allclose(law.prior.counts.sum(axis=0), expected, atol=0.08)
-    assert not law.spread.shared.any()
-    assert np.abs(law.spread.mean).max() < 0.002
-    assert law.prior.load_share < 0.02
+    np.testing.assert_allclose(model.prior.counts.sum(axis=0), expected, atol=0.08)
+    assert not model.spread.shared.any()
+    assert np.abs(model.spread.mean).max() < 0.002
+    assert model.prior.load_share < 0.02
 
 
 def test_what_vehicles_without_faults_differ_by_is_learned() -> None:
-    K, rng, b = 2, np.random.default_rng(3), row_places(2).intercept(0)
+    K, rng, b = 2, np.random.default_rng(3), RowPlaces(2).intercept(0)
     rows = rows_of(random_faults(3, vehicles=80, branches=K), seed=3)
     more = np.zeros((80, 5 * K))
     more[:, [0, b]] = rng.normal(0.0, [0.01, 0.004], (80, 2))
@@ -82,7 +82,7 @@ def test_intercepts_that_err_more_than_their_blocks_show_are_trusted_less() -> N
     K = 2
     rows = rows_of(random_faults(4, vehicles=60, branches=K), seed=4, errors=Errors(intercept=0.004))
     stated = rows.covariance.copy()
-    at = row_places(K).intercepts
+    at = RowPlaces(K).intercepts
     stated[:, at, at] -= np.diag([0.004**2 - 0.001**2] * K)
     wide, plain = (learned(each).spread for each in (replace(rows, covariance=stated), rows))
     variance = 0.001**2 * wide.dispersion + np.diag(wide.covariance)[at]
@@ -91,7 +91,7 @@ def test_intercepts_that_err_more_than_their_blocks_show_are_trusted_less() -> N
 
 
 def test_error_of_the_reference_that_all_vehicles_share_is_its_centre() -> None:
-    K, at = 2, row_places(2)
+    K, at = 2, RowPlaces(2)
     rows, by = rows_of(random_faults(5, vehicles=40, branches=K), seed=5), np.zeros(5 * K)
     by[at.slopes], by[at.intercept(0)] = (0.02, -0.015), 0.006
     plain, shifted = learned(rows), learned(moved(rows, np.tile(by, (40, 1))))
@@ -114,35 +114,35 @@ def test_share_of_faulty_vehicles_is_as_expected() -> None:
 
 
 def test_centre_that_trusted_vehicles_carry_is_kept() -> None:
-    K, at = 2, row_places(2)
+    K, at = 2, RowPlaces(2)
     rows, fixed = rows_of(random_faults(10, vehicles=25, branches=K), seed=10), np.full(5 * K, np.nan)
     trusted = [at.slope(0), at.intercept(0)]
     fixed[trusted] = 0.001, -0.0005
-    law = learn_laws(rows, feed=0, fixed=fixed)[0]
-    np.testing.assert_array_equal(law.spread.mean[trusted], fixed[trusted])
+    model = learn_fault_models(rows, feed=0, fixed=fixed)[0]
+    np.testing.assert_array_equal(model.spread.mean[trusted], fixed[trusted])
     assert np.isnan(fixed[at.junction]), "what the caller gave is not changed"
 
 
 @pytest.mark.parametrize("declared", [None, 0.0125])
 def test_load_of_all_vehicles_is_found_or_taken_as_declared(declared: float | None) -> None:
-    K, at = 3, row_places(3)
+    K, at = 3, RowPlaces(3)
     rows = rows_of(random_faults(11, vehicles=40, branches=K), seed=11, load=0.0125)
-    laws = learn_laws(rows, feed=0, load=declared)
-    assert laws[0].spread.mean[at.junction] == pytest.approx(0.0125, abs=3e-4)
-    assert not laws[0].spread.shared[:K].any()
-    assert laws[0].prior.counts[0].sum() == pytest.approx(0.7, abs=0.2)
+    models = learn_fault_models(rows, feed=0, load=declared)
+    assert models[0].spread.mean[at.junction] == pytest.approx(0.0125, abs=3e-4)
+    assert not models[0].spread.shared[:K].any()
+    assert models[0].prior.counts[0].sum() == pytest.approx(0.7, abs=0.2)
     if declared is not None:
-        assert laws[0].spread.mean[at.junction] == declared
+        assert models[0].spread.mean[at.junction] == declared
 
 
 @pytest.mark.parametrize("K", [2, 3])
 def test_loads_that_differ_between_vehicles_are_no_offsets_of_sensors(K: int) -> None:
     load = np.random.default_rng(15).normal(0.0075, 0.0025, 30).clip(0.0)
     errors = Errors(intercept=0.0003, junction=0.0001)  # as on recorded trips
-    law = learned(rows_of(random_faults(15, vehicles=30, branches=K), seed=15, errors=errors, load=load))
-    carried = [law.spread.covariance[row, 4 * K - 1] for row in (3 * K - 1, 4 * K - 1)]
+    model = learned(rows_of(random_faults(15, vehicles=30, branches=K), seed=15, errors=errors, load=load))
+    carried = [model.spread.covariance[row, 4 * K - 1] for row in (3 * K - 1, 4 * K - 1)]
     np.testing.assert_allclose(np.sqrt(carried), load.std(), rtol=0.3)
-    assert not law.spread.shared.any()
+    assert not model.spread.shared.any()
 
 
 @pytest.mark.parametrize("K", [2, 3])
@@ -150,7 +150,7 @@ def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K:
     """Currents that sum to less than zero: no load gives current."""
     faults = random_faults(12, vehicles=40, branches=K)
     faults.offset_a[:, 0] -= 0.03
-    causes = shared_by(learn_laws(rows_of(faults, seed=12), feed=0))
+    causes = shared_by(learn_fault_models(rows_of(faults, seed=12), feed=0))
     assert causes.get((), 0.0) < 0.01
     assert max(causes, key=causes.__getitem__) == (0,)
 
@@ -159,11 +159,11 @@ def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K:
 def test_vehicles_that_share_a_constant_are_a_group_and_its_cause_is_left_open(of_sensor: bool) -> None:
     faults, some = random_faults(13, vehicles=40, branches=2), np.arange(40) < 12
     faults.offset_a[some, 0] += 0.03 * of_sensor
-    laws = learn_laws(rows_of(faults, seed=13, load=0.0 if of_sensor else 0.03 * some), feed=0)
-    (share,), (centre,) = laws[0].prior.group_share, laws[0].prior.group_centre
+    models = learn_fault_models(rows_of(faults, seed=13, load=0.0 if of_sensor else 0.03 * some), feed=0)
+    (share,), (centre,) = models[0].prior.group_share, models[0].prior.group_centre
     assert share == pytest.approx(0.3, abs=0.1)
     assert centre == pytest.approx(0.03, abs=0.001)
-    assert {law.spread.shared[-1] for law in laws} == {0.0, 1.0}
+    assert {model.spread.shared[-1] for model in models} == {0.0, 1.0}
 
 
 @pytest.mark.parametrize("gain", [0.08, -0.05])
@@ -175,19 +175,19 @@ def test_gain_that_all_sensors_of_a_branch_share_is_found_and_of_two_branches_ei
     faults.drift[:, branch] = (1.0 + gain) * (1.0 + faults.drift[:, branch]) - 1.0
     rows = rows_of(faults, seed=14)
     rows.relative[:, branch] -= np.log1p(gain)  # the fleet's model has the same error
-    causes = shared_by(learn_laws(rows, feed=0))
+    causes = shared_by(learn_fault_models(rows, feed=0))
     if K == 2:
         assert causes == pytest.approx({(2,): 0.5, (3,): 0.5}, abs=0.01)
     else:
         assert causes.get((K + branch,), 0.0) > 0.99
 
 
-def law_of(K: int, prior: Prior | None = None) -> Law:
-    """Law of vehicles that are alike but for their faults."""
+def law_of(K: int, prior: Prior | None = None) -> FaultModel:
+    """FaultModel of vehicles that are alike but for their faults."""
     spread = Spread(
         mean=np.zeros(5 * K), covariance=1e-10 * np.eye(5 * K), dispersion=np.ones(K), shared=np.zeros(2 * K + 1)
     )
-    return Law(spread=spread, priors=((1.0, prior or first_prior(K)),))
+    return FaultModel(spread=spread, priors=((1.0, prior or first_prior(K)),))
 
 
 def test_vehicle_that_no_explanation_fits_is_known_less_well_and_others_are_as_before() -> None:
@@ -210,13 +210,13 @@ def test_vehicle_that_no_explanation_fits_is_known_less_well_and_others_are_as_b
 def test_one_vehicle_and_a_branch_that_nobody_used_are_learned_from_without_failing() -> None:
     K = 3
     rows = rows_of(Faults(**{name: values[:1] for name, values in vars(no_faults(2, K)).items()}), seed=17)
-    assert len(learn_laws(rows, feed=0)) >= 1
+    assert len(learn_fault_models(rows, feed=0)) >= 1
     rows = rows_of(no_faults(8, K), seed=17, currents=np.array([0.1, -0.1, 0.0]))
-    at = row_places(K)
+    at = RowPlaces(K)
     for row in (at.slope(K - 1), at.ratio(K - 1)):
         rows.covariance[:, row], rows.covariance[:, :, row] = 0.0, 0.0
         rows.covariance[:, row, row] = 100.0
         rows.relative[:, row] = 0.0
-    law = learned(rows)
-    assert np.isfinite(law.spread.covariance).all()
-    assert law.spread.mean[K - 1] == pytest.approx(0.0, abs=1e-3)
+    model = learned(rows)
+    assert np.isfinite(model.spread.covariance).all()
+    assert model.spread.mean[K - 1] == pytest.approx(0.0, abs=1e-3)

@@ -1,22 +1,26 @@
 """Weights of the draws: those of integration on a grid, probabilities for fleets that the prior describes."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.special import logsumexp
 
 from calibrator.drive import Array
-from calibrator.estimator.explanations import fit_explanations
-from calibrator.estimator.posterior import GAIN, OFFSET, Draws, draw_explanations, size_evidence, weigh
+from calibrator.estimator.evidence import EvidenceRows
+from calibrator.estimator.posterior import (
+    GAIN,
+    OFFSET,
+    Draws,
+    draw_explanations,
+    fit_explanations,
+    size_evidence,
+    weigh,
+)
 from calibrator.estimator.prior import GRID, LOAD_DENSITY, Prior, Slab, known_prior, with_slabs
-from calibrator.estimator.rows import EvidenceRows
 from tests.calibrator.estimator.simulated_drives import no_faults
 from tests.calibrator.estimator.simulated_rows import (
     Errors,
     all_supports,
     dense_fit,
-    parameters_of,
     plain_evidence,
     plain_residual,
     random_faults,
@@ -153,50 +157,6 @@ def test_load_weighs_as_on_a_grid_and_is_never_negative() -> None:
     loads = draws.values[..., 6] * draws.fits.support[:, :, None, 6]
     assert weight[loads < 0.0].max() < 1e-30
     assert [of_supports(draws, weight, j)[6,][0] > 0.5 for j in range(3)] == [True, False, False]
-
-
-@pytest.mark.parametrize("sparsity", [83.0, 67.0])
-def test_weights_are_probabilities_for_fleets_that_the_prior_describes(sparsity: float) -> None:
-    truth = random_faults(4, vehicles=500, branches=2, sparsity=sparsity)
-    counts = np.zeros((3, 5))
-    np.add.at(
-        counts,
-        (
-            (truth.hardware_drift != 0.0) * 1 + (truth.hardware_offset_a[:, 0] != 0.0),
-            np.count_nonzero(np.hstack([truth.drift, truth.offset_a]), axis=1),
-        ),
-        1.0 / 500.0,
-    )
-    prior = known_prior(counts, MAGNITUDE)
-    draws = drawn(rows_of(truth, seed=4), prior)
-    weight, _ = weigh(draws, prior)
-    of_fit, present = weight.sum(axis=(2, 3)), parameters_of(truth) != 0.0
-    best = np.argmax(of_fit, axis=1)
-    confidence = of_fit[np.arange(500), best]
-    hit = (draws.fits.support[np.arange(500), best] == present).all(axis=1)
-    error = np.sqrt(np.sum(confidence * (1.0 - confidence))) / 500.0
-    assert hit.mean() == pytest.approx(confidence.mean(), abs=3.0 * error + 0.005)
-
-
-@pytest.mark.parametrize("of_sensor", [False, True])
-def test_vehicle_of_a_group_belongs_to_it(of_sensor: bool) -> None:
-    share, centre, sd = np.array([[0.3], [0.02], [0.001]])
-    plain = known_prior(paper_prior(2, 0, 1).counts, MAGNITUDE)
-    prior = replace(plain, load_share=0.01, group_share=share, group_centre=centre, group_sd=sd)
-    rows = rows_of(no_faults(3, 2), seed=7, load=np.array([0.0, 0.02, 0.03]))
-    shared = np.append(np.zeros(4), of_sensor)
-    weight, log_evidence = weigh(drawn(rows, prior, shared), prior)
-    of_group = weight[..., 1].sum(axis=(1, 2))
-    assert of_group[0] < 1e-3
-    assert of_group[1] > 0.99
-    assert of_group[2] < 0.01  # ten standard deviations away: a load of its own
-    # A group of zero width at the load: density of the rows there, by the sum of squares
-    fixed = plain_residual(rows.take(slice(1, 2)), np.array([[0, 0, 0, 0, 0, 0, 0.02]]))[0]
-    covariance = rows.covariance[1].copy()
-    covariance[np.ix_([5, 7], [5, 7])] += 0.001**2
-    expected = -0.5 * (fixed @ np.linalg.solve(covariance, fixed) + np.linalg.slogdet(2.0 * np.pi * covariance)[1])
-    expected += np.log(0.3) + prior.log_supports[0, 0]
-    assert log_evidence[1] == pytest.approx(expected, abs=0.05)
 
 
 def test_fault_beside_what_a_group_shares_is_found() -> None:

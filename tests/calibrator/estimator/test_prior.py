@@ -57,14 +57,3 @@ def test_supports_of_every_prior_sum_to_one(K: int) -> None:
 def test_law_of_sparse_faults_is_that_of_the_fleet(K: int, sparsity: float) -> None:
     tally = counted(K, sparsity)
     np.testing.assert_allclose(sparse_counts(tally), tally / tally.sum(), atol=0.02)
-
-
-@BRANCHES
-def test_law_of_a_fleet_without_faults_has_next_to_none_and_of_no_fleet_is_a_law_all_the_same(K: int) -> None:
-    tally = np.zeros((K + 1, 2 * K + 1))
-    assert sparse_counts(tally).sum() == pytest.approx(1.0)
-    tally[0, 0] = 100.0
-    law = sparse_counts(tally)
-    assert law.sum() == pytest.approx(1.0)
-    assert law[0, 0] > 0.98
-    assert (law > 0.0).all(), "nothing is impossible"

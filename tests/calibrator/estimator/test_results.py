@@ -7,6 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from calibrator.errors import FleetError
+from calibrator.estimator.evidence import VehicleEvidence
 from calibrator.estimator.results import (
     MOST_FILES,
     PARTS,
@@ -14,6 +15,7 @@ from calibrator.estimator.results import (
     encode_chunk,
     join_rows,
     left_out_of,
+    part_file,
     read_part,
     read_results,
     read_run,
@@ -22,7 +24,6 @@ from calibrator.estimator.results import (
     write_run,
     written_of,
 )
-from calibrator.estimator.rows import VehicleEvidence
 from calibrator.report.fleet_table import read_fleet_table
 from calibrator.report.overview import overview_of
 from calibrator.summaries.identity import bucket_of
@@ -57,13 +58,11 @@ def vehicle(database: VehicleDatabase, name: str) -> VehicleParameters:
 @pytest.fixture(params=[2, MOST_FILES + 1], ids=["a file each", "in parts"])
 def result(request: pytest.FixtureRequest, tmp_path: Path, database: VehicleDatabase) -> Path:
     """A result of two vehicles, written as one of few or of many."""
-    parts = {}
-    for name in ("v1", "v2"):
-        parts[bucket_of(name, BUCKETS)] = tmp_path / f"{name}.parquet"
-        (tmp_path / f"{name}.parquet").write_bytes(encode_chunk([vehicle(database, name)], {}).parameters)
     folder = tmp_path / "result"
-    folder.mkdir()
-    where = write_parameter_files(folder, parts, vehicles=request.param)
+    (folder / PARTS).mkdir(parents=True)
+    for name in ("v1", "v2"):
+        part_file(folder, bucket_of(name, BUCKETS)).write_bytes(encode_chunk([vehicle(database, name)], {}))
+    where = write_parameter_files(folder, vehicles=request.param)
     assert where == ("params" if request.param == 2 else PARTS)
     assert (folder / "params").exists() == (where == "params")
     write_run(folder, RUN)
@@ -83,8 +82,8 @@ def test_unknown_vehicle_is_named(result: Path, name: str) -> None:
 
 
 def test_vehicle_left_out_is_named_with_its_reason(result: Path, tmp_path: Path) -> None:
-    (tmp_path / "part").write_bytes(encode_chunk([], {"v3": "too short"}).rows)
-    assert join_rows(result, [tmp_path / "part"], {"a log": "unreadable", "v3": "known"}) == 0
+    part_file(result, 15).write_bytes(encode_chunk([], {"v3": "too short"}))
+    assert join_rows(result, {"a log": "unreadable", "v3": "known"}) == 2
     assert left_out_of(result) == {"a log": "unreadable", "v3": "too short"}
     with pytest.raises(FleetError, match=r"no parameters of vehicle 'v3', it was left out: too short"):
         written_of(result, "v3")
@@ -104,7 +103,7 @@ def test_parameter_files_are_written_by_the_command(
 def test_chunk_keeps_evidence_and_digest_of_the_drives(tmp_path: Path, database: VehicleDatabase) -> None:
     evidence = VehicleEvidence(value=[1.0, None], sd=[0.5, None], explained=[1.0, 2.0])
     chunk = encode_chunk([vehicle(database, "v1")], {}, drives={"v1": "abc"}, evidence={"v1": evidence})
-    (tmp_path / "part").write_bytes(chunk.parameters)
+    (tmp_path / "part").write_bytes(chunk)
     (written,) = read_part(tmp_path / "part").values()
     assert (written.drives, written.evidence) == ("abc", evidence)
 
@@ -112,8 +111,9 @@ def test_chunk_keeps_evidence_and_digest_of_the_drives(tmp_path: Path, database:
 def test_parameters_that_cannot_be_written_leave_their_vehicle_out(tmp_path: Path, database: VehicleDatabase) -> None:
     good = vehicle(database, "v1")
     bad = replace(good, vehicle="v2", branches={"battery": replace(good.branches["battery"], offset_a=float("nan"))})
-    (tmp_path / "part").write_bytes(encode_chunk([bad, good], {}).rows)
-    assert join_rows(tmp_path, [tmp_path / "part"], {}) == 1
+    (tmp_path / PARTS).mkdir()
+    part_file(tmp_path, 0).write_bytes(encode_chunk([bad, good], {}))
+    assert join_rows(tmp_path, {}) == 1
     (reason,) = left_out_of(tmp_path).values()
     assert reason.endswith("; look at its recordings")
 

@@ -8,9 +8,9 @@ import pytest
 
 from calibrator.drive import Array, Mask
 from calibrator.estimator.decision import RowsEstimate, estimate_rows
+from calibrator.estimator.evidence import EvidenceRows
 from calibrator.estimator.fleet_estimate import HARM_LIMIT
-from calibrator.estimator.learning import learn_laws
-from calibrator.estimator.rows import EvidenceRows
+from calibrator.estimator.learning import learn_fault_models
 from calibrator.faults import Faults
 from calibrator.score import harmed, recovered
 from tests.calibrator.estimator.simulated_drives import no_faults
@@ -28,7 +28,7 @@ def moments(rows: EvidenceRows) -> dict[str, Any]:
 def estimated(faults: Faults, *, seed: int, load: Array | float = 0.0) -> tuple[RowsEstimate, Faults]:
     """Estimate, and what of it would be deployed."""
     rows = rows_of(faults, seed=seed, load=load)
-    found = estimate_rows(rows, learn_laws(rows, feed=0), feed=0, **moments(rows))
+    found = estimate_rows(rows, learn_fault_models(rows, feed=0), feed=0, **moments(rows))
     deployed = found.identifiable & (found.harm_probability < HARM_LIMIT)
     none = no_faults(*faults.drift.shape)
     return found, replace(none, drift=found.drift * deployed, offset_a=found.offset_a * deployed)
@@ -95,12 +95,12 @@ def test_standard_deviations_are_those_of_the_errors() -> None:
 @pytest.mark.parametrize("K", [2, 3])
 def test_vehicle_is_estimated_alike_to_the_bit_alone_and_in_any_fleet(K: int) -> None:
     rows = rows_of(random_faults(7, vehicles=300, branches=K, sparsity=70.0), seed=7)
-    laws, drives = learn_laws(rows.take(slice(0, 40)), feed=0), moments(rows)
-    together = estimate_rows(rows, laws, feed=0, **drives)
+    models, drives = learn_fault_models(rows.take(slice(0, 40)), feed=0), moments(rows)
+    together = estimate_rows(rows, models, feed=0, **drives)
     for j in (0, 171, 299):
         one = slice(j, j + 1)
         own = {"mean": drives["mean"][one], "mean_square": drives["mean_square"][one], "usual": drives["usual"]}
-        alone = estimate_rows(rows.take(one), laws, feed=0, **own)
+        alone = estimate_rows(rows.take(one), models, feed=0, **own)
         for name, values in vars(alone).items():
             if isinstance(values, np.ndarray):
                 np.testing.assert_array_equal(values[0], getattr(together, name)[j], err_msg=name)

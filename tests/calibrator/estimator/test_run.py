@@ -21,11 +21,10 @@ import pytest
 
 from calibrator.errors import FleetError
 from calibrator.estimator import run
-from calibrator.estimator.fleet_task import FleetTask, learn_task
-from calibrator.estimator.results import ChunkResult, read_results, read_run
-from calibrator.estimator.run import calibrate_bucket, read_sample, take_census
+from calibrator.estimator.fleet_task import NOT_THERE, FleetTask, calibrate_bucket, learn_task
+from calibrator.estimator.results import read_results, read_run, unfinished_run
+from calibrator.estimator.run import read_sample, take_census
 from calibrator.estimator.settings import CalibrationSettings
-from calibrator.estimator.unfinished import unfinished_run
 from calibrator.faults import Faults
 from calibrator.files.parameter_files import RunIdentity
 from calibrator.files.storage import open_storage
@@ -85,17 +84,16 @@ def task(store: SummaryStore, database: VehicleDatabase) -> FleetTask:
     return learn_task(sample, settings, {}, branches=BRANCHES, identity=identity, fleet_size=VEHICLES)[0]
 
 
-def texts(chunk: ChunkResult) -> dict[str, bytes]:
-    table = pq.read_table(pa.BufferReader(chunk.parameters)).to_pylist()
-    return {row["vehicle"]: row["parameters"].encode() for row in table}
+def texts(chunk: bytes) -> dict[str, bytes]:
+    return {row["vehicle"]: row["parameters"].encode() for row in rows(chunk) if row["parameters"] is not None}
 
 
-def rows(chunk: ChunkResult) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = pq.read_table(pa.BufferReader(chunk.rows)).to_pylist()
+def rows(chunk: bytes) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = pq.read_table(pa.BufferReader(chunk)).to_pylist()
     return found
 
 
-def left_out(chunk: ChunkResult) -> dict[str, str]:
+def left_out(chunk: bytes) -> dict[str, str]:
     return {row["vehicle"]: row["reason"] for row in rows(chunk) if row["branch"] is None}
 
 
@@ -143,16 +141,16 @@ def test_result_is_the_same_for_any_number_of_workers(store: SummaryStore, resul
 
 
 def test_killed_run_goes_on_where_it_stopped(store: SummaryStore, result: Path, tmp_path: Path) -> None:
-    out, chunks = tmp_path / "out", tmp_path / ".out.unfinished" / "chunks"
+    out, chunks = tmp_path / "out", tmp_path / ".out.unfinished" / "result" / "parameters"
     line = command("calibrate", store.url, "--layout", LAYOUT, "--out", out, "--workers", 1)
     written: dict[str, int] = {}
     for wanted in (1, 6):
         with subprocess.Popen(line, stderr=subprocess.PIPE, env=ENVIRONMENT) as process:
             until = time.monotonic() + 120.0
-            while len(list(chunks.glob("*.rows.parquet"))) < wanted and time.monotonic() < until:
+            while len(list(chunks.glob("[0-9]*.parquet"))) < wanted and time.monotonic() < until:
                 time.sleep(0.002)
             process.send_signal(signal.SIGKILL)
-        found = {path.name: path.stat().st_mtime_ns for path in chunks.glob("*.rows.parquet")}
+        found = {path.name: path.stat().st_mtime_ns for path in chunks.glob("[0-9]*.parquet")}
         assert len(found) >= wanted
         assert written.items() <= found.items(), "chunks that are done are not made again"
         assert not out.exists()
@@ -163,9 +161,9 @@ def test_killed_run_goes_on_where_it_stopped(store: SummaryStore, result: Path, 
 
 def test_chunks_of_other_settings_are_not_used(store: SummaryStore, result: Path, tmp_path: Path) -> None:
     unfinished = tmp_path / ".out.unfinished"
-    (unfinished / "chunks").mkdir(parents=True)
+    (unfinished / "result" / "parameters").mkdir(parents=True)
     (unfinished / "plan").write_text("another plan\n1999")
-    (unfinished / "chunks" / "00000.rows.parquet").write_bytes(b"nonsense")
+    (unfinished / "result" / "parameters" / "00000.parquet").write_bytes(b"nonsense")
     assert calibrate(store.url, tmp_path / "out", "--workers", 1).returncode == 0
     assert contents(tmp_path / "out") == contents(result)
 
@@ -179,7 +177,11 @@ def test_second_run_to_the_same_place_is_refused(store: SummaryStore, tmp_path: 
 
 def test_only_computed_work_is_kept(store: SummaryStore, tmp_path: Path) -> None:
     out, folder = tmp_path / "out", tmp_path / ".out.unfinished"
-    for name, kept in (("chunks/00003.rows.parquet", True), ("summaries/buckets/00003.parquet", True), ("plan", False)):
+    for name, kept in (
+        ("result/parameters/00003.parquet", True),
+        ("summaries/buckets/00003.parquet", True),
+        ("plan", False),
+    ):
         with suppress(FleetError), unfinished_run(out):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).touch()
@@ -412,9 +414,9 @@ def test_internal_error_is_named_and_ends_the_command_with_70(
 # Since an earlier result
 
 
-def earlier_result(folder: Path, chunk: ChunkResult, bucket: int) -> Path:
+def earlier_result(folder: Path, chunk: bytes, bucket: int) -> Path:
     (folder / "parameters").mkdir(parents=True)
-    (folder / "parameters" / f"{bucket:05d}.parquet").write_bytes(chunk.parameters)
+    (folder / "parameters" / f"{bucket:05d}.parquet").write_bytes(chunk)
     return folder
 
 
@@ -497,7 +499,7 @@ def test_earlier_vehicle_that_the_store_lacks_is_named(store: SummaryStore, task
     del records[name]
     other = rewritten(store, tmp_path / "s", bucket, records)
     reasons = left_out(calibrate_bucket(bucket, store=other, task=task, previous=previous))
-    assert reasons == {name: run.NOT_THERE}
+    assert reasons == {name: NOT_THERE}
 
 
 def test_earlier_result_that_cannot_be_read_is_refused(store: SummaryStore, task: FleetTask, tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ import pytest
 from msgspec.structs import replace as changed
 
 from calibrator.drive import Array
+from calibrator.estimator.evidence import EvidenceRows, evidence_names, reported_evidence
 from calibrator.estimator.fleet_estimate import FleetEstimate
-from calibrator.estimator.rows import EvidenceRows, evidence_names, reported_evidence
 from calibrator.estimator.vehicle_report import deciding_evidence, explained, impossible
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import BranchParameters, Explanation, Finding, HardwareFault

@@ -5,8 +5,16 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from calibrator.estimator.results import RunRecord, encode_chunk, join_rows, write_parameter_files, write_run
-from calibrator.estimator.rows import VehicleEvidence, evidence_names
+from calibrator.estimator.evidence import VehicleEvidence, evidence_names
+from calibrator.estimator.results import (
+    PARTS,
+    RunRecord,
+    encode_chunk,
+    join_rows,
+    part_file,
+    write_parameter_files,
+    write_run,
+)
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import (
     BranchParameters,
@@ -141,16 +149,12 @@ def write_result(
     created: str = "2026-01-01T00:00:00+00:00",
 ) -> Path:
     """A result folder as ``calibrator calibrate`` writes it."""
-    folder.mkdir()
+    (folder / PARTS).mkdir(parents=True)
     told = {item.vehicle: evidence_of(item) for item in vehicles} if evidence else {}
-    chunk = encode_chunk(vehicles, left_out or {}, moved=moved or {}, evidence=told)
-    rows, parameters = folder / "rows", folder / "part"
-    rows.write_bytes(chunk.rows)
-    parameters.write_bytes(chunk.parameters)
-    join_rows(folder, [rows], {})
-    write_parameter_files(folder, {0: parameters}, vehicles=len(vehicles))
-    rows.unlink()
-    parameters.unlink()
+    part = encode_chunk(vehicles, left_out or {}, moved=moved or {}, evidence=told)
+    part_file(folder, 0).write_bytes(part)
+    join_rows(folder, {})
+    write_parameter_files(folder, vehicles=len(vehicles))
     run = run_of(len(vehicles), left_out or {}, method=method, evidence=evidence)
     write_run(folder, replace(run, created=created))
     return folder

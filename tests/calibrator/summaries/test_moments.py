@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
-from calibrator.estimator.moments import stack_summaries
+from calibrator.estimator.evidence import stack_summaries
 from calibrator.summaries.filter_bank import FilterBank, low_passes
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
 from calibrator.summaries.summariser import Summariser, summarise

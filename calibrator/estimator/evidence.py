@@ -1,0 +1,907 @@
+"""Evidence of a fleet: what its drives say of each vehicle, as Gaussian rows that are linear in the faults.
+
+    second moments of drives (FleetMoments)
+      -> fleet model (M7): the ideal currents of identical vehicles over their inputs (fit_fleet_model)
+      -> slopes and intercepts over it (15), and each vehicle's own junction regression (M8)
+      -> evidence rows (M9) to (M11) with their covariance (collect_rows)
+
+Every step is done for all vehicles at once. What each block of a drive moves an estimate by (its influence) gives the
+covariance, correlation in time and heteroscedasticity included [1]_, also between regressions on the same blocks.
+
+With lambda_k = log(1 + d_k), eta = log(1 + d_h) and omega_k = o_k / (1 + d_k), equations (11), (13) and (15) of [2]_
+and the junction's sum of currents sum_k (i_m,k - o_k) / (1 + d_k) = l (l: load that no branch measures) become
+
+    relative rows                                             constant rows, in fractions of full scale
+    log a_k                  = lambda_k + eta + m_k           b_k / (1 + d_k)   = o_h,k + omega_k + n_k
+    log(-g_k), k > 1         = lambda_1 - lambda_k + q_k      c / (1 + d_1)     = sum_k omega_k + l
+    log of a bench reading   = lambda_k                       offset reading_k / (1 + d_k) = omega_k
+
+a, b are slopes and intercepts over the fleet model; g, c those of the first measured current over the others. m, n, q
+are what a vehicle and its drives differ from the fleet without any fault: the model spread. An unknown row has the
+value 0 and a variance of :data:`UNKNOWN_VARIANCE`.
+
+b and c are where lines meet zero. If a ratio is wrong, its line pivots about the mean of its data, which is known far
+better, and b or c follows: (M10). The covariance holds this to first order, the residuals of an explanation (M11)
+exactly: :func:`calibrator.estimator.posterior.row_residuals`.
+
+.. [1] H. White, "A heteroskedasticity-consistent covariance matrix estimator", Econometrica 48 (1980) 817-838.
+.. [2] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import isfinite
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from calibrator.drive import Array, Mask
+from calibrator.errors import FleetError
+from calibrator.faults import Index
+from calibrator.summaries.moments import DriveSummary, common_bank
+
+__all__ = [
+    "UNKNOWN_VARIANCE",
+    "Blocks",
+    "EvidenceRows",
+    "FleetMoments",
+    "ParameterPlaces",
+    "RowPlaces",
+    "VehicleEvidence",
+    "VehicleRegressions",
+    "collect_rows",
+    "densest_clusters",
+    "evidence_names",
+    "fit_fleet_model",
+    "junction_regression",
+    "products",
+    "regress_on_fleet",
+    "regress_vehicles",
+    "reported_evidence",
+    "row_design",
+    "stack_summaries",
+]  # fmt: skip
+
+REGRESSION_ROUNDS = 3
+"""The residual's variance rho depends on the estimate and the estimate, weakly, on rho. [1]"""
+LEAST_RHO = 1e-9
+"""Of the mean square of y: a regression that fits exactly. [1]"""
+LEAST_VARIANCE = 1e-12
+"""Of y where it is zero throughout, so that the prior stays: below a microampere, in any unit that is used."""
+TOO_FEW = 4.0
+"""Blocks from which no variance can be estimated: two for slope and intercept, two because the error of the variance
+itself makes the tails heavier than normal."""
+SINGULAR = 1e-12
+"""Eigenvalue over the largest one below which a direction counts as unknown. [1]"""
+GAIN_SD = 0.4
+"""Prior deviation of a gain ratio from -1: no running sensor is farther off. [1]"""
+NOISE_ROUNDS = 3
+"""The bound on the noise depends on the gains, and they on it; three rounds settle it. [1]"""
+MOST_NOISE = 0.9
+"""Largest share of a current's variance that is taken for noise. [1]"""
+LEAST_WEIGHT = 0.1
+"""Of a branch in the junction sum, where its share of the residual is bounded. [1]"""
+MODEL_ROUNDS = 12
+"""Of alternating least squares; slopes change by less than 1e-4 after eight on all fleets tried. [1]"""
+RIDGE = 1e-9
+"""On the normalised moments of the inputs: an input that hardly varies gets no read-out."""
+SLOPE_SD = 0.4
+"""Prior deviation of a slope from 1: a branch that hardly moves counts as faultless. [1]"""
+LEAST_SLOPE_SD = 1e-5
+"""Of slopes and intercepts where a model fits exactly. [1], [A]"""
+MOST_VARIATION = 100.0
+"""Deviation of an input over the fleet's median deviation from which on a vehicle has another unit there. [1]"""
+TINY_A2 = 1e-12
+"""Of a fleet that stands still. [A^2]"""
+MOST_CENTRES = 200
+SPREADS = 12
+SHARE_STEPS = 8
+MARGIN = 0.1
+"""The background reaches beyond the values by this share of their range. [1]"""
+SD_OF_RANGE = 9.0
+"""Range of the background over the deviation of its Gaussian half, where faults say how wide it is. [1]"""
+UNKNOWN_VARIANCE = 100.0
+"""Of an unknown row: ten times full scale, or a factor of 20 000. [1]"""
+LEAST_GAIN = 0.3
+"""Slopes and gain ratios below are no sensor's, but those of a branch that hardly moved. [1]"""
+FEWEST_BLOCKS = 4
+"""Of a vehicle; from fewer no variance can be estimated."""
+FLEET_BLOCKS = 20.0
+"""Weight of the fleet's usual correlation of rows against that of one vehicle, in blocks."""
+LEAST_SD = np.array([5e-5, 1e-5])
+"""Least deviation of relative and constant rows: resolution of the signals and of their interpolation. [1]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blocks:
+    """Which of B blocks, stacked vehicle after vehicle, belong to which of N vehicles.
+
+    Attributes
+    ----------
+    count : ndarray of int of shape (N,)
+        Number of blocks of each vehicle, at least one.
+    vehicle : ndarray of int of shape (B,)
+        Vehicle of each block.
+    """
+
+    count: NDArray[np.int64]
+    vehicle: NDArray[np.int64]
+
+    @classmethod
+    def of_lengths(cls, lengths: Sequence[int]) -> "Blocks":
+        """Make the blocks of vehicles that have so many each."""
+        count = np.asarray(lengths, np.int64)
+        return cls(count=count, vehicle=np.repeat(np.arange(len(count)), count))
+
+    def total(self, values: Array) -> Array:
+        """Sums over the blocks of each vehicle, shape (N, ...) of (B, ...); the same to the bit beside any others."""
+        first = np.cumsum(self.count) - self.count
+        return np.asarray(np.add.reduceat(np.ascontiguousarray(values), first, axis=0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetMoments:
+    """Moments of N vehicles with M inputs and K branches in B blocks.
+
+    Attributes
+    ----------
+    moments : ndarray of shape (B, M + K + 1, M + K + 1)
+        Sums of products of (inputs, measured currents [A], 1), as in a
+        :class:`~calibrator.summaries.moments.DriveSummary`, stacked vehicle after vehicle.
+    noise_a2 : ndarray of shape (B, K)
+        White noise of each measured current. [A^2]
+    blocks : Blocks
+        Which blocks belong to which vehicle.
+    branches : int
+        Number of branches K.
+    """
+
+    moments: Array
+    noise_a2: Array
+    blocks: Blocks
+    branches: int
+
+    def __len__(self) -> int:
+        return len(self.blocks.count)
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs M."""
+        return int(self.moments.shape[1]) - self.branches - 1
+
+    @cached_property
+    def mean(self) -> Array:
+        """Mean products of (inputs, measured currents, 1) over all samples of a vehicle, shape (N, p, p)."""
+        total = self.blocks.total(self.moments)
+        return np.asarray(total / total[:, -1:, -1:])
+
+    @property
+    def mean_a(self) -> Array:
+        """Mean measured currents, shape (N, K). [A]"""
+        return self.mean[:, -1, self.inputs : -1]
+
+    @property
+    def mean_square_a2(self) -> Array:
+        """Mean squares of the measured currents, shape (N, K). [A^2]"""
+        return np.diagonal(self.mean, axis1=1, axis2=2)[:, self.inputs : -1]
+
+    @property
+    def variance_a2(self) -> Array:
+        """Variance of the measured currents, which no offset changes, shape (N, K). [A^2]"""
+        return np.asarray(self.mean_square_a2 - self.mean_a**2)
+
+
+def stack_summaries(summaries: Sequence[DriveSummary], order: Sequence[int] | None = None) -> FleetMoments:
+    """Stack the summaries of a fleet.
+
+    Parameters
+    ----------
+    summaries : sequence of DriveSummary
+        Of N vehicles, at least one, with the same inputs and branches.
+    order : sequence of int or None
+        Branches to take, in this order; None: all in theirs.
+
+    Returns
+    -------
+    FleetMoments
+        Without extra columns.
+
+    Raises
+    ------
+    DriveError
+        If the summaries were made with different filter banks.
+    """
+    common_bank(summaries)
+    M, K = summaries[0].inputs, summaries[0].branches
+    chosen = list(range(K)) if order is None else list(order)
+    columns = np.array([*range(M), *(M + k for k in chosen), M + K])
+    return FleetMoments(
+        moments=np.concatenate([summary.moments for summary in summaries])[:, columns[:, None], columns],
+        noise_a2=np.concatenate([summary.noise_a2 for summary in summaries])[:, chosen],
+        blocks=Blocks.of_lengths([len(summary.moments) for summary in summaries]),
+        branches=len(chosen),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleRegressions:
+    """The same regression of N vehicles.
+
+    Attributes
+    ----------
+    estimate : ndarray of shape (N, p)
+        theta of each vehicle.
+    influence : ndarray of shape (B, p)
+        What each block moves the estimate of its vehicle by; the sum of their outer products is the covariance of the
+        sampling error.
+    prior_covariance : ndarray of shape (N, p, p)
+        Part of the covariance that is due to the prior.
+    blocks : Blocks
+        Which blocks belong to which vehicle.
+    """
+
+    estimate: Array
+    influence: Array
+    prior_covariance: Array
+    blocks: Blocks
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations, shape (N, p)."""
+        prior = np.diagonal(self.prior_covariance, axis1=1, axis2=2)
+        return np.asarray(np.sqrt(self.blocks.total(self.influence**2) + prior))
+
+
+def regress_vehicles(
+    gram: Array, right: Array, power: Array, blocks: Blocks, *, prior_mean: Array, prior_precision: Array
+) -> VehicleRegressions:
+    """Regress y on z in each of N vehicles.
+
+    Parameters
+    ----------
+    gram : ndarray of shape (B, p, p)
+        Sums of z z^T per block.
+    right : ndarray of shape (B, p)
+        Sums of z y per block.
+    power : ndarray of shape (N,)
+        Mean square of y over all blocks of a vehicle: the scale below which a residual is rounding.
+    blocks : Blocks
+        Which blocks belong to which vehicle.
+    prior_mean, prior_precision : ndarray of shape (p,)
+        Independent Gaussian prior; precision zero where there is none.
+
+    Returns
+    -------
+    VehicleRegressions
+        In the units of y over z.
+    """
+    count, p = blocks.count, right.shape[1]
+    Z, y = blocks.total(gram), blocks.total(right)
+    least = np.maximum(LEAST_RHO * power, LEAST_VARIANCE)
+    rho = least
+    for _ in range(REGRESSION_ROUNDS):
+        # (Z^T Z + rho P) theta = Z^T y + rho P theta_0, by the pseudo-inverse of the matrix scaled to a diagonal of one
+        matrix = Z + rho[:, None, None] * np.diag(prior_precision)
+        scale = 1.0 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), np.finfo(float).tiny))
+        square = scale[:, :, None] * scale[:, None, :]
+        inverse = np.linalg.pinv(matrix * square, rcond=SINGULAR, hermitian=True) * square
+        estimate = products(inverse, y + rho[:, None] * prior_precision * prior_mean)
+        scores = right - products(gram, estimate[blocks.vehicle])
+        influence = products(inverse[blocks.vehicle], scores)
+        # long-run variance of the residual: its variance times by how much neighbouring samples repeat each other
+        rho = np.maximum(blocks.total(np.sum(scores * influence, axis=1)) / p, least)
+    influence -= (blocks.total(influence) / count[:, None])[blocks.vehicle]
+    widened = np.sqrt(np.maximum(count, TOO_FEW + 1.0) / np.maximum(count - TOO_FEW, 1.0))
+    return VehicleRegressions(
+        estimate=estimate,
+        influence=influence * widened[blocks.vehicle][:, None],
+        prior_covariance=rho[:, None, None] ** 2 * (inverse * prior_precision) @ inverse,
+        blocks=blocks,
+    )
+
+
+def products(matrices: Array, vectors: Array) -> Array:
+    """Each matrix times its vector, shape (N, q) of (N, q, p) and (N, p).
+
+    The same to the bit for any N, which neither matmul nor einsum promise: these choose their way by the whole shape.
+    """
+    return np.asarray(np.sum(np.ascontiguousarray(matrices) * vectors[:, None, :], axis=2))
+
+
+def junction_regression(fleet: FleetMoments) -> VehicleRegressions:
+    """Regress the first measured current on the others.
+
+    Parameters
+    ----------
+    fleet : FleetMoments
+        Of N vehicles; the first branch should be the one that moves most.
+
+    Returns
+    -------
+    VehicleRegressions
+        Of (g_2 .. g_K [1], c [A]).
+    """
+    M, K, N = fleet.inputs, fleet.branches, len(fleet)
+    z = np.array([*range(M + 1, M + K), M + K])
+    gram, right = fleet.moments[:, z[:, None], z], fleet.moments[:, z, M]
+    samples, currents = fleet.moments[:, -1, -1], fleet.mean[:, M:, M:]
+    bound_a2 = fleet.blocks.total(fleet.noise_a2) / fleet.blocks.count[:, None]
+    bound_a2 = np.minimum(bound_a2, MOST_NOISE * fleet.variance_a2)
+    noise_a2, others = np.zeros_like(bound_a2), range(K - 1)
+    for _ in range(NOISE_ROUNDS):
+        clean = gram.copy()
+        clean[:, others, others] -= samples[:, None] * noise_a2[fleet.blocks.vehicle, 1:]
+        fit = regress_vehicles(
+            clean,
+            right,
+            currents[:, 0, 0],
+            fleet.blocks,
+            prior_mean=np.append(-np.ones(K - 1), 0.0),
+            prior_precision=np.append(np.full(K - 1, GAIN_SD**-2), 0.0),
+        )
+        sums = np.concatenate([np.ones((N, 1)), -fit.estimate], axis=1)  # i_m,1 - sum g_k i_m,k - c, as weights
+        residual_a2 = np.maximum(np.sum(sums * products(currents, sums), axis=1), 0.0)
+        noise_a2 = _shared_noise_a2(residual_a2, bound_a2, np.maximum(sums[:, :K] ** 2, LEAST_WEIGHT))
+    return fit
+
+
+def _shared_noise_a2(residual_a2: Array, bound_a2: Array, weight: Array) -> Array:
+    """Noise of each current (N, K), equal up to its bound, whose weighted sum is the residual (N,) at most. [A^2]"""
+    order = np.argsort(bound_a2, axis=1, kind="stable")
+    bound, weight = np.take_along_axis(bound_a2, order, axis=1), np.take_along_axis(weight, order, axis=1)
+    # level: noise of the currents from here on, if all before are at their bounds (water filling)
+    below = np.cumsum(weight * bound, axis=1) - weight * bound
+    level = (residual_a2[:, None] - below) / np.cumsum(weight[:, ::-1], axis=1)[:, ::-1]
+    reached: Mask = np.less_equal(level, bound)
+    first = np.take_along_axis(level, np.argmax(reached, axis=1)[:, None], axis=1)
+    return np.asarray(np.where(reached.any(axis=1, keepdims=True), np.minimum(bound_a2, first), bound_a2))
+
+
+def fit_fleet_model(fleet: FleetMoments) -> Array:
+    """Learn the fleet model.
+
+    Parameters
+    ----------
+    fleet : FleetMoments
+        Of the N vehicles to learn from.
+
+    Returns
+    -------
+    ndarray of shape (M + 1, K)
+        Read-out: ideal currents per unit of each input, and the constant, with the scale and zero of the vehicles that
+        agree; each row sums to zero. [A]
+    """
+    M, K = fleet.inputs, fleet.branches
+    u = [*range(M), M + K]  # columns of the inputs and the constant
+    centred = fleet.mean - fleet.mean[:, :, -1:] * fleet.mean[:, -1:, :]
+    variance = np.diagonal(centred, axis1=1, axis2=2)[:, :M]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # an input that varies in no vehicle has no median
+        median = np.nanmedian(np.where(variance > 0.0, variance, np.nan), axis=0)
+    usual = ~(variance > MOST_VARIATION**2 * median).any(axis=1)
+    centred = centred[usual]
+    slopes = np.ones((len(fleet), K))
+    for _ in range(MODEL_ROUNDS):
+        # Read-outs by least squares about each vehicle's own means, as it has an intercept of its own; all vehicles
+        # count alike, however long they drove. The constants stay zero.
+        read_out = np.zeros((M + 1, K))
+        for k, a in enumerate(slopes[usual].T):
+            gram = np.einsum("n,npq->pq", a**2, centred[:, :M, :M])
+            scale = np.where(np.diag(gram) > 0.0, np.sqrt(np.abs(np.diag(gram))), 1.0)
+            normalised = gram / np.outer(scale, scale) + RIDGE * np.eye(M)
+            read_out[:M, k] = np.linalg.solve(normalised, a @ centred[:, :M, M + k] / scale) / scale
+        fits = regress_on_fleet(fleet, read_out)
+        sd = [np.maximum(fit.sd, LEAST_SLOPE_SD) for fit in fits]
+        scale, zero = (
+            np.array([densest_clusters(fit.estimate[:, i], e[:, i])[0].centre for fit, e in zip(fits, sd, strict=True)])
+            for i in (0, 1)
+        )
+        read_out = read_out * scale
+        read_out[-1] += zero
+        slopes = np.stack([fit.estimate[:, 0] for fit in fits], axis=1) / scale
+    # Ideal currents sum to zero, whatever the inputs. The excess of an input is shared by the branches as their
+    # currents' variance. The excess of the constants is the mean load that no branch measures: it is taken from the
+    # source, as it does not grow with others.
+    mean = fleet.mean.mean(axis=0)
+    mean_a = mean[-1, u] @ read_out
+    variance_a2 = np.diag(read_out.T @ mean[np.ix_(u, u)] @ read_out) - mean_a**2
+    excess = read_out.sum(axis=1)
+    read_out = read_out - np.outer(np.append(excess[:-1], 0.0), variance_a2 / max(variance_a2.sum(), TINY_A2))
+    read_out[-1, int(np.argmax(mean_a))] -= excess[-1]
+    return read_out
+
+
+def regress_on_fleet(fleet: FleetMoments, read_out: Array) -> list[VehicleRegressions]:
+    """Slope and intercept (15) of each branch of each vehicle over the fleet model on its own drives.
+
+    Parameters
+    ----------
+    fleet : FleetMoments
+        Of N vehicles.
+    read_out : ndarray of shape (M + 1, K)
+        Of the fleet model. [A]
+
+    Returns
+    -------
+    list of K VehicleRegressions
+        Of (a_k [1], b_k [A]).
+    """
+    M, K = fleet.inputs, fleet.branches
+    u = np.array([*range(M), M + K])
+    gram = np.ascontiguousarray(fleet.moments[:, u[:, None], u])
+    fits = []
+    for k in range(K):
+        z = np.stack([read_out[:, k], np.append(np.zeros(M), 1.0)])  # modelled current and constant
+        fits.append(
+            regress_vehicles(
+                z @ gram @ z.T,
+                products(np.broadcast_to(z, (len(gram), 2, M + 1)), fleet.moments[:, u, M + k]),
+                fleet.mean[:, M + k, M + k],
+                fleet.blocks,
+                prior_mean=np.array([1.0, 0.0]),
+                prior_precision=np.array([SLOPE_SD**-2, 0.0]),
+            )
+        )
+    return fits
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cluster:
+    """One cluster.
+
+    Attributes
+    ----------
+    centre, spread : float
+        Mean and standard deviation of its members, sampling error apart.
+    share : float
+        Share of the values in it. [1]
+    """
+
+    centre: float
+    spread: float
+    share: float
+
+
+def densest_clusters(
+    values: Array, sd: Array, *, most: int = 1, farthest: float = np.inf, widest: float = 0.0
+) -> list[Cluster]:
+    """Find the most likely clusters (M15), the best first; later ones lie apart from those before.
+
+    Values are taken as a mixture of one Gaussian cluster (centre c, spread s, each value with its own sampling error)
+    and a broad background. The most likely of a grid of centres and spreads is chosen. Unlike the mean and the median
+    the result does not need a symmetric fleet, nor that most vehicles are without faults.
+
+    Parameters
+    ----------
+    values, sd : ndarray of shape (N,)
+        Values, and standard deviations of their sampling errors, positive.
+    most : int
+        Number of clusters wanted.
+    farthest : float
+        Largest magnitude of a centre.
+    widest : float
+        Range of what faults can make of the values: the background is at least as wide, so that values that all agree
+        are a cluster too.
+
+    Returns
+    -------
+    list of Cluster
+        At least one, unless no value is near enough; fewer than wanted if there are not so many.
+    """
+    near = values[np.abs(values) <= farthest]
+    if not near.size:
+        return []
+    extent, narrowest = float(np.ptp(values)), float(np.median(sd))
+    if extent <= narrowest:
+        return [Cluster(centre=float(np.median(near)), spread=0.0, share=1.0)]
+    centres = np.unique(np.quantile(near, np.linspace(0.0, 1.0, min(len(near), MOST_CENTRES)), method="nearest"))
+    spreads = np.geomspace(narrowest / 4.0, max(extent / 4.0, narrowest), SPREADS)
+    wide, sd_wide = max(extent * (1.0 + 2.0 * MARGIN), widest), max(values.std(), widest / SD_OF_RANGE)
+    background = 0.5 * norm.pdf(values, values.mean(), sd_wide) + 0.5 / wide  # half Gaussian, half uniform
+    gain, share = np.empty((2, SPREADS, len(centres)))
+    for s, spread in enumerate(spreads):
+        variance = sd**2 + spread**2
+        density = np.exp(-0.5 * (values - centres[:, None]) ** 2 / variance) / np.sqrt(2.0 * np.pi * variance)
+        kappa = np.full((len(centres), 1), 0.5)  # share of the cluster, by expectation maximisation
+        for _ in range(SHARE_STEPS):
+            inside = kappa * density
+            kappa = np.mean(inside / (inside + (1.0 - kappa) * background), axis=1, keepdims=True)
+        gain[s] = np.sum(np.log(kappa * density / background + (1.0 - kappa)), axis=1)
+        share[s] = kappa[:, 0]
+    clusters: list[Cluster] = []
+    while len(clusters) < most and np.isfinite(gain).any():
+        s, c = divmod(int(np.argmax(gain)), len(centres))
+        variance = sd**2 + spreads[s] ** 2
+        members = np.abs(values - centres[c]) <= 3.0 * np.sqrt(variance)
+        centre = float(np.average(values, weights=members / variance))
+        clusters.append(Cluster(centre=centre, spread=float(spreads[s]), share=float(share[s, c])))
+        gain[:, np.abs(centres - centre) <= 3.0 * (spreads[s] + narrowest)] = -np.inf
+    return clusters
+
+
+class RowPlaces:
+    """Where an array of 5K rows holds each kind of row, for K branches.
+
+    Attributes
+    ----------
+    slopes : slice
+        K, log a. [1]
+    ratios : slice
+        K - 1, log(-g) of every branch but the first. [1]
+    gain_reads : slice
+        K, bench readings of log(1 + d). [1]
+    intercepts : slice
+        K, b, in fractions of full scale.
+    junction : int
+        c, in fractions of full scale.
+    offset_reads : slice
+        K, readings of the offsets, in fractions of full scale.
+    relative, constant : slice
+        The 3K - 1 rows of the first three kinds, and the 2K + 1 of the others.
+    measured : ndarray of int
+        The 3K rows that drives show; the others are readings.
+    """
+
+    def __init__(self, branches: int) -> None:
+        K = branches
+        self.slopes, self.ratios, self.gain_reads = slice(0, K), slice(K, 2 * K - 1), slice(2 * K - 1, 3 * K - 1)
+        self.intercepts, self.junction, self.offset_reads = slice(3 * K - 1, 4 * K - 1), 4 * K - 1, slice(4 * K, 5 * K)
+        self.relative, self.constant = slice(0, 3 * K - 1), slice(3 * K - 1, 5 * K)
+        self.measured: NDArray[np.int64] = np.r_[self.slopes, self.ratios, self.intercepts, self.junction]
+
+    def slope(self, branch: int) -> int:
+        """Row of the slope of a branch, counted from 0."""
+        return int(self.slopes.start) + branch
+
+    def ratio(self, branch: int) -> int:
+        """Row of the gain ratio of a branch, counted from 0; the first branch has none."""
+        return int(self.ratios.start) + branch - 1
+
+    def intercept(self, branch: int) -> int:
+        """Row of the intercept of a branch, counted from 0."""
+        return int(self.intercepts.start) + branch
+
+
+class ParameterPlaces:
+    """Where an array of 3K + 1 parameters holds each kind, for K branches, in the symbols above.
+
+    Attributes
+    ----------
+    eta : int
+        Hardware gain. [1]
+    gains : slice
+        lambda of K sensors. [1]
+    hardware_offsets : slice
+        o_h of all branches but the last, which is minus their sum, in fractions of full scale.
+    offsets : slice
+        omega of K sensors, in fractions of full scale.
+    load : int
+        l, in fractions of full scale.
+    """
+
+    def __init__(self, branches: int) -> None:
+        K = branches
+        self.eta, self.load = 0, 3 * K
+        self.gains, self.hardware_offsets, self.offsets = slice(1, K + 1), slice(K + 1, 2 * K), slice(2 * K, 3 * K)
+
+    def offset(self, branch: int) -> int:
+        """Place of omega of the sensor of a branch, counted from 0."""
+        return int(self.offsets.start) + branch
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvidenceRows:
+    """Evidence of N vehicles with K branches.
+
+    Attributes
+    ----------
+    relative : ndarray of shape (N, 3K - 1)
+        log a (K), log(-g) (K - 1), bench readings of log(1 + d) (K). [1]
+    constant : ndarray of shape (N, 2K + 1)
+        b (K), c (1), readings of the offsets (K), in fractions of full scale. [1]
+    covariance : ndarray of shape (N, 5K, 5K)
+        Of the sampling error of both, relative rows first; of the constant rows as seen in true currents, that is
+        divided by 1 + d. [1]
+    means : ndarray of shape (N, 2, K)
+        Means of the fleet model's and of the measured currents, in fractions of full scale, about which the lines of
+        the constants pivot; zero where constants do not depend on the ratios. [1]
+    """
+
+    relative: Array
+    constant: Array
+    covariance: Array
+    means: Array
+
+    def __post_init__(self) -> None:
+        N, K = len(self.relative), self.branches
+        shapes = [values.shape for values in vars(self).values()]
+        if shapes != [(N, 3 * K - 1), (N, 2 * K + 1), (N, 5 * K, 5 * K), (N, 2, K)]:
+            raise FleetError(
+                f"evidence of shapes {', '.join(map(str, shapes))}; expected relative rows of shape (N, 3K - 1), "
+                f"constant rows (N, 2K + 1), covariance (N, 5K, 5K) and means (N, 2, K)"
+            )
+        if not all(np.isfinite(values).all() for values in vars(self).values()):
+            raise FleetError("evidence is not finite; leave out the vehicles that have none")
+
+    def __len__(self) -> int:
+        return len(self.relative)
+
+    @property
+    def branches(self) -> int:
+        """Number of branches K."""
+        return int(self.relative.shape[1] + 1) // 3
+
+    @property
+    def places(self) -> RowPlaces:
+        """Where :attr:`values`, :attr:`known` and the covariance hold each kind of row."""
+        return RowPlaces(self.branches)
+
+    @property
+    def values(self) -> Array:
+        """All rows, relative ones first, shape (N, 5K)."""
+        return np.concatenate([self.relative, self.constant], axis=1)
+
+    @property
+    def known(self) -> Mask:
+        """Which rows say something, shape (N, 5K)."""
+        return np.asarray(np.diagonal(self.covariance, axis1=1, axis2=2) < UNKNOWN_VARIANCE / 2.0)
+
+    def shown(self, row: int) -> tuple[Array, Array]:
+        """Values of a row in the vehicles that show it, and their standard deviations."""
+        known = self.known[:, row]
+        return self.values[known, row], np.sqrt(self.covariance[known, row, row])
+
+    def take(self, index: Index) -> "EvidenceRows":
+        """Return the evidence of some of the vehicles."""
+        return EvidenceRows(**{name: values[index] for name, values in vars(self).items()})
+
+    def intercept_covariance(self) -> Array:
+        """Covariance of b + a mean(f), which does not depend on errors of the slopes a, shape (N, K, K)."""
+        b = self.places.intercepts
+        return _shifted(self.covariance, -_pivot(self.means, self.relative), first=b.start)[:, b, b]
+
+    def dispersed(self, dispersion: Array | float) -> tuple[Array, Array]:
+        """Covariance if that of the intercepts at their means is larger.
+
+        Parameters
+        ----------
+        dispersion : ndarray of shape (K,), or float
+            Factor on the variance of the intercepts, at least 1. [1]
+
+        Returns
+        -------
+        whole : ndarray of shape (N, 5K, 5K)
+            Of all rows.
+        added : ndarray of shape (N, K, K)
+            What of it is added to the intercepts, independent of everything else.
+        """
+        b = self.places.intercepts
+        more = np.sqrt(np.broadcast_to(np.asarray(dispersion) - 1.0, self.branches))
+        added = self.intercept_covariance() * np.outer(more, more)
+        whole = self.covariance.copy()
+        whole[:, b, b] += added
+        return whole, added
+
+    def with_load_spread(self, sd: float) -> "EvidenceRows":
+        """Return the evidence if loads that no branch measures differ by a standard deviation, over full scale [1]."""
+        covariance, junction = self.covariance.copy(), self.places.junction
+        covariance[:, junction, junction] += sd**2
+        return replace(self, covariance=covariance)
+
+
+def collect_rows(
+    fleet: FleetMoments, read_out: Array, *, full_scale_a: float, usual_correlation: Array | None = None
+) -> tuple[EvidenceRows, Array]:
+    """Collect the evidence of every vehicle of a fleet.
+
+    Parameters
+    ----------
+    fleet : FleetMoments
+        Of N vehicles.
+    read_out : ndarray of shape (M + 1, K)
+        Of the model of the same fleet. [A]
+    full_scale_a : float
+        Full scale of the junction. [A]
+    usual_correlation : ndarray of shape (3K, 3K), or None
+        Correlation of the rows that is usual in the fleet, as an earlier call returned it; None: the mean over these
+        vehicles. That of each vehicle is smoothed with it, as few blocks show little of a correlation. [1]
+
+    Returns
+    -------
+    rows : EvidenceRows
+        Slopes and intercepts over the fleet model, and the junction law; without bench readings.
+    usual_correlation : ndarray of shape (3K, 3K)
+        The one that was used.
+    """
+    M, K, N = fleet.inputs, fleet.branches, len(fleet)
+    R = 2 * K - 1  # number of slopes and gain ratios: the first of the rows that are measured, before b and c
+    fits = [*regress_on_fleet(fleet, read_out), junction_regression(fleet)]
+    influence = np.concatenate([fit.influence for fit in fits], axis=1)
+    covariance = fleet.blocks.total(influence[:, :, None] * influence[:, None, :])
+    for k, fit in enumerate(fits):
+        part = slice(2 * k, 2 * k + fit.estimate.shape[1])
+        covariance[:, part, part] += fit.prior_covariance
+    # from (a_1, b_1 .. a_K, b_K, g_2 .. g_K, c) to (a, -g, b, c), the latter two over full scale
+    order = np.array([*range(0, 2 * K, 2), *range(2 * K, 3 * K - 1), *range(1, 2 * K, 2), 3 * K - 1])
+    unit = np.concatenate([np.ones(K), -np.ones(K - 1), np.full(K + 1, 1.0 / full_scale_a)])
+    values = np.concatenate([fit.estimate for fit in fits], axis=1)[:, order] * unit
+    covariance = covariance[:, order[:, None], order] * np.outer(unit, unit)
+    inputs = fleet.mean[:, -1, [*range(M), -1]]
+    model_a = products(np.broadcast_to(read_out.T, (N, K, M + 1)), inputs)
+    means = np.stack([model_a, fleet.mean_a], axis=1) / full_scale_a
+
+    # Correlations are smoothed for the constants at the means (M10): at zero they depend on how far away the means
+    # are, and no average over vehicles would respect that.
+    to_means = np.zeros((N, K + 1, R))
+    to_means[:, range(K), range(K)] = means[:, 0]
+    to_means[:, K, K:] = -means[:, 1, 1:]
+    covariance = _shifted(covariance, to_means, first=R)
+    blocks = fleet.blocks.count[:, None, None]
+    covariance[blocks[:, 0, 0] < FEWEST_BLOCKS] = UNKNOWN_VARIANCE * np.eye(3 * K)
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    safe_sd = np.where(sd > 0.0, sd, np.inf)
+    own = covariance / (safe_sd[:, :, None] * safe_sd[:, None, :])
+    usual = own.mean(axis=0) if usual_correlation is None else usual_correlation
+    correlation = (blocks * own + FLEET_BLOCKS * usual) / (blocks + FLEET_BLOCKS)
+    correlation[:, range(3 * K), range(3 * K)] = 1.0
+    covariance = correlation * sd[:, :, None] * sd[:, None, :]
+
+    # Logarithms of the ratios, constants as seen in true currents. An unknown ratio becomes 1; its constant follows.
+    ratios, constant = values[:, :R], values[:, R:]
+    known = ratios > LEAST_GAIN
+    safe = np.where(known, ratios, 1.0)
+    constant = constant + products(to_means, ratios - safe)
+    per_unit = np.concatenate([1.0 / safe, 1.0 / safe[:, :K], 1.0 / safe[:, :1]], axis=1)
+    covariance = covariance * per_unit[:, :, None] * per_unit[:, None, :]
+    covariance += np.diag(np.repeat(LEAST_SD, [R, K + 1]) ** 2)
+    vehicle, row = np.nonzero(~known)
+    covariance[vehicle, row, :], covariance[vehicle, :, row] = 0.0, 0.0
+    covariance[vehicle, row, row] = UNKNOWN_VARIANCE
+
+    unread = np.zeros((N, K))
+    relative = np.concatenate([np.log(safe), unread], axis=1)
+    whole = np.tile(np.diag(np.full(5 * K, UNKNOWN_VARIANCE)), (N, 1, 1))
+    place = RowPlaces(K).measured
+    whole[:, place[:, None], place] = _shifted(covariance, _pivot(means, relative), first=R)
+    constant = np.concatenate([constant, unread], axis=1)
+    return EvidenceRows(relative=relative, constant=constant, covariance=whole, means=means), usual
+
+
+def _pivot(means: Array, relative: Array) -> Array:
+    """Change of b and c, as seen in true currents, per error of log a and log(-g), shape (N, K + 1, 2K - 1)."""
+    N, _, K = means.shape
+    pivot = np.zeros((N, K + 1, 2 * K - 1))
+    pivot[:, range(K), range(K)] = -means[:, 0]
+    pivot[:, K, K:] = means[:, 1, 1:] * np.exp(-relative[:, 1:K])  # -g_k / (1 + d_1) = 1 / (1 + d_k), about 1 / a_k
+    return pivot
+
+
+def _shifted(covariance: Array, by: Array, *, first: int) -> Array:
+    """Covariance if ``by`` (N, c, r) times the first r variables is added to c variables from ``first`` on."""
+    turn = np.tile(np.eye(covariance.shape[-1]), (len(covariance), 1, 1))
+    turn[:, first : first + by.shape[1], : by.shape[2]] += by
+    return np.asarray(turn @ covariance @ np.swapaxes(turn, 1, 2))
+
+
+def row_design(branches: int, feed: int) -> Array:
+    """Rows over parameters, linear as they are in true currents.
+
+    Parameters
+    ----------
+    branches : int
+        Number of branches K.
+    feed : int
+        Branch that carries a load without a sensor, counted from 0.
+
+    Returns
+    -------
+    ndarray of shape (5K, 3K + 1)
+        Rows as :class:`RowPlaces`, columns as :class:`ParameterPlaces` names them. [1]
+    """
+    K, row, column = branches, RowPlaces(branches), ParameterPlaces(branches)
+    design = np.zeros((5 * K, 3 * K + 1))
+    design[row.slopes, column.eta] = 1.0
+    design[row.slopes, column.gains] = design[row.gain_reads, column.gains] = np.eye(K)
+    design[row.ratios, column.gains] = np.hstack([np.ones((K - 1, 1)), -np.eye(K - 1)])
+    design[row.intercepts, column.hardware_offsets] = np.vstack([np.eye(K - 1), -np.ones((1, K - 1))])
+    design[row.intercepts, column.offsets] = design[row.offset_reads, column.offsets] = np.eye(K)
+    design[row.junction, column.offsets] = 1.0
+    design[[row.intercept(feed), row.junction], column.load] = 1.0
+    return design
+
+
+def evidence_names(branches: Sequence[str]) -> list[str]:
+    """Names of the 5K rows.
+
+    Parameters
+    ----------
+    branches : sequence of str
+        The K branches, the most moving first: the junction law is written for it.
+
+    Returns
+    -------
+    list of str
+        3K - 1 ratios [1], then 2K + 1 constants [A].
+    """
+    first = branches[0]
+    return [
+        *(f"slope {name}" for name in branches),
+        *(f"gain ratio {first} / {name}" for name in branches[1:]),
+        *(f"gain read {name}" for name in branches),
+        *(f"intercept {name}" for name in branches),
+        "junction constant",
+        *(f"offset read {name}" for name in branches),
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleEvidence:
+    """What the parameters of one vehicle were found from, in the units of its sensors.
+
+    Attributes
+    ----------
+    value, sd, explained : list of 5K float or None
+        What was measured, its standard deviation, and what the estimate makes of it; None for both of the first two
+        where a row is unknown. ``evidence`` in the details of ``run.json`` names the rows: ratios [1], then constants
+        [A].
+    """
+
+    value: list[float | None]
+    sd: list[float | None]
+    explained: list[float]
+
+
+def reported_evidence(
+    rows: EvidenceRows,
+    *,
+    centre: Array,
+    covariance: Array,
+    drift: Array,
+    offset_a: Array,
+    hardware_drift: Array,
+    hardware_offset_a: Array,
+    full_scale_a: float,
+) -> list[VehicleEvidence]:
+    """The evidence rows in the units of the sensors, beside what the estimates make of them, for the pages of a report.
+
+    Parameters
+    ----------
+    rows : EvidenceRows
+        Of N vehicles with K branches; all that follows has its order of branches.
+    centre : ndarray of shape (5K,)
+        What vehicles without faults show in the rows: the load without a sensor belongs to the junction constant. [1]
+    covariance : ndarray of shape (N, 5K, 5K)
+        Of each reading together with what faultless vehicles differ by. [1]
+    drift, offset_a, hardware_offset_a : ndarray of shape (N, K)
+        Estimates. [1], [A], [A]
+    hardware_drift : ndarray of shape (N,)
+        Estimates. [1]
+    full_scale_a : float
+        Full scale of the junction. [A]
+
+    Returns
+    -------
+    list of VehicleEvidence
+        In the order of the vehicles.
+    """
+    gain, first = 1.0 + drift, 1.0 + drift[:, :1]
+    ratios = np.exp(rows.relative)
+    seen = np.concatenate([gain, first, np.ones_like(gain)], axis=1) * full_scale_a  # constants are held over (1 + d)
+    value = np.concatenate([ratios, rows.constant * full_scale_a], axis=1)
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) * np.concatenate([ratios, seen], axis=1)
+    # a_k = (1 + d_k)(1 + d_h); -g_k = (1 + d_1) / (1 + d_k); b_k = o_k + (1 + d_k) o_h,k; c = (1 + d_1) sum o/(1 + d)
+    relative = np.concatenate([gain * (1.0 + hardware_drift[:, None]), first / gain[:, 1:], gain], axis=1)
+    junction = first * (offset_a / gain).sum(axis=1, keepdims=True)
+    constant = np.concatenate([offset_a + gain * hardware_offset_a, junction, offset_a], axis=1)
+    at = rows.places
+    made = np.concatenate([relative * np.exp(centre[at.relative]), constant + seen * centre[at.constant]], axis=1)
+    value[~rows.known], sd[~rows.known] = np.nan, np.nan
+
+    def told(values: Array) -> list[list[float | None]]:
+        return [[v if isfinite(v) else None for v in row] for row in values.tolist()]
+
+    columns = zip(told(value), told(sd), made.tolist(), strict=True)
+    return [VehicleEvidence(value=v, sd=s, explained=m) for v, s, m in columns]
