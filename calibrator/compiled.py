@@ -38,6 +38,7 @@ SOURCES = (
     "drives/align.py",
     "drives/charge.py",
     "drives/delays.py",
+    "estimator/decision.py",
     "estimator/posterior.py",
     "estimator/prior.py",
     "recordings/asc.py",

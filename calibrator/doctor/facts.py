@@ -13,7 +13,7 @@ from cantools.database.can import Signal
 from calibrator.drive import Array, Channel, Drive
 from calibrator.drives.align import align, base_inputs, choose_inputs
 from calibrator.errors import DriveError, LogError
-from calibrator.kirchhoff.findings import Junction, look_at_junction
+from calibrator.kirchhoff.findings import RecordedJunction, look_at_junction
 from calibrator.kirchhoff.signs import multiplied
 from calibrator.kirchhoff.sums import VOLTAGE, junction_voltage, with_voltages
 from calibrator.recordings.frame_arrays import repaired_time
@@ -140,7 +140,7 @@ class Facts:
         Of those that the DBC has, in the order of the layout.
     slip : tuple of (str, float, float) or None
         Signal of a voltage that is impossible, its median [V], and the power of ten that makes it usual.
-    junction : Junction
+    junction : RecordedJunction
         The sum of the branches, with such a slip put right.
     explained : mapping of str to float
         Share of each current's variation that the model inputs explain; empty if that cannot be told.
@@ -153,7 +153,7 @@ class Facts:
     branches: tuple[ChannelFacts, ...]
     inputs: tuple[ChannelFacts, ...]
     slip: tuple[str, float, float] | None
-    junction: Junction
+    junction: RecordedJunction
     explained: Mapping[str, float]
 
     @property

@@ -21,7 +21,7 @@ from calibrator.terminal.text import figure
 from calibrator.words import POSITIONS, places_of, words_of
 from ecu_node.database import VehicleDatabase
 
-__all__ = ["CHECKS", "CHECKS_OF_MOVING", "Junction", "look_at_junction", "sum_findings", "times"]
+__all__ = ["CHECKS", "CHECKS_OF_MOVING", "RecordedJunction", "look_at_junction", "sum_findings", "times"]
 
 AVERAGED_S, FEWEST_AVERAGES = 2.0, 3
 """Noise is averaged out over this long, to see whether currents move; fewer averages do not tell. [s], [1]"""
@@ -57,7 +57,7 @@ adds to values that are the same. [1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Junction:
+class RecordedJunction:
     """The sum of some branches, over recordings of one vehicle.
 
     Attributes
@@ -146,7 +146,7 @@ def steps_of(database: VehicleDatabase, branches: Sequence[str], drives: Sequenc
 
 def look_at_junction(
     drives: Sequence[Drive], database: VehicleDatabase, *, full_scale_a: float | None = None
-) -> Junction:
+) -> RecordedJunction:
     """Look at the sum of the branches that have usable values in some drives of one vehicle.
 
     Parameters
@@ -169,14 +169,16 @@ def look_at_junction(
                 comparisons.append(compare_kirchhoff(drive, database))
         least_a = float(np.linalg.norm([*steps_of(database, names, whole).values()]))
         facts = look_at_sum(drives, names, layout, least_a=least_a, full_scale_a=full_scale_a or layout.full_scale_a)
-    return Junction(database=database, branches=names, drives=tuple(whole), comparisons=tuple(comparisons), facts=facts)
+    return RecordedJunction(
+        database=database, branches=names, drives=tuple(whole), comparisons=tuple(comparisons), facts=facts
+    )
 
 
 Findings = Iterator[Finding]
 error, warning, hint = (partial(Finding, severity) for severity in Severity)
 
 
-def sum_findings(junction: Junction) -> list[Finding]:
+def sum_findings(junction: RecordedJunction) -> list[Finding]:
     """All findings of the sum, errors first."""
     facts = junction.facts
     found = [each for check in CHECKS for each in check(junction)]
@@ -185,7 +187,7 @@ def sum_findings(junction: Junction) -> list[Finding]:
     return worst_first(found)
 
 
-def enough(junction: Junction) -> Findings:
+def enough(junction: RecordedJunction) -> Findings:
     """Whether there is a sum, whether it is long enough, and whether anything moves in it."""
     names, record = junction.branches, "record a minute of driving or more"
     if len(names) < 2:
@@ -218,7 +220,7 @@ def times(factor: float) -> str:
     return f"{1.0 / factor:g} times too large" if factor < 1.0 else f"{factor:g} times too small"
 
 
-def signs_and_units(junction: Junction, facts: SumFacts) -> Findings:
+def signs_and_units(junction: RecordedJunction, facts: SumFacts) -> Findings:
     """Branches with the wrong sign, or a slip of a unit."""
     multipliers, bands, layout = facts.multipliers, facts.bands, junction.database.layout
     if _exchanged(junction):
@@ -250,7 +252,7 @@ def signs_and_units(junction: Junction, facts: SumFacts) -> Findings:
                 yield error(code, name, text, advice, factor if code == "unit" else before_a / max(after_a, 1e-9))
 
 
-def exchanged(junction: Junction) -> Findings:
+def exchanged(junction: RecordedJunction) -> Findings:
     """Branches of which each has the signal that the other is named after."""
     facts, layout = junction.facts, junction.database.layout
     for one, other in _exchanged(junction):
@@ -269,7 +271,7 @@ def exchanged(junction: Junction) -> Findings:
         yield say("exchanged", one, text, advice, ratio)
 
 
-def _exchanged(junction: Junction) -> list[tuple[str, str]]:
+def _exchanged(junction: RecordedJunction) -> list[tuple[str, str]]:
     said: dict[str, list[set[str]]] = {}
     for branch in junction.database.layout.branch:
         if branch.name in junction.branches and not branch.computed:
@@ -282,7 +284,7 @@ def _exchanged(junction: Junction) -> list[tuple[str, str]]:
     ]
 
 
-def sum_cancels(junction: Junction, facts: SumFacts) -> Findings:
+def sum_cancels(junction: RecordedJunction, facts: SumFacts) -> Findings:
     """Branches that do not belong to one junction."""
     rest_a = facts.bands.rms_a(facts.multipliers)
     all_a = float(np.linalg.norm(facts.multipliers * facts.rms_a))
@@ -299,7 +301,7 @@ def sum_cancels(junction: Junction, facts: SumFacts) -> Findings:
         yield error("sum", "sum", text, advice, rest_a)
 
 
-def cannot_tell(_: Junction, facts: SumFacts) -> Findings:
+def cannot_tell(_: RecordedJunction, facts: SumFacts) -> Findings:
     """Small branches of which another sign or unit would do nearly as well."""
     rest_a = facts.bands.rms_a(facts.multipliers)
     for k, name in enumerate(facts.branches):
@@ -312,7 +314,7 @@ def cannot_tell(_: Junction, facts: SumFacts) -> Findings:
             yield hint("cannot tell", name, text, "record a drive in which it carries more current", rms_a)
 
 
-def delays(_: Junction, facts: SumFacts) -> Findings:
+def delays(_: RecordedJunction, facts: SumFacts) -> Findings:
     """Branches that come late."""
     found = facts.delays
     if found is None:
@@ -336,7 +338,7 @@ def delays(_: Junction, facts: SumFacts) -> Findings:
         yield say("delay", found.branches[k], text, advice, late_s)
 
 
-def gains(_: Junction, facts: SumFacts) -> Findings:
+def gains(_: RecordedJunction, facts: SumFacts) -> Findings:
     """Branches whose gains differ."""
     if not facts.gains or facts.delays is None:
         return
@@ -369,7 +371,7 @@ def _off(gains: Mapping[str, tuple[float, float]], reference: str) -> dict[str, 
     return {name: (gain, sd) for name, (gain, sd) in beside.items() if abs(gain - 1.0) > max(LEAST_GAIN, SURE * sd)}
 
 
-def mean_of_sum(junction: Junction) -> Findings:
+def mean_of_sum(junction: RecordedJunction) -> Findings:
     """What flows where no branch measures it."""
     load, scale_a = junction.database.layout.unmeasured_load, junction.database.layout.full_scale_a
     facts, moves = junction.facts, not junction.stands_still
@@ -388,7 +390,7 @@ def mean_of_sum(junction: Junction) -> Findings:
     yield (warning if unexplained_a > LARGE_MEAN * scale_a else hint)("mean", "sum", text, advice, mean_a)
 
 
-def stuck(junction: Junction) -> Findings:
+def stuck(junction: RecordedJunction) -> Findings:
     """The longest stretch of each branch in which it stands still though the others move."""
     scale_a, longest = junction.database.layout.full_scale_a, dict[str, Finding]()
     for comparison in junction.comparisons:
@@ -413,8 +415,8 @@ def stuck(junction: Junction) -> Findings:
     yield from longest.values()
 
 
-CHECKS: Sequence[Callable[[Junction], Findings]] = (enough, exchanged, mean_of_sum, stuck)
-CHECKS_OF_MOVING: Sequence[Callable[[Junction, SumFacts], Findings]] = (
+CHECKS: Sequence[Callable[[RecordedJunction], Findings]] = (enough, exchanged, mean_of_sum, stuck)
+CHECKS_OF_MOVING: Sequence[Callable[[RecordedJunction, SumFacts], Findings]] = (
     signs_and_units, sum_cancels, cannot_tell, delays, gains,
 )  # fmt: skip
 """What can be told only where currents move long enough."""

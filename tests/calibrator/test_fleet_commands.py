@@ -5,7 +5,6 @@ import json
 import shutil
 from pathlib import Path
 
-import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
@@ -95,18 +94,6 @@ def test_store_made_by_import_gives_the_same_parameters_as_the_logs(fleet: Path,
         assert row["drift"] == pytest.approx(expected["drift"], abs=1e-9)
 
 
-def test_second_import_changes_nothing_and_says_so(fleet: Path, tmp_path: Path) -> None:
-    log = sorted((fleet / "logs").glob("*/*.log.gz"))[0]
-    store = tmp_path / "store"
-    assert calibrator("import", log, "--layout", LAYOUT, "--out", store).returncode == 0
-    before = {path: path.read_bytes() for path in store.rglob("*.parquet")}
-    again = calibrator("import", log, "--layout", LAYOUT, "--out", store, "--json")
-    assert again.returncode == 0, again.stderr
-    report = json.loads(again.stdout)
-    assert (report["already_there"], report["left_out"]) == ([f"{log.parent.name}/drive"], {})
-    assert {path: path.read_bytes() for path in store.rglob("*.parquet")} == before
-
-
 def test_nothing_is_learnt_from_a_vehicle_that_is_held_out(fleet: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     shutil.copytree(fleet / "logs", other)
@@ -170,14 +157,6 @@ def test_bad_vehicles_are_left_out_by_name_and_the_others_go_on(broken_fleet: Pa
     assert any("my,drive" in reason for reason in left_out.values()), left_out
     assert sorted(path.stem for path in (out / "params").iterdir()) == ["V003", "V004", "V005", "V006"]
     assert {row["vehicle"] for row in read_results(out) if row["branch"] is None} == set(left_out)
-
-
-def test_one_car_alone_gives_ratios_of_gains(fleet: Path, tmp_path: Path) -> None:
-    shutil.copytree(fleet / "logs" / "V001", tmp_path / "logs" / "V001")
-    run = calibrator("calibrate", tmp_path / "logs", "--layout", LAYOUT, "--out", tmp_path / "x", "--workers", 1)
-    assert run.returncode == 0
-    assert "only ratios of gains are known: name a sensor that you trust" in run.stdout
-    assert not pd.read_parquet(tmp_path / "x" / "results.parquet").applied.any()
 
 
 def test_only_vehicle_that_drove_since_is_one_of_its_fleet(fleet: Path, tmp_path: Path) -> None:
