@@ -82,7 +82,7 @@ def test_unknown_vehicle_is_named(result: Path, name: str) -> None:
 
 
 def test_vehicle_left_out_is_named_with_its_reason(result: Path, tmp_path: Path) -> None:
-    part_file(result, 15).write_bytes(encode_chunk([], {"v3": "too short"}))
+    part_file(result, BUCKETS).write_bytes(encode_chunk([], {"v3": "too short"}))
     assert join_rows(result, {"a log": "unreadable", "v3": "known"}) == 2
     assert left_out_of(result) == {"a log": "unreadable", "v3": "too short"}
     with pytest.raises(FleetError, match=r"no parameters of vehicle 'v3', it was left out: too short"):
