@@ -9,9 +9,10 @@ sound, so a line of simulated over reference current (15) that is not the fleet'
 import numpy as np
 from rich.console import Console
 
-from calibrator.experiments.experiments import EXPERIMENTS, fleet_for, run_experiment
+from calibrator.experiments.experiments import EXPERIMENTS, fleet_for
 from calibrator.experiments.methods import PERFECT, POSTERIOR, Estimate
 from calibrator.experiments.pages import result_table
+from calibrator.experiments.runner import run_experiment
 from calibrator.experiments.trial import Trial
 from calibrator.faults import Faults
 

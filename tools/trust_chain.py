@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from calibrator.artificial.options import MAX_MINUTES, CurrentsOption, UnmeasuredOption
+from calibrator.artificial.command import MAX_MINUTES, CurrentsOption, UnmeasuredOption
 from calibrator.artificial.simulate import FleetPlan
 from calibrator.artificial.trips import choose_trips
 from calibrator.terminal.command_line import command_app, run_tool

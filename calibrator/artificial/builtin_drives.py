@@ -7,6 +7,7 @@ to the low-voltage net, a rear motor that takes a share of the torque, and the b
 Currents are positive into the junction.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from types import ModuleType
@@ -15,11 +16,10 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.signal import lfilter
 
-from calibrator.artificial.ground_truth import GroundTruth
 from calibrator.drive import Array
 from calibrator.errors import FleetError
 
-__all__ = ["BUILTIN_BRANCHES", "BUILTIN_INPUTS", "builtin_trip"]
+__all__ = ["BUILTIN_BRANCHES", "BUILTIN_INPUTS", "GroundTruth", "builtin_trip"]
 
 BUILTIN_BRANCHES = ("battery", "motor", "auxiliary", "dcdc", "motor_rear")
 BUILTIN_INPUTS = (
@@ -46,13 +46,58 @@ DCDC_EFFICIENCY = 0.93
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Motion:
-    """What fastsim knows of a trip, at the sample period."""
+class GroundTruth:
+    """One trip of the ideal vehicle.
 
-    speed_ms: Array
-    mechanical_w: Array
-    electrical_w: Array
-    charge: Array
+    Attributes
+    ----------
+    name : str
+        Name of the trip.
+    period_s : float
+        Sample period. [s]
+    currents_a : mapping of str to ndarray of shape (T,)
+        Ideal current of each branch, positive into the junction; they sum to zero. [A]
+    inputs : mapping of str to ndarray of shape (T,)
+        Inputs by the names of the layout, in the units of its DBC.
+    """
+
+    name: str
+    period_s: float
+    currents_a: Mapping[str, Array]
+    inputs: Mapping[str, Array]
+
+    def __len__(self) -> int:
+        return len(next(iter(self.currents_a.values())))
+
+    @property
+    def time_s(self) -> Array:
+        """Instants of the samples since the start, shape (T,). [s]"""
+        return self.period_s * np.arange(float(len(self)))
+
+    def matrix_a(self) -> Array:
+        """Currents as an array of shape (T, K). [A]"""
+        return np.stack(list(self.currents_a.values()), axis=1)
+
+    @classmethod
+    def joined(cls, trips: Sequence["GroundTruth"], name: str) -> "GroundTruth":
+        """Trips one after the other, with the inputs that all of them have."""
+        first = trips[0]
+        common = [key for key in first.inputs if all(key in trip.inputs for trip in trips)]
+        return cls(
+            name=name,
+            period_s=first.period_s,
+            currents_a={key: np.concatenate([trip.currents_a[key] for trip in trips]) for key in first.currents_a},
+            inputs={key: np.concatenate([trip.inputs[key] for trip in trips]) for key in common},
+        )
+
+    def part(self, start: int, stop: int) -> "GroundTruth":
+        """Samples start to stop (excluded) as a trip of its own."""
+        return GroundTruth(
+            name=self.name,
+            period_s=self.period_s,
+            currents_a={name: x[start:stop] for name, x in self.currents_a.items()},
+            inputs={name: x[start:stop] for name, x in self.inputs.items()},
+        )
 
 
 def builtin_trip(rng: np.random.Generator, *, duration_s: float, name: str) -> GroundTruth:
@@ -77,17 +122,17 @@ def builtin_trip(rng: np.random.Generator, *, duration_s: float, name: str) -> G
     FleetError
         If fastsim is not installed.
     """
-    motion = _drive(_speed_trace(rng, duration_s))
-    samples = len(motion.speed_ms)
+    speed_ms, mechanical_w, electrical_w, charge = _drive(_speed_trace(rng, duration_s))
+    samples = len(speed_ms)
     heater_demand = _random_steps(rng, samples, mean_s=90.0, levels=(0.0, 0.0, 800.0, 2000.0, 4000.0, 5500.0))
     aircon_demand = _random_steps(rng, samples, mean_s=60.0, levels=(0.0, 300.0, 700.0, 1500.0, 2500.0))
     low_voltage_demand = _random_steps(rng, samples, mean_s=30.0, levels=(250.0, 350.0, 450.0, 700.0, 1100.0))
     auxiliary_w = _lag(heater_demand, HEATER_LAG_S) + _lag(aircon_demand, AIRCON_LAG_S)
     dcdc_w = _lag(low_voltage_demand, DCDC_LAG_S) / DCDC_EFFICIENCY
-    battery_a, voltage = _battery(motion.electrical_w + auxiliary_w + dcdc_w, motion.charge)
-    torque = motion.mechanical_w / np.maximum(GEAR_RAD_PER_M * motion.speed_ms, SLOWEST_RAD_S)
+    battery_a, voltage = _battery(electrical_w + auxiliary_w + dcdc_w, charge)
+    torque = mechanical_w / np.maximum(GEAR_RAD_PER_M * speed_ms, SLOWEST_RAD_S)
     rear_share = 0.2 + 0.3 * np.minimum(np.abs(torque) / 200.0, 1.0)
-    motor_a = motion.electrical_w / voltage
+    motor_a = electrical_w / voltage
     return GroundTruth(
         name=name,
         period_s=PERIOD_S,
@@ -101,9 +146,9 @@ def builtin_trip(rng: np.random.Generator, *, duration_s: float, name: str) -> G
         inputs={
             "voltage": voltage,
             "torque": torque,
-            "speed": 3.6 * motion.speed_ms,
-            "acceleration": np.gradient(motion.speed_ms, PERIOD_S),
-            "accelerator": np.clip(100.0 * motion.mechanical_w / MOTOR_W, 0.0, 100.0),
+            "speed": 3.6 * speed_ms,
+            "acceleration": np.gradient(speed_ms, PERIOD_S),
+            "accelerator": np.clip(100.0 * mechanical_w / MOTOR_W, 0.0, 100.0),
             "heater_demand": heater_demand,
             "aircon_demand": aircon_demand,
             "low_voltage_demand": low_voltage_demand,
@@ -134,8 +179,8 @@ def _microtrips() -> list[Array]:
     return pieces
 
 
-def _drive(speed_ms: Array) -> _Motion:
-    """Let fastsim drive a speed trace of 1 Hz and bring the result to the sample period."""
+def _drive(speed_ms: Array) -> tuple[Array, Array, Array, Array]:
+    """Let fastsim drive a speed trace of 1 Hz: speed [m/s], mechanical and electrical motor power [W], charge [1]."""
     fastsim = _fastsim()
     seconds = np.arange(float(len(speed_ms)))
     vehicle = fastsim.Vehicle.from_resource(VEHICLE)
@@ -145,17 +190,17 @@ def _drive(speed_ms: Array) -> _Motion:
     run.walk()
     table = run.to_dataframe()
     fine = np.arange(0.0, seconds[-1], PERIOD_S)
-
-    def column(name: str) -> Array:
-        return np.asarray(PchipInterpolator(seconds, table[name].to_numpy())(fine))
-
     motor = "veh.pt_type.BEV.em.history."
-    return _Motion(
-        speed_ms=np.maximum(column("veh.history.speed_ach_meters_per_second"), 0.0),
-        mechanical_w=column(f"{motor}pwr_mech_prop_out_watts"),
-        electrical_w=column(f"{motor}pwr_elec_prop_in_watts"),
-        charge=column("veh.pt_type.BEV.res.history.soc"),
+    names = (
+        "veh.history.speed_ach_meters_per_second",
+        f"{motor}pwr_mech_prop_out_watts",
+        f"{motor}pwr_elec_prop_in_watts",
+        "veh.pt_type.BEV.res.history.soc",
     )
+    speed, mechanical, electrical, charge = (
+        np.asarray(PchipInterpolator(seconds, table[name].to_numpy())(fine)) for name in names
+    )
+    return np.maximum(speed, 0.0), mechanical, electrical, charge
 
 
 def _battery(power_w: Array, charge: Array) -> tuple[Array, Array]:

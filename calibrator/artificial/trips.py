@@ -1,14 +1,22 @@
-"""Where the trips of an artificial fleet come from: the built-in vehicle, or recorded drives."""
+"""Trips of the ideal vehicle, from which artificial vehicles are made: of the built-in vehicle, or recorded drives.
 
+Recorded currents do not sum to zero, so one branch is set to minus the sum of the others, (19) of [1]_. What is
+said about that branch afterwards is therefore not independent of the other sensors of the recording.
+
+.. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
+"""
+
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
-from calibrator.artificial.builtin_drives import BUILTIN_BRANCHES, BUILTIN_INPUTS, builtin_trip
-from calibrator.artificial.ground_truth import GroundTruth, cut_and_rejoin, ground_truth_from_drive
+from calibrator.artificial.builtin_drives import BUILTIN_BRANCHES, BUILTIN_INPUTS, GroundTruth, builtin_trip
+from calibrator.drive import Drive
 from calibrator.drives.align import choose_inputs
 from calibrator.drives.store import iterate_drives
 from calibrator.errors import FleetError
@@ -16,14 +24,140 @@ from calibrator.random_streams import Purpose, random_stream
 from ecu_node.layout import Layout
 
 __all__ = [
-    "BuiltinTrips",
-    "CommonTrips",
-    "RecordedTrips",
-    "TripPurpose",
-    "TripSource",
-    "choose_trips",
-    "read_recorded_trips",
-]
+    "BuiltinTrips", "GroundTruth", "RecordedTrips", "TripPurpose", "TripSource", "balance_branch", "choose_branches",
+    "choose_trips", "cut_and_rejoin", "ground_truth_from_drive", "read_recorded_trips", "with_branches",
+]  # fmt: skip
+
+STANDSTILL_KMH = 0.5
+"""Below this speed trips may be cut and joined: the power train is at rest, so no current jumps. [km/h]"""
+
+
+def choose_branches(layout: Layout, available: Sequence[str], count: int) -> tuple[str, ...]:
+    """Choose which branches a fleet of K currents has: the first K of the layout that the recordings have.
+
+    Parameters
+    ----------
+    layout : Layout
+        Names the branches in order, and the one that takes the balance (19).
+    available : sequence of str
+        Branches that the recordings have.
+    count : int
+        Number of branches K.
+
+    Returns
+    -------
+    tuple of str
+        K names, in the order of the layout, with the balancing branch among them.
+
+    Raises
+    ------
+    FleetError
+        If the recordings have fewer branches.
+    """
+    names = [name for name in layout.branch_names if name in available]
+    if len(names) < 2:
+        raise FleetError(
+            f"{layout.path}: has the branches {', '.join(layout.branch_names)}, these drives have "
+            f"{', '.join(available)}; at least two must be common; give --drives a store made with this layout"
+        )
+    if not 2 <= count <= len(names):
+        raise FleetError(
+            f"{count} currents asked for; these drives have {len(names)} of the branches of {layout.path} "
+            f"({', '.join(names)}), so 2 to {len(names)} are possible"
+        )
+    return tuple(names[:count])
+
+
+def with_branches(trip: GroundTruth, branches: Sequence[str], balance: str) -> GroundTruth:
+    """Keep some branches and let one of them take minus the sum of the others, (19) in [1]_."""
+    kept = {name: trip.currents_a[name] for name in branches}
+    kept[balance] = -np.sum([kept[name] for name in branches if name != balance], axis=0)
+    return GroundTruth(name=trip.name, period_s=trip.period_s, currents_a=kept, inputs=trip.inputs)
+
+
+def balance_branch(layout: Layout, branches: Sequence[str]) -> str:
+    """The branch that is minus the sum of the others: the layout's, or the last one as in (19) of the paper."""
+    return next((branch.name for branch in layout.branch if branch.balance and branch.name in branches), branches[-1])
+
+
+def ground_truth_from_drive(drive: Drive, period_s: float) -> GroundTruth | None:
+    """Turn a recorded drive into a trip of the ideal vehicle.
+
+    Bad samples are bridged by interpolation between their good neighbours: what counts here is a realistic trip,
+    not the recording itself.
+
+    Parameters
+    ----------
+    drive : Drive
+        A recording.
+    period_s : float
+        Sample period of the trip. [s]
+
+    Returns
+    -------
+    GroundTruth or None
+        The trip over the span that all channels cover; None if it is empty or a channel has no good sample.
+    """
+    channels = {**drive.branches, **drive.inputs}
+    if not drive.branches or any(not channel.good.any() for channel in channels.values()):
+        return None
+    start = max(float(channel.time_s[channel.good][0]) for channel in channels.values())
+    stop = min(float(channel.time_s[channel.good][-1]) for channel in channels.values())
+    time_s = np.arange(start, stop, period_s)
+    if not time_s.size:
+        return None
+    values = {
+        name: np.interp(time_s, channel.time_s[channel.good], channel.value[channel.good])
+        for name, channel in channels.items()
+    }
+    return GroundTruth(
+        name=drive.name,
+        period_s=period_s,
+        currents_a={name: values[name] for name in drive.branches},
+        inputs={name: values[name] for name in drive.inputs},
+    )
+
+
+def cut_and_rejoin(
+    rng: np.random.Generator, trips: Sequence[GroundTruth], *, duration_s: float, name: str
+) -> GroundTruth:
+    """Make a different trip from pieces of several, cut at standstill.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of chance.
+    trips : sequence of GroundTruth
+        Trips of one period, with the same branches; inputs that not all of them have are left out. Without an
+        input named 'speed' each trip is one piece.
+    duration_s : float
+        Least duration of the new trip. [s]
+    name : str
+        Name of the new trip.
+
+    Returns
+    -------
+    GroundTruth
+        Random pieces one after the other.
+    """
+    pieces = [piece for trip in trips for piece in _pieces(trip)]
+    samples = int(duration_s / trips[0].period_s)
+    chosen: list[GroundTruth] = []
+    while sum(len(piece) for piece in chosen) < samples:
+        chosen += [pieces[k] for k in rng.permutation(len(pieces))]
+    count = int(np.searchsorted(np.cumsum([len(piece) for piece in chosen]), samples)) + 1
+    return GroundTruth.joined(chosen[:count], name)
+
+
+def _pieces(trip: GroundTruth) -> list[GroundTruth]:
+    """Cut a trip in the middle of every standstill."""
+    if "speed" not in trip.inputs:
+        return [trip]
+    edges = np.flatnonzero(np.diff(np.pad(trip.inputs["speed"] < STANDSTILL_KMH, 1)))  # starts and stops by turns
+    middles = (edges[::2] + edges[1::2]) // 2
+    cuts = [0, *(m for m in middles.tolist() if 0 < m < len(trip)), len(trip)]
+    return [trip.part(a, b) for a, b in pairwise(cuts) if b > a]
+
 
 TripPurpose = Literal["calibration", "unseen"]
 """A trip to learn from, or one to test on."""
@@ -35,61 +169,78 @@ LEARNT_SHARE = 0.75
 """Share of a single recording that trips to learn from are made of; the rest is for unseen ones. [1]"""
 
 
-class TripSource(Protocol):
-    """Gives every vehicle its trips; the same number and purpose give the same trip."""
+@dataclass(frozen=True, kw_only=True)
+class TripSource(ABC):
+    """Gives every vehicle its trips; the same number and purpose give the same trip.
+
+    Attributes
+    ----------
+    seed : int
+        Seed of the trips.
+    unseen_s : float
+        Length of each trip to test on. [s]
+    notices : tuple of str
+        What a user should know about the trips.
+    common : bool
+        Every vehicle drives the trips of vehicle 0, as in the experiments of the paper.
+    """
+
+    seed: int
+    unseen_s: float
+    notices: tuple[str, ...] = ()
+    common: bool = False
 
     @property
+    @abstractmethod
     def branches(self) -> tuple[str, ...]:
         """Branches that the trips have."""
-        ...
-
-    @property
-    def notices(self) -> tuple[str, ...]:
-        """What a user should know about the trips."""
-        ...
 
     def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
         """Trip of vehicle ``number``."""
-        ...
+        if self.common:
+            return replace(self.make(0, purpose), name=f"common-{purpose}")
+        return self.make(number, purpose)
+
+    @abstractmethod
+    def make(self, number: int, purpose: TripPurpose) -> GroundTruth:
+        """Make a trip for vehicle ``number``, whether or not trips are common."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class BuiltinTrips:
-    """A different trip of the built-in vehicle for every vehicle and purpose."""
+class BuiltinTrips(TripSource):
+    """A different trip of the built-in vehicle for every vehicle and purpose; duration_s of those to learn from."""
 
-    seed: int
     duration_s: float
-    unseen_s: float
-    branches: tuple[str, ...] = BUILTIN_BRANCHES
-    notices: tuple[str, ...] = ()
 
-    def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
-        """Trip of vehicle ``number``."""
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """Branches of the built-in vehicle."""
+        return BUILTIN_BRANCHES
+
+    def make(self, number: int, purpose: TripPurpose) -> GroundTruth:
+        """Drive a trip."""
         rng = random_stream(_STREAM[purpose], self.seed, number)
         duration_s = self.duration_s if purpose == "calibration" else self.unseen_s
         return builtin_trip(rng, duration_s=duration_s, name=f"builtin-{number}-{purpose}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedTrips:
+class RecordedTrips(TripSource):
     """Recorded trips: one each while they last, then pieces of them joined anew; unseen trips are joined anew.
 
     No piece of a recording is in both trips of a vehicle; a single recording is cut in time.
     """
 
-    seed: int
     recorded: Sequence[GroundTruth]
     vehicles: int
-    unseen_s: float
-    notices: tuple[str, ...] = ()
 
     @property
     def branches(self) -> tuple[str, ...]:
         """Branches that all recordings have."""
         return tuple(b for b in self.recorded[0].currents_a if all(b in trip.currents_a for trip in self.recorded))
 
-    def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:
-        """Trip of vehicle ``number``."""
+    def make(self, number: int, purpose: TripPurpose) -> GroundTruth:
+        """Take or join a trip."""
         one_each = self.vehicles <= len(self.recorded)
         if purpose == "calibration" and one_each and len(self.recorded) > 1:
             return self.recorded[number]
@@ -111,27 +262,6 @@ class RecordedTrips:
             return [trip for k, trip in enumerate(self.recorded) if k != number]
         half = len(self.recorded) // 2
         return list(self.recorded[:-half] if purpose == "calibration" else self.recorded[-half:])
-
-
-@dataclass(frozen=True, kw_only=True)
-class CommonTrips:
-    """Every vehicle drives the trips of vehicle 0, as in the experiments of the paper."""
-
-    source: TripSource
-
-    @property
-    def branches(self) -> tuple[str, ...]:
-        """Branches that the trips have."""
-        return self.source.branches
-
-    @property
-    def notices(self) -> tuple[str, ...]:
-        """What a user should know about the trips."""
-        return self.source.notices
-
-    def trip(self, number: int, purpose: TripPurpose) -> GroundTruth:  # noqa: ARG002
-        """Trip of every vehicle."""
-        return replace(self.source.trip(0, purpose), name=f"common-{purpose}")
 
 
 def read_recorded_trips(store: Path, layout: Layout) -> tuple[list[GroundTruth], list[str]]:
@@ -199,21 +329,20 @@ def choose_trips(
     FleetError
         If no drive of the store is usable, or the built-in vehicle has not what the layout names.
     """
-    source: TripSource
     if drives == "builtin":
-        notices = _builtin_notices(layout)
-        source = BuiltinTrips(seed=seed, duration_s=duration_s, unseen_s=unseen_s, notices=notices)
-    else:
-        recorded, unusable = read_recorded_trips(Path(drives), layout)
-        notice = f"{len(unusable)} drives lack good samples of some channel and are left out: {', '.join(unusable)}"
-        source = RecordedTrips(
-            seed=seed,
-            recorded=recorded,
-            vehicles=1 if common else vehicles,
-            unseen_s=unseen_s,
-            notices=(notice,) if unusable else (),
+        return BuiltinTrips(
+            seed=seed, duration_s=duration_s, unseen_s=unseen_s, notices=_builtin_notices(layout), common=common
         )
-    return CommonTrips(source=source) if common else source
+    recorded, unusable = read_recorded_trips(Path(drives), layout)
+    notice = f"{len(unusable)} drives lack good samples of some channel and are left out: {', '.join(unusable)}"
+    return RecordedTrips(
+        seed=seed,
+        recorded=recorded,
+        vehicles=1 if common else vehicles,
+        unseen_s=unseen_s,
+        notices=(notice,) if unusable else (),
+        common=common,
+    )
 
 
 def _builtin_notices(layout: Layout) -> tuple[str, ...]:

@@ -12,6 +12,6 @@ Read in this order, with docs/method.md beside it:
     fleet_task, run, results         the command: bucket by bucket, over processes, into a folder
     fleet, frames                    the door for Python: data frames in, parameters out
 
-``published_fleet`` is the published method in the same frame; ``state_space`` and ``fleet_identification`` find a
+``published_fleet`` is the published method in the same frame; ``fleet_identification`` finds a
 filter bank where inputs alone do not tell the currents.
 """

@@ -22,8 +22,8 @@ import numpy as np
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
-from calibrator.estimator.state_space import pooled_poles, snr_from_power, solve_scaled
 from calibrator.processes.run_many import Workers
+from calibrator.published.state_space import pooled_poles, snr_from_power, solve_scaled
 from calibrator.sources.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment, read_vehicles
 from calibrator.summaries.filter_bank import FilterBank, Poles, low_pass_bank, low_passes
 from calibrator.summaries.moments import DriveSummary

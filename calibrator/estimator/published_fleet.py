@@ -20,12 +20,12 @@ from calibrator.drives.align import Samples, align
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.results import encode_chunk
 from calibrator.estimator.settings import CalibrationSettings, require_learning
-from calibrator.estimator.state_space import StateSpaceModel, bridged, identify, simulation_snr_db
 from calibrator.files.parameter_files import RunIdentity, by_branch, current_moments, junction_residual
 from calibrator.fleet_truth import faults_of
 from calibrator.processes.run_many import Workers
 from calibrator.published.classify import ExpectedFaults
 from calibrator.published.recovery import Recovery, calibrate_published
+from calibrator.published.state_space import StateSpaceModel, bridged, identify, simulation_snr_db
 from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, read_vehicles
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import counted, few

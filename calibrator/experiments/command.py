@@ -52,27 +52,35 @@ def experiment(
     """
     with importing():
         from calibrator.errors import FleetError
-        from calibrator.experiments.calibration import CALIBRATION, pool_confidences
-        from calibrator.experiments.experiments import EXPERIMENTS, fleet_for, run_experiment
-        from calibrator.experiments.pages import ORDER, result_table, write_result
-        from calibrator.experiments.result import ExperimentResult, made_now, read_results
+        from calibrator.experiments.experiments import CALIBRATION, EXPERIMENTS, fleet_for
+        from calibrator.experiments.pages import result_table, write_result
+        from calibrator.experiments.runner import (
+            ExperimentResult,
+            made_now,
+            pool_confidences,
+            read_results,
+            run_experiment,
+        )
 
     if name is None:
-        titles = {CALIBRATION: "Reliability of the confidence", **{row.name: row.title for row in EXPERIMENTS.values()}}
-        write_output("\n".join(f"{each:<12} {titles[each]}" for each in ORDER))
+        write_output("\n".join(f"{row.name:<12} {row.title}" for row in EXPERIMENTS.values()))
         return
-    if name not in {*ORDER, "all"}:
-        raise typer.BadParameter(f"{name}: expected one of {', '.join(ORDER)} or all", param_hint="NAME")
-    unheeded: tuple[str, ...] = ("drives", "layout", "quick", "repetitions", "seed", "workers")
-    reason = "calibration runs nothing, it pools what is recorded in --out"
-    if name == "all" or (name in EXPERIMENTS and EXPERIMENTS[name].recorded):
-        unheeded = ()
-    elif name != CALIBRATION:
-        recorded = ", ".join(each for each in EXPERIMENTS if EXPERIMENTS[each].recorded)
-        unheeded, reason = ("drives", "layout"), f"{name} takes the built-in vehicle; this is only for {recorded}"
+    if name not in {*EXPERIMENTS, "all"}:
+        raise typer.BadParameter(f"{name}: expected one of {', '.join(EXPERIMENTS)} or all", param_hint="NAME")
+    rows = list(EXPERIMENTS.values()) if name == "all" else [EXPERIMENTS[name]]
+    recorded = [row for row in rows if row.recorded]
+    unheeded: tuple[str, ...] = ()
+    reason = ""
+    if rows == [CALIBRATION]:
+        unheeded = ("drives", "layout", "quick", "repetitions", "seed", "workers")
+        reason = "calibration runs nothing, it pools what is recorded in --out"
+    elif not recorded:
+        unheeded = ("drives", "layout")
+        others = ", ".join(row.name for row in EXPERIMENTS.values() if row.recorded)
+        reason = f"{name} takes the built-in vehicle; this is only for {others}"
     if given := given_options(context, unheeded):
         raise typer.BadParameter(reason, param_hint=given[0])
-    if name == CALIBRATION and out is None:
+    if rows == [CALIBRATION] and out is None:
         raise typer.BadParameter(
             "calibration pools what is recorded there; first run 'calibrator experiment all --out FOLDER', or some "
             "experiments by their names",
@@ -81,17 +89,15 @@ def experiment(
     if out is not None:
         require_possible_folder(out)
         require_possible_folder(out.absolute().parent)
-    names = ORDER if name == "all" else (name,)
     # recorded trips are read before anything is run, and once
-    trips = next((e for each, e in EXPERIMENTS.items() if each in names and e.recorded), None)
-    fleet = None if trips is None else fleet_for(trips, quick=quick, drives=drives, layout=layout)
+    trips = fleet_for(recorded[0], quick=quick, drives=drives, layout=layout) if recorded else None
     count = repetitions or (QUICK_REPETITIONS if quick else REPETITIONS)
-    done: list[ExperimentResult] = []
-    for number, each in enumerate(names, start=1):
-        with one_pass(number, len(names)):
-            if each == CALIBRATION:
+    done: dict[str, ExperimentResult] = {}
+    for number, row in enumerate(rows, start=1):
+        with one_pass(number, len(rows)):
+            if row is CALIBRATION:
                 before = [] if out is None else read_results(out, EXPERIMENTS)
-                pooled = {result.name: result for result in (*before, *done)}
+                pooled = {result.experiment.name: result for result in before} | done
                 if not pooled:
                     raise FleetError(
                         f"{out}: no experiment is recorded that calibration could pool; first run 'calibrator "
@@ -99,18 +105,16 @@ def experiment(
                     )
                 result = pool_confidences(list(pooled.values()))
             else:
-                row = EXPERIMENTS[each]
-                own = fleet if row.recorded and fleet is not None else fleet_for(row, quick=quick)
-                result = run_experiment(
-                    row.small() if quick else row, own, repetitions=count, seed=seed, workers=workers
-                )
-        done.append(replace(result, made=made_now()))
+                fleet = trips if row.recorded and trips is not None else fleet_for(row, quick=quick)
+                small = row.small() if quick else row
+                result = run_experiment(small, fleet, repetitions=count, seed=seed, workers=workers)
+        done[row.name] = result = replace(result, made=made_now())
         if not json:
-            Console().print(result_table(done[-1]))
+            Console().print(result_table(result))
         if out is not None:
-            write_result(out, done[-1])
+            write_result(out, result)
     if json:
-        texts = [result.to_json().decode().rstrip() for result in done]
+        texts = [result.to_json() for result in done.values()]
         write_output(texts[0] if len(texts) == 1 else f"[{','.join(texts)}]")
 
 

@@ -19,15 +19,15 @@ from functools import partial
 import numpy as np
 
 from calibrator.artificial.builtin_drives import BUILTIN_BRANCHES, builtin_trip
-from calibrator.artificial.ground_truth import with_branches
 from calibrator.artificial.random_fleet import draw_faults
+from calibrator.artificial.trips import with_branches
 from calibrator.drive import Array
 from calibrator.errors import DriveError
 from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, densest_clusters
-from calibrator.estimator.state_space import choose_order, identify
 from calibrator.experiments.trial import CommonEvidence, Trial, UnseenDrive
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
+from calibrator.published.state_space import choose_order, identify
 from calibrator.random_streams import Purpose, random_stream
 
 __all__ = [

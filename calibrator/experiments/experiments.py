@@ -1,24 +1,21 @@
-"""The table of experiments, those of the paper [1]_ and ours, and the one runner of all of them.
+"""The table of experiments, those of the paper [1]_ and ours.
 
 An experiment is a row of :data:`EXPERIMENTS`: settings (a case of how fleets are made, and where it stands in the
-table), the methods that are compared on them, and how it is shown. A new one is a new row. Every setting is run with
-the same seeds; all methods of a setting see the same trials.
+table), the methods that are compared on them, and how it is shown. A new one is a new row;
+:func:`~calibrator.experiments.runner.run_experiment` runs them all.
 
 .. [1] "Measurement Correction for Electric Vehicles Based on Compressed Sensing".
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
-
-import numpy as np
 
 from calibrator.errors import FleetError
 from calibrator.experiments.attacks import WORLDS
 from calibrator.experiments.baselines import BASELINES
-from calibrator.experiments.common_drive import CommonCase, CommonDrive, builtin_common_drive, common_trial
+from calibrator.experiments.common_drive import CommonCase, CommonDrive, builtin_common_drive
 from calibrator.experiments.methods import (
     CEILING,
     LEFT_IN,
@@ -27,22 +24,16 @@ from calibrator.experiments.methods import (
     THRESHOLD,
     TREE,
     Method,
-    require_estimate,
 )
-from calibrator.experiments.outcome import Outcome, confidence_bins, figures_of, judge, pit_counts, pooled
 from calibrator.experiments.recorded_trips import (
     RecordedCase,
     RecordedFleet,
     builtin_fleet,
     read_fleet,
-    recorded_trial,
 )
-from calibrator.experiments.result import ExperimentResult, Row
 from calibrator.files.layout_files import vehicle_database
-from calibrator.processes.run_many import Workers, run_many
-from calibrator.terminal.progress import shown
 
-__all__ = ["EXPERIMENTS", "Experiment", "Setting", "fleet_for", "run_experiment"]
+__all__ = ["CALIBRATION", "COVERAGE", "EXPERIMENTS", "REAL", "Experiment", "Setting", "fleet_for"]
 
 QUICK_VEHICLES, QUICK_TRAINING_VEHICLES, QUICK_TRIPS, QUICK_DURATION_S = 20, 400, 8, 300.0
 DEFAULT_LAYOUT = Path("dbc/hv_powertrain.toml")
@@ -84,7 +75,7 @@ class Experiment:
     methods : tuple of Method
         What it compares.
     settings : tuple of Setting
-        All on the common drive, or all on recorded trips.
+        All on the common drive, or all on recorded trips; none where it pools what others have found.
     quick : mapping of str to collection of float
         Series and values of x to which ``--quick`` keeps; empty: all.
     drive_s : float
@@ -97,7 +88,7 @@ class Experiment:
         Kind of its picture, see :mod:`calibrator.experiments.picture`.
     shown : tuple of str
         Figures, besides the recovery rate, that its table shows of the default, by the names of
-        :mod:`calibrator.experiments.outcome`.
+        :data:`calibrator.experiments.figures.FIGURES`.
     panels : tuple of str
         Figures that its picture shows.
     """
@@ -112,14 +103,14 @@ class Experiment:
     drive_s: float = 3600.0
     paper: Mapping[tuple[float, str], Mapping[str, float]] = field(default_factory=dict)
     note: str = ""
-    picture: Literal["lines", "dots", "map"] = "lines"
+    picture: Literal["lines", "dots", "map", "reliability"] = "lines"
     shown: tuple[str, ...] = ("confidence", "sure_wrong", "ece", "ece_by_chance", "deployed", "harmed", "delay_rmse_ms")
     panels: tuple[str, ...] = ("recovery_rate", "confidence")
 
     @property
     def recorded(self) -> bool:
         """Whether it is on recorded trips."""
-        return isinstance(self.settings[0].case, RecordedCase)
+        return any(isinstance(setting.case, RecordedCase) for setting in self.settings)
 
     def with_vehicles(self, vehicles: int, training_vehicles: int | None = None) -> "Experiment":
         """The same with smaller fleets on the common drive, and a smaller one to train trees on."""
@@ -343,7 +334,17 @@ TABLE = (
         panels=("gain_within_1", "offset_within_1"),
     ),
 )
-EXPERIMENTS = {experiment.name: experiment for experiment in TABLE}
+CALIBRATION = Experiment(
+    name="calibration",
+    title="Reliability of the confidence",
+    x_label="vehicles",
+    series_label="experiment",
+    methods=(POSTERIOR,),
+    settings=(),
+    picture="reliability",
+)
+"""Of the vehicles with a confidence of 0.9, is a share of 0.9 recovered? Pools what the others have found."""
+EXPERIMENTS = {experiment.name: experiment for experiment in (*TABLE, CALIBRATION)}
 """The table by name."""
 
 
@@ -382,116 +383,3 @@ def fleet_for(
     if quick:
         return builtin_fleet(database, trips=QUICK_TRIPS, duration_s=QUICK_DURATION_S)
     return builtin_fleet(database)
-
-
-def run_experiment(
-    experiment: Experiment,
-    fleet: CommonDrive | RecordedFleet,
-    *,
-    methods: Sequence[Method] | None = None,
-    repetitions: int = 10,
-    seed: int = 0,
-    workers: int = 1,
-) -> ExperimentResult:
-    """Run every method on the same trials of every setting.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        A row of :data:`EXPERIMENTS`, or one like them.
-    fleet : CommonDrive or RecordedFleet
-        What the vehicles drive, see :func:`fleet_for`.
-    methods : sequence of Method or None
-        What to compare; None: what the row says.
-    repetitions, seed : int
-        Trials per setting, and the seed of the first; the others follow.
-    workers : int
-        Processes; the figures do not depend on them.
-
-    Returns
-    -------
-    ExperimentResult
-        Rows by setting, then method.
-
-    Raises
-    ------
-    FleetError
-        If there is no repetition, methods share a name, or one returns what cannot be judged.
-    """
-    if repetitions < 1:
-        raise FleetError(f"an experiment needs at least 1 repetition, not {repetitions}")
-    usual = tuple(experiment.methods if methods is None else methods)
-    names = [method.name for method in usual]
-    for called in names:
-        if names.count(called) > 1:
-            raise FleetError(f"{names.count(called)} methods are called '{called}'; give each method a name of its own")
-    settings, seeds = experiment.settings, range(seed, seed + repetitions)
-    tasks = ((setting.case, setting.methods or usual, each) for setting in settings for each in seeds)
-    judged = run_many(partial(_run_trial, fleet), tasks, Workers(processes=workers))
-    outcomes = iter(shown(judged, experiment.name, len(settings) * repetitions, "trials"))
-    rows = []
-    for setting in settings:
-        trials = [next(outcomes) for _ in seeds]
-        for k, method in enumerate(setting.methods or usual):
-            paper = experiment.paper.get((setting.x, method.name), {})
-            rows.append(_row(setting, method.name, [trial[k] for trial in trials], paper))
-    next(outcomes, None)  # the bar is done
-    cases = [asdict(setting.case) for setting in settings]
-    common = {key: value for key, value in cases[0].items() if all(case[key] == value for case in cases)}
-    pair = "{:g} to {:g}"
-    written = {key: pair.format(*value) if isinstance(value, tuple) else value for key, value in common.items()}
-    note = experiment.note
-    if isinstance(fleet, RecordedFleet):
-        note += (
-            f" In every trip the current of {fleet.balance_branch} is minus the sum of the other branches: it is not "
-            "independent of their sensors, and true currents sum to 0 A but for a load that is put in."
-        )
-    return ExperimentResult(
-        name=experiment.name,
-        title=experiment.title,
-        x_label=experiment.x_label,
-        series_label=experiment.series_label,
-        settings={
-            "seed": seed,
-            "repetitions": repetitions,
-            **{key: value for key, value in written.items() if value not in {None, ""}},
-            **fleet.record,
-        },
-        rows=tuple(rows),
-        paper={
-            x: max(each["recovery_rate"] for (at, _), each in experiment.paper.items() if at == x)
-            for x in sorted({x for x, _ in experiment.paper})
-        },
-        note=note.strip(),
-    )
-
-
-def _run_trial(
-    fleet: CommonDrive | RecordedFleet, task: tuple[CommonCase | RecordedCase, Sequence[Method], int]
-) -> list[Outcome]:
-    case, methods, seed = task
-    if isinstance(fleet, CommonDrive) and isinstance(case, CommonCase):
-        trial = common_trial(fleet, case, seed)
-    elif isinstance(fleet, RecordedFleet) and isinstance(case, RecordedCase):
-        trial = recorded_trial(fleet, case, seed)
-    else:
-        raise FleetError(f"{type(case).__name__} cannot be run on a {type(fleet).__name__}; see fleet_for()")
-    return [judge(require_estimate(method.name, method.estimate(trial), trial.truth), trial) for method in methods]
-
-
-def _row(setting: Setting, method: str, trials: Sequence[Outcome], paper: Mapping[str, float]) -> Row:
-    together = pooled(trials)
-    singly = [figures_of(trial) for trial in trials]
-    figures = {}
-    for name, figure in figures_of(together).items():
-        values = [each[name].mean for each in singly if name in each]
-        sd = float(np.std(values, ddof=1)) if len(values) > 1 and np.isfinite(values).all() else 0.0
-        figures[name] = replace(figure, sd=sd, paper=paper.get(name))
-    return Row(
-        x=setting.x,
-        series=setting.series,
-        method=method,
-        figures=figures,
-        bins=confidence_bins(together),
-        pit=pit_counts(together),
-    )

@@ -203,33 +203,35 @@ def require_estimate(method: str, estimate: object, truth: Faults) -> Estimate:
     FleetError
         If it is no estimate, or one of its arrays has another shape or type, or values that are not finite.
     """
-
-    def require(good: object, what: str, given: object, expected: str) -> None:
-        if not good:
-            kind = "None" if given is None else f"an object of type {type(given).__name__}"
-            if isinstance(given, np.ndarray):
-                kind = f"an array of {given.dtype} of shape {given.shape}"
-            raise FleetError(f"method '{method}': {what} {kind}, expected {expected}; see Estimate of {__name__}")
-
-    def require_array(what: str, given: object, shape: tuple[int, ...], kinds: str, low: float = -np.inf) -> None:
-        elements, axes = "bool" if kinds == "b" else "numbers", "vehicles and branches" if shape[1:] else "vehicles"
-        good = isinstance(given, np.ndarray) and given.shape == shape and given.dtype.kind in kinds
-        require(good, f"{what} is", given, f"an array of {elements} of shape {shape}: {axes}")
-        assert isinstance(given, np.ndarray)
-        bad = int(np.sum(~(np.isfinite(given) & (given >= low) & (given <= 1.0 - low))))
-        expected = "finite ones, 0 where no fault is found" if low < -1.0 else "probabilities from 0 to 1"
-        require(not bad, f"{what} has {bad} wrong values in", given, expected)
-
-    require(isinstance(estimate, Estimate), "estimate() returned", estimate, "an Estimate")
-    assert isinstance(estimate, Estimate)
-    require(isinstance(estimate.faults, Faults), "faults are", estimate.faults, "Faults of calibrator.faults")
     N, K = truth.drift.shape
-    for name in ("hardware_drift", "hardware_offset_a", "drift", "offset_a"):
-        shape = (N,) if name == "hardware_drift" else (N, K)
-        require_array(f"faults.{name}", getattr(estimate.faults, name), shape, "fiu")
-    require_array("hardware", estimate.hardware, (N,), "b")
-    require_array("corrected", estimate.corrected, (N, K), "b")
+
+    def wrong(what: str, given: object, expected: str) -> FleetError:
+        kind = "None" if given is None else f"an object of type {type(given).__name__}"
+        if isinstance(given, np.ndarray):
+            kind = f"an array of {given.dtype} of shape {given.shape}"
+        return FleetError(f"method '{method}': {what} {kind}, expected {expected}; see Estimate of {__name__}")
+
+    if not isinstance(estimate, Estimate):
+        raise wrong("estimate() returned", estimate, "an Estimate")
+    if not isinstance(estimate.faults, Faults):
+        raise wrong("faults are", estimate.faults, "Faults of calibrator.faults")
+    arrays: dict[str, tuple[object, tuple[int, ...], str]] = {
+        f"faults.{name}": (value, (N, K), "numbers") for name, value in vars(estimate.faults).items()
+    }
+    arrays["faults.hardware_drift"] = (estimate.faults.hardware_drift, (N,), "numbers")
+    arrays |= {"hardware": (estimate.hardware, (N,), "bool"), "corrected": (estimate.corrected, (N, K), "bool")}
     if estimate.confidence is not None:
-        require_array("confidence", estimate.confidence, (N,), "fiu", low=-ROUNDING)
-    require(isinstance(estimate.failed, int | np.integer), "failed is", estimate.failed, "a number of vehicles")
+        arrays["confidence"] = (estimate.confidence, (N,), "numbers")
+    for what, (given, shape, elements) in arrays.items():
+        kinds, axes = "b" if elements == "bool" else "fiu", "vehicles and branches" if shape[1:] else "vehicles"
+        if not (isinstance(given, np.ndarray) and given.shape == shape and given.dtype.kind in kinds):
+            raise wrong(f"{what} is", given, f"an array of {elements} of shape {shape}: {axes}")
+        bad, expected = ~np.isfinite(given), "finite ones, 0 where no fault is found"
+        if what == "confidence":
+            bad |= (given < -ROUNDING) | (given > 1.0 + ROUNDING)
+            expected = "probabilities from 0 to 1"
+        if bad.any():
+            raise wrong(f"{what} has {np.sum(bad)} wrong values in", given, expected)
+    if not isinstance(estimate.failed, int | np.integer):
+        raise wrong("failed is", estimate.failed, "a number of vehicles")
     return estimate

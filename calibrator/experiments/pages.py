@@ -1,86 +1,46 @@
 """Results of experiments as tables on the console, and as pages with their pictures in a folder."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
 from calibrator.experiments.baselines import BASELINES
-from calibrator.experiments.calibration import ALL, CALIBRATION, pooled_bins, pooled_share
 from calibrator.experiments.experiments import COVERAGE, EXPERIMENTS, Experiment
+from calibrator.experiments.figures import FIGURES, calibration_errors, pool_figures, pool_tenths
 from calibrator.experiments.methods import CEILING, LEFT_IN, POSTERIOR
-from calibrator.experiments.outcome import calibration_figures
 from calibrator.experiments.picture import write_picture
-from calibrator.experiments.result import ExperimentResult, Row, read_results
+from calibrator.experiments.runner import ALL, KEYS, ExperimentResult, read_results
 from calibrator.terminal.text import counted
 from ecu_node.documents import write_atomically
 
-__all__ = ["FIGURES", "ORDER", "headline", "result_markdown", "result_table", "write_result"]
+__all__ = ["headline", "result_markdown", "result_table", "write_result"]
 
-ORDER = (*EXPERIMENTS, CALIBRATION)
-"""Experiments in the order of the index."""
-PAPER, PUBLISHED = "paper", "published"
 METHODS = {
-    PAPER: "the paper's best printed figure",
-    PUBLISHED: "the published method (/ its classifier)",
     "best subset": "best subset with BIC on the default's evidence",
     "LASSO": "LASSO with refit on the same",
     "fleet median": "regression on the fleet's median",
     "total least squares": "total least squares on the junction law",
     "VDI 2048": "reconciliation by VDI 2048",
-    POSTERIOR.name: "the default (posterior)",
+    POSTERIOR.name: "the default",
     LEFT_IN.name: "the default with the delays left in",
-    CEILING.name: "the default if it is told how the faults were drawn (law known: the most that this evidence gives)",
+    CEILING.name: "the default if it is told how the faults were drawn: the most that this evidence gives",
 }
-FIGURES = {
-    "recovery_rate": ("10 %", "share of vehicles recovered within 10 %"),
-    "recovery_rate_25": ("25 %", "within 25 %"),
-    "f2": ("f2", "f2 of the hardware classification"),
-    "complexity": ("hardware", "share held to have hardware faults (hardware)"),
-    "confidence": ("confidence", "mean confidence"),
-    "sure": ("> 0.95", "share of vehicles above 0.95"),
-    "sure_confidence": ("their confidence", "their mean confidence"),
-    "sure_recovered": ("of them recovered", "the share of them that is recovered"),
-    "sure_wrong": ("> 0.95, wrong", "of the vehicles above 0.95 those not recovered, and how many they expect"),
-    "ece": ("ECE", "expected calibration error (ECE, by tenths)"),
-    "ece_by_chance": ("by chance", "what it is by chance if the confidence is exact"),
-    "corrected": ("corrected", "share of the vehicles that is corrected in some branch (corrected)"),
-    "deployed": ("deployed", "share of the vehicles with faulty sensors that is corrected in some branch (deployed)"),
-    "harmed": (
-        "harmed",
-        "share of the corrected ones of which some branch gets worse on an unseen drive, however little (harmed)",
-    ),
-    "worst_a": ("worst [A]", "largest worsening of a branch's root mean square error (worst)"),
-    "named": ("named", "share of the vehicles attacked of which a finding names the cause (named)"),
-    "misnamed": ("misnamed", "share of the others of which a finding names any cause (misnamed)"),
-    "gain_within_1": ("gain, within 1", "share of the deployed gain errors within 1 standard deviation of the truth"),
-    "gain_beyond_3": ("gain, beyond 3", "beyond 3"),
-    "offset_within_1": ("offset, within 1", "the same of the offsets"),
-    "offset_beyond_3": ("offset, beyond 3", "beyond 3"),
-    "delay_rmse_ms": ("delay error [ms]", "root mean square error of the estimated delays"),
-}
-"""Heading and explanation of each figure, in the order of the columns."""
-COUNTED = ("sure_wrong", "harmed", "named", "misnamed", "gain_beyond_3", "offset_beyond_3")
-"""Shares that are rare, and stand beside their counts."""
+"""What the names of methods mean, where they do not say it."""
 SHORT = ("confidence", "ece", "delay_rmse_ms", "worst_a", *COVERAGE)
 """Figures for which a console of 80 columns has room."""
 PAGES_ALONE = (CEILING.name, *(method.name for method in BASELINES[1:]))
 """Methods for which only pages have room."""
-INTERVALS = "In brackets: 95 % intervals (Clopper and Pearson), for which vehicles are independent."
-SHARED_ONCE = f"Settings that several experiments share are the same trials and count once in '{ALL}'."
-CORRECTS_ALL = (
-    "The published method corrects every branch that it regresses, a sound one by what noise leaves there: such a "
-    "vehicle counts as harmed although it is recovered."
-)
 NOTHING = "-"
 
 
-def headline(result: ExperimentResult, *, short: bool = False) -> tuple[list[str], list[list[str]]]:
-    """Recovery of the paper and of all methods side by side, and the figures of the default's honesty.
+def headline(result: ExperimentResult, *, short: bool = False) -> pd.DataFrame:
+    """Recovery of the paper and of all methods side by side, and the figures of the default's honesty, as texts.
 
     Parameters
     ----------
@@ -91,81 +51,96 @@ def headline(result: ExperimentResult, *, short: bool = False) -> tuple[list[str
 
     Returns
     -------
-    header : list of str
-        Columns. Figures besides the recovery are of the default, or where it was not run of the first method with a
-        confidence.
-    rows : list of list of str
-        One per setting.
+    DataFrame
+        A row per setting. Figures besides the recovery are of the default, or where it was not run of the first method
+        with a confidence.
     """
-    names, owner = _shown(result, short=short), _owner(result)
-    lines = []
-    for series, x in dict.fromkeys((row.series, row.x) for row in result.rows):
-        rows = {row.method: row for row in result.rows if (row.series, row.x) == (series, x)}
-        paper = f"{result.paper[x]:.2f}" if x in result.paper else NOTHING
-        cells = [*([series] if result.series_label else []), f"{x:g}", *([paper] if result.paper else [])]
-        cells += [_cell(rows.get(method), "recovery_rate", short=short) for method in result.methods]
-        lines.append([*cells, *(_cell(rows.get(owner), name, short=short) for name in names)])
-    paper_column = [PAPER] if result.paper else []
-    headings = [FIGURES[name][0] for name in names]
-    return [*_keys(result), *paper_column, *result.methods, *headings], lines
+    experiment, texts = result.experiment, _texts(result.figures, short=short)
+    settings = texts[["series", "x"]].drop_duplicates().set_index(["series", "x"])
+    best = _paper_rates(experiment)
+    if best:
+        settings["paper"] = [f"{best[x]:.2f}" if x in best else NOTHING for _, x in settings.index]
+    columns = [(method, "recovery_rate", method) for method in result.methods]
+    columns += [(FIGURES[name].heading, name, _owner(result)) for name in _shown(result, short=short)]
+    for heading, figure, method in columns:
+        own = texts[(texts["figure"] == figure) & (texts["method"] == method)].set_index(["series", "x"])["text"]
+        settings[heading] = own.reindex(settings.index).astype(object).fillna(NOTHING)
+    return _labelled(settings.reset_index(), experiment)
 
 
-def _keys(result: ExperimentResult) -> list[str]:
-    """Headings of what tells rows apart."""
-    return [*([result.series_label] if result.series_label else []), result.x_label]
+def _labelled(table: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
+    """Table with the labels of what is varied; without series, if there are none."""
+    table = table.assign(x=["" if np.isnan(x) else f"{x:g}" for x in table["x"]])
+    table = table if experiment.series_label else table.drop(columns="series")
+    return table.rename(columns={"series": experiment.series_label, "x": experiment.x_label})
+
+
+def _paper_rates(experiment: Experiment) -> dict[float, float]:
+    """Best recovery rate that the paper prints, by x, whatever methods were run."""
+    rates = sorted((x, figures["recovery_rate"]) for (x, _), figures in experiment.paper.items())
+    return dict(rates)
 
 
 def _owner(result: ExperimentResult) -> str:
     """The method whose honesty the headline shows: the default, else the first with a confidence; empty for none."""
-    confident = [row.method for row in result.rows if row.bins]
+    confident = result.figures.loc[result.figures["figure"] == "confidence", "method"].tolist()
     return POSTERIOR.name if POSTERIOR.name in confident else next(iter(confident), "")
 
 
 def _shown(result: ExperimentResult, *, short: bool = False) -> list[str]:
     """Figures of the owner in the headline."""
-    there = {name for row in result.rows if row.method == _owner(result) for name in row.figures}
-    wanted = EXPERIMENTS[result.name].shown if result.name in EXPERIMENTS else Experiment.shown
+    there = set(result.figures.loc[result.figures["method"] == _owner(result), "figure"])
+    wanted = result.experiment.shown
     short_names = (*SHORT, "harmed") if wanted != Experiment.shown else SHORT
     return [name for name in wanted if name in there and (not short or name in short_names)]
 
 
-def _detailed(result: ExperimentResult) -> list[str]:
-    """Figures in the table of all."""
-    hidden = () if result.name == "coverage" else COVERAGE
-    return [name for name in FIGURES if name not in hidden and any(name in row.figures for row in result.rows)]
-
-
-def _cell(row: Row | None, name: str, *, short: bool = False) -> str:
-    """A figure; a share with its interval, and one that is rare with its counts and what is expected."""
-    if row is None or name not in row.figures:
-        return NOTHING
-    figure = row.figures[name]
-    text = f"{figure.mean:.1f}" if name == "worst_a" else f"{figure.mean:.3f}"
-    counts = f"{figure.hits} of {figure.of}" if name in COUNTED and figure.of else ""
-    if short or figure.interval is None:
-        return counts or text
-    low, high = figure.interval
-    beside = f"; {counts}" if counts else ""
-    if figure.expected is not None:
-        beside += f", {figure.expected:.1f} expected"
-    return f"{text} ({low:.3f} to {high:.3f}{beside})"
+def _texts(figures: pd.DataFrame, *, short: bool = False) -> pd.DataFrame:
+    """Figures with their ``text``: a share with its interval, a rare one with its counts and what is expected."""
+    sure = figures[figures["figure"] == "sure_confidence"].set_index(KEYS)["value"].to_dict()
+    texts = []
+    for row in figures.itertuples():
+        kind, share = FIGURES[row.figure], not np.isnan(row.low)
+        text = f"{row.value:.1f}" if row.figure == "worst_a" else f"{row.value:.3f}"
+        counts = f"{round(row.value * row.of)} of {row.of:.0f}" if kind.rare and share else ""
+        if short or not share:
+            texts.append(counts or text)
+            continue
+        beside = f"; {counts}" if counts else ""
+        if row.figure == "sure_wrong":
+            beside += f", {(1.0 - sure[row.series, row.x, row.method]) * row.of:.1f} expected"
+        texts.append(f"{text} ({row.low:.3f} to {row.high:.3f}{beside})")
+    return figures.assign(text=texts)
 
 
 def _caption(results: Sequence[ExperimentResult], *, short: bool = False) -> str:
     """Explain the columns of the headlines of results; a column that none of them has is not mentioned."""
-    methods = list(dict.fromkeys(method for result in results for method in result.methods))
-    there = {PUBLISHED if name.startswith(f"{PUBLISHED}/") else name for name in methods}
-    there |= {PAPER} if any(result.paper for result in results) else set()
-    own = [f"{name} (a method of one's own)" for name in methods if name in there - METHODS.keys()]
-    figures = {name for result in results for name in _shown(result, short=short)}
-    owners = dict.fromkeys(_called(_owner(result)) for result in results if _shown(result, short=short))
-    text = f"Share of vehicles recovered within 10 %: {_listed([METHODS[n] for n in METHODS if n in there] + own)}."
-    if figures:
-        text += f" Of {_listed([*owners])}: {_listed([t for name, (_, t) in FIGURES.items() if name in figures])}."
-    notes = dict.fromkeys(result.note for result in results if result.note)
-    if any(row.series == ALL for result in results for row in result.rows):
-        notes[SHARED_ONCE] = None
-    return " ".join([text, *([] if short else [INTERVALS]), *notes])
+    methods = dict.fromkeys(method for result in results for method in result.methods)
+    named = {name: METHODS.get(name, "a method of one's own") for name in methods if not name.startswith("published/")}
+    means = ["paper (its best printed figure)"] if any(result.experiment.paper for result in results) else []
+    means += ["published/classifier (the published method)"] if len(named) < len(methods) else []
+    means += [f"{name} ({meaning})" for name, meaning in named.items()]
+    text = f"Share of vehicles recovered within 10 %: {', '.join(means)}."
+    shown = {name for result in results for name in _shown(result, short=short)}
+    if shown:
+        owners = dict.fromkeys(_called(_owner(result)) for result in results if _shown(result, short=short))
+        text += f" Of {' and '.join(owners)}: {_explained([name for name in FIGURES if name in shown])}."
+    notes = dict.fromkeys(result.experiment.note for result in results if result.experiment.note)
+    if not short:
+        text += " In brackets: 95 % intervals (Clopper and Pearson), for which vehicles are independent."
+    for branch in dict.fromkeys(result.settings.get("balance_branch") for result in results):
+        if branch is not None:
+            notes[
+                f"In every trip the current of {branch} is minus the sum of the other branches: it is not independent "
+                "of their sensors, and true currents sum to 0 A but for a load that is put in."
+            ] = None
+    if any((result.figures["series"] == ALL).any() for result in results):
+        notes[f"Settings that several experiments share are the same trials and count once in '{ALL}'."] = None
+    return " ".join([text, *notes])
+
+
+def _explained(names: Sequence[str]) -> str:
+    return ", ".join(f"{FIGURES[name].heading} ({FIGURES[name].meaning})" for name in names)
 
 
 def _called(method: str) -> str:
@@ -173,40 +148,37 @@ def _called(method: str) -> str:
     return "the default" if method == POSTERIOR.name else method
 
 
-def _listed(texts: Sequence[str]) -> str:
-    """Texts with commas, and 'and' before the last."""
-    return " and ".join(part for part in (", ".join(texts[:-1]), *texts[-1:]) if part)
-
-
-def _repetitions(result: ExperimentResult) -> str:
+def _effort(result: ExperimentResult) -> str:
     count = result.settings["repetitions"]
-    return counted(1, "repetition") if str(count) == "1" else f"{count} repetitions"
-
-
-def _failures(result: ExperimentResult) -> str:
-    """Say where an optimisation failed; empty if none did."""
-    failed = {f"{row.series} {row.x:g} {row.method}".strip(): row.figures.get("failed") for row in result.rows}
-    named = [f"{name} {figure.mean:.3f}" for name, figure in failed.items() if figure is not None and figure.mean]
-    return f" Optimisation failed for a share of: {', '.join(named)}." if named else ""
+    times = counted(1, "repetition") if str(count) == "1" else f"{count} repetitions"
+    return f"{times}, seed {result.settings['seed']}, drive {result.settings['drive']}"
 
 
 def result_table(result: ExperimentResult) -> Group:
     """Headline of a result for the console: title, table and caption, which is as wide as the console."""
-    shown = replace(result, rows=tuple(row for row in result.rows if row.method not in PAGES_ALONE))
+    figures = result.figures[~result.figures["method"].isin(PAGES_ALONE)]
+    shown = ExperimentResult(
+        experiment=result.experiment, settings=result.settings, figures=figures, tenths=result.tenths
+    )
     table = Table(box=None, pad_edge=False, collapse_padding=True)
-    header, rows = headline(shown, short=True)
-    for number, heading in enumerate(header):
-        first = number == 0 and bool(result.series_label)
+    cells = headline(shown, short=True)
+    for number, heading in enumerate(cells.columns):
+        first = number == 0 and bool(result.experiment.series_label)
         text = escape(heading).replace("/", "/\n").replace(", ", ",\n")
         table.add_column(text, justify="left" if first else "right", no_wrap=first, overflow="fold")
-    for row in rows:
+    for row in cells.to_numpy():
         table.add_row(*row)
-    settings = result.settings
-    vehicles = f"{settings['vehicles']} vehicles, " if isinstance(settings.get("vehicles"), int) else ""
-    effort = f"{_repetitions(result)}, seed {settings['seed']}, drive {settings['drive']}"
+    vehicles = f"{result.settings['vehicles']} vehicles, " if isinstance(result.settings.get("vehicles"), int) else ""
     more = "--out writes all figures" if result.made else "result_markdown shows all figures"
-    text = f"{_caption([shown], short=True)} {more}. {vehicles}{effort}.{_failures(shown)}"
-    return Group(Text(result.title, style="bold"), table, Text(text, style="dim"), Text())
+    text = f"{_caption([shown], short=True)} {more}. {vehicles}{_effort(result)}.{_failures(figures)}"
+    return Group(Text(result.experiment.title, style="bold"), table, Text(text, style="dim"), Text())
+
+
+def _failures(figures: pd.DataFrame) -> str:
+    """Say where an optimisation failed; empty if none did."""
+    failed = figures[(figures["figure"] == "failed") & (figures["value"] > 0.0)]
+    named = [f"{row.series} {row.x:g} {row.method} {row.value:.3f}".strip() for row in failed.itertuples()]
+    return f" Optimisation failed for a share of: {', '.join(named)}." if named else ""
 
 
 def result_markdown(result: ExperimentResult, *, picture: str = "") -> str:
@@ -219,88 +191,91 @@ def result_markdown(result: ExperimentResult, *, picture: str = "") -> str:
     picture : str
         File of its picture, as the page is to link it; empty: there is none.
     """
-    command = f"Written by `calibrator experiment {result.name} --out FOLDER`. " if result.made else ""
+    experiment, figures = result.experiment, result.figures
+    hidden = ("failed",) if experiment.name == "coverage" else ("failed", *COVERAGE)
+    names = [name for name in FIGURES if name not in hidden and (figures["figure"] == name).any()]
+    written = f"Written by `calibrator experiment {experiment.name} --out FOLDER`. " if result.made else ""
+    more = _explained([name for name in names if name not in _shown(result)])
+    about = f"All figures{f'; besides those above {more}' if more else ''}."
+    about += " After a stroke: the paper." if experiment.paper else ""
+    if "harmed" in names and any(name.startswith("published/") for name in result.methods):
+        about += (
+            " The published method corrects every branch that it regresses, a sound one by what noise leaves there: "
+            "such a vehicle counts as harmed although it is recovered."
+        )
+    sections = [
+        f"# {experiment.title}",
+        f"{written}{_caption([result])}{_failures(figures)}",
+        _markdown(headline(result)),
+        _together(result),
+        f"![{experiment.title}]({picture})" if picture else "",
+        about,
+        _details(result, names),
+    ]
+    tenths = result.tenths[result.tenths["method"] == _owner(result)]
+    whole = pool_tenths(tenths[tenths["series"] == ALL] if (tenths["series"] == ALL).any() else tenths)
+    if len(whole):
+        ece, chance = calibration_errors(whole)
+        sections += [
+            f"All settings together, by tenths of the confidence of {_called(_owner(result))} (ECE {ece:.3f}, by "
+            f"chance {chance:.3f}):",
+            _reliability(whole),
+        ]
+    if experiment.name == "coverage" and len(tenths):
+        pit = tenths.pivot_table(index=["series", "x"], columns="low", values="pit", sort=False, aggfunc="sum")
+        pit.loc[(ALL, np.nan), :] = pit.sum()
+        sections += [
+            "Deployed parameters by tenths of their probability integral transform, which are equal if the posterior "
+            "is right (of the simulation-based calibration these are its ranks):",
+            _markdown(_labelled(pit.astype(int).reset_index(), experiment)),
+        ]
     settings = ", ".join(
         f"{name} {str(value).lower() if isinstance(value, bool) else value}" for name, value in result.settings.items()
     )
-    lines = [f"# {result.title}", "", f"{command}{_caption([result])}{_failures(result)}", ""]
-    lines += [*_markdown(*headline(result)), "", *_together(result)]
-    lines += [f"![{result.title}]({picture})", ""] if picture else []
-    lines += [*_details(result), *_reliability(result), *_pit(result)]
-    return "\n".join([*lines, f"Settings: {settings}.{f' Made by {result.made}.' if result.made else ''}", ""])
+    sections.append(f"Settings: {settings}.{f' Made by {result.made}.' if result.made else ''}")
+    return "\n\n".join(section for section in sections if section) + "\n"
 
 
-def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table."""
-    return [f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *rows)]
+def _markdown(table: pd.DataFrame) -> str:
+    """Table as Markdown."""
+    rows = (table.columns, ["---"] * table.shape[1], *table.to_numpy())
+    return "\n".join(f"| {' | '.join(map(str, cells))} |" for cells in rows)
 
 
-def _together(result: ExperimentResult) -> list[str]:
-    """Lines on all settings together: what is rare in one may be told by many."""
-    names, lines = ("harmed", "sure_wrong"), []
+def _together(result: ExperimentResult) -> str:
+    """All settings together: what is rare in one may be told by many; empty for a single setting."""
+    rows = []
     for method in result.methods:
-        rows = [row for row in result.rows if row.method == method and row.series != ALL]
-        pooled = {name: figure for name in names if (figure := pooled_share(rows, name)) is not None}
-        if pooled and len(rows) > 1:
-            whole = Row(x=0.0, method=method, figures=pooled)
-            lines.append([method, *(_cell(whole, name) for name in names)])
-    header = ["all settings together", *(FIGURES[name][0] for name in names)]
-    return [*_markdown(header, lines), ""] if lines else []
+        own = result.figures[(result.figures["method"] == method) & (result.figures["series"] != ALL)]
+        counted_shares = own["figure"].isin(["harmed", "sure_wrong"]) & own["low"].notna()
+        if own[["series", "x"]].drop_duplicates().shape[0] > 1 and counted_shares.any():
+            rows.append(_texts(pool_figures(own).assign(series="", x=0.0, method=method)))
+    if not rows:
+        return ""
+    texts = pd.concat(rows).pivot_table(index="method", columns="figure", values="text", sort=False, aggfunc="first")
+    texts = texts.reindex(columns=["harmed", "sure_wrong"]).astype(object).fillna(NOTHING)
+    texts.columns = [FIGURES[name].heading for name in texts.columns]
+    return _markdown(texts.rename_axis("all settings together").reset_index())
 
 
-def _details(result: ExperimentResult) -> list[str]:
-    """All figures of all rows, the paper's after a stroke, and what the columns mean that are not in the headline."""
-    names, rows = _detailed(result), []
-    for row in result.rows:
-        cells = []
-        for name in names:
-            figure = row.figures.get(name)
-            paper = "" if figure is None or figure.paper is None else f" / {figure.paper:.2f}"
-            cells.append(_cell(row, name) + paper)
-        rows.append([*([row.series] if result.series_label else []), f"{row.x:g}", row.method, *cells])
-    more = dict.fromkeys(FIGURES[name][1] for name in names if name not in _shown(result))
-    text = f"All figures; besides those above {_listed([*more])}." if more else "All figures."
-    if result.paper:
-        text += " After a stroke: the paper."
-    if "harmed" in names and any(name.startswith(f"{PUBLISHED}/") for name in result.methods):
-        text += f" {CORRECTS_ALL}"
-    return [text, "", *_markdown([*_keys(result), "method", *(FIGURES[name][0] for name in names)], rows), ""]
-
-
-def _reliability(result: ExperimentResult) -> list[str]:
-    """Lines that compare the owner's confidence with what became of it; none without a confidence."""
-    rows_of_owner = [row for row in result.rows if row.method == _owner(result)]
-    bins = pooled_bins([row for row in rows_of_owner if row.series == ALL] or rows_of_owner)
-    if not bins:
-        return []
-    rows = [[f"{b.low:.1f}", f"{b.count}", f"{b.confidence:.3f}", f"{b.recovered:.3f}"] for b in bins]
-    ece, chance = (figure.mean for figure in calibration_figures(bins).values())
-    return [
-        f"All settings together, by tenths of {_called(_owner(result))}'s confidence (ECE {ece:.3f}, by chance "
-        f"{chance:.3f}):",
-        "",
-        *_markdown(["from", "vehicles", "mean confidence", "recovered"], rows),
-        "",
+def _details(result: ExperimentResult, names: Sequence[str]) -> str:
+    """All figures of all methods, the paper's after a stroke."""
+    texts, paper = _texts(result.figures), result.experiment.paper
+    texts["text"] += [
+        f" / {paper[key][figure]:.2f}" if figure in paper.get(key := (x, method), {}) else ""
+        for x, method, figure in zip(texts["x"], texts["method"], texts["figure"], strict=True)
     ]
+    table = texts.pivot_table(index=KEYS, columns="figure", values="text", sort=False, aggfunc="first")
+    table = table.reindex(columns=names).astype(object).fillna(NOTHING)
+    table.columns = [FIGURES[name].heading for name in names]
+    return _markdown(_labelled(table.reset_index(), result.experiment))
 
 
-def _pit(result: ExperimentResult) -> list[str]:
-    """Lines of the histogram of the probability integral transform; none but where that is the question."""
-    rows = [row for row in result.rows if row.pit and row.method == _owner(result)]
-    if result.name != "coverage" or not rows:
-        return []
-    cells = [[row.series, f"{row.x:g}", *(f"{count}" for count in row.pit)] for row in rows]
-    total = [sum(counts) for counts in zip(*(row.pit for row in rows), strict=True)]
-    return [
-        "Deployed parameters by tenths of their probability integral transform, which are equal if the posterior is "
-        "right (of the simulation-based calibration these are its ranks):",
-        "",
-        *_markdown(
-            [*_keys(result), *(f"{k / len(total):.1f}" for k in range(len(total)))],
-            [*cells, [ALL, "", *(f"{count}" for count in total)]],
-        ),
-        "",
-    ]
+def _reliability(whole: pd.DataFrame) -> str:
+    """Confidence beside what became of it, by tenths."""
+    formats = {"low": "{:.1f}", "vehicles": "{:.0f}", "confidence": "{:.3f}", "recovered": "{:.3f}"}
+    cells = pd.DataFrame({name: whole[name].map(text.format) for name, text in formats.items()})
+    return _markdown(cells.rename(columns={"low": "from", "confidence": "mean confidence"}))
 
 
 def write_result(folder: Path, result: ExperimentResult) -> None:
@@ -311,20 +286,18 @@ def write_result(folder: Path, result: ExperimentResult) -> None:
     FleetError
         If another record of the folder is damaged.
     """
+    name = result.experiment.name
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / f"{result.name}.json", result.to_json())
-    write_atomically(folder / f"{result.name}.md", result_markdown(result, picture=f"{result.name}.png").encode())
-    write_picture(result, folder / f"{result.name}.png")
-    results = read_results(folder, dict.fromkeys([*ORDER, result.name]))
-    lines = ["# Results of the experiments", "", f"Written by `calibrator experiment`. {_caption(results)}", ""]
+    write_atomically(folder / f"{name}.json", f"{result.to_json()}\n".encode())
+    write_atomically(folder / f"{name}.md", result_markdown(result, picture=f"{name}.png").encode())
+    write_picture(result, folder / f"{name}.png")
+    results = [*read_results(folder, EXPERIMENTS), *([] if name in EXPERIMENTS else [result])]
+    index = ["# Results of the experiments", f"Written by `calibrator experiment`. {_caption(results)}"]
     for each in results:
-        lines += [
-            f"## [{each.title}]({folder.name}/{each.name}.md)",
-            "",
-            f"`calibrator experiment {each.name}`: {_repetitions(each)}, seed {each.settings['seed']}, "
-            f"drive {each.settings['drive']}{f'; {each.made}' if each.made else ''}.",
-            "",
-            *_markdown(*headline(each)),
-            "",
+        row, made = each.experiment, f"; {each.made}" if each.made else ""
+        index += [
+            f"## [{row.title}]({folder.name}/{row.name}.md)",
+            f"`calibrator experiment {row.name}`: {_effort(each)}{made}.",
+            _markdown(headline(each)),
         ]
-    write_atomically(folder.parent / f"{folder.name}.md", "\n".join(lines).encode())
+    write_atomically(folder.parent / f"{folder.name}.md", ("\n\n".join(index) + "\n").encode())

@@ -1,10 +1,11 @@
 """Results of experiments as pictures: one function per kind. Bars are 95 % intervals, rings the paper's figures."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -13,12 +14,8 @@ from matplotlib.transforms import ScaledTranslation
 
 from calibrator.drive import Array
 from calibrator.experiments.baselines import BASELINES
-from calibrator.experiments.calibration import ALL, CALIBRATION
-from calibrator.experiments.experiments import EXPERIMENTS, Experiment
 from calibrator.experiments.methods import CEILING, LEFT_IN, PERFECT, POSTERIOR, THRESHOLD, TREE
-from calibrator.experiments.outcome import BINS
-from calibrator.experiments.result import ExperimentResult
-from calibrator.experiments.result import Figure as Merit
+from calibrator.experiments.runner import ALL, ExperimentResult
 
 __all__ = ["draw_result", "write_picture"]
 
@@ -66,26 +63,30 @@ def write_picture(result: ExperimentResult, path: Path) -> None:
 
 def draw_result(result: ExperimentResult) -> Figure:
     """Draw a result of an experiment as its row in the table says, with one legend beside the data."""
-    kind = EXPERIMENTS[result.name].picture if result.name in EXPERIMENTS else "lines"
-    draw = {"lines": _draw_lines, "dots": _draw_dots, "map": _draw_map}[kind]
+    kinds = {"lines": _draw_lines, "dots": _draw_dots, "map": _draw_map, "reliability": _draw_reliability}
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(result.title)
-    (_draw_reliability if result.name == CALIBRATION else draw)(figure, result)
+    figure.suptitle(result.experiment.title)
+    kinds[result.experiment.picture](figure, result)
     return figure
 
 
-def _panels(result: ExperimentResult) -> tuple[str, ...]:
-    return EXPERIMENTS[result.name].panels if result.name in EXPERIMENTS else Experiment.panels
-
-
-def _bars(figures: Sequence[Merit]) -> Array:
+def _bars(rows: pd.DataFrame) -> Array:
     """Lengths of the 95 % intervals down and up, shape (2, n); 0 where there is none."""
-    ends = [figure.interval or (figure.mean, figure.mean) for figure in figures]
-    return np.array([[max(f.mean - low, 0.0), max(high - f.mean, 0.0)] for f, (low, high) in zip(figures, ends)]).T  # noqa: B905
+    lengths = np.stack([rows["value"] - rows["low"], rows["high"] - rows["value"]])
+    return np.asarray(np.maximum(np.nan_to_num(lengths), 0.0))
 
 
-def _rings(axes: Axes, points: Sequence[tuple[float, float | None]], label: str, colour: str, **more: Any) -> None:
+def _paper(result: ExperimentResult, rows: pd.DataFrame) -> list[float | None]:
+    """The paper's figures for these rows, where it prints any."""
+    paper = result.experiment.paper
+    keys = zip(rows["x"], rows["method"], rows["figure"], strict=True)
+    return [paper.get((x, method), {}).get(figure) for x, method, figure in keys]
+
+
+def _rings(
+    axes: Axes, points: Iterable[tuple[float | None, float | None]], label: str, colour: str, **more: Any
+) -> None:
     """Figures of the paper: rings that hide nothing."""
     known = [(x, y) for x, y in points if x is not None and y is not None]
     if known:
@@ -110,24 +111,23 @@ def _legend(figure: Figure, *, title: str | None = None) -> None:
 
 def _draw_dots(figure: Figure, result: ExperimentResult) -> None:
     """A line of dots per setting and a panel per figure, where settings are no numbers."""
-    keys = list(dict.fromkeys((row.series, row.x) for row in result.rows))
+    table, panels = result.figures, result.experiment.panels
+    keys = list(dict.fromkeys(zip(table["series"], table["x"], strict=True)))
     figure.set_size_inches(11.0, 2.0 + max(3.0, 0.3 * len(keys)))
-    panels = _panels(result)
     all_axes = figure.subplots(1, len(panels), sharey=True)
     for axes, name in zip(all_axes, panels, strict=True):
         for number, method in enumerate(result.methods):
-            rows = [row for row in result.rows if row.method == method and name in row.figures]
+            rows = table[(table["method"] == method) & (table["figure"] == name)]
+            if rows.empty:
+                continue
             aside = 0.6 * ((number + 0.5) / len(result.methods) - 0.5)
-            place = [keys.index((row.series, row.x)) + aside for row in rows]
-            figures, style = [row.figures[name] for row in rows], _style_of(method)
-            if rows:
-                means = [figure.mean for figure in figures]
-                axes.errorbar(means, place, xerr=_bars(figures), label=method, linestyle="", markersize=5.0, **style)
-                points: Any = [(figure.paper, y) for figure, y in zip(figures, place, strict=True)]
-                _rings(axes, points, method, style["color"])
+            place = [keys.index(key) + aside for key in zip(rows["series"], rows["x"], strict=True)]
+            style = _style_of(method)
+            axes.errorbar(rows["value"], place, xerr=_bars(rows), label=method, linestyle="", markersize=5.0, **style)
+            _rings(axes, zip(_paper(result, rows), place, strict=True), method, style["color"])
         axes.set(title=TITLES[name], xlim=SHARES)
         axes.grid(visible=True, alpha=0.3)
-    ticks = [f"{series}, {result.x_label.split()[0]} {x:g}".removeprefix(", ") for series, x in keys]
+    ticks = [f"{series}, {result.experiment.x_label.split()[0]} {x:g}".removeprefix(", ") for series, x in keys]
     all_axes[0].set_yticks(range(len(keys)), ticks, fontsize="small")
     all_axes[0].invert_yaxis()
     _legend(figure)
@@ -135,34 +135,29 @@ def _draw_dots(figure: Figure, result: ExperimentResult) -> None:
 
 def _draw_lines(figure: Figure, result: ExperimentResult) -> None:
     """Figures over what is varied: a curve per method; with several series a panel per method, a curve per series."""
-    series = list(dict.fromkeys(row.series for row in result.rows))
-    several = len(series) > 1
-    groups = [(method,) for method in result.methods] if several else [result.methods]
-    panels = []
-    for name in _panels(result):
-        for group in groups:
-            rows = [row for row in result.rows if row.method in group and name in row.figures]
-            panels += [(name, group, rows)] if rows else []
-    all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axes, (name, group, panel_rows) in zip(all_axes, panels, strict=True):
-        curves = list(dict.fromkeys((row.method, row.series) for row in panel_rows))
-        for number, (method, one) in enumerate(curves):
-            rows = [row for row in panel_rows if (row.method, row.series) == (method, one)]
+    table, x_label = result.figures, result.experiment.x_label
+    several = table["series"].nunique() > 1
+    groups = [[method] for method in result.methods] if several else [list(result.methods)]
+    wanted = [(name, group) for name in result.experiment.panels for group in groups]
+    drawn = [(*one, table[(table["figure"] == one[0]) & table["method"].isin(one[1])]) for one in wanted]
+    drawn = [panel for panel in drawn if len(panel[2])]
+    all_axes = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0]
+    values = sorted(set(table["x"]))
+    for axes, (name, group, panel) in zip(all_axes, drawn, strict=True):
+        curves = list(panel.groupby(["method", "series"], sort=False))
+        for number, ((method, one), rows) in enumerate(curves):
             label = (one or "as S says") if several else method
             style = _style(number) if several else _style_of(method)
             aside_pt = DODGE_PT * (number - (len(curves) - 1) / 2.0)
             transform = axes.transData + ScaledTranslation(aside_pt / 72.0, 0.0, figure.dpi_scale_trans)
-            x, figures = [row.x for row in rows], [row.figures[name] for row in rows]
             axes.errorbar(
-                x, [figure.mean for figure in figures], yerr=_bars(figures), label=label, transform=transform,
+                rows["x"], rows["value"], yerr=_bars(rows), label=label, transform=transform,
                 linestyle=LINES[number % len(LINES)], markersize=5.5, capsize=2.5, elinewidth=1.0, **style,
             )  # fmt: skip
-            points = [(row.x, row.figures[name].paper) for row in rows]
-            _rings(axes, points, label, style["color"], transform=transform)
-        axes.set(title=f"{TITLES[name]}, {group[0]}" if several else TITLES[name], xlabel=result.x_label, ylim=SHARES)
+            _rings(axes, zip(rows["x"], _paper(result, rows), strict=True), label, style["color"], transform=transform)
+        axes.set(title=f"{TITLES[name]}, {group[0]}" if several else TITLES[name], xlabel=x_label, ylim=SHARES)
         axes.tick_params(labelleft=True)
         axes.grid(visible=True, alpha=0.3)
-        values = sorted({row.x for row in result.rows})
         margin = MARGIN * (values[-1] - values[0]) or 1.0
         axes.set_xlim(values[0] - margin, values[-1] + margin)
         if values[0] > 0.0 and values[-1] > LOGARITHMIC * values[0]:
@@ -171,46 +166,44 @@ def _draw_lines(figure: Figure, result: ExperimentResult) -> None:
         axes.set_xticks(values, [f"{value:g}" for value in values])
         axes.set_xticks([], minor=True)
     all_axes[0].set_ylabel("share of vehicles; bars: 95 % intervals")
-    _legend(figure, title=result.series_label if several else None)
+    _legend(figure, title=result.experiment.series_label if several else None)
 
 
 def _draw_map(figure: Figure, result: ExperimentResult) -> None:
     """A map of the recovery rate per method."""
-    series = list(dict.fromkeys(row.series for row in result.rows))
-    x = sorted({row.x for row in result.rows})
-    for axes, method in zip(np.atleast_1d(figure.subplots(1, len(result.methods))), result.methods, strict=True):
-        rates: Array = np.full((len(series), len(x)), np.nan)
-        for row in result.rows:
-            if row.method == method:
-                rates[series.index(row.series), x.index(row.x)] = row.figures["recovery_rate"].mean
-        axes.imshow(rates, vmin=0.0, vmax=1.0, origin="lower", aspect="auto", cmap="viridis")
-        for (i, j), rate in np.ndenumerate(rates):
+    table, experiment = result.figures, result.experiment
+    all_axes = np.atleast_1d(figure.subplots(1, len(result.methods)))
+    for axes, method in zip(all_axes, result.methods, strict=True):
+        rates = table[(table["method"] == method) & (table["figure"] == "recovery_rate")]
+        grid = rates.pivot_table(index="series", columns="x", values="value", sort=False).sort_index(axis=1)
+        axes.imshow(grid, vmin=0.0, vmax=1.0, origin="lower", aspect="auto", cmap="viridis")
+        for (i, j), rate in np.ndenumerate(grid.to_numpy()):
             axes.text(j, i, f"{rate:.2f}", ha="center", va="center", color="black" if rate > 0.6 else "white")
-        axes.set_xticks(range(len(x)), [f"{value:g}" for value in x])
-        axes.set_yticks(range(len(series)), series)
-        axes.set(title=f"recovery rate, {method}", xlabel=result.x_label, ylabel=result.series_label)
+        axes.set_xticks(range(grid.shape[1]), [f"{x:g}" for x in grid.columns])
+        axes.set_yticks(range(len(grid)), grid.index)
+        axes.set(title=f"recovery rate, {method}", xlabel=experiment.x_label, ylabel=experiment.series_label)
 
 
 def _draw_reliability(figure: Figure, result: ExperimentResult) -> None:
     """Share recovered over confidence, experiment by experiment and all together, with the numbers of vehicles."""
     reliability, counts = figure.subplots(1, 2)
     reliability.plot([0.0, 1.0], [0.0, 1.0], color="0.6", linewidth=1.0)
-    for number, row in enumerate(result.rows):
-        label = f"{row.series}, ECE {row.figures['ece'].mean:.3f}"
-        if row.series == ALL:
-            reliability.plot([b.confidence for b in row.bins], [b.recovered for b in row.bins], "k.-", label=label)
+    errors = result.figures[result.figures["figure"] == "ece"].set_index("series")["value"]
+    for number, (series, tenths) in enumerate(result.tenths.groupby("series", sort=False)):
+        label = f"{series}, ECE {errors[series]:.3f}"
+        if series == ALL:
+            reliability.plot(tenths["confidence"], tenths["recovered"], "k.-", label=label)
+            bars = counts.bar(tenths["low"] + 0.05, tenths["vehicles"], width=0.09, color="0.6")
+            counts.bar_label(bars, fontsize="x-small")
+            counts.set_ylim(0.8, 3.0 * tenths["vehicles"].max())
             continue
         style = _style(number)
         reliability.plot([], [], linestyle="", label=label, **style)
-        for b in row.bins:
-            face = style["color"] if b.count >= FEW else "white"
-            reliability.plot(b.confidence, b.recovered, linestyle="", markerfacecolor=face, **style)
+        for tenth in tenths.itertuples():
+            face = style["color"] if tenth.vehicles >= FEW else "white"
+            reliability.plot(tenth.confidence, tenth.recovered, linestyle="", markerfacecolor=face, **style)
     reliability.plot([], [], "o", color="0.6", markerfacecolor="white", label=f"hollow: fewer than {FEW} vehicles")
     reliability.set(xlabel="confidence", ylabel="share recovered", xlim=SHARES, ylim=SHARES)
     reliability.grid(visible=True, alpha=0.3)
-    bins = result.rows[-1].bins
-    bars = counts.bar([b.low + 0.5 / BINS for b in bins], [b.count for b in bins], width=0.9 / BINS, color="0.6")
-    counts.bar_label(bars, fontsize="x-small")
     counts.set(xlabel="confidence", ylabel=f"vehicles, {ALL}", yscale="log", xlim=SHARES)
-    counts.set_ylim(0.8, 3.0 * max(b.count for b in bins))
     _legend(figure)

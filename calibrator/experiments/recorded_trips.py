@@ -12,10 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from calibrator.artificial.builtin_drives import builtin_trip
-from calibrator.artificial.ground_truth import GroundTruth, choose_branches, with_branches
 from calibrator.artificial.random_fleet import draw_faults
-from calibrator.artificial.trips import read_recorded_trips
-from calibrator.artificial.vehicle import Disturbances, Vehicle, vehicle_drive
+from calibrator.artificial.simulate import Vehicle, vehicle_drive
+from calibrator.artificial.trips import GroundTruth, balance_branch, choose_branches, read_recorded_trips, with_branches
 from calibrator.drive import Array
 from calibrator.drives.align import Samples, align, base_inputs, choose_inputs, evaluate_formula
 from calibrator.drives.delays import estimate_delays, without_delays
@@ -86,7 +85,7 @@ class RecordedFleet:
     @property
     def balance_branch(self) -> str:
         """The branch whose current is minus the sum of the others."""
-        return self._balance_of(tuple(self.trips[0].currents_a))
+        return balance_branch(self.database.layout, tuple(self.trips[0].currents_a))
 
     @property
     def record(self) -> dict[str, int | float | str]:
@@ -115,11 +114,7 @@ class RecordedFleet:
             If the trips have fewer branches.
         """
         names = choose_branches(self.database.layout, tuple(self.trips[0].currents_a), count)
-        return tuple(with_branches(trip, names, self._balance_of(names)) for trip in self.trips)
-
-    def _balance_of(self, names: tuple[str, ...]) -> str:
-        layout = self.database.layout
-        return next((branch.name for branch in layout.branch if branch.balance and branch.name in names), names[-1])
+        return tuple(with_branches(trip, names, balance_branch(self.database.layout, names)) for trip in self.trips)
 
     def resolution_a(self, branches: tuple[str, ...]) -> Array:
         """Steps of the signals of some branches, shape (K,); 0 where a branch has none. [A]"""
@@ -394,11 +389,13 @@ def _through_frames(
     assert case.delay_max_s is not None
     rng, j = random_stream(Purpose.FRAMES, *seed), seed[1]
     delay_s = rng.uniform(0.0, 1.0, size=case.branches) * case.delay_max_s
-    disturbances = Disturbances(
-        noise_a=NOISE * fleet.full_scale_a, delay_s=delay_s, unmeasured_a=float(vehicles.unmeasured_a[j])
-    )
     vehicle = Vehicle(
-        name=trip.name, branches=tuple(trip.currents_a), faults=vehicles.truth.take(j), disturbances=disturbances
+        name=trip.name,
+        branches=tuple(trip.currents_a),
+        faults=vehicles.truth.take(j),
+        noise_a=NOISE * fleet.full_scale_a,
+        delay_s=delay_s,
+        unmeasured_a=float(vehicles.unmeasured_a[j]),
     )
     drive = vehicle_drive(rng, fleet.database, vehicle, trip)
     found_s: Array = np.zeros(len(delay_s))

@@ -14,9 +14,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from calibrator.artificial.ground_truth import GroundTruth, ground_truth_from_drive, with_branches
 from calibrator.artificial.random_fleet import draw_faults
-from calibrator.artificial.vehicle import Vehicle, draw_disturbances, vehicle_frames
+from calibrator.artificial.simulate import Vehicle, vehicle_frames
+from calibrator.artificial.trips import GroundTruth, ground_truth_from_drive, with_branches
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.drives.delays import estimate_delays
 from calibrator.drives.store import iterate_drives
@@ -110,18 +110,18 @@ def _delayed(trip: GroundTruth, database: VehicleDatabase, rng: np.random.Genera
     faults = draw_faults(
         rng, vehicles=1, branches=len(names), sparsity=SPARSITY, magnitude=FAULTS, full_scale_a=full_scale_a
     ).take(0)
-    disturbances = draw_disturbances(
-        rng,
-        branches=len(names),
+    vehicle = Vehicle(
+        name=trip.name,
+        branches=names,
+        faults=faults,
         noise_a=NOISE * full_scale_a,
-        delay_max_s=MAX_DELAY_S,
-        unmeasured_a=UNMEASURED_A,
+        delay_s=rng.uniform(0.0, MAX_DELAY_S, size=len(names)),
+        unmeasured_a=max(0.0, float(rng.normal(*UNMEASURED_A))),
     )
-    vehicle = Vehicle(name=trip.name, branches=names, faults=faults, disturbances=disturbances)
     series = {item.arbitration_id: item for item in vehicle_frames(rng, database, vehicle, trip)}
     channels = {name: _channel(database, series, name) for name in names}
     drive = Drive(vehicle=trip.name, name="d", branches=channels, inputs={})
-    return DelayedTrip(drive=drive, delay_s=disturbances.delay_s - disturbances.delay_s[0])
+    return DelayedTrip(drive=drive, delay_s=vehicle.delay_s - vehicle.delay_s[0])
 
 
 def _channel(database: VehicleDatabase, series: dict[int, FrameSeries], name: str) -> Channel:

@@ -11,8 +11,8 @@ import pytest
 
 from calibrator.drives.align import align, choose_inputs
 from calibrator.drives.store import iterate_drives
+from calibrator.experiments.figures import judge
 from calibrator.experiments.methods import POSTERIOR
-from calibrator.experiments.outcome import judge
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet, read_fleet, recorded_trial
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
@@ -72,8 +72,8 @@ def test_fleet_with_many_faults_is_not_left_alone(trips: RecordedFleet, balanced
     for seed in (400, 401):
         trial = recorded_trial(trips, RecordedCase(branches=3, sparsity=60.0, balanced=balanced, world=""), seed)
         found = judge(POSTERIOR.estimate(trial), trial)
-        assert found.corrected.any()
-        assert not (found.corrected & found.harmed).any()
+        assert found["corrected"].any()
+        assert not found["harmed"].any()
 
 
 @pytest.mark.parametrize(("vehicles", "branches", "least"), [(6, 2, 0.5), (12, 2, 0.8), (6, 3, 0.5), (12, 3, 0.5)])
@@ -85,7 +85,5 @@ def test_small_fleet_is_corrected(trips: RecordedFleet, vehicles: int, branches:
         fleet = replace(trips, trips=tuple(trips.trips[place] for place in some))
         trial = recorded_trial(fleet, RecordedCase(branches=branches, sparsity=80.0, balanced=True, world=""), seed)
         found.append(judge(POSTERIOR.estimate(trial), trial))
-    faulty = np.concatenate([each.faulty for each in found])
-    corrected = np.concatenate([each.corrected for each in found])
-    assert corrected[faulty].mean() >= least
-    assert not (corrected & np.concatenate([each.harmed for each in found])).any()
+    assert np.concatenate([each["deployed"] for each in found]).mean() >= least
+    assert not np.concatenate([each["harmed"] for each in found]).any()

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.estimator.fleet_identification import held_out_snr_db, read_outs
-from calibrator.estimator.state_space import StateSpaceModel
+from calibrator.published.state_space import StateSpaceModel
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.summariser import summarise
 

@@ -21,9 +21,8 @@ import numpy as np
 
 from bench.row import Row
 from bench.synthetic_store import LAYOUT, make_store
-from calibrator.artificial.simulate import FleetPlan, draw_vehicles, simulate_fleet, trip_of
+from calibrator.artificial.simulate import FleetPlan, draw_vehicles, simulate_fleet, trip_of, vehicle_drive
 from calibrator.artificial.trips import BuiltinTrips
-from calibrator.artificial.vehicle import vehicle_drive
 from calibrator.drive import Drive
 from calibrator.drives.store import write_drive
 from ecu_node.database import read_database

@@ -23,7 +23,7 @@ from bench.dynamic_vehicles import PERIOD_S, DynamicVehicle, bank_model, drive_i
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.estimator.fleet_identification import choose_filter_bank, held_out_snr_db, read_outs
-from calibrator.estimator.state_space import StateSpaceModel, simulation_snr_db
+from calibrator.published.state_space import StateSpaceModel, simulation_snr_db
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.summariser import summarise
 

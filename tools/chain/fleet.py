@@ -5,10 +5,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from calibrator.artificial.ground_truth import GroundTruth, choose_branches
-from calibrator.artificial.simulate import FleetPlan, draw_vehicles, trip_of
-from calibrator.artificial.trips import TripPurpose, TripSource
-from calibrator.artificial.vehicle import Vehicle, vehicle_drive
+from calibrator.artificial.simulate import FleetPlan, Vehicle, draw_vehicles, trip_of, vehicle_drive
+from calibrator.artificial.trips import GroundTruth, TripPurpose, TripSource, choose_branches
 from calibrator.drives.store import write_drive
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.random_streams import Purpose, random_stream

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrator.artificial.ground_truth import GroundTruth
-from calibrator.artificial.vehicle import Vehicle, vehicle_currents, vehicle_frames
+from calibrator.artificial.simulate import Vehicle, vehicle_currents, vehicle_frames
+from calibrator.artificial.trips import GroundTruth
 from calibrator.drive import Array
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.recordings.canlog import FrameSeries
@@ -130,7 +130,7 @@ def _trace(
     key = key_of(drive.database.message(message_name))
     signals = branch_signals(drive.database, branch, Mode.OVERLAY)
     time_s = sent[key].time_s
-    seen_s = np.asarray(time_s - drive.vehicle.disturbances.delay_s[k])
+    seen_s = np.asarray(time_s - drive.vehicle.delay_s[k])
     return BranchTrace(
         time_s=time_s,
         true_a=np.interp(seen_s, drive.trip.time_s, vehicle_currents(drive.vehicle, drive.trip)[:, k]),

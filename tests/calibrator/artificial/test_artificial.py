@@ -1,22 +1,23 @@
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from calibrator.artificial.ground_truth import GroundTruth
-from calibrator.artificial.vehicle import (
-    Disturbances,
+from calibrator.artificial.simulate import (
+    FleetPlan,
     Vehicle,
-    draw_disturbances,
+    draw_vehicles,
     vehicle_drive,
     vehicle_frames,
     write_vehicle,
 )
+from calibrator.artificial.trips import GroundTruth
 from calibrator.faults import Faults
 from calibrator.recordings.canlog import FrameSeries
 from ecu_node.database import VehicleDatabase
 
-NONE = Disturbances(noise_a=0.0, delay_s=np.zeros(2), unmeasured_a=0.0)
+SOUND: dict[str, Any] = {"noise_a": 0.0, "delay_s": np.zeros(2), "unmeasured_a": 0.0}
 
 
 def faults(drift: float = 0.0, offset_a: float = 0.0, hardware_drift: float = 0.0) -> Faults:
@@ -36,8 +37,8 @@ def trip() -> GroundTruth:
     )
 
 
-def vehicle(faults_: Faults, disturbances: Disturbances = NONE) -> Vehicle:
-    return Vehicle(name="V1", branches=("battery", "motor"), faults=faults_, disturbances=disturbances)
+def vehicle(faults_: Faults, **disturbances: Any) -> Vehicle:
+    return Vehicle(name="V1", branches=("battery", "motor"), faults=faults_, **(SOUND | disturbances))
 
 
 def decoded(
@@ -68,22 +69,20 @@ def test_faulty_sensor_shows_drift_and_offset(database: VehicleDatabase) -> None
 
 
 def test_delayed_branch_shows_the_past(database: VehicleDatabase) -> None:
-    late = Disturbances(noise_a=0.0, delay_s=np.array([0.0, 0.3]), unmeasured_a=0.0)
-    time_s, value = decoded(database, frames(database, vehicle(faults(), late)), "HV_Motor", "MotorCurrent")
+    late = vehicle(faults(), delay_s=np.array([0.0, 0.3]))
+    time_s, value = decoded(database, frames(database, late), "HV_Motor", "MotorCurrent")
     np.testing.assert_allclose(value, np.interp(time_s - 0.3, trip().time_s, trip().currents_a["battery"]), atol=0.0101)
 
 
 def test_unmeasured_load_is_carried_by_the_battery_alone(database: VehicleDatabase) -> None:
-    loaded = Disturbances(noise_a=0.0, delay_s=np.zeros(2), unmeasured_a=3.0)
     for message, signal, extra in (("HV_Battery", "BatteryCurrent", 3.0), ("HV_Motor", "MotorCurrent", 0.0)):
-        _, with_load = decoded(database, frames(database, vehicle(faults(), loaded)), message, signal)
+        _, with_load = decoded(database, frames(database, vehicle(faults(), unmeasured_a=3.0)), message, signal)
         _, without = decoded(database, frames(database, vehicle(faults())), message, signal)
         np.testing.assert_allclose(with_load - without, extra, atol=0.0201)
 
 
 def test_noise_has_the_size_asked_for(database: VehicleDatabase) -> None:
-    noisy = Disturbances(noise_a=0.4, delay_s=np.zeros(2), unmeasured_a=0.0)
-    _, with_noise = decoded(database, frames(database, vehicle(faults(), noisy)), "HV_Motor", "MotorCurrent")
+    _, with_noise = decoded(database, frames(database, vehicle(faults(), noise_a=0.4)), "HV_Motor", "MotorCurrent")
     _, without = decoded(database, frames(database, vehicle(faults())), "HV_Motor", "MotorCurrent")
     assert np.std(with_noise - without) == pytest.approx(0.4, rel=0.05)
 
@@ -96,14 +95,14 @@ def test_messages_keep_their_cycle_time_and_their_own_instants(database: Vehicle
     assert all(np.all(np.diff(time_s) > 0.0) for time_s in series.values())
 
 
-def test_disturbances_stay_in_their_ranges() -> None:
-    rng = np.random.default_rng(0)
-    drawn = [
-        draw_disturbances(rng, branches=3, noise_a=0.1, delay_max_s=0.3, unmeasured_a=(3.0, 5.0)) for _ in range(200)
-    ]
-    delays = np.array([d.delay_s for d in drawn])
+def test_delays_and_loads_stay_in_their_ranges(database: VehicleDatabase) -> None:
+    plan = FleetPlan(
+        vehicles=200, currents=3, sparsity=80.0, magnitude=(0.05, 0.25), delay_max_s=0.3, unmeasured_a=(3.0, 5.0)
+    )
+    drawn = draw_vehicles(plan, database.layout, ("battery", "motor", "auxiliary"))
+    delays = np.array([vehicle.delay_s for vehicle in drawn])
     assert 0.0 <= delays.min() < 0.02 < 0.28 < delays.max() <= 0.3
-    assert min(d.unmeasured_a for d in drawn) == 0.0
+    assert min(vehicle.unmeasured_a for vehicle in drawn) == 0.0
 
 
 def test_truth_holds_the_moments_of_the_true_currents(database: VehicleDatabase, tmp_path: Path) -> None:
@@ -118,7 +117,7 @@ def test_truth_holds_the_moments_of_the_true_currents(database: VehicleDatabase,
 
 
 def test_drive_without_frames_is_what_the_frames_decode_to(database: VehicleDatabase) -> None:
-    v = vehicle(faults(0.2, 10.0), Disturbances(noise_a=1.0, delay_s=np.array([0.0, 0.2]), unmeasured_a=2.0))
+    v = vehicle(faults(0.2, 10.0), noise_a=1.0, delay_s=np.array([0.0, 0.2]), unmeasured_a=2.0)
     drive = vehicle_drive(np.random.default_rng(3), database, v, trip())
     series = frames(database, v)
     for name, sign, message, signal in (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibrator.artificial.builtin_drives import _fastsim, builtin_trip
-from calibrator.artificial.ground_truth import GroundTruth
+from calibrator.artificial.trips import GroundTruth
 from calibrator.errors import FleetError
 from ecu_node.database import VehicleDatabase
 
@@ -42,12 +42,6 @@ def test_values_fit_the_dbc(trip: GroundTruth, database: VehicleDatabase) -> Non
         assert signal.maximum is not None
         assert signal.minimum <= trip.inputs[item.name].min()
         assert trip.inputs[item.name].max() <= signal.maximum
-
-
-def test_battery_power_is_the_power_of_the_loads(trip: GroundTruth) -> None:
-    voltage = trip.inputs["voltage"]
-    loads_w = -voltage * (trip.matrix_a()[:, 1:].sum(axis=1))
-    np.testing.assert_allclose(voltage * trip.currents_a["battery"], loads_w, rtol=1e-9, atol=1e-6)
 
 
 def test_seed_decides_the_trip() -> None:

@@ -51,10 +51,6 @@ def test_magnitudes_lie_in_their_range_and_signs_are_even() -> None:
     assert np.mean(np.abs(values)) == pytest.approx(0.15, abs=0.002)
 
 
-def test_hardware_offsets_sum_to_zero() -> None:
-    np.testing.assert_allclose(draw(branches=4).hardware_offset_a.sum(axis=1), 0.0, atol=1e-12)
-
-
 def test_balanced_fleet_has_hardware_faults_in_half_of_those_that_drew_any() -> None:
     assert np.mean(draw(balanced=True, vehicles=20_000).has_hardware_fault) == pytest.approx(0.30, abs=0.01)
 
@@ -68,10 +64,6 @@ def test_mean_of_a_symmetric_fleet_is_the_ideal_current() -> None:
     i_s = np.array([[100.0, -100.0], [3.0, -3.0]])
     measured = [measured_currents(true_currents(i_s, faults.take(j)), faults.take(j)) for j in range(len(faults))]
     np.testing.assert_allclose(np.mean(measured, axis=0), i_s, atol=1e-10)
-
-
-def test_sparsity_100_means_no_fault() -> None:
-    assert not np.any(free_parameters(draw(sparsity=100.0)))
 
 
 def test_symmetric_fleet_of_odd_size_is_refused() -> None:

@@ -5,8 +5,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrator.artificial.ground_truth import GroundTruth, choose_branches
-from calibrator.artificial.trips import BuiltinTrips, CommonTrips, RecordedTrips, TripSource, choose_trips
+from calibrator.artificial.trips import (
+    BuiltinTrips,
+    GroundTruth,
+    RecordedTrips,
+    TripSource,
+    choose_branches,
+    choose_trips,
+)
 from calibrator.drive import Channel, Drive
 from calibrator.drives.store import write_drive
 from calibrator.errors import FleetError
@@ -59,7 +65,7 @@ def test_single_recording_is_cut_in_time() -> None:
 
 
 def test_common_trips_are_the_same_for_all_and_differ_by_purpose() -> None:
-    trips = CommonTrips(source=BuiltinTrips(seed=0, duration_s=60.0, unseen_s=60.0))
+    trips = BuiltinTrips(seed=0, duration_s=60.0, unseen_s=60.0, common=True)
     first, second = trips.trip(0, "calibration"), trips.trip(5, "calibration")
     np.testing.assert_array_equal(first.currents_a["battery"], second.currents_a["battery"])
     unseen = trips.trip(0, "unseen")

@@ -37,11 +37,6 @@ def truth(drift: float = 0.1, seed: int = 0) -> FleetTruth:
     )
 
 
-def test_the_same_fleet_has_the_same_name() -> None:
-    assert truth().fleet_id == truth().fleet_id
-    assert with_fleet_id(truth()) == truth()
-
-
 @pytest.mark.parametrize("other", [truth(drift=0.2), truth(seed=1)])
 def test_other_faults_or_settings_make_another_fleet(other: FleetTruth) -> None:
     assert other.fleet_id != truth().fleet_id

@@ -16,7 +16,7 @@ from calibrator.estimator.fleet_identification import (
     held_out_snr_db,
     read_outs,
 )
-from calibrator.estimator.state_space import StateSpaceModel, simulation_snr_db
+from calibrator.published.state_space import StateSpaceModel, simulation_snr_db
 from calibrator.summaries.filter_bank import FilterBank, low_pass_bank, plain_bank
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
 from calibrator.summaries.summariser import summarise

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from calibrator.artificial.ground_truth import GroundTruth
+from calibrator.artificial.trips import GroundTruth
 from calibrator.drive import Array
 from calibrator.experiments.common_drive import CommonDrive
 from calibrator.experiments.recorded_trips import RecordedFleet

@@ -5,8 +5,8 @@ import pytest
 
 from calibrator.experiments.attacks import WORLDS
 from calibrator.experiments.baselines import BASELINES
+from calibrator.experiments.figures import judge
 from calibrator.experiments.methods import POSTERIOR
-from calibrator.experiments.outcome import figures_of, judge
 from calibrator.experiments.recorded_trips import NOISE, RecordedCase, RecordedFleet, record_vehicles, recorded_trial
 from tests.calibrator.experiments.small_trials import small_fleet
 
@@ -77,4 +77,4 @@ def test_recovery_counts_faults_of_the_size_of_the_world(fleet: RecordedFleet) -
     assert trial.smallest_fault == 0.3
     sizes = np.abs(trial.truth.drift[trial.truth.drift != 0.0])
     assert 0.3 <= sizes.min() <= sizes.max() <= 0.6
-    assert "named" not in figures_of(judge(BASELINES[2].estimate(trial), trial))
+    assert "named" not in judge(BASELINES[2].estimate(trial), trial)

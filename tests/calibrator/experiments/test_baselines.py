@@ -5,7 +5,7 @@ import pytest
 
 from calibrator.experiments.baselines import BASELINES, Baseline
 from calibrator.experiments.common_drive import CommonCase, common_trial
-from calibrator.experiments.outcome import figures_of, judge
+from calibrator.experiments.figures import judge
 from calibrator.experiments.recorded_trips import RecordedCase, recorded_trial
 from calibrator.experiments.trial import Trial
 from calibrator.faults import Faults
@@ -18,7 +18,7 @@ def trial() -> Trial:
 
 
 def rate(baseline: Baseline, trial: Trial) -> float:
-    return figures_of(judge(baseline.estimate(trial), trial))["recovery_rate"].mean
+    return float(judge(baseline.estimate(trial), trial)["recovery_rate"].mean())
 
 
 def test_best_subset_and_lasso_recover_single_faults(trial: Trial) -> None:

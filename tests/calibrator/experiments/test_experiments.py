@@ -6,20 +6,22 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
 from calibrator.cli import app
 from calibrator.errors import FleetError
-from calibrator.experiments.calibration import ALL, pool_confidences
 from calibrator.experiments.common_drive import CommonCase
-from calibrator.experiments.experiments import EXPERIMENTS, Experiment, Setting, fleet_for, run_experiment
+from calibrator.experiments.experiments import CALIBRATION, EXPERIMENTS, Experiment, Setting, fleet_for
 from calibrator.experiments.methods import LEFT_IN, PERFECT, POSTERIOR
 from calibrator.experiments.pages import headline, result_markdown, result_table, write_result
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet
-from calibrator.experiments.result import ExperimentResult, Figure, read_results
+from calibrator.experiments.runner import ALL, ExperimentResult, pool_confidences, read_results, run_experiment
 from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, smooth_drive
+
+RUN = [name for name in EXPERIMENTS if name != CALIBRATION.name]
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +35,12 @@ def snr() -> ExperimentResult:
     return run_experiment(replace(EXPERIMENTS["snr"], settings=settings), smooth_drive(), repetitions=2)
 
 
+def only(result: ExperimentResult, column: str, value: object) -> ExperimentResult:
+    """Rows of a result with this value alone."""
+    figures, tenths = (table[table[column] == value] for table in (result.figures, result.tenths))
+    return replace(result, figures=figures, tenths=tenths)
+
+
 def printed(result: ExperimentResult, width: int = 200) -> str:
     console = Console(width=width)
     with console.capture() as capture:
@@ -40,7 +48,7 @@ def printed(result: ExperimentResult, width: int = 200) -> str:
     return capture.get()
 
 
-def test_new_experiment_is_one_row(fleet: RecordedFleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_experiment_is_one_row(fleet: RecordedFleet, tmp_path: Path) -> None:
     row = Experiment(
         name="loads",
         title="Loads without a sensor",
@@ -48,10 +56,9 @@ def test_new_experiment_is_one_row(fleet: RecordedFleet, tmp_path: Path, monkeyp
         methods=(POSTERIOR,),
         settings=tuple(Setting(x=a, case=RecordedCase(unmeasured_a=(a, 0.0))) for a in (0.0, 5.0)),
     )
-    monkeypatch.setitem(EXPERIMENTS, "loads", row)
     result = run_experiment(row, fleet, repetitions=1)
     write_result(tmp_path / "results", result)
-    assert [found.x for found in result.rows] == [0.0, 5.0]
+    assert result.figures["x"].unique().tolist() == [0.0, 5.0]
     assert result.settings["sparsity"] == 80.0
     assert "unmeasured_a" not in result.settings
     page = (tmp_path / "results" / "loads.md").read_text()
@@ -61,7 +68,7 @@ def test_new_experiment_is_one_row(fleet: RecordedFleet, tmp_path: Path, monkeyp
     assert "(results/loads.md)" in (tmp_path / "results.md").read_text()
 
 
-@pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.parametrize("name", RUN)
 def test_every_row_is_whole_and_has_a_small_version(name: str) -> None:
     row, small = EXPERIMENTS[name], EXPERIMENTS[name].small()
     places = [(setting.series, setting.x, setting.methods) for setting in row.settings]
@@ -74,19 +81,20 @@ def test_every_row_is_whole_and_has_a_small_version(name: str) -> None:
         assert not isinstance(setting.case, CommonCase) or setting.case.vehicles <= 20
 
 
-@pytest.mark.parametrize("name", ["classifier", "real", "delay", "phase", "attacks", "coverage"])
+@pytest.mark.parametrize(
+    "name", ["delay", *(pytest.param(n, marks=pytest.mark.long) for n in RUN if n not in {"delay", "snr"})]
+)
 def test_rows_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet, tmp_path: Path) -> None:
     row = EXPERIMENTS[name].small()
-    more = replace(fleet, trips=fleet.trips + small_fleet(trips=12, samples=1800).trips[6:])
-    result = run_experiment(row, more if row.recorded else smooth_drive(samples=2000), repetitions=1)
+    result = run_experiment(row, fleet if row.recorded else smooth_drive(samples=2000), repetitions=1)
     result = replace(result, made="calibrator 1.0")
     write_result(tmp_path / "results", result)
-    assert [(each.series, each.x, each.method) for each in result.rows] == [
-        (setting.series, setting.x, method.name)
-        for setting in row.settings
-        for method in setting.methods or row.methods
-    ]
-    assert read_results(tmp_path / "results", EXPERIMENTS) == [result]
+    assert list(dict.fromkeys(zip(result.figures["series"], result.figures["x"], result.figures["method"], strict=True))
+    ) == [(s.series, s.x, method.name) for s in row.settings for method in s.methods or row.methods]  # fmt: skip
+    (read,) = read_results(tmp_path / "results", EXPERIMENTS)
+    for name_, table in (("figures", result.figures), ("tenths", result.tenths)):
+        pd.testing.assert_frame_equal(getattr(read, name_), table, check_dtype=False)
+    assert (read.settings, read.made) == (result.settings, result.made)
     page = (tmp_path / "results" / f"{name}.md").read_text()
     assert f"`calibrator experiment {name} --out FOLDER`" in page
     assert ("minus the sum of the other branches" in page) == row.recorded
@@ -96,49 +104,39 @@ def test_rows_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet,
         assert "…" not in line
     if name == "delay":
         assert LEFT_IN.name in result.methods
-        assert result.row(x=300.0, method=POSTERIOR.name).figures["delay_rmse_ms"].mean < 5.0
+        assert result.value("delay_rmse_ms", x=300.0, method=POSTERIOR.name) < 5.0
     if name == "coverage":
-        counts = [
-            (sum(r.pit), sum(r.figures[k].of or 0 for k in r.figures if k.endswith("beyond_3"))) for r in result.rows
-        ]
-        assert all(pit == deployed for pit, deployed in counts)
+        counts = result.figures[result.figures["figure"].str.endswith("beyond_3")].groupby("series")["of"].sum()
+        assert result.tenths.groupby("series")["pit"].sum().to_dict() == counts.to_dict()
         assert "by tenths of their probability integral transform" in page
 
 
 def test_figures_depend_on_the_seed_and_not_on_the_number_of_processes(snr: ExperimentResult) -> None:
-    settings = tuple(Setting(x=x, case=CommonCase(vehicles=16, snr_db=x)) for x in (10.0, 20.0))
-    row = replace(EXPERIMENTS["snr"], settings=settings, methods=(PERFECT,))
+    row = replace(snr.experiment, methods=(PERFECT,))
     again = run_experiment(row, smooth_drive(), repetitions=2, workers=2)
-    assert again.rows == tuple(found for found in snr.rows if found.method == PERFECT.name)
+    before = only(snr, "method", PERFECT.name).figures.reset_index(drop=True)
+    pd.testing.assert_frame_equal(again.figures, before)
     other = run_experiment(row, smooth_drive(), repetitions=2, seed=100)
-    assert other.rows != again.rows
+    assert not other.figures["value"].equals(again.figures["value"])
 
 
 def test_table_puts_paper_published_method_and_default_side_by_side(snr: ExperimentResult) -> None:
-    header, rows = headline(snr)
-    assert header[:5] == ["SNR [dB]", "paper", PERFECT.name, POSTERIOR.name, "confidence"]
-    assert [row[:2] for row in rows] == [["10", "-"], ["20", "0.91"]]
-    rate = snr.row(x=20.0, method=POSTERIOR.name).figures["recovery_rate"]
-    assert rate.interval is not None
-    assert rows[1][3] == f"{rate.mean:.3f} ({rate.interval[0]:.3f} to {rate.interval[1]:.3f})"
+    table = headline(snr)
+    assert list(table.columns[:5]) == ["SNR [dB]", "paper", PERFECT.name, POSTERIOR.name, "confidence"]
+    assert table[["SNR [dB]", "paper"]].to_numpy().tolist() == [["10", "-"], ["20", "0.91"]]
+    rate = snr.value("recovery_rate", x=20.0, method=POSTERIOR.name)
+    assert re.fullmatch(rf"{rate:.3f} \(\d\.\d{{3}} to \d\.\d{{3}}\)", table[POSTERIOR.name].iloc[1])
     assert f" / {0.91:.2f} |" in result_markdown(snr)
 
 
 def test_captions_explain_only_columns_that_are_there(snr: ExperimentResult) -> None:
-    only_published = replace(snr, rows=tuple(row for row in snr.rows if row.method == PERFECT.name))
+    only_published = only(snr, "method", PERFECT.name)
     for text in (result_markdown(only_published), " ".join(printed(only_published).split())):
-        assert "the paper's best printed figure and the published method (/ its classifier)." in text
+        assert "paper (its best printed figure), published/classifier (the published method)." in text
         for absent in ("the default", "confidence", "calibration error", "delays", "law known"):
             assert absent not in text
     assert "counts as harmed although it is recovered." in result_markdown(snr)
-    only_default = replace(snr, rows=tuple(row for row in snr.rows if row.method == POSTERIOR.name))
-    assert "The published method corrects" not in result_markdown(only_default)
-
-
-def test_record_without_counts_is_shown_without_intervals(snr: ExperimentResult) -> None:
-    plain = {name: Figure(mean=0.5) for name in ("recovery_rate", "confidence")}
-    old = replace(snr, paper={}, rows=tuple(replace(row, figures=plain) for row in snr.rows))
-    assert headline(old)[1][0] == ["10", "0.500", "0.500", "0.500"]
+    assert "The published method corrects" not in result_markdown(only(snr, "method", POSTERIOR.name))
 
 
 def test_damaged_record_is_named(tmp_path: Path) -> None:
@@ -155,33 +153,27 @@ def test_flags_are_booleans_in_records_and_words_on_pages(snr: ExperimentResult)
 
 def test_index_lists_the_results_of_the_folder_in_order(snr: ExperimentResult, tmp_path: Path) -> None:
     write_result(tmp_path / "results", snr)
-    write_result(tmp_path / "results", replace(snr, name="classifier", title="Second"))
+    write_result(tmp_path / "results", replace(snr, experiment=EXPERIMENTS["classifier"]))
     index = (tmp_path / "results.md").read_text()
-    assert index.index("[Second](results/classifier.md)") < index.index("(results/snr.md)")
+    assert index.index("(results/classifier.md)") < index.index("(results/snr.md)")
     assert "2 repetitions, seed 0, drive smooth" in index
     once = replace(snr, settings={**snr.settings, "repetitions": 1})
     assert "1 repetition, seed 0" in printed(once)
 
 
-def test_calibration_pools_the_confidences_of_the_default(snr: ExperimentResult) -> None:
-    other = replace(snr, name="sparsity", settings={**snr.settings, "seed": 100})
-    result = pool_confidences([snr, other])
-    assert [row.series for row in result.rows] == ["snr", "sparsity", ALL]
-    one, _, both = result.rows
-    assert (one.x, both.x) == (64.0, 128.0)
-    assert both.figures["ece"].mean == pytest.approx(one.figures["ece"].mean)
-    rates = [row.figures["recovery_rate"].mean for row in snr.rows if row.method == POSTERIOR.name]
-    assert one.figures["recovery_rate"].mean == pytest.approx(np.mean(rates))
+def test_calibration_pools_the_confidences_and_counts_shared_trials_once(snr: ExperimentResult) -> None:
+    shared = replace(only(snr, "x", 20.0), experiment=EXPERIMENTS["classifier"])
+    other = replace(snr, experiment=EXPERIMENTS["sparsity"], settings={**snr.settings, "seed": 100})
+    result = pool_confidences([shared, snr, other])
+    rows = result.figures.set_index(["series", "figure"])
+    vehicles = {"classifier": 32.0, "snr": 64.0, "sparsity": 64.0, ALL: 128.0}
+    assert result.figures.groupby("series", sort=False)["x"].first().to_dict() == vehicles
+    assert rows.loc[(ALL, "ece"), "value"] == pytest.approx(rows.loc[("snr", "ece"), "value"])
+    rates = [snr.value("recovery_rate", x=x, method=POSTERIOR.name) for x in (10.0, 20.0)]
+    assert rows.loc[("snr", "recovery_rate"), "value"] == pytest.approx(np.mean(rates))
+    assert (result.tenths.groupby("series")["vehicles"].sum().to_dict()) == vehicles
     with pytest.raises(FleetError, match="no experiment has a confidence"):
         pool_confidences([])
-
-
-def test_trials_that_experiments_share_count_once(snr: ExperimentResult) -> None:
-    shared = replace(snr, name="classifier", rows=tuple(row for row in snr.rows if row.x == 20.0))
-    classifier, whole, together = pool_confidences([shared, snr]).rows
-    assert (classifier.x, whole.x, together.x) == (32.0, 64.0, 64.0)
-    assert together.bins == whole.bins
-    assert together.figures == whole.figures
 
 
 def test_only_experiments_on_recorded_trips_need_a_layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -201,6 +193,9 @@ def test_wrong_fleet_and_no_repetition_are_refused(fleet: RecordedFleet) -> None
 
 def test_command_runs_records_and_pools(tmp_path: Path) -> None:
     out = ("--out", str(tmp_path / "results"))
+    ran = CliRunner().invoke(app, ["experiment", "calibration", *out])
+    assert re.search("no experiment is recorded .* 'calibrator experiment all --out", str(ran.exception))
+    assert not (tmp_path / "results").exists()
     ran = CliRunner().invoke(app, ["experiment", "snr", "--quick", "--repetitions", "1", "--workers", "1", *out])
     assert ran.exit_code == 0, ran.output
     ran = CliRunner().invoke(app, ["experiment", "calibration", "--json", *out])
@@ -208,10 +203,4 @@ def test_command_runs_records_and_pools(tmp_path: Path) -> None:
     assert json.loads(ran.stdout)["settings"]["experiments"] == "snr"
     assert (tmp_path / "results" / "calibration.png").is_file()
     listed = CliRunner().invoke(app, ["experiment"]).stdout.splitlines()
-    assert [line.split()[0] for line in listed] == [*EXPERIMENTS, "calibration"]
-
-
-def test_calibration_without_records_says_what_to_run_first(tmp_path: Path) -> None:
-    ran = CliRunner().invoke(app, ["experiment", "calibration", "--out", str(tmp_path / "results")])
-    assert re.search("no experiment is recorded .* 'calibrator experiment all --out", str(ran.exception))
-    assert not (tmp_path / "results").exists()
+    assert [line.split()[0] for line in listed] == list(EXPERIMENTS)

@@ -9,10 +9,10 @@ import pytest
 from rich.console import Console
 
 from calibrator.errors import FleetError
-from calibrator.experiments.experiments import EXPERIMENTS, run_experiment
+from calibrator.experiments.experiments import EXPERIMENTS
 from calibrator.experiments.methods import PERFECT, POSTERIOR, Estimate, Method
 from calibrator.experiments.pages import headline, result_markdown, result_table
-from calibrator.experiments.result import ExperimentResult
+from calibrator.experiments.runner import ExperimentResult, run_experiment
 from calibrator.experiments.trial import Trial
 from calibrator.faults import Faults
 from tests.calibrator.experiments.small_trials import smooth_drive
@@ -57,27 +57,25 @@ def printed(result: ExperimentResult) -> str:
     return " ".join(capture.get().split())
 
 
-def test_own_methods_stand_beside_the_paper_and_the_default() -> None:
-    result = run(Own(), Own("other"))
-    header, rows = headline(result)
-    assert header == ["reading of S", "sparsity S [%]", "paper", "own", "other"]
-    assert [row[:3] for row in rows] == [["", "60", "0.91"], ["3 of 6", "60", "0.91"]]
+def test_own_methods_stand_beside_the_paper_and_confidence_is_of_the_first_that_has_one() -> None:
+    result = run(PERFECT, Own("silent"), Own(change=sure))
+    table = headline(result)
+    assert list(table.columns[:6]) == ["reading of S", "sparsity S [%]", "paper", PERFECT.name, "silent", "own"]
+    assert table.iloc[:, :3].to_numpy().tolist() == [["", "60", "0.91"], ["3 of 6", "60", "0.91"]]
+    assert table["confidence"].iloc[0] == "0.800"
     for text in (printed(result), result_markdown(result)):
-        names = "own (a method of one's own) and other (a method of one's own)."
-        assert f"within 10 %: the paper's best printed figure, {names}" in text
+        assert (
+            "paper (its best printed figure), published/classifier (the published method), silent (a method of" in text
+        )
+        assert "Of own: confidence (mean confidence)" in text
         assert "Of the default" not in text
 
 
-def test_confidence_shown_is_the_defaults_or_of_the_first_method_that_has_one() -> None:
-    alone = run(PERFECT, Own("silent"), Own(change=sure))
-    header, rows = headline(alone)
-    assert rows[0][header.index("confidence")] == "0.800"
-    assert "Of own: mean confidence" in printed(alone)
-    beside = run(Own(change=sure), POSTERIOR)
-    header, rows = headline(beside)
-    default = beside.row(x=60.0, method=POSTERIOR.name).figures["confidence"].mean
-    assert rows[0][header.index("confidence")] == f"{default:.3f}"
-    assert "Of the default: mean confidence" in printed(beside)
+def test_confidence_shown_is_the_defaults_where_it_was_run() -> None:
+    result = run(Own(change=sure), POSTERIOR)
+    default = result.value("confidence", x=60.0, method=POSTERIOR.name)
+    assert headline(result)["confidence"].iloc[0] == f"{default:.3f}"
+    assert "Of the default: confidence (mean confidence)" in printed(result)
 
 
 def test_methods_of_one_name_are_refused() -> None:

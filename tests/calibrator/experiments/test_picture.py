@@ -4,6 +4,7 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -12,41 +13,49 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from calibrator.drive import Array
-from calibrator.experiments.calibration import NOT_POOLED, pool_confidences
-from calibrator.experiments.experiments import EXPERIMENTS
+from calibrator.experiments.experiments import CALIBRATION, EXPERIMENTS
+from calibrator.experiments.figures import figure_rows
 from calibrator.experiments.methods import PERFECT, POSTERIOR, TREE
-from calibrator.experiments.picture import draw_result
-from calibrator.experiments.result import Bin, ExperimentResult, Row
-from calibrator.experiments.result import Figure as Merit
+from calibrator.experiments.picture import FEW, draw_result
+from calibrator.experiments.runner import ExperimentResult, pool_confidences
 
 BIASES = ("0", "0.2", "0.4", "0.5")
 
 
-def result_of(*rows: Row, name: str = "asymmetry", series_label: str = "sign bias") -> ExperimentResult:
+Point = tuple[float, str, float, str]
+"""Value of what is varied, method, recovery rate, series."""
+
+
+def result_of(*points: Point, name: str = "asymmetry") -> ExperimentResult:
+    """Result of 30 vehicles per point; the default is as confident as it is right."""
+    figures: list[pd.DataFrame] = []
+    tenths: list[pd.DataFrame] = []
+    for x, method, rate, series in points:
+        within = np.arange(30) < round(30 * rate)
+        values: dict[str, np.ndarray] = {"recovery_rate": within}
+        if method == POSTERIOR.name:
+            values |= {"confidence": within.astype(float), "sure": within, "sure_confidence": within[within] + 0.0}
+            values |= {"ece": np.column_stack([np.where(within, 0.99, 0.25), within])}
+        for tables, table in zip((figures, tenths), figure_rows([values]), strict=True):
+            tables.append(table.assign(series=series, x=float(x), method=method))
     return ExperimentResult(
-        name=name, title="Title", x_label="vehicles", series_label=series_label, settings={"seed": 0}, rows=rows
+        experiment=EXPERIMENTS[name],
+        settings={"seed": 0},
+        figures=pd.concat(figures, ignore_index=True),
+        tenths=pd.concat(tenths, ignore_index=True),
     )
 
 
-def row_of(x: float, method: str, rate: float, series: str = "", paper: float | None = None) -> Row:
-    figures = {"recovery_rate": Merit(mean=rate, hits=round(30 * rate), of=30, paper=paper)}
-    if method == POSTERIOR.name:
-        figures["confidence"] = Merit(mean=rate)
-    return Row(x=x, series=series, method=method, figures=figures)
+def shown_as(result: ExperimentResult, name: str) -> ExperimentResult:
+    """The same figures, drawn as another experiment."""
+    return replace(result, experiment=EXPERIMENTS[name])
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def equal() -> ExperimentResult:
     """All series and methods the same, at the ends of the scale."""
     methods = (PERFECT.name, POSTERIOR.name)
-    return result_of(
-        *(row_of(x, m, rate, one) for one in BIASES for x, rate in ((20, 0.0), (2000, 1.0)) for m in methods)
-    )
-
-
-def test_a_mean_that_rounding_lifts_over_one_is_drawn() -> None:
-    over = float(np.nextafter(1.0, 2.0))
-    drawn(result_of(row_of(20, POSTERIOR.name, over), row_of(100, POSTERIOR.name, 1.0)))
+    return result_of(*((x, m, rate, one) for one in BIASES for x, rate in ((20, 0.0), (2000, 1.0)) for m in methods))
 
 
 def curves_of(axes: Axes) -> list[Line2D]:
@@ -75,8 +84,8 @@ def test_equal_curves_stand_side_by_side_inside_the_axes(equal: ExperimentResult
 
 
 def test_bars_are_the_95_percent_intervals(equal: ExperimentResult) -> None:
-    single = replace(equal, name="snr", rows=tuple(replace(r, series="") for r in equal.rows if r.series == "0"))
-    for result, across in ((equal, 1), (single, 1), (replace(equal, name="real"), 0)):
+    single = replace(equal, figures=equal.figures.query("series == '0'").assign(series=""))
+    for result, across in ((equal, 1), (shown_as(single, "snr"), 1), (shown_as(equal, "real"), 0)):
         axes = drawn(result).axes[0]
         lines = [c for c in axes.collections if isinstance(c, LineCollection)]
         ends = np.concatenate([np.ravel([s[:, across] for s in line.get_segments()]) for line in lines])
@@ -84,7 +93,7 @@ def test_bars_are_the_95_percent_intervals(equal: ExperimentResult) -> None:
 
 
 def test_curves_of_a_panel_differ_in_colour_marker_and_line_style(equal: ExperimentResult) -> None:
-    methods = replace(equal, name="sparsity", rows=tuple(row_of(20, m.name, 0.5) for m in (TREE, PERFECT, POSTERIOR)))
+    methods = result_of(*((20, m.name, 0.5, "") for m in (TREE, PERFECT, POSTERIOR)), name="snr")
     for result, number in ((equal, len(BIASES)), (methods, 3)):
         lines = curves_of(drawn(result).axes[0])
         assert len({line.get_color() for line in lines}) == number
@@ -93,8 +102,7 @@ def test_curves_of_a_panel_differ_in_colour_marker_and_line_style(equal: Experim
 
 
 def test_legend_covers_no_data_and_names_each_curve_once(equal: ExperimentResult) -> None:
-    pooled = pool_confidences([_with_bins(equal)])
-    for result in (equal, replace(equal, name="real"), pooled):
+    for result in (equal, shown_as(equal, "real"), pool_confidences([equal])):
         figure = drawn(result)
         (legend,) = figure.legends
         assert all(axes.get_legend() is None for axes in figure.axes)
@@ -105,43 +113,31 @@ def test_legend_covers_no_data_and_names_each_curve_once(equal: ExperimentResult
 
 
 def test_panels_without_any_figure_are_left_out(equal: ExperimentResult) -> None:
-    published = tuple(row for row in equal.rows if row.method == PERFECT.name)
-    assert len(drawn(replace(equal, rows=published)).axes) == 1
+    published = replace(equal, figures=equal.figures[equal.figures["method"] == PERFECT.name])
+    assert len(drawn(published).axes) == 1
     assert len(drawn(equal).axes) == 3
 
 
 @pytest.mark.parametrize("name", ["classifier", "sparsity"])
 def test_papers_figure_does_not_hide_ours(name: str) -> None:
-    rows = (row_of(60, TREE.name, 0.86, paper=0.86), row_of(60, POSTERIOR.name, 0.9))
-    figure = drawn(result_of(*rows, name=name, series_label=""))
+    figure = drawn(result_of((60, TREE.name, 0.9, ""), (60, POSTERIOR.name, 0.9, ""), name=name))
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert sum(label.startswith("paper, ") for label in labels) == 1
     (paper,) = [c for c in figure.axes[0].collections if str(c.get_label()).startswith("paper, ")]
     assert len(np.asarray(paper.get_facecolor())) == 0
 
 
-def test_every_experiment_that_can_be_pooled_has_a_colour_and_a_marker_of_its_own(equal: ExperimentResult) -> None:
-    results = [replace(_with_bins(equal), name=name, settings={"seed": k}) for k, name in enumerate(EXPERIMENTS)]
-    reliability = drawn(pool_confidences(results)).axes[0]
-    names = [name for name in EXPERIMENTS if name not in NOT_POOLED]
-    labelled = [line for line in reliability.lines if str(line.get_label()).startswith(tuple(names))]
-    assert len({line.get_color() for line in labelled}) == len(names)
-    assert len({line.get_marker() for line in labelled}) == len(names)
+def test_map_shows_every_rate(equal: ExperimentResult) -> None:
+    texts = [text.get_text() for text in drawn(shown_as(equal, "phase")).axes[0].texts]
+    assert sorted(texts) == ["0.00"] * len(BIASES) + ["1.00"] * len(BIASES)
 
 
-def test_markers_of_few_vehicles_are_hollow(equal: ExperimentResult) -> None:
-    reliability = drawn(pool_confidences([_with_bins(equal)])).axes[0]
-    faces = {tuple(np.asarray(line.get_xydata())[0]): line.get_markerfacecolor() for line in reliability.lines[1:]
-             if len(np.asarray(line.get_xydata())) == 1}  # fmt: skip
-    assert faces[0.25, 0.5] == "white"
-    assert faces[0.95, 1.0] != "white"
-
-
-def _with_bins(result: ExperimentResult) -> ExperimentResult:
-    bins = (
-        Bin(low=0.2, count=2, confidence=0.25, recovered=0.5),
-        Bin(low=0.9, count=900, confidence=0.95, recovered=1.0),
-    )
-    figures = {name: Merit(mean=0.9, sd=0.0) for name in ("recovery_rate", "sure", "sure_confidence", "sure_recovered")}
-    rows = tuple(replace(row, bins=bins, figures=figures) for row in result.rows if row.method == POSTERIOR.name)
-    return replace(result, rows=rows[:1])
+def test_experiments_of_the_reliability_differ_and_few_vehicles_are_hollow() -> None:
+    names = [name for name in EXPERIMENTS if name not in {CALIBRATION.name, "attacks"}]
+    results = [replace(result_of((20, POSTERIOR.name, k / 30.0, "")), experiment=EXPERIMENTS[name])
+               for k, name in enumerate(names)]  # fmt: skip
+    figure = drawn(pool_confidences(results))
+    labelled = [line for line in figure.axes[0].lines if str(line.get_label()).startswith(tuple(names))]
+    assert len({line.get_color() for line in labelled}) == len({line.get_marker() for line in labelled}) == len(names)
+    faces = [line.get_markerfacecolor() for line in figure.axes[0].lines[1:] if len(np.asarray(line.get_xydata())) == 1]
+    assert set(faces[1:-1]) == {"white"}, f"less than {FEW} vehicles each"

@@ -8,8 +8,8 @@ from calibrator.artificial.random_fleet import draw_faults
 from calibrator.drive import Array, Channel, Drive, Mask
 from calibrator.drives.store import write_drive
 from calibrator.errors import FleetError
+from calibrator.experiments.figures import judge
 from calibrator.experiments.methods import PERFECT, POSTERIOR
-from calibrator.experiments.outcome import figures_of, judge
 from calibrator.experiments.recorded_trips import (
     NOISE,
     RecordedCase,
@@ -73,10 +73,10 @@ def test_samples_obey_the_fault_model_within_noise_and_steps(fleet: RecordedFlee
 
 def test_default_recovers_recorded_vehicles_that_defeat_the_published_method(fleet: RecordedFleet) -> None:
     trial = recorded_trial(fleet, RecordedCase(), 0)
-    default, published = (figures_of(judge(m.estimate(trial), trial)) for m in (POSTERIOR, PERFECT))
-    assert default["recovery_rate"].mean >= 0.9
-    assert default["harmed"].mean == 0.0
-    assert published["recovery_rate"].mean < 0.6
+    default, published = (judge(m.estimate(trial), trial) for m in (POSTERIOR, PERFECT))
+    assert default["recovery_rate"].mean() >= 0.9
+    assert not default["harmed"].any()
+    assert published["recovery_rate"].mean() < 0.6
 
 
 def test_corrections_are_judged_on_the_trip_of_the_next_vehicle(fleet: RecordedFleet) -> None:
@@ -125,13 +125,14 @@ def test_any_vehicle_of_a_fleet_that_is_not_balanced_may_have_a_hardware_fault(f
     np.testing.assert_array_equal(balanced.drift.shape, any_vehicle.drift.shape)
 
 
+@pytest.mark.long
 def test_faults_of_the_own_prior_are_drawn_anew_for_the_same_trips(fleet: RecordedFleet) -> None:
     first = recorded_trial(fleet, RecordedCase(), 0)
     own = recorded_trial(fleet, RecordedCase(own_prior=True), 0)
     assert not np.array_equal(own.truth.drift, first.truth.drift)
-    figures = figures_of(judge(POSTERIOR.estimate(own), own))
-    assert figures["recovery_rate"].mean >= 0.8
-    assert figures["harmed"].hits == 0
+    values = judge(POSTERIOR.estimate(own), own)
+    assert values["recovery_rate"].mean() >= 0.8
+    assert not values["harmed"].any()
 
 
 def test_case_with_minutes_has_the_vehicles_asked_for(fleet: RecordedFleet) -> None:
@@ -147,7 +148,7 @@ def test_delays_are_found_and_taken_out(fleet: RecordedFleet) -> None:
     trial = recorded_trial(few, RecordedCase(delay_max_s=0.3), 0)
     assert trial.delay_error_s is not None
     assert trial.delay_error_s.shape == (6, 1)
-    assert figures_of(judge(POSTERIOR.estimate(trial), trial))["delay_rmse_ms"].mean < 5.0
+    assert np.abs(judge(POSTERIOR.estimate(trial), trial)["delay_rmse_ms"]).max() < 10.0
     left_in = recorded_trial(few, RecordedCase(delay_max_s=0.3, delays_left_in=True), 0)
     assert left_in.delay_error_s is None
     np.testing.assert_array_equal(left_in.truth.drift, trial.truth.drift)

@@ -56,13 +56,6 @@ def test_expected_features_follow_the_mean_of_a_fleet_that_is_not_symmetric() ->
     np.testing.assert_allclose(evidence.features, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_simulation_error_adds_its_power_to_each_deviation() -> None:
-    i_s, faults = ideal_currents(), fleet(8, symmetric=True)
-    without = expected_features(faults, i_s, np.zeros(3), reference_vehicles=None)
-    error = expected_features(faults, i_s, np.array([1.0, 2.0, 3.0]), reference_vehicles=None) - without
-    np.testing.assert_allclose(error, np.tile([1.0, 4.0, 9.0, 0.0], (8, 1)), atol=1e-6)
-
-
 @pytest.mark.parametrize(("classifier", "least"), [(Classifier.PERFECT, 0.9), (Classifier.TREE, 0.8)])
 def test_symmetric_fleet_is_recovered(classifier: Classifier, least: float) -> None:
     i_s, faults = ideal_currents(), fleet(120, symmetric=True)

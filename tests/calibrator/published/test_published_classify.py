@@ -3,7 +3,6 @@ import pytest
 
 from calibrator.faults import Faults
 from calibrator.published.classify import (
-    Classification,
     FaultTrees,
     classify_by_threshold,
     classify_by_truth,
@@ -41,12 +40,6 @@ def test_threshold_is_a_third_of_the_fleets_spread() -> None:
     assert found.sensor.all()
 
 
-def test_threshold_does_not_depend_on_the_unit() -> None:
-    features = np.random.default_rng(1).uniform(size=(50, 3))
-    plain, scaled = classify_by_threshold(features), classify_by_threshold(1e4 * features)
-    np.testing.assert_array_equal(plain.hardware, scaled.hardware)
-
-
 def test_fleet_of_one_is_compared_with_zero() -> None:
     assert classify_by_threshold(np.array([[1.0, 1.0, 0.0]])).hardware.tolist() == [True]
 
@@ -65,10 +58,3 @@ def test_trees_learn_what_separates_the_classes() -> None:
     found = trees.classify(features[1000:])
     np.testing.assert_array_equal(found.hardware, hardware[1000:])
     np.testing.assert_array_equal(found.sensor, sensor[1000:])
-
-
-def test_trees_of_one_class_know_only_that_class() -> None:
-    features = np.random.default_rng(3).random((20, 3))
-    found = FaultTrees(features, faults_of([0.0] * 20, [0.0] * 20)).classify(features)
-    assert isinstance(found, Classification)
-    assert found.case.tolist() == [1] * 20

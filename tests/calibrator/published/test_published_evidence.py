@@ -32,11 +32,6 @@ def test_mean_of_a_symmetric_fleet_is_the_ideal_current() -> None:
     np.testing.assert_allclose(fleet_mean(simulations(i_s, symmetric_fleet(), 0.0)), i_s, atol=1e-10)
 
 
-def test_mean_takes_vehicles_one_by_one() -> None:
-    simulated = simulations(ideal_currents(), symmetric_fleet(), 1.0)
-    np.testing.assert_allclose(fleet_mean(iter(simulated)), simulated.mean(axis=0), atol=1e-12)
-
-
 def test_noise_free_slopes_and_intercepts_are_those_of_the_faults() -> None:
     i_s, faults = ideal_currents(), symmetric_fleet()
     evidence = collect_evidence(simulations(i_s, faults, 0.0), i_s, np.zeros(len(faults)))
@@ -62,16 +57,6 @@ def test_features_are_the_mean_squares_of_deviation_and_junction_sum() -> None:
     features = collect_evidence(simulated, i_s, junction_a2).features
     np.testing.assert_allclose(features[:, :3], np.mean((simulated - i_s) ** 2, axis=1))
     np.testing.assert_array_equal(features[:, 3], junction_a2)
-
-
-def test_evidence_scales_with_the_currents() -> None:
-    i_s, faults = ideal_currents(), symmetric_fleet(4)
-    simulated = simulations(i_s, faults, 2.0)
-    plain = collect_evidence(simulated, i_s, np.zeros(4))
-    scaled = collect_evidence(3.0 * simulated, 3.0 * i_s, np.zeros(4))
-    np.testing.assert_allclose(scaled.slopes, plain.slopes)
-    np.testing.assert_allclose(scaled.intercepts_a, 3.0 * plain.intercepts_a)
-    np.testing.assert_allclose(scaled.deviation_a2, 9.0 * plain.deviation_a2)
 
 
 def test_empty_fleet_is_refused() -> None:

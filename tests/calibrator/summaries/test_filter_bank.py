@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from calibrator.drive import Array
 from calibrator.errors import DriveError
-from calibrator.estimator.state_space import StateSpaceModel
+from calibrator.published.state_space import StateSpaceModel
 from calibrator.summaries.filter_bank import (
     LONGEST_HOLD_S,
     UNSETTLED,

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from calibrator.experiments.pages import result_table
-from calibrator.experiments.result import read_results
+from calibrator.experiments.runner import read_results
 
 RESULTS = sorted((Path(__file__).parents[3] / "docs" / "results").glob("*.json"))
 

@@ -6,7 +6,7 @@ from scipy.signal import lfilter
 
 from calibrator.drive import Array
 from calibrator.errors import DriveError
-from calibrator.estimator.state_space import (
+from calibrator.published.state_space import (
     StateSpaceModel,
     choose_order,
     identify,

@@ -1,0 +1,256 @@
+"""Figures of merit: what a method says of a trial beside the truth, and the table of what they are and how they pool.
+
+Every figure is one number made of many values, mostly their mean: :func:`judge` gives the values of one trial,
+:func:`figure_rows` the figures of several trials together. The expected calibration error is that of [1]_, intervals
+are those of [2]_, for which vehicles are independent.
+
+.. [1] M. Naeini, G. Cooper, M. Hauskrecht, "Obtaining well calibrated probabilities using Bayesian binning", AAAI 2015.
+.. [2] C. Clopper, E. Pearson, "The use of confidence or fiducial limits ...", Biometrika 26 (1934).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.stats import beta, norm
+
+from calibrator.drive import Array
+from calibrator.experiments.methods import Estimate
+from calibrator.experiments.trial import Trial
+from calibrator.score import f2_score, recovered
+
+__all__ = [
+    "FIGURES", "TENTH_COLUMNS", "calibration_errors", "figure_rows", "judge", "pool_figures", "pool_tenths",
+    "tenths_of",
+]  # fmt: skip
+
+SURE = 0.95
+"""Confidence from which on a vehicle counts as sure. [1]"""
+LEAST_GAIN = 1e-9
+"""Corrections divide by 1 + d; nearer to zero there is none. [1]"""
+TAIL = 0.025
+"""Probability on either side of the 95 % intervals. [1]"""
+TENTHS = np.arange(10) / 10.0
+TENTH_COLUMNS = ("low", "vehicles", "confidence", "recovered", "pit")
+
+Values = Mapping[str, NDArray[Any]]
+"""Values of one or several trials by figure; those of a share are true or false."""
+
+
+class FigureKind(NamedTuple):
+    """Heading of a figure's column, what it is, how values become it, and whether it is rare (counts stand beside)."""
+
+    heading: str
+    meaning: str
+    merged: Callable[[NDArray[Any]], Any] = np.mean
+    rare: bool = False
+
+
+def _calibration_error(pairs: Array) -> float:
+    return calibration_errors(tenths_of({"ece": pairs}))[0]
+
+
+def _error_by_chance(pairs: Array) -> float:
+    return calibration_errors(tenths_of({"ece": pairs}))[1]
+
+
+FIGURES = {
+    "recovery_rate": FigureKind("10 %", "share of vehicles recovered within 10 %"),
+    "recovery_rate_25": FigureKind("25 %", "share within 25 %"),
+    "f2": FigureKind("f2", "f2 of the hardware classification", lambda pairs: f2_score(*pairs.T)),
+    "complexity": FigureKind("hardware", "share held to have hardware faults"),
+    "confidence": FigureKind("confidence", "mean confidence"),
+    "sure": FigureKind("> 0.95", "share of vehicles with a confidence above 0.95"),
+    "sure_confidence": FigureKind("their confidence", "their mean confidence"),
+    "sure_recovered": FigureKind("of them recovered", "share of them that is recovered"),
+    "sure_wrong": FigureKind(
+        "> 0.95, wrong", "of the vehicles above 0.95 those not recovered, and how many they expect", rare=True
+    ),
+    "ece": FigureKind("ECE", "expected calibration error, by tenths of the confidence", _calibration_error),
+    "ece_by_chance": FigureKind("by chance", "what it is by chance if the confidence is exact", _error_by_chance),
+    "corrected": FigureKind("corrected", "share of the vehicles that is corrected in some branch"),
+    "deployed": FigureKind("deployed", "share of the vehicles with faulty sensors that is corrected in some branch"),
+    "harmed": FigureKind(
+        "harmed",
+        "share of the corrected vehicles of which some branch gets worse on an unseen drive, however little",
+        rare=True,
+    ),
+    "worst_a": FigureKind("worst [A]", "largest worsening of a branch's root mean square error", np.max),
+    "named": FigureKind("named", "share of the vehicles attacked of which a finding names the cause", rare=True),
+    "misnamed": FigureKind("misnamed", "share of the others of which a finding names any cause", rare=True),
+    "gain_within_1": FigureKind(
+        "gain, within 1", "share of the deployed gain errors within 1 standard deviation of the truth"
+    ),
+    "gain_beyond_3": FigureKind("gain, beyond 3", "the same beyond 3", rare=True),
+    "offset_within_1": FigureKind("offset, within 1", "share of the deployed offsets within 1"),
+    "offset_beyond_3": FigureKind("offset, beyond 3", "the same beyond 3", rare=True),
+    "delay_rmse_ms": FigureKind(
+        "delay error [ms]", "root mean square error of the estimated delays", lambda e: np.sqrt(np.mean(e**2))
+    ),
+    "failed": FigureKind("failed", "share of vehicles whose optimisation failed"),
+}
+"""In the order of the columns."""
+
+
+def judge(estimate: Estimate, trial: Trial) -> dict[str, NDArray[Any]]:
+    """Compare an estimate with the truth.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        What a method found.
+    trial : Trial
+        With the truth.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Values of the figures of :data:`FIGURES`, one per vehicle, parameter or delay that counts in the figure; pairs
+        (held to be, is) faulty of ``f2``, and (confidence, recovered) of ``ece``. ``pit`` holds the probability
+        integral transforms of the deployed parameters. Figures that have no meaning here are left out.
+    """
+    truth, count = trial.truth, len(trial.truth)
+    within, within_25 = (
+        recovered(
+            estimate.faults, truth, full_scale_a=trial.full_scale_a, smallest_fault=trial.smallest_fault, tolerance=t
+        )
+        for t in (0.10, 0.25)
+    )
+    corrected, worsening_a = np.any(estimate.corrected, axis=1), _worsening_a(estimate, trial)
+    values: dict[str, NDArray[Any]] = {
+        "recovery_rate": within,
+        "recovery_rate_25": within_25,
+        "f2": np.column_stack([estimate.hardware, truth.has_hardware_fault]),
+        "complexity": estimate.hardware,
+        "corrected": corrected,
+        "deployed": corrected[truth.has_sensor_fault],
+        "harmed": np.any(worsening_a > 0.0, axis=1)[corrected],
+        "worst_a": worsening_a.max(axis=1, initial=0.0),
+        "failed": np.full(count, estimate.failed / count),
+    }
+    if estimate.confidence is not None:
+        confidence, sure = estimate.confidence, estimate.confidence > SURE
+        values |= {
+            "confidence": confidence,
+            "sure": sure,
+            "sure_confidence": confidence[sure],
+            "sure_recovered": within[sure],
+            "sure_wrong": ~within[sure],
+            "ece": np.column_stack([confidence, within]),
+            "ece_by_chance": np.column_stack([confidence, within]),
+        }
+    if trial.attacked is not None and trial.causes:
+        causes = [set(found) for found in estimate.findings] or [set[str]()] * count
+        values["named"] = np.array([not found.isdisjoint(trial.causes) for found in causes])[trial.attacked]
+        values["misnamed"] = np.array([bool(found) for found in causes])[~trial.attacked]
+    if trial.delay_error_s is not None:
+        values["delay_rmse_ms"] = 1e3 * trial.delay_error_s.ravel()
+    if estimate.drift_sd is not None and estimate.offset_sd_a is not None:
+        pits = [] if estimate.pit is None else estimate.pit(truth)
+        own, found = (truth.drift, truth.offset_a), (estimate.faults.drift, estimate.faults.offset_a)
+        transforms = []
+        for k, (name, sd) in enumerate((("gain", estimate.drift_sd), ("offset", estimate.offset_sd_a))):
+            deployed = estimate.corrected & (found[k] != 0.0)
+            z = (own[k][deployed] - found[k][deployed]) / sd[deployed]
+            values[f"{name}_within_1"], values[f"{name}_beyond_3"] = np.abs(z) <= 1.0, np.abs(z) > 3.0
+            transforms.append(pits[k][deployed] if pits else norm.cdf(z))
+        values["pit"] = np.concatenate(transforms)
+    return values
+
+
+def _worsening_a(estimate: Estimate, trial: Trial) -> Array:
+    """By how much the corrected branches (N, K) get worse; full scale where the gain is 0, which has no inverse. [A]"""
+    drift, offset_a = (np.where(estimate.corrected, x, 0.0) for x in (estimate.faults.drift, estimate.faults.offset_a))
+    impossible = np.abs(1.0 + drift) < LEAST_GAIN
+    zero = np.zeros_like(drift)
+    worsening = trial.unseen.rms_a(np.where(impossible, 0.0, drift), offset_a) - trial.unseen.rms_a(zero, zero)
+    return np.where(impossible, trial.full_scale_a, np.where(estimate.corrected, worsening, 0.0))
+
+
+def figure_rows(trials: Sequence[Values]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Figures of one method over the trials of one setting.
+
+    Parameters
+    ----------
+    trials : sequence of mapping
+        From :func:`judge`.
+
+    Returns
+    -------
+    figures : DataFrame
+        A row per figure: ``figure``, ``value``, ``sd`` over the trials (0 for a single one), ``of`` how many
+        values, and of a share the ends ``low`` and ``high`` of its 95 % interval.
+    tenths : DataFrame
+        From :func:`tenths_of`.
+    """
+    together = {
+        name: np.concatenate([trial[name] for trial in trials if name in trial])
+        for name in dict.fromkeys(name for trial in trials for name in trial)
+    }
+    rows = []
+    for name, kind in FIGURES.items():
+        if name in together and len(together[name]):
+            values = together[name]
+            singly = [kind.merged(trial[name]) for trial in trials if name in trial and len(trial[name])]
+            sd = np.std(singly, ddof=1) if len(singly) > 1 else 0.0
+            share = values.ndim == 1 and values.dtype == bool
+            rows.append((name, float(kind.merged(values)), float(sd), len(values), share))
+    figures = pd.DataFrame(rows, columns=["figure", "value", "sd", "of", "share"])
+    return _with_intervals(figures), tenths_of(together)
+
+
+def _with_intervals(figures: pd.DataFrame) -> pd.DataFrame:
+    """Figures with the 95 % intervals of those that are shares."""
+    hits = np.rint(figures["value"] * figures["of"])
+    misses = figures["of"] - hits
+    low = np.nan_to_num(beta.ppf(TAIL, hits, misses + 1), nan=0.0)  # no distribution has 0 hits, nor 0 misses
+    high = np.nan_to_num(beta.ppf(1.0 - TAIL, hits + 1, misses), nan=1.0)
+    share = figures["share"].astype(bool)
+    return figures.assign(low=np.where(share, low, np.nan), high=np.where(share, high, np.nan)).drop(columns="share")
+
+
+def tenths_of(values: Values) -> pd.DataFrame:
+    """Vehicles by tenths of their confidence, and deployed parameters by tenths of their integral transforms.
+
+    Returns a row per tenth: its lower end ``low``, ``vehicles`` in it, their mean ``confidence`` and the share of them
+    that is ``recovered`` (NaN of none), and the number of parameters ``pit``; no row where there is neither.
+    """
+    pairs, pit = (values.get(name, np.zeros((0, 2))) for name in ("ece", "pit"))
+    if not len(pairs) and not len(pit):
+        return pd.DataFrame(columns=TENTH_COLUMNS, dtype=float)
+    number = np.minimum((pairs[:, 0] * len(TENTHS)).astype(int), len(TENTHS) - 1)
+    grouped = pd.DataFrame(pairs, columns=["confidence", "recovered"], dtype=float).groupby(number)
+    tenths = grouped.mean().assign(vehicles=grouped.size()).reindex(range(len(TENTHS)))
+    counts, _ = np.histogram(pit, bins=len(TENTHS), range=(0.0, 1.0))
+    return tenths.assign(low=TENTHS, pit=counts).fillna({"vehicles": 0})[[*TENTH_COLUMNS]]
+
+
+def pool_tenths(tenths: pd.DataFrame) -> pd.DataFrame:
+    """Tenths of several settings together, without those that hold no vehicle."""
+    weighed = tenths[["low", "vehicles", "confidence", "recovered"]].astype(float)
+    weighed[["confidence", "recovered"]] = weighed[["confidence", "recovered"]].mul(weighed["vehicles"], axis=0)
+    summed = weighed.groupby("low", as_index=False).sum().query("vehicles > 0")
+    means = summed[["confidence", "recovered"]].div(summed["vehicles"], axis=0)
+    return summed.assign(confidence=means["confidence"], recovered=means["recovered"])
+
+
+def calibration_errors(tenths: pd.DataFrame) -> tuple[float, float]:
+    """Expected calibration error, and what chance alone makes of it; NaN without vehicles."""
+    vehicles, confidence = tenths["vehicles"].to_numpy(float), tenths["confidence"].to_numpy(float)
+    if not vehicles.sum():
+        return float("nan"), float("nan")
+    error = vehicles * np.abs(confidence - tenths["recovered"].to_numpy(float))
+    chance = np.sqrt(2.0 / np.pi * vehicles * confidence * (1.0 - confidence))
+    return float(np.nansum(error) / vehicles.sum()), float(np.nansum(chance) / vehicles.sum())
+
+
+def pool_figures(figures: pd.DataFrame) -> pd.DataFrame:
+    """Figures that are means, each over the values of several settings together; without standard deviations."""
+    means = figures[[FIGURES[name].merged is np.mean for name in figures["figure"]]]
+    grouped = means.assign(total=means["value"] * means["of"]).groupby("figure", sort=False)
+    pooled = grouped.agg(total=("total", "sum"), of=("of", "sum"), low=("low", "max")).reset_index()
+    return _with_intervals(
+        pooled.assign(value=pooled["total"] / pooled["of"], sd=0.0, share=pooled["low"].notna())
+    ).drop(columns="total")

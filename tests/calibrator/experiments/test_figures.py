@@ -1,0 +1,200 @@
+"""Figures of merit against what they are by definition."""
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binomtest, chisquare
+
+from calibrator.drive import Array, Mask
+from calibrator.experiments.figures import Values, calibration_errors, figure_rows, judge, pool_tenths, tenths_of
+from calibrator.experiments.methods import Estimate
+from calibrator.experiments.trial import Trial, UnseenDrive
+from calibrator.faults import Faults, corrected_currents, measured_currents, true_currents
+
+N = 1000
+SWINGING_A = np.array([[11.0, -11.0], [-9.0, 9.0]])
+"""Ideal currents with a root mean square of about 10 A. [A]"""
+
+
+def figures_of(*trials: Values) -> dict[str, Any]:
+    figures, _ = figure_rows(trials)
+    return {row.figure: row for row in figures.itertuples()}
+
+
+def confident(confidence: Array, recovered: Array | Mask) -> Values:
+    """Values of a method that says its confidence, and recovers some vehicles."""
+    within = recovered.astype(bool)
+    zero = np.zeros((len(within), 2))
+    truth = Faults(hardware_drift=zero[:, 0], hardware_offset_a=zero, drift=zero, offset_a=zero)
+    found = replace(truth, drift=zero + np.where(within, 0.0, 1.0)[:, None])
+    trial = replace(two_vehicles(drift=0.1, harm_second=0.0)[1], truth=truth, unseen=unseen_of(truth))
+    estimate = Estimate(faults=found, hardware=within, corrected=zero > 0.0, confidence=confidence, failed=0)
+    return judge(estimate, trial)
+
+
+def unseen_of(truth: Faults) -> UnseenDrive:
+    return UnseenDrive.of_linear_sensors(SWINGING_A, truth)
+
+
+def two_vehicles(*, drift: float, harm_second: float) -> tuple[Estimate, Trial]:
+    """Two vehicles with a drift of 0.1 in their first branch, and an estimate."""
+    zero, real = np.zeros((2, 2)), np.array([[0.1, 0.0], [0.1, 0.0]])
+    truth = Faults(hardware_drift=np.zeros(2), hardware_offset_a=zero, drift=real, offset_a=zero)
+    found = replace(truth, drift=np.array([[drift, 0.0], [drift, harm_second]]))
+    trial = Trial(
+        smallest_fault=0.05,
+        full_scale_a=400.0,
+        truth=truth,
+        unseen=unseen_of(truth),
+        record=lambda: pytest.fail("not needed"),
+        collect=lambda: pytest.fail("not needed"),
+    )
+    estimate = Estimate(
+        faults=found, hardware=np.zeros(2, bool), corrected=found.drift != 0.0, confidence=np.ones(2), failed=0
+    )
+    return estimate, trial
+
+
+def test_calibration_error_of_an_honest_confidence_is_that_of_chance_and_of_boasting_its_excess() -> None:
+    rng = np.random.default_rng(0)
+    confidence = rng.random(100 * N)
+    honest = figures_of(confident(confidence, rng.random(100 * N) < confidence))
+    assert honest["ece"].value < 0.01
+    assert honest["sure_recovered"].value == pytest.approx(honest["sure_confidence"].value, abs=0.01)
+    assert honest["sure"].value == pytest.approx(0.05, abs=0.005)
+    boasting = figures_of(confident(np.full(N, 0.9), np.arange(N) < 0.6 * N))
+    assert boasting["ece"].value == pytest.approx(0.3)
+    assert "sure_recovered" not in boasting
+    assert np.isnan(calibration_errors(tenths_of({}))).all()
+
+
+def test_calibration_error_by_chance_is_the_usual_one_of_an_exact_confidence() -> None:
+    rng = np.random.default_rng(1)
+    confidence = rng.beta(4.0, 1.0, 300)
+    drawn = [calibration_errors(tenths_of({"ece": np.column_stack([confidence, rng.random(300) < confidence])}))
+             for _ in range(200)]  # fmt: skip
+    assert drawn[0][1] == pytest.approx(np.mean([error for error, _ in drawn]), rel=0.1)
+
+
+def test_method_without_confidence_has_no_figures_of_it() -> None:
+    estimate, trial = two_vehicles(drift=0.1, harm_second=0.0)
+    silent = judge(replace(estimate, confidence=None), trial)
+    assert {"confidence", "ece", "sure", "delay_rmse_ms"}.isdisjoint(figures_of(silent))
+    assert not len(tenths_of(silent))
+
+
+def test_tenths_hold_every_vehicle_once_and_pooling_adds_them() -> None:
+    first, second = confident(np.linspace(0.0, 1.0, N), np.ones(N)), confident(np.ones(N), np.zeros(N))
+    _, together = figure_rows([first, second])
+    one = tenths_of(first)
+    assert together["vehicles"].sum() == 2 * N
+    assert together["vehicles"].iloc[-1] == one["vehicles"].iloc[-1] + N
+    pooled = pool_tenths(pd.concat([tenths_of(first), tenths_of(second)]))
+    for column in ("vehicles", "confidence", "recovered"):
+        np.testing.assert_allclose(pooled[column], together[column])
+
+
+@pytest.mark.parametrize(
+    ("drift", "harm_second", "recovery_rate", "harmed"),
+    [(0.1, 0.0, 1.0, 0.0), (0.1, 0.2, 0.5, 0.5), (0.1, -1.0, 0.5, 0.5)],
+    ids=["truth", "a sound branch is corrected", "a gain of zero cannot be corrected"],
+)
+def test_correction_that_makes_a_branch_worse_is_harm(
+    drift: float, harm_second: float, recovery_rate: float, harmed: float
+) -> None:
+    figures = figures_of(judge(*two_vehicles(drift=drift, harm_second=harm_second)))
+    assert (figures["recovery_rate"].value, figures["harmed"].value) == (recovery_rate, harmed)
+    assert figures["deployed"].value == 1.0
+    if harm_second == 0.2:
+        rms_a = np.sqrt(np.mean(SWINGING_A[:, 1] ** 2))  # of the second branch, whose sensor is sound
+        assert figures["worst_a"].value == pytest.approx(rms_a * (1.0 - 1.0 / 1.2))
+
+
+def test_branch_that_passes_through_can_do_no_harm() -> None:
+    estimate, trial = two_vehicles(drift=0.1, harm_second=0.2)
+    only_first = replace(estimate, corrected=estimate.corrected & np.array([True, False]))
+    assert figures_of(judge(only_first, trial))["harmed"].value == 0.0
+    nothing = replace(estimate, corrected=np.zeros((2, 2), bool))
+    figures = figures_of(judge(nothing, trial))
+    assert figures["deployed"].value == 0.0
+    assert "harmed" not in figures
+
+
+def test_unseen_moments_are_those_of_the_samples() -> None:
+    rng = np.random.default_rng(0)
+    i_s = rng.normal(size=(N, 2)) * 50.0 + 10.0
+    truth = Faults(
+        hardware_drift=np.array([0.2]),
+        hardware_offset_a=np.array([[10.0, -10.0]]),
+        drift=np.array([[0.1, -0.2]]),
+        offset_a=np.array([[5.0, -3.0]]),
+    )
+    i = true_currents(i_s, truth.take(0))
+    i_m = measured_currents(i, truth.take(0))
+    unseen, sampled = UnseenDrive.of_linear_sensors(i_s, truth), UnseenDrive.of_samples([(i, i_m)])
+    for field in fields(UnseenDrive):
+        np.testing.assert_allclose(getattr(unseen, field.name), getattr(sampled, field.name))
+    drift, offset_a = np.array([[0.15, -0.1]]), np.array([[2.0, 1.0]])
+    error_a = corrected_currents(i_m, drift=drift[0], offset_a=offset_a[0]) - i
+    np.testing.assert_allclose(unseen.rms_a(drift, offset_a)[0], np.sqrt(np.mean(error_a**2, axis=0)))
+
+
+def test_inverted_sensor_can_be_corrected() -> None:
+    estimate, trial = two_vehicles(drift=0.1, harm_second=0.0)
+    truth = replace(trial.truth, drift=np.full((2, 2), -2.0))
+    inverted = replace(trial, truth=truth, unseen=unseen_of(truth))
+    whole = replace(estimate, faults=truth, corrected=np.ones((2, 2), bool))
+    assert figures_of(judge(whole, inverted))["harmed"].value == 0.0
+
+
+def test_shares_have_an_exact_interval() -> None:
+    for hits, of in ((0, 100), (3, 175), (5, 5)):
+        row = figures_of({"harmed": np.arange(of) < hits})["harmed"]
+        assert (round(row.value * row.of), row.of) == (hits, of)
+        assert (row.low, row.high) == pytest.approx(binomtest(hits, of).proportion_ci(0.95, method="exact"))
+    assert np.isnan(figures_of({"confidence": np.array([0.3])})["confidence"].low)
+
+
+def test_standard_deviation_is_that_over_trials() -> None:
+    figures = figures_of({"recovery_rate": np.array([True, False])}, {"recovery_rate": np.array([True, True])})
+    assert (figures["recovery_rate"].value, figures["recovery_rate"].of) == (0.75, 4)
+    assert figures["recovery_rate"].sd == pytest.approx(np.std([0.5, 1.0], ddof=1))
+
+
+def test_standard_deviations_that_are_right_have_normal_scores() -> None:
+    rng, vehicles = np.random.default_rng(0), 4000
+    zero, sd = np.zeros((vehicles, 2)), rng.uniform(0.01, 0.03, (vehicles, 2))
+    truth = Faults(hardware_drift=zero[:, 0], hardware_offset_a=zero, drift=0.2 + zero, offset_a=zero)
+    found = replace(truth, drift=truth.drift + sd * rng.standard_normal(sd.shape))
+    estimate = Estimate(
+        faults=found,
+        hardware=zero[:, 0] > 0.0,
+        corrected=np.ones((vehicles, 2), bool),
+        confidence=None,
+        failed=0,
+        drift_sd=sd,
+        offset_sd_a=sd,
+    )
+    trial = replace(two_vehicles(drift=0.1, harm_second=0.0)[1], truth=truth, unseen=unseen_of(truth))
+    values = judge(estimate, trial)
+    figures = figures_of(values)
+    assert figures["gain_within_1"].value == pytest.approx(0.683, abs=0.02)
+    assert figures["gain_beyond_3"].of == 2 * vehicles
+    assert "offset_within_1" not in figures  # no offset was found, so none is deployed
+    counts = tenths_of(values)["pit"]
+    assert sum(counts) == 2 * vehicles
+    assert chisquare(counts).pvalue > 0.01
+    own = replace(estimate, pit=lambda truth: (np.full(truth.drift.shape, 0.55), np.zeros(truth.drift.shape)))
+    assert tenths_of(judge(own, trial))["pit"][5] == 2 * vehicles
+
+
+def test_causes_that_findings_name_are_counted_where_there_is_an_attack() -> None:
+    estimate, trial = two_vehicles(drift=0.1, harm_second=0.0)
+    attacked = replace(trial, attacked=np.array([True, False]), causes=("inverted",))
+    for findings, named, misnamed in (((["inverted"], []), 1, 0), (([], ["step"]), 0, 1), ((), 0, 0)):
+        values = judge(replace(estimate, findings=findings), attacked)
+        assert (values["named"].sum(), values["misnamed"].sum()) == (named, misnamed)
+    assert "named" not in judge(estimate, trial)
