@@ -73,7 +73,7 @@ def checked(fleet: RecordedFleet, branches: int, seed: int, bends: dict[int, Ben
     return find_misfits(summaries, read_out, usual, full_scale_a=fleet.full_scale_a, branches=names)
 
 
-@pytest.mark.parametrize("branches", [2, 3])
+@pytest.mark.parametrize("branches", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_of_vehicles_with_linear_sensors_at_most_one_in_a_hundred_has_a_finding(
     fleet: RecordedFleet, branches: int
 ) -> None:
@@ -81,7 +81,7 @@ def test_of_vehicles_with_linear_sensors_at_most_one_in_a_hundred_has_a_finding(
     assert sum(map(bool, found)) <= 0.01 * len(found)
 
 
-@pytest.mark.parametrize("branches", [2, 3])
+@pytest.mark.parametrize("branches", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_sensors_that_are_not_linear_are_named(fleet: RecordedFleet, branches: int) -> None:
     vehicles = [int(j) for j in np.argsort([-np.ptp(trip.matrix_a()[:, 0]) for trip in fleet.with_branches(branches)])]
     put = dict(zip(vehicles[::3], BENDS, strict=False))

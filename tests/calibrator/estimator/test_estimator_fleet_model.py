@@ -47,7 +47,7 @@ def largest_error(read_out: Array) -> float:
     return float(np.max(np.abs(read_out[:-1] - W) / np.abs(W).max(axis=0)))
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.long), 0.5])
 def test_read_outs_are_those_of_faultless_vehicles_however_lopsided_the_faults(share: float) -> None:
     read_out = model_of(summaries_of(one_sided_faults(40, share)))
     assert largest_error(read_out) < 0.005

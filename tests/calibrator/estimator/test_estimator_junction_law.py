@@ -40,7 +40,7 @@ def summary_of(
     return summary_of_currents(i_m), np.append(gain, (1.0 + d[0]) * (np.sum(o / (1.0 + d)) - load_a))
 
 
-@pytest.mark.parametrize("size_a", [(80.0,), (80.0, 6.0)])
+@pytest.mark.parametrize("size_a", [pytest.param((80.0,), marks=pytest.mark.long), (80.0, 6.0)])
 def test_standardised_errors_are_standard_normal(size_a: tuple[float, ...]) -> None:
     noise_a = (0.5,) * (len(size_a) + 1)
     summaries, truths = zip(

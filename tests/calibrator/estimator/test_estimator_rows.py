@@ -57,7 +57,12 @@ def errors(rows: EvidenceRows, faults: Faults) -> Array:
 
 
 @pytest.mark.parametrize(
-    "conditions", [Conditions(), Conditions(noise_a=1.0, memory=0.8), Conditions(model_error_a=1.0)]
+    "conditions",
+    [
+        pytest.param(Conditions(), marks=pytest.mark.long),
+        Conditions(noise_a=1.0, memory=0.8),
+        pytest.param(Conditions(model_error_a=1.0), marks=pytest.mark.long),
+    ],
 )
 def test_standardised_errors_are_standard_normal(conditions: Conditions) -> None:
     faults = random_faults(1, 150)

@@ -70,7 +70,14 @@ def test_residuals_are_those_of_the_equations_of_the_rows(K: int) -> None:
         np.testing.assert_allclose(left[j], plain_residual(rows.take(slice(j, j + 1)), theta[j]), atol=1e-13)
 
 
-@pytest.mark.parametrize("errors", [Errors(), Errors(slope=0.02, ratio=0.01, intercept=0.01, junction=0.01), READ])
+@pytest.mark.parametrize(
+    "errors",
+    [
+        pytest.param(Errors(), marks=pytest.mark.long),
+        pytest.param(Errors(slope=0.02, ratio=0.01, intercept=0.01, junction=0.01), marks=pytest.mark.long),
+        READ,
+    ],
+)
 def test_fits_of_two_branches_are_those_of_all_supports_one_by_one(errors: Errors) -> None:
     rows = rows_of(random_faults(4, vehicles=8, branches=2, sparsity=60.0), seed=4, errors=errors)
     fits, log_prior = fitted(plain_evidence(rows)), first_prior(2).log_supports

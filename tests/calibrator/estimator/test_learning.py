@@ -48,7 +48,7 @@ def same(one: FaultModel, other: FaultModel, rtol: float) -> None:
 
 
 @pytest.mark.parametrize("magnitude", [(0.05, 0.25), (0.3, 0.6)])
-@pytest.mark.parametrize("K", [2, 3])
+@pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_sizes_and_numbers_are_those_that_the_fleet_was_drawn_with(K: int, magnitude: tuple[float, float]) -> None:
     faults = random_faults(1, vehicles=60, branches=K, magnitude=magnitude)
     model = learned(rows_of(faults, seed=1))
@@ -135,7 +135,7 @@ def test_load_of_all_vehicles_is_found_or_taken_as_declared(declared: float | No
         assert models[0].spread.mean[at.junction] == declared
 
 
-@pytest.mark.parametrize("K", [2, 3])
+@pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_loads_that_differ_between_vehicles_are_no_offsets_of_sensors(K: int) -> None:
     load = np.random.default_rng(15).normal(0.0075, 0.0025, 30).clip(0.0)
     errors = Errors(intercept=0.0003, junction=0.0001)  # as on recorded trips
@@ -145,7 +145,7 @@ def test_loads_that_differ_between_vehicles_are_no_offsets_of_sensors(K: int) ->
     assert not model.spread.shared.any()
 
 
-@pytest.mark.parametrize("K", [2, 3])
+@pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_constant_that_no_load_can_be_is_an_offset_of_all_sensors_of_a_branch(K: int) -> None:
     """Currents that sum to less than zero: no load gives current."""
     faults = random_faults(12, vehicles=40, branches=K)
@@ -166,7 +166,7 @@ def test_vehicles_that_share_a_constant_are_a_group_and_its_cause_is_left_open(o
     assert {model.spread.shared[-1] for model in models} == {0.0, 1.0}
 
 
-@pytest.mark.parametrize("gain", [0.08, -0.05])
+@pytest.mark.parametrize("gain", [0.08, pytest.param(-0.05, marks=pytest.mark.long)])
 @pytest.mark.parametrize(("K", "branch"), [(3, 0), (3, 2), (2, 1)])
 def test_gain_that_all_sensors_of_a_branch_share_is_found_and_of_two_branches_either_may_have_it(
     K: int, branch: int, gain: float

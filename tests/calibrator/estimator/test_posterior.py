@@ -94,7 +94,9 @@ def of_supports(draws: Draws, weight: Array, vehicle: int) -> dict[tuple[int, ..
     return found
 
 
-@pytest.mark.parametrize(("faults", "points", "tolerance"), [(1, 1001, 0.04), (2, 121, 0.08)])
+@pytest.mark.parametrize(
+    ("faults", "points", "tolerance"), [(1, 1001, 0.04), pytest.param(2, 121, 0.08, marks=pytest.mark.long)]
+)
 def test_weights_are_those_of_integration_on_a_grid(faults: int, points: int, tolerance: float) -> None:
     """Vague rows: the posterior is cut by the bounds of the sizes, and offsets depend on gains."""
     prior = paper_prior(2, *range(faults + 1))

@@ -41,7 +41,7 @@ def worse(deployed: Faults, faults: Faults) -> Mask:
 
 
 @pytest.mark.parametrize("magnitude", [(0.05, 0.25), (0.01, 0.05), (0.3, 0.6)])
-@pytest.mark.parametrize("K", [2, 3])
+@pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_faults_are_recovered_and_corrected_whatever_their_size(K: int, magnitude: tuple[float, float]) -> None:
     faults = random_faults(1, vehicles=40, branches=K, magnitude=magnitude)
     found, deployed = estimated(faults, seed=1)
@@ -55,7 +55,7 @@ def test_faults_are_recovered_and_corrected_whatever_their_size(K: int, magnitud
     assert abs(right.sum() - found.confidence.sum()) < 3.0 * spread + 1.0
 
 
-@pytest.mark.parametrize("offset", [0.0125, 0.05, -0.03])
+@pytest.mark.parametrize("offset", [0.0125, 0.05, pytest.param(-0.03, marks=pytest.mark.long)])
 @pytest.mark.parametrize("share", [0.6, 1.0])
 def test_batch_of_sensors_with_a_common_offset_makes_no_vehicle_worse(offset: float, share: float) -> None:
     faults = random_faults(2, vehicles=30, branches=2)
@@ -73,8 +73,8 @@ def test_load_without_a_sensor_makes_no_vehicle_worse(load: float, share: float)
     assert np.abs(found.offset_a[:, 1:] - faults.offset_a[:, 1:]).max() < 0.01
 
 
-@pytest.mark.parametrize("gain", [0.04, -0.04])
-@pytest.mark.parametrize("K", [2, 3])
+@pytest.mark.parametrize("gain", [0.04, pytest.param(-0.04, marks=pytest.mark.long)])
+@pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_batch_of_sensors_with_a_common_gain_makes_no_vehicle_worse(K: int, gain: float) -> None:
     faults = random_faults(4, vehicles=30, branches=K)
     faults.drift[:, 1] = (1.0 + gain) * (1.0 + faults.drift[:, 1]) - 1.0
@@ -92,7 +92,7 @@ def test_standard_deviations_are_those_of_the_errors() -> None:
     assert (within > 3.5).mean() < 0.02
 
 
-@pytest.mark.parametrize("K", [2, 3])
+@pytest.mark.parametrize("K", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_vehicle_is_estimated_alike_to_the_bit_alone_and_in_any_fleet(K: int) -> None:
     rows = rows_of(random_faults(7, vehicles=300, branches=K, sparsity=70.0), seed=7)
     models, drives = learn_fault_models(rows.take(slice(0, 40)), feed=0), moments(rows)
