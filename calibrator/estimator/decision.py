@@ -34,7 +34,7 @@ __all__ = [
     "estimate_rows",
     "harm_probability",
     "posterior_points",
-    "recovered",
+    "recovery_probability",
 ]
 
 NEGLIGIBLE = 1e-8
@@ -160,12 +160,12 @@ def best_estimate(points: Points, smallest: Array) -> tuple[Array, float]:
         tried += [points.faults[i] for i in own[np.argsort(-points.weight[own], kind="stable")[:2]]]
     candidates = np.array(tried)
     candidates[np.abs(candidates) < RESOLUTION] = 0.0
-    covered = recovered(points, candidates, smallest)
+    covered = recovery_probability(points, candidates, smallest)
     best = int(np.argmax(covered >= covered.max() - EQUALLY_GOOD))
     return candidates[best], float(min(covered[best], 1.0))
 
 
-def recovered(points: Points, candidates: Array, smallest: Sequence[float] | Array) -> Array:
+def recovery_probability(points: Points, candidates: Array, smallest: Sequence[float] | Array) -> Array:
     """Find how much of a posterior is within the tolerance of "recovered" of each candidate.
 
     Parameters

@@ -29,7 +29,7 @@ from calibrator.drives.charge import GAP_PERIODS
 from calibrator.drives.delays import MAX_DELAY_S, estimate_delays, without_delays
 from calibrator.errors import DriveError, FleetError
 from calibrator.estimator.checks import CAUSES, UsualMisfits, find_misfits
-from calibrator.estimator.decision import Points, harm_probability, recovered
+from calibrator.estimator.decision import Points, harm_probability, recovery_probability
 from calibrator.estimator.evidence import junction_regression, stack_summaries
 from calibrator.estimator.fleet_estimate import SUSPECTED, FleetEstimate
 from calibrator.estimator.readings import (
@@ -529,7 +529,7 @@ def estimate_junction(
         true = own[None], (own**2 + spread)[None]
         harm[j] = harm_probability(points[j], estimate, *true)
         harm_of_gain[j] = harm_probability(points[j], np.append(drift[j], np.zeros(K)), *true)
-        confidence[j] = recovered(points[j], estimate[None], (LEAST_FAULT, LEAST_FAULT))[0]
+        confidence[j] = recovery_probability(points[j], estimate[None], (LEAST_FAULT, LEAST_FAULT))[0]
     vague = bool(gain_sd.min() > KNOWN_GAIN_SD)
     known_well = (gain_sd <= SOUND_GAIN_SD) & (offset_sd <= SOUND_OFFSET_SD)
     # Where it is open whose an offset is, the gain alone may be corrected.
