@@ -1,6 +1,6 @@
 """A real ``ecu-node run`` on the virtual bus, in a process with a thread that sends to it and watches it.
 
-Started by :mod:`bench.node_process` with its arguments as JSON; prints what it saw as JSON. What stands beside the node
+Started by :mod:`bench.node` with its arguments as JSON; prints what it saw as JSON. What stands beside the node
 here is one thread, one bus with its queue, and a few frames; the node's memory is read before they are there, and when
 they are. Imports nothing that the node itself does not.
 """

@@ -1,6 +1,7 @@
 """The node as a process on SocketCAN, beside other ways from vcan0 to vcan1: run with ``tools/with_vcan``.
 
     PYTHONPATH=tools tools/with_vcan python -m bench.node_socketcan --frames 20000
+    python -m bench.node_socketcan --peer bare|plain CHANNEL_IN CHANNEL_OUT    one of the other ways, until it is ended
 
 Compared are ``ecu-node run --gateway``, a program in C that does the same, a python-can loop that only receives and
 sends, the plain version with Notifier and cantools, and the kernel's own gateway (cangw), which changes nothing. One
@@ -13,6 +14,7 @@ import argparse
 import json
 import os
 import shutil
+import signal
 import socket
 import struct
 import subprocess
@@ -26,11 +28,11 @@ from statistics import median, quantiles
 
 import can
 
-from bench.node_c import compile_gateway
-from bench.node_plain import plain_job
-from bench.node_process import command_line
-from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle
+from bench.c_core import CORE
+from bench.node import MEBIBYTE, command_line
+from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle, plain_job
 from bench.row import Row
+from calibrator.export.core import Checked, c_text
 from ecu_node.bus.steady_bus import SocketCanLink
 from ecu_node.bus.wiring import Mode
 from ecu_node.parameters import write_parameters
@@ -47,7 +49,6 @@ QUIET_S = 0.5
 """When no frame comes for this long none is on its way. [s]"""
 LATENCY_SHARE = 10
 """Every so many-th frame is sent alone, for its latency."""
-MEBIBYTE = 1024.0**2
 
 
 def rows(frames: int) -> list[Row]:
@@ -70,11 +71,12 @@ def rows(frames: int) -> list[Row]:
         plain = [bytes(found) for found in map(plain_job(vehicle, Mode.GATEWAY), vehicle.frames) if found is not None]
         node = command_line(vehicle, "--interface", "socketcan", "--channel", IN, "--gateway", OUT)
         python = [sys.executable, "-m"]
-        in_c = [str(compile_gateway(vehicle, Path(folder))), IN, OUT]
+        peer = [*python, "bench.node_socketcan", "--peer"]
+        in_c = [str(_compiled_gateway(vehicle, Path(folder))), IN, OUT]
         ways: dict[str, Callable[[], dict[str, float]]] = {
             "cangw": lambda: _kernel(vehicle, same, frames),
-            "bare loop": lambda: _process([*python, "bench.node_peer", "bare", IN, OUT], vehicle, same, frames),
-            "plain": lambda: _process([*python, "bench.node_peer", "plain", IN, OUT], vehicle, plain, frames),
+            "bare loop": lambda: _process([*peer, "bare", IN, OUT], vehicle, same, frames),
+            "plain": lambda: _process([*peer, "plain", IN, OUT], vehicle, plain, frames),
             "C": lambda: _process(in_c, vehicle, vehicle.corrected(Mode.GATEWAY), frames),
             "ecu-node": lambda: _process(
                 [*python, "ecu_node", *node], vehicle, vehicle.corrected(Mode.GATEWAY), frames
@@ -214,6 +216,38 @@ def _line(vehicle: BenchVehicle, expected: list[bytes]) -> Iterator[_Line]:
         yield _Line(near, far, vehicle, expected)
 
 
+def _compiled_gateway(vehicle: BenchVehicle, folder: Path) -> Path:
+    """The program in C, ``gateway CHANNEL_IN CHANNEL_OUT``: the C core with the vehicle's calibration."""
+    checked = Checked(name="params", digest="0" * 64, parameters=vehicle.parameters, database=vehicle.database)
+    (folder / "hv_calibration.c").write_text(c_text(checked))
+    sources = [Path(__file__).with_name("node_gateway.c"), folder / "hv_calibration.c", CORE / "hv_correction.c"]
+    subprocess.run([shutil.which("gcc") or "gcc", "-O2", f"-I{CORE}", *sources, "-o", folder / "gateway"], check=True)
+    return folder / "gateway"
+
+
+def _pass_on(kind: str, source: str, target: str) -> None:
+    """The loop that receives and sends, or the plain version."""
+    with (
+        can.Bus(source, "socketcan", ignore_config=True) as receiving,
+        can.Bus(target, "socketcan", ignore_config=True) as sending,
+        tempfile.TemporaryDirectory(prefix="bench-") as folder,
+    ):
+        while kind == "bare":
+            message = receiving.recv()
+            if message is not None:
+                sending.send(message)
+        job = plain_job(make_vehicle(Path(folder), numbered=True), Mode.GATEWAY)
+
+        def on_message(message: can.Message) -> None:
+            data = job(message.data) if message.arbitration_id == IDENTIFIER else message.data
+            if data is not None:
+                message.data = data
+                sending.send(message)
+
+        with can.Notifier(receiving, [on_message]):
+            signal.pause()
+
+
 def _cpu_s(process: int) -> float:
     """Processor time of a process so far. [s]"""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
@@ -229,7 +263,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--frames", type=int, default=20_000)
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--peer", nargs=3, metavar=("KIND", "CHANNEL_IN", "CHANNEL_OUT"), help="bare or plain")
     arguments = parser.parse_args()
+    if arguments.peer:
+        _pass_on(*arguments.peer)
     if shutil.which("cangw") is None:
         parser.exit(2, "cangw is not installed: apt-get install can-utils\n")
     found = rows(arguments.frames)

@@ -1,22 +1,27 @@
 """The vehicle of the node's benchmarks: a message with two currents of 16 bits and E2E profile P01, sent in a circle.
 
+Beside it the node's work as most programs would do it: cantools decodes the message, cantools encodes it again.
+
 The true currents sum to zero and the parameters are those of the sensors' faults, so that the node has no reason to
 doubt its corrections, however long it runs. Nothing here needs numpy: it is loaded beside a node whose memory counts.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from bench.true_parameters import true_parameters
 from ecu_node.bus.wiring import InForce, Mode, wire
 from ecu_node.core.corrector import Corrector
-from ecu_node.core.e2e import protection_of
+from ecu_node.core.e2e import Check, Protection, Receiver, protection_of
+from ecu_node.core.status import Quality
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters, VehicleParameters
 
-__all__ = ["FAULTS", "IDENTIFIER", "NUMBERS", "OUT_IDENTIFIER", "BenchVehicle", "make_vehicle"]
+__all__ = ["FAULTS", "IDENTIFIER", "NUMBERS", "OUT_IDENTIFIER", "BenchVehicle", "PlainJob", "make_vehicle", "plain_job"]
 
 IDENTIFIER, OUT_IDENTIFIER = 0x100, 0x200
 """Of the message with the currents, and of the one that answers it."""
@@ -136,3 +141,74 @@ def _codes(current_a: float) -> list[int]:
         round(sign * ((1.0 + FAULTS[name][0]) * sign * current_a + FAULTS[name][1]) / _STEPS_A[name])
         for name, sign in _SIGNS.items()
     ]
+
+
+PlainJob = Callable[[bytearray], bytearray | None]
+"""Takes the payload of a frame and makes the one to send; None if the frame is not used."""
+
+_USABLE = frozenset({Check.OK, Check.LOST})
+
+
+def plain_job(vehicle: BenchVehicle, mode: Mode) -> PlainJob:
+    """The work of one mode, with the node's own end-to-end protection.
+
+    Parameters
+    ----------
+    vehicle : BenchVehicle
+        Whose currents are corrected.
+    mode : Mode
+        In a gateway the message is rewritten; else another one is filled.
+
+    Returns
+    -------
+    callable
+        The work of one frame.
+    """
+    (battery, battery_a), (motor, motor_a) = FAULTS.values()
+    database = vehicle.database
+    message, answer = database.message("Pair"), database.message("PairOut")
+    check = Receiver(_protection(vehicle, "Pair")).check
+    seal, advance = _protection(vehicle, "Pair").seal, _protection(vehicle, "PairOut").advance
+
+    def corrected(payload: bytearray) -> dict[str, Any]:
+        values: dict[str, Any] = message.decode(payload)  # type: ignore[arg-type, assignment]
+        values["Battery"] = (values["Battery"] - battery_a) / (1.0 + battery)
+        values["Motor"] = -(-values["Motor"] - motor_a) / (1.0 + motor)
+        return values
+
+    def rewrite(payload: bytearray) -> bytearray | None:
+        if check(payload) not in _USABLE:
+            return None
+        out = bytearray(message.encode(corrected(payload)))
+        seal(out)
+        return out
+
+    counter = -1
+
+    def fill(payload: bytearray) -> bytearray | None:
+        nonlocal counter
+        if check(payload) not in _USABLE:
+            return None
+        values = corrected(payload)
+        out = bytearray(
+            answer.encode(
+                {
+                    "Crc": 0,
+                    "Counter": counter % 15,
+                    "Battery": values["Battery"],
+                    "Motor": values["Motor"],
+                    "Quality": int(Quality.CORRECTED),
+                }
+            )
+        )
+        advance(out)
+        counter += 1
+        return out
+
+    return rewrite if mode is Mode.GATEWAY else fill
+
+
+def _protection(vehicle: BenchVehicle, name: str) -> Protection:
+    found = protection_of(vehicle.database, vehicle.database.message(name))
+    assert found is not None
+    return found

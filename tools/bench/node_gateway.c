@@ -1,16 +1,4 @@
-"""A gateway in C that does with the bench's frames what the node does: the C core on SocketCAN."""
-
-import shutil
-import subprocess
-from pathlib import Path
-
-from bench.c_core import CORE
-from bench.node_vehicle import BenchVehicle
-from calibrator.export.core import Checked, c_text
-
-__all__ = ["compile_gateway"]
-
-_MAIN = """\
+/* A gateway between two SocketCAN interfaces that does with the bench's frames what the node does. */
 #include "hv_correction.h"
 #include <linux/can.h>
 #include <linux/can/raw.h>
@@ -48,27 +36,3 @@ int main(int count, char **names)
     }
     return 0;
 }
-"""
-
-
-def compile_gateway(vehicle: BenchVehicle, folder: Path) -> Path:
-    """Write and compile it.
-
-    Parameters
-    ----------
-    vehicle : BenchVehicle
-        Whose frames it corrects.
-    folder : Path
-        For everything.
-
-    Returns
-    -------
-    Path
-        The program: ``gateway CHANNEL_IN CHANNEL_OUT``.
-    """
-    checked = Checked(name="params", digest="0" * 64, parameters=vehicle.parameters, database=vehicle.database)
-    (folder / "hv_calibration.c").write_text(c_text(checked))
-    (folder / "gateway.c").write_text(_MAIN)
-    sources = [folder / "gateway.c", folder / "hv_calibration.c", CORE / "hv_correction.c"]
-    subprocess.run([shutil.which("gcc") or "gcc", "-O2", f"-I{CORE}", *sources, "-o", folder / "gateway"], check=True)
-    return folder / "gateway"
