@@ -19,7 +19,8 @@ Importing the package is quick; what takes time is imported when it is used.
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calibrator.estimator.fleet import Fleet, FleetCalibrator, Junction, JunctionCalibrator, read_log
+    from calibrator.estimator.fleet import Fleet, FleetCalibrator, JunctionCalibrator, read_log
+    from calibrator.estimator.frames import Junction
 
 __all__ = ["Fleet", "FleetCalibrator", "Junction", "JunctionCalibrator", "read_log"]
 

@@ -29,11 +29,11 @@ __all__ = [
     "BranchParameters",
     "Explanation",
     "FileReference",
-    "Finding",
     "HardwareFault",
     "HeldBack",
     "JunctionResidual",
     "Provenance",
+    "SensorFinding",
     "VehicleParameters",
     "Verdict",
     "check_fit",
@@ -99,7 +99,7 @@ class Explanation(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     hardware_offset_a: Annotated[dict[str, float], Meta(description="[A]")] = {}
 
 
-class Finding(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SensorFinding(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a check found in the recordings that no gain error and offset explain; the node ignores it."""
 
     branch: Annotated[_Text64 | None, Meta(description="whose sensor it is about; null: the vehicle as a whole")] = None
@@ -168,7 +168,7 @@ class VehicleParameters(Struct, frozen=True, kw_only=True, forbid_unknown_fields
     hardware_fault: HardwareFault
     explanations: Annotated[list[Explanation], Meta(description="the likeliest, where the calibrator cannot tell")] = []
     deciding_evidence: Annotated[str, Meta(description="what would tell the explanations apart")] = ""
-    findings: Annotated[list[Finding], Meta(max_length=64, description="what a workshop should look at")] = []
+    findings: Annotated[list[SensorFinding], Meta(max_length=64, description="what a workshop should look at")] = []
     junction_residual: JunctionResidual
     provenance: Provenance
 

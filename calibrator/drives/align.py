@@ -116,7 +116,7 @@ def evaluate_formula(formula: str, values: Mapping[str, Array]) -> Array:
     Parameters
     ----------
     formula : str
-        As :func:`ecu_node.formulas.parse_formula` takes it.
+        As ``ecu_node.formulas.parse_formula`` takes it.
     values : mapping of str to ndarray of shape (T,)
         Inputs by name; all that the formula names.
     """

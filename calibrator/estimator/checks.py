@@ -19,7 +19,7 @@ from scipy.stats import t as student_t
 from calibrator.drive import Array
 from calibrator.estimator.evidence import MOST_NOISE, NOISE_ROUNDS, FleetMoments, products, stack_summaries
 from calibrator.summaries.moments import DriveSummary
-from ecu_node.parameters import Finding
+from ecu_node.parameters import SensorFinding
 
 __all__ = ["UsualMisfits", "find_misfits", "learn_usual_misfits"]
 
@@ -572,7 +572,7 @@ def find_misfits(
     *,
     full_scale_a: float,
     branches: Sequence[str],
-) -> list[tuple[Finding, ...]]:
+) -> list[tuple[SensorFinding, ...]]:
     """Find what linear sensors do not explain, in each vehicle by itself.
 
     Parameters
@@ -590,12 +590,12 @@ def find_misfits(
 
     Returns
     -------
-    list of N tuples of Finding
+    list of N tuples of SensorFinding
         By falling probability; causes are ``inverted``, ``dead``, ``clipped``, ``saturating``, ``quadratic``,
         ``cubic``, ``sign``, ``step``, ``ramp``, ``temperature``, ``spikes``, ``outliers``, ``noise`` and ``switching``.
         No branch is named where the evidence does not say which sensor it is, or it is none.
     """
-    found: list[tuple[Finding, ...]] = [()] * len(summaries)
+    found: list[tuple[SensorFinding, ...]] = [()] * len(summaries)
     places = [j for j, summary in enumerate(summaries) if summary.fit is not None]
     if usual is None or not places:
         return found
@@ -645,9 +645,9 @@ def _of_slopes(model: _OverModel, usual: UsualMisfits) -> tuple[Array, Array]:
     return inverted / whole, dead / whole
 
 
-def _finding(branch: str | None, cause: str, probability: float, text: str) -> Finding:
+def _finding(branch: str | None, cause: str, probability: float, text: str) -> SensorFinding:
     # Rounded, as vehicles that are checked together change the last digits.
-    return Finding(branch=branch, cause=cause, probability=min(round(float(probability), 4), 1.0), text=text)
+    return SensorFinding(branch=branch, cause=cause, probability=min(round(float(probability), 4), 1.0), text=text)
 
 
 def _who(name: str | None) -> str:
@@ -664,7 +664,7 @@ class _Vehicle:
     branches: tuple[str, ...]
     near_zero_a: float
 
-    def of_slopes(self, inverted: Array, dead: Array) -> list[Finding]:
+    def of_slopes(self, inverted: Array, dead: Array) -> list[SensorFinding]:
         """Sensors that are inverted or dead, by their slope over the fleet model."""
         found, slope, mean_a = [], self.misfits.model.slope[self.j], self.misfits.mean_a[self.j]
         for k, name in enumerate(self.branches):
@@ -676,7 +676,7 @@ class _Vehicle:
                 found.append(_finding(name, "dead", dead[k], f"{text}check it, its plug and its supply"))
         return found
 
-    def of_law(self, shape: Array, unusual: Array) -> list[Finding]:
+    def of_law(self, shape: Array, unusual: Array) -> list[SensorFinding]:
         """The cause that explains most of the junction law's residual; noise and switched loads by what is left."""
         misfits, usual, j = self.misfits, self.usual, self.j
         fit = misfits.causes.fit[j]
@@ -705,7 +705,7 @@ class _Vehicle:
             return [_finding(None, "switching", unusual[at], text)]
         return [*found, self._worded(c, probability)] if at >= 0 else found
 
-    def _worded(self, c: int, probability: float) -> Finding:
+    def _worded(self, c: int, probability: float) -> SensorFinding:
         """One of :data:`CAUSES`, with its sensor and figures."""
         misfits, causes, j, cause = self.misfits, self.misfits.causes, self.j, CAUSES[c]
         weight = np.exp(misfits.branch_fit[j, c] - misfits.branch_fit[j, c].max())
@@ -730,7 +730,7 @@ class _Vehicle:
         text = f"{_who(name)}: {text}; this makes {rms_a:.1f} A RMS; check the sensor against a reference"
         return _finding(name, cause, probability, text)
 
-    def of_spikes(self) -> list[Finding]:
+    def of_spikes(self) -> list[SensorFinding]:
         """Sensors with many spikes."""
         found, n = [], self.misfits.samples[self.j]
         for name, (up, down) in zip(self.branches, self.misfits.spikes[self.j], strict=True):

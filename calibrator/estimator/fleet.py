@@ -6,6 +6,7 @@ become drives first (:mod:`calibrator.estimator.frames`).
 """
 
 import html
+import inspect
 import os
 import re
 import shutil
@@ -17,14 +18,13 @@ from dataclasses import dataclass, field, replace
 from numbers import Integral
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
-from typing import Any, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import pandas as pd
-from sklearn.base import BaseEstimator
 
 from calibrator.drive import Drive
 from calibrator.drives.align import align, choose_inputs
-from calibrator.errors import FleetError
+from calibrator.errors import ContradictionError, FleetError
 from calibrator.estimator.frames import (
     Junction,
     column_values,
@@ -53,7 +53,7 @@ from ecu_node.errors import UserError
 from ecu_node.layout import Layout, UnmeasuredLoad
 from ecu_node.parameters import VehicleParameters, decode_parameters
 
-__all__ = ["CalibratedVehicle", "Fleet", "FleetCalibrator", "Junction", "JunctionCalibrator", "RecordedLog", "read_log"]
+__all__ = ["CalibratedVehicle", "Fleet", "FleetCalibrator", "JunctionCalibrator", "RecordedLog", "read_log"]
 
 Frames: TypeAlias = pd.DataFrame | Sequence[pd.DataFrame]
 Recordings: TypeAlias = Frames | Mapping[str, Frames] | str | Path
@@ -173,7 +173,7 @@ class Fleet:
             Drives by vehicle. Index: seconds, or a DatetimeIndex, rising; gaps over 60 s count as 60 s. Columns: every
             branch of the junction, positive into it [A], and the inputs; NaN where a sample is bad.
         junction : Junction
-            Says which columns are branches. One made by :meth:`Junction.from_layout` also has derived inputs.
+            Says which columns are branches. One made by :meth:`calibrator.Junction.from_layout` also has derived inputs.
         inputs : sequence of str or None
             Columns that the currents depend on (speed, torque, demands of auxiliaries ...). None: those of the layout,
             or all columns that are no branches, which all vehicles must have.
@@ -251,13 +251,34 @@ class CalibratedVehicle:
         return f"<pre>{html.escape(self.explain())}</pre>"
 
 
-class _Calibrator(BaseEstimator):  # type: ignore[misc] # scikit-learn has no types
-    """What both calibrators share: what was learned stands in attributes that end in ``_``."""
+class _Calibrator:
+    """What both calibrators share: scikit-learn's conventions, and what was learned in attributes that end in ``_``."""
 
     parameters_: pd.DataFrame
     vehicles_: dict[str, CalibratedVehicle]
     left_out_: dict[str, str]
     notices_: list[str]
+
+    # scikit-learn's BaseEstimator does the next three as well, but takes more than a second to import
+
+    def get_params(self, deep: bool = True) -> dict[str, Any]:  # noqa: ARG002 (scikit-learn's signature)
+        """Parameters of the constructor by name."""
+        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
+
+    def set_params(self, **parameters: Any) -> Self:
+        """Set parameters of the constructor, and return the calibrator."""
+        for name, value in parameters.items():
+            if name not in self.get_params():
+                raise ContradictionError(f"no parameter {name!r}; there are {', '.join(self.get_params())}")
+            setattr(self, name, value)
+        return self
+
+    def __repr__(self) -> str:
+        defaults = {name: item.default for name, item in inspect.signature(type(self)).parameters.items()}
+        changed = (
+            f"{name}={value!r}" for name, value in self.get_params().items() if repr(value) != repr(defaults[name])
+        )
+        return f"{type(self).__name__}({', '.join(changed)})"
 
     def _settings(self, *, alone: bool) -> CalibrationSettings:
         """Parameters of the constructor as the command takes them; FleetError if one makes no sense."""

@@ -34,7 +34,7 @@ from calibrator.estimator.readings import FEWEST_TRUSTED, Readings, untrusted_ve
 from calibrator.estimator.settings import FEWEST_VEHICLES, HARM_LIMIT
 from calibrator.summaries.moments import DriveSummary
 from ecu_node.layout import UnmeasuredLoad
-from ecu_node.parameters import Explanation, Finding
+from ecu_node.parameters import Explanation, SensorFinding
 
 __all__ = ["HARM_LIMIT", "FleetEstimate", "FleetReference", "estimate_vehicles", "learn_fleet"]
 
@@ -220,7 +220,7 @@ class FleetEstimate(RowsEstimate):
         Of each vehicle.
     explanations : sequence of N sequences of Explanation
         By falling probability, at least one.
-    findings : sequence of N sequences of Finding
+    findings : sequence of N sequences of SensorFinding
         What no explanation fits.
     evidence : sequence of N VehicleEvidence
         For the pages of a report.
@@ -230,7 +230,7 @@ class FleetEstimate(RowsEstimate):
     held_back: NDArray[np.str_]
     verdicts: Sequence[str]
     explanations: Sequence[Sequence[Explanation]]
-    findings: Sequence[Sequence[Finding]]
+    findings: Sequence[Sequence[SensorFinding]]
     evidence: Sequence[VehicleEvidence]
 
     def pit(self, drift: Array, offset_a: Array) -> tuple[Array, Array]:
@@ -513,7 +513,7 @@ def estimate_vehicles(
     )
 
 
-def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[list[Finding]]:
+def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[list[SensorFinding]]:
     """Loads without a sensor, batches and variants, of each vehicle: explained, and nothing of them is corrected."""
     scale_a, feed = reference.full_scale_a, reference.ordered[reference.feed]
     sensor = sum(model.probability for model in reference.models if model.spread.shared[-1])
@@ -522,7 +522,7 @@ def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[lis
     groups = max(
         (model.prior.group_centre for model in reference.models), key=len
     )  # those of the first model, if it has any
-    findings: list[list[Finding]] = [[] for _ in found.load_probability]
+    findings: list[list[SensorFinding]] = [[] for _ in found.load_probability]
     for j, mine in enumerate(findings):
         for g in np.flatnonzero(found.group_probability[j] > SUSPECTED):
             size_a = groups[g] * scale_a
@@ -542,11 +542,11 @@ def _shared_findings(found: RowsEstimate, reference: FleetReference) -> list[lis
     return findings
 
 
-def _finding(branch: str | None, cause: str, probability: float, text: str) -> Finding:
-    return Finding(branch=branch, cause=cause, probability=float(min(probability, 1.0)), text=text)
+def _finding(branch: str | None, cause: str, probability: float, text: str) -> SensorFinding:
+    return SensorFinding(branch=branch, cause=cause, probability=float(min(probability, 1.0)), text=text)
 
 
-def _unfit(findings: Sequence[Finding], branches: Sequence[str]) -> list[bool]:
+def _unfit(findings: Sequence[SensorFinding], branches: Sequence[str]) -> list[bool]:
     """Branches that a finding concerns: all, as they share the junction law, unless its samples are left out."""
     everywhere = any(each.cause not in LEFT_OUT_CAUSES or each.branch is None for each in findings)
     return [everywhere or any(each.branch == name for each in findings) for name in branches]

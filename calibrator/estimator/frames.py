@@ -140,7 +140,7 @@ class Junction:
         Returns
         -------
         Junction
-            For :meth:`Fleet.from_frames`.
+            For :meth:`calibrator.estimator.fleet.Fleet.from_frames`.
 
         Raises
         ------

@@ -47,12 +47,12 @@ from calibrator.files.parameter_files import RunIdentity
 from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, read_vehicles
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
-from calibrator.summaries.summariser import summarise
+from calibrator.summaries.summariser import summarise_samples
 from calibrator.summaries.vehicle_summary import VehicleSummary, most_moving_first, require_possible
 from calibrator.summaries.zero_current import weighted_mean, zero_current_offsets
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout, UnmeasuredLoad
-from ecu_node.parameters import Explanation, Finding, VehicleParameters
+from ecu_node.parameters import Explanation, SensorFinding, VehicleParameters
 
 __all__ = [
     "JunctionEstimate",
@@ -205,7 +205,7 @@ def summarise_junction(drives: Sequence[Drive], branches: Sequence[str], databas
             f"needed; rows farther apart than the timeout_s of their branch are stale"
         )
     block_s = max(min(BLOCK_S, duration_s / BLOCKS), SHORTEST_BLOCK_S, layout.period_s)
-    summary = summarise(samples, period_s=layout.period_s, block_s=block_s)
+    summary = summarise_samples(samples, period_s=layout.period_s, block_s=block_s)
     if len(summary.moments) < len(branches) + FEWEST_BLOCKS:
         raise DriveError(
             f"{duration_s:.1f} s of usable samples on a time base of {layout.period_s:g} s tell too little: at least "
@@ -602,7 +602,7 @@ def estimate_junction(
     )
 
 
-def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a: float) -> list[list[Finding]]:
+def _misfits(summaries: Sequence[DriveSummary], branches: Sequence[str], scale_a: float) -> list[list[SensorFinding]]:
     """What linear sensors do not explain, by current, time or temperature; whose it is, only a fleet tells."""
     K = len(branches)
     usual = UsualMisfits(

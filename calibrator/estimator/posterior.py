@@ -72,7 +72,7 @@ OPEN_SD = 0.02
 LOAD_GIVES_NONE = 100.0
 """Logarithm of the odds against a load that would supply current: finite, so that every vehicle has an explanation."""
 GAIN, OFFSET, LOAD = 0, 1, 2
-"""Rows of :attr:`Prior.log_density`."""
+"""Rows of ``Prior.log_density``."""
 LOG_FIRST, LOG_STEP = float(np.log(GRID[0])), float(np.log(GRID[1] / GRID[0]))
 LOG_ROOT_TAU = 0.5 * float(np.log(2.0 * np.pi))
 

@@ -25,7 +25,7 @@ from calibrator.fleet_truth import faults_of
 from calibrator.processes.run_many import Workers
 from calibrator.published.classify import ExpectedFaults
 from calibrator.published.recovery import Recovery, calibrate_published
-from calibrator.published.state_space import StateSpaceModel, bridged, identify, simulation_snr_db
+from calibrator.published.state_space import StateSpaceModel, bridged, identify_model, simulation_snr_db
 from calibrator.sources.fleet_source import Equipment, FleetSource, load_drive, read_vehicles
 from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import counted, few
@@ -190,7 +190,7 @@ def _identify_excited(inputs: Array, currents: Array, valid: Mask) -> StateSpace
     if not excited.any():
         raise DriveError("none of its inputs varies: was it parked? record a drive in which it is used")
     try:
-        model = identify(inputs[:, excited], currents, valid=valid)
+        model = identify_model(inputs[:, excited], currents, valid=valid)
     except np.linalg.LinAlgError as error:
         raise DriveError(
             f"no model can be identified from its drives ({error}); record a longer, varied drive"

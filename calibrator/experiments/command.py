@@ -53,12 +53,12 @@ def experiment(
     with importing():
         from calibrator.errors import FleetError
         from calibrator.experiments.experiments import CALIBRATION, EXPERIMENTS, fleet_for
-        from calibrator.experiments.pages import result_table, write_result
+        from calibrator.experiments.pages import result_table, write_page
         from calibrator.experiments.runner import (
             ExperimentResult,
             made_now,
             pool_confidences,
-            read_results,
+            read_records,
             run_experiment,
         )
 
@@ -96,7 +96,7 @@ def experiment(
     for number, row in enumerate(rows, start=1):
         with one_pass(number, len(rows)):
             if row is CALIBRATION:
-                before = [] if out is None else read_results(out, EXPERIMENTS)
+                before = [] if out is None else read_records(out, EXPERIMENTS)
                 pooled = {result.experiment.name: result for result in before} | done
                 if not pooled:
                     raise FleetError(
@@ -112,7 +112,7 @@ def experiment(
         if not json:
             Console().print(result_table(result))
         if out is not None:
-            write_result(out, result)
+            write_page(out, result)
     if json:
         texts = [result.to_json() for result in done.values()]
         write_output(texts[0] if len(texts) == 1 else f"[{','.join(texts)}]")

@@ -27,7 +27,7 @@ from calibrator.estimator.evidence import UNKNOWN_VARIANCE, EvidenceRows, denses
 from calibrator.experiments.trial import CommonEvidence, Trial, UnseenDrive
 from calibrator.faults import Faults, slopes_and_intercepts
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
-from calibrator.published.state_space import choose_order, identify
+from calibrator.published.state_space import choose_order, identify_model
 from calibrator.random_streams import Purpose, random_stream
 
 __all__ = [
@@ -249,7 +249,7 @@ def _state_space_simulations(drive: CommonDrive, truth: Faults) -> Iterator[Arra
     for measured in _measured(drive.i_s, truth):
         if order is None:
             order = choose_order(drive.inputs[:start], measured[:start])
-        model = identify(drive.inputs[:start], measured[:start], order=order)
+        model = identify_model(drive.inputs[:start], measured[:start], order=order)
         yield model.simulate(drive.inputs, initial_state=model.x0)[start:]
 
 

@@ -23,7 +23,7 @@ from calibrator.experiments.methods import (
     POSTERIOR,
     THRESHOLD,
     TREE,
-    Method,
+    ComparedMethod,
 )
 from calibrator.experiments.recorded_trips import (
     RecordedCase,
@@ -52,14 +52,14 @@ class Setting:
         What else it varies.
     case : CommonCase or RecordedCase
         How the fleets are made.
-    methods : tuple of Method
+    methods : tuple of ComparedMethod
         What is run on them instead of the methods of the experiment; empty: those.
     """
 
     x: float
     series: str = ""
     case: CommonCase | RecordedCase
-    methods: tuple[Method, ...] = ()
+    methods: tuple[ComparedMethod, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +72,7 @@ class Experiment:
         Name on the command line, and what it shows.
     x_label, series_label : str
         What it varies, with units.
-    methods : tuple of Method
+    methods : tuple of ComparedMethod
         What it compares.
     settings : tuple of Setting
         All on the common drive, or all on recorded trips; none where it pools what others have found.
@@ -97,7 +97,7 @@ class Experiment:
     title: str
     x_label: str
     series_label: str = ""
-    methods: tuple[Method, ...]
+    methods: tuple[ComparedMethod, ...]
     settings: tuple[Setting, ...]
     quick: Mapping[str, Sequence[float]] = field(default_factory=dict)
     drive_s: float = 3600.0

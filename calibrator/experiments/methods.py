@@ -22,7 +22,16 @@ from calibrator.published.classify import Classification, FaultTrees, classify_b
 from calibrator.published.recovery import recover_fleet
 
 __all__ = [
-    "CEILING", "LEFT_IN", "PERFECT", "POSTERIOR", "THRESHOLD", "TREE", "Estimate", "Method", "Posterior", "Published",
+    "CEILING",
+    "LEFT_IN",
+    "PERFECT",
+    "POSTERIOR",
+    "THRESHOLD",
+    "TREE",
+    "ComparedMethod",
+    "Estimate",
+    "Posterior",
+    "Published",
     "require_estimate",
 ]  # fmt: skip
 
@@ -69,7 +78,7 @@ class Estimate:
     redraw: Callable[[np.random.Generator, int], Faults] | None = None
 
 
-class Method(Protocol):
+class ComparedMethod(Protocol):
     """Anything that recovers a fleet."""
 
     @property

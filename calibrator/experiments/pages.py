@@ -15,11 +15,11 @@ from calibrator.experiments.experiments import COVERAGE, EXPERIMENTS, Experiment
 from calibrator.experiments.figures import FIGURES, calibration_errors, pool_figures, pool_tenths
 from calibrator.experiments.methods import CEILING, LEFT_IN, POSTERIOR
 from calibrator.experiments.picture import write_picture
-from calibrator.experiments.runner import ALL, KEYS, ExperimentResult, read_results
+from calibrator.experiments.runner import ALL, KEYS, ExperimentResult, read_records
 from calibrator.terminal.text import counted
 from ecu_node.documents import write_atomically
 
-__all__ = ["headline", "result_markdown", "result_table", "write_result"]
+__all__ = ["headline", "result_markdown", "result_table", "write_page"]
 
 METHODS = {
     "best subset": "best subset with BIC on the default's evidence",
@@ -278,7 +278,7 @@ def _reliability(whole: pd.DataFrame) -> str:
     return _markdown(cells.rename(columns={"low": "from", "confidence": "mean confidence"}))
 
 
-def write_result(folder: Path, result: ExperimentResult) -> None:
+def write_page(folder: Path, result: ExperimentResult) -> None:
     """Write NAME.json, NAME.md and NAME.png into a folder, and beside it the index ``FOLDER.md`` of all its results.
 
     Raises
@@ -291,7 +291,7 @@ def write_result(folder: Path, result: ExperimentResult) -> None:
     write_atomically(folder / f"{name}.json", f"{result.to_json()}\n".encode())
     write_atomically(folder / f"{name}.md", result_markdown(result, picture=f"{name}.png").encode())
     write_picture(result, folder / f"{name}.png")
-    results = [*read_results(folder, EXPERIMENTS), *([] if name in EXPERIMENTS else [result])]
+    results = [*read_records(folder, EXPERIMENTS), *([] if name in EXPERIMENTS else [result])]
     index = ["# Results of the experiments", f"Written by `calibrator experiment`. {_caption(results)}"]
     for each in results:
         row, made = each.experiment, f"; {each.made}" if each.made else ""

@@ -27,7 +27,7 @@ from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.published.evidence import FleetEvidence, collect_evidence, fleet_mean
 from calibrator.random_streams import Purpose, random_stream
 from calibrator.summaries.moments import DriveSummary
-from calibrator.summaries.summariser import summarise
+from calibrator.summaries.summariser import summarise_samples
 from calibrator.terminal.progress import shown
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
@@ -410,7 +410,7 @@ def _through_frames(
 
 def _summaries(samples: Sequence[Samples], fleet: RecordedFleet) -> list[DriveSummary]:
     names = fleet.database.layout.fleet_inputs or fleet.database.layout.model_inputs
-    return [summarise([drive.with_inputs(names)], period_s=fleet.period_s) for drive in samples]
+    return [summarise_samples([drive.with_inputs(names)], period_s=fleet.period_s) for drive in samples]
 
 
 def _published_evidence(samples: Sequence[Samples], fleet: RecordedFleet) -> FleetEvidence:

@@ -26,14 +26,14 @@ from calibrator.experiments.figures import (
     pool_figures,
     pool_tenths,
 )
-from calibrator.experiments.methods import POSTERIOR, Method, require_estimate
+from calibrator.experiments.methods import POSTERIOR, ComparedMethod, require_estimate
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet, recorded_trial
 from calibrator.processes.run_many import Workers, run_many
 from calibrator.terminal.progress import shown
 from calibrator.time_of_run import time_of_run
 from ecu_node import __version__
 
-__all__ = ["ALL", "ExperimentResult", "made_now", "pool_confidences", "read_results", "run_experiment"]
+__all__ = ["ALL", "ExperimentResult", "made_now", "pool_confidences", "read_records", "run_experiment"]
 
 ALL = "all together"
 NOT_POOLED = (CALIBRATION.name, "attacks")
@@ -89,7 +89,7 @@ def run_experiment(
     experiment: Experiment,
     fleet: CommonDrive | RecordedFleet,
     *,
-    methods: Sequence[Method] | None = None,
+    methods: Sequence[ComparedMethod] | None = None,
     repetitions: int = 10,
     seed: int = 0,
     workers: int = 1,
@@ -102,7 +102,7 @@ def run_experiment(
         A row of :data:`~calibrator.experiments.experiments.EXPERIMENTS`, or one like them.
     fleet : CommonDrive or RecordedFleet
         What the vehicles drive, see :func:`~calibrator.experiments.experiments.fleet_for`.
-    methods : sequence of Method or None
+    methods : sequence of ComparedMethod or None
         What to compare; None: what the row says.
     repetitions, seed : int
         Trials per setting, and the seed of the first; the others follow.
@@ -145,7 +145,7 @@ def run_experiment(
 
 
 def _run_trial(
-    fleet: CommonDrive | RecordedFleet, task: tuple[CommonCase | RecordedCase, Sequence[Method], int]
+    fleet: CommonDrive | RecordedFleet, task: tuple[CommonCase | RecordedCase, Sequence[ComparedMethod], int]
 ) -> list[dict[str, Any]]:
     case, methods, seed = task
     if isinstance(fleet, CommonDrive) and isinstance(case, CommonCase):
@@ -254,7 +254,7 @@ def made_now() -> str:
     )
 
 
-def read_results(folder: Path, names: Iterable[str]) -> list[ExperimentResult]:
+def read_records(folder: Path, names: Iterable[str]) -> list[ExperimentResult]:
     """Read the records ``NAME.json`` of a folder in the given order; those that are not there are left out.
 
     Raises

@@ -33,7 +33,7 @@ def _layout() -> None:
 
 
 @layout.command("init", epilog=example("calibrator layout init my_car.dbc --log drive.log --out my_car.toml"))
-def init(
+def propose(
     source: Annotated[
         Path, typer.Argument(help="Database of the vehicle (DBC, KCD, SYM, ARXML), or a table.", metavar="FILE")
     ],

@@ -30,7 +30,7 @@ __all__ = [
     "StateSpaceModel",
     "bridged",
     "choose_order",
-    "identify",
+    "identify_model",
     "pooled_poles",
     "simulation_snr_db",
     "snr_from_power",
@@ -119,7 +119,9 @@ def snr_from_power(signal: Array, error: Array) -> Array:
         return np.asarray(np.where(signal > 0.0, 10.0 * np.log10(signal / error), np.nan))
 
 
-def identify(inputs: Array, currents: Array, *, order: int | None = None, valid: Mask | None = None) -> StateSpaceModel:
+def identify_model(
+    inputs: Array, currents: Array, *, order: int | None = None, valid: Mask | None = None
+) -> StateSpaceModel:
     """Identify a stable model of one vehicle from one drive.
 
     Parameters
@@ -149,7 +151,7 @@ def identify(inputs: Array, currents: Array, *, order: int | None = None, valid:
 
 
 def choose_order(inputs: Array, currents: Array, *, valid: Mask | None = None) -> int:
-    """Smallest order that simulates held-out samples as well as the best; parameters and errors as :func:`identify`.
+    """Smallest order that simulates held-out samples as well as the best; otherwise as :func:`identify_model`.
 
     Models of all :data:`ORDERS` are fitted on the first 80 % and simulated on the rest. The error of an order is the
     mean over channels of its power in dB; chosen is the smallest order within 0.2 dB of the smallest error.
@@ -171,7 +173,7 @@ def pooled_poles(drives: Sequence[tuple[Array, Array, Mask]], orders: Sequence[i
     Parameters
     ----------
     drives : sequence of (inputs, currents, valid)
-        At least one, as in :func:`identify`.
+        At least one, as in :func:`identify_model`.
     orders : sequence of int
         Orders n.
 

@@ -17,7 +17,7 @@ from calibrator.estimator.results import SCHEMA, RunRecord, deployed_rms_a, part
 from calibrator.summaries.identity import bucket_of
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import few_reasons
-from ecu_node.parameters import Explanation, Finding
+from ecu_node.parameters import Explanation, SensorFinding
 
 OPEN_GAIN, OPEN_OFFSET = 0.1, 0.05
 """Standard deviations beyond which a gain, and an offset over full scale, are not known. [1]"""
@@ -151,7 +151,7 @@ class ParameterDetails(msgspec.Struct, frozen=True):
     """Whether the gain of each could be estimated."""
     explanations: list[Explanation] = []
     """Competing ones, the most probable first; none where one was left."""
-    findings: list[Finding] = []
+    findings: list[SensorFinding] = []
     """Of the check of fit."""
 
 

@@ -106,7 +106,7 @@ def key(
         "--snapshot keys/online.pub --timestamp keys/online.pub"
     ),
 )
-def init(
+def make_repository(
     folder: FolderArgument,
     root: Annotated[list[Path], typer.Option("--root", help=_PUBLIC.format("the root, offline"))],
     targets: Annotated[list[Path], typer.Option("--targets", help=_PUBLIC.format("parameters"))],

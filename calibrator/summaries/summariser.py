@@ -21,7 +21,7 @@ from ecu_node.summary import (
     NORMAL_MEDIAN,
 )
 
-__all__ = ["Summariser", "summarise"]
+__all__ = ["Summariser", "summarise_samples"]
 
 
 class Summariser:
@@ -199,7 +199,7 @@ class Summariser:
             self._block_c.append((np.where(known, warm, 0.0).sum(axis=1) / known.sum(axis=1))[kept])
 
 
-def summarise(
+def summarise_samples(
     drives: Sequence[Samples],
     *,
     period_s: float,

@@ -12,7 +12,7 @@ from calibrator.errors import DriveError
 from calibrator.sources.fleet_source import Equipment, load_drive
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.moments import DriveSummary
-from calibrator.summaries.summariser import summarise
+from calibrator.summaries.summariser import summarise_samples
 from calibrator.summaries.zero_current import ZeroCurrent, zero_current_offsets
 from calibrator.terminal.text import counted
 from ecu_node.database import VehicleDatabase
@@ -121,7 +121,7 @@ def summarise_drives(
     return VehicleSummary(
         vehicle=drives[0].vehicle,
         drives=tuple(drive.name for drive in drives),
-        summary=summarise(
+        summary=summarise_samples(
             vehicle.samples, period_s=database.layout.period_s, bank=bank, temperatures_c=vehicle.temperatures_c
         ),
         delays=vehicle.delays,

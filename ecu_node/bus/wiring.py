@@ -492,7 +492,7 @@ def open_bus(
     own : bool
         Whether an overlay node also receives what only one node may send, as sent by others.
     interface, channel, **settings :
-        As for :func:`ecu_node.bus.adapters.bus_config`.
+        As for ``ecu_node.bus.adapters.bus_config``.
 
     Returns
     -------

@@ -30,7 +30,7 @@ from ecu_node.parameters import MAX_FILE_BYTES, BranchParameters, VehicleParamet
 from ecu_node.update.sources import open_source
 from ecu_node.update.state import (
     ParameterSet,
-    State,
+    VehicleState,
     add_decision,
     locked,
     read_state,
@@ -146,7 +146,7 @@ def provision(folder: Path, vehicle: str, root: Path, now: datetime) -> int:
     with locked(folder):
         if state_path(folder).exists():
             raise UserError(f"{folder}: there is a state already; a new root comes with 'ecu-node update'")
-        write_state(folder, State(vehicle=vehicle, root=text, latest=now))
+        write_state(folder, VehicleState(vehicle=vehicle, root=text, latest=now))
         add_decision(folder, "provisioned", f"vehicle {vehicle} trusts root {metadata.signed.version}", now)
     return metadata.signed.version
 
@@ -213,7 +213,7 @@ def update(
     return f"revoked: {told}; {event}: {text}" if told else f"{event}: {text}"
 
 
-def _verified_offer(state: State, source: str, now: datetime) -> _Offer:
+def _verified_offer(state: VehicleState, source: str, now: datetime) -> _Offer:
     """Run TUF's client workflow on a copy of the trusted metadata; the state is not touched."""
     fetcher, base = open_source(source)
     target = target_path(state.vehicle)
@@ -277,7 +277,7 @@ def _refusal(error: Exception, source: str, vehicle: str) -> TrustError:
     return TrustError(reason, f"{source}: {error}{hint.get(reason, '')}")
 
 
-def _without_revoked(state: State, offer: _Offer, now: datetime) -> tuple[State, str]:
+def _without_revoked(state: VehicleState, offer: _Offer, now: datetime) -> tuple[VehicleState, str]:
     """The state with the verified metadata and without the sets that were revoked; and what was revoked, in words."""
     if offer.facts.vehicle != state.vehicle:
         raise TrustError(
@@ -297,8 +297,8 @@ def _without_revoked(state: State, offer: _Offer, now: datetime) -> tuple[State,
 
 
 def _judged(
-    state: State, offer: _Offer, source: str, database: VehicleDatabase, now: datetime
-) -> tuple[State, str, str]:
+    state: VehicleState, offer: _Offer, source: str, database: VehicleDatabase, now: datetime
+) -> tuple[VehicleState, str, str]:
     """Decide on the set that is offered: the new state, the event, and words."""
     if offer.sha256 in offer.facts.revoked:
         return state, "nothing new", f"what the repository has for vehicle {state.vehicle} is revoked"

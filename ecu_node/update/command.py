@@ -14,7 +14,7 @@ from ecu_node.errors import UserError, printable
 from ecu_node.program import say_error, write_output, write_result
 
 if TYPE_CHECKING:
-    from ecu_node.update.state import ParameterSet, State
+    from ecu_node.update.state import ParameterSet, VehicleState
 
 # what stands on python-can is imported by the commands themselves, after load_python_can
 
@@ -112,7 +112,7 @@ def _update(options: argparse.Namespace) -> int:
     return 0
 
 
-def _facts(state: "State") -> dict[str, Any]:
+def _facts(state: "VehicleState") -> dict[str, Any]:
     """State for programs; ``null`` where there is no set."""
     from ecu_node.update.state import time_text  # noqa: PLC0415
 

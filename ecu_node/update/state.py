@@ -26,7 +26,7 @@ from ecu_node.parameters import VehicleParameters, decode_parameters
 
 __all__ = [
     "ParameterSet",
-    "State",
+    "VehicleState",
     "add_decision",
     "locked",
     "read_state",
@@ -68,7 +68,7 @@ class ParameterSet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return f"parameter set {self.parameters.number} ({self.sha256[:8]})"
 
 
-class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class VehicleState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a vehicle holds and trusts."""
 
     schema_version: Literal[2] = 2
@@ -96,7 +96,7 @@ def time_text(moment: datetime) -> str:
     return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def require_not_expired(found: ParameterSet, state: State, now: datetime) -> None:
+def require_not_expired(found: ParameterSet, state: VehicleState, now: datetime) -> None:
     """Raise TrustError (NOT_VALID_NOW) if a set has expired; the clock is not believed if it is behind the state."""
     if max(now, state.latest) >= found.expires:
         believed = f"the latest time seen here is {time_text(state.latest)}, though the clock says {time_text(now)}"
@@ -106,7 +106,7 @@ def require_not_expired(found: ParameterSet, state: State, now: datetime) -> Non
         )
 
 
-def read_state(folder: Path) -> State:
+def read_state(folder: Path) -> VehicleState:
     """Read the state of a vehicle.
 
     Parameters
@@ -116,7 +116,7 @@ def read_state(folder: Path) -> State:
 
     Returns
     -------
-    State
+    VehicleState
         What it holds.
 
     Raises
@@ -143,14 +143,14 @@ def read_state(folder: Path) -> State:
     if digest != hashlib.sha256(document).hexdigest().encode():
         raise TrustError(Reason.MALFORMED_PARAMETERS, f"{path}: damaged, its digest is another one; {_REPLACE}")
     try:
-        return msgspec.json.decode(document, type=State)
+        return msgspec.json.decode(document, type=VehicleState)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise TrustError(
             Reason.MALFORMED_PARAMETERS, f"{path}: not a state that this version knows: {error}; {_REPLACE}"
         ) from None
 
 
-def write_state(folder: Path, state: State) -> None:
+def write_state(folder: Path, state: VehicleState) -> None:
     """Replace the state in one step; the folder must be :func:`locked`.
 
     Raises

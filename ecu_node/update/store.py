@@ -17,7 +17,7 @@ from ecu_node.errors import UserError
 from ecu_node.parameters import VehicleParameters, check_fit
 from ecu_node.update.state import (
     ParameterSet,
-    State,
+    VehicleState,
     add_decision,
     locked,
     read_state,
@@ -37,7 +37,7 @@ _SURELY_EXPIRED = timedelta(minutes=1)
 """A clock that jumps ahead for a moment, as before it is set from the network, ends nothing for ever."""
 
 
-def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now: datetime) -> State:
+def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now: datetime) -> VehicleState:
     """End a trial: the set is in force, or gone. Does not wait for other processes, as the bus would wait too.
 
     Parameters
@@ -55,7 +55,7 @@ def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now:
 
     Returns
     -------
-    State
+    VehicleState
         After that; as it was if another set is on trial by now.
 
     Raises
@@ -81,7 +81,7 @@ def conclude(folder: Path, tried: ParameterSet, *, passed: bool, text: str, now:
     return state
 
 
-def end_expired(folder: Path, expired: ParameterSet, now: datetime) -> State:
+def end_expired(folder: Path, expired: ParameterSet, now: datetime) -> VehicleState:
     """Take an expired set out of the state for good: a clock that is set back later does not bring it back."""
     with locked(folder, wait=False):
         state = read_state(folder)
@@ -128,7 +128,7 @@ class ParameterStore:
         self._folder, self._database, self._mode, self._say, self._now = folder, database, mode, say, now
         self._vehicle, self._background = vehicle, background
         self._due_s = self._retry_due_s = float("-inf")
-        self._state: State | None = None
+        self._state: VehicleState | None = None
         self._seen = signature(state_path(folder))
         self._unread: str | None = None
         self._fitting: tuple[ParameterSet, VehicleParameters] | None = None
@@ -137,8 +137,8 @@ class ParameterStore:
         self._result: TrialResult | None = None
         self._no_trial: Reason | None = None
         self._expired_since: datetime | None = None
-        self._writing: Future[State] | None = None
-        self._after_writing: Callable[[State], None] = lambda _: None
+        self._writing: Future[VehicleState] | None = None
+        self._after_writing: Callable[[VehicleState], None] = lambda _: None
         try:
             self._state = read_state(folder)
         except TrustError as error:
@@ -199,7 +199,7 @@ class ParameterStore:
                 self._say(f"the state of the vehicle is not read, what was in force stays: {error}")
             self._unread = str(error)
 
-    def _in_force(self, state: State) -> tuple[InForce, str | None]:
+    def _in_force(self, state: VehicleState) -> tuple[InForce, str | None]:
         """What the state says, and why there are no parameters."""
         try:
             if state.in_force is None:
@@ -208,7 +208,7 @@ class ParameterStore:
         except UnfitError as error:
             return InForce(parameters=None, reason=error.reason), f"{self._folder}: {error}"
 
-    def _usable(self, state: State, found: ParameterSet) -> VehicleParameters:
+    def _usable(self, state: VehicleState, found: ParameterSet) -> VehicleParameters:
         """Parameters of a set that has not expired and fits; decoded once, as the bus waits meanwhile."""
         require_not_expired(found, state, self._now())
         if self._fitting is None or self._fitting[0] is not found:
@@ -246,14 +246,14 @@ class ParameterStore:
             self._say(f"{on_trial} is on trial")
             self._trial = ParameterTrial(parameters, self._database, corrector.branches)
 
-    def _say_result(self, tried: ParameterSet, result: TrialResult, state: State) -> None:
+    def _say_result(self, tried: ParameterSet, result: TrialResult, state: VehicleState) -> None:
         self._result = None
         if result.passed and state.in_force != tried:
             self._say(f"{tried} is not in force, though its trial went well: the end of decisions.log says why")
         else:
             self._say(f"{tried} has {'passed' if result.passed else 'failed'} its trial: {result.text}")
 
-    def _end_expired(self, state: State, now_s: float) -> None:
+    def _end_expired(self, state: VehicleState, now_s: float) -> None:
         """Once the set in force is seen to be expired for a minute, it is so for good."""
         found, now = state.in_force, self._now()
         if found is None or now < found.expires:
@@ -263,7 +263,7 @@ class ParameterStore:
         if now - self._expired_since >= _SURELY_EXPIRED:
             self._write(partial(end_expired, self._folder, found, now), lambda _: None, now_s)
 
-    def _write(self, work: Callable[[], State], after: Callable[[State], None], now_s: float) -> None:
+    def _write(self, work: Callable[[], VehicleState], after: Callable[[VehicleState], None], now_s: float) -> None:
         """Write a decision in the background, unless one is being written or could not be a moment ago."""
         if self._writing is not None or now_s < self._retry_due_s:
             return
@@ -296,7 +296,7 @@ class ParameterStore:
         self._after_writing(self._state)
 
 
-def _why_nothing(state: State) -> TrustError:
+def _why_nothing(state: VehicleState) -> TrustError:
     if state.on_trial is not None:
         return TrustError(Reason.ON_TRIAL, f"{state.on_trial} is on trial, and nothing is in force yet")
     if state.ended == "revoked":

@@ -14,8 +14,8 @@ from calibrator.estimator.evidence import fit_fleet_model, stack_summaries
 from calibrator.experiments.recorded_trips import RecordedFleet, read_fleet
 from calibrator.faults import measured_currents, true_currents
 from calibrator.files.layout_files import vehicle_database
-from calibrator.summaries.summariser import summarise
-from ecu_node.parameters import Finding
+from calibrator.summaries.summariser import summarise_samples
+from ecu_node.parameters import SensorFinding
 from tests.real.delay_trips import LAYOUT, import_trips
 
 Bend = Callable[[Array, Array], Array]
@@ -38,7 +38,7 @@ def fleet(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Record
     return read_fleet(store, vehicle_database(LAYOUT))
 
 
-def checked(fleet: RecordedFleet, branches: int, seed: int, bends: dict[int, Bend]) -> list[tuple[Finding, ...]]:
+def checked(fleet: RecordedFleet, branches: int, seed: int, bends: dict[int, Bend]) -> list[tuple[SensorFinding, ...]]:
     """Findings in a fleet with gain errors and offsets, in which the batteries' sensors of some vehicles are bent."""
     trips, rng, summaries = fleet.with_branches(branches), np.random.default_rng(seed), []
     faults = draw_faults(
@@ -66,7 +66,7 @@ def checked(fleet: RecordedFleet, branches: int, seed: int, bends: dict[int, Ben
             masked={},
         ).with_inputs(fleet.database.layout.fleet_inputs)
         warm_c = 10.0 + 25.0 * np.sqrt(share)
-        summaries.append(summarise([samples], period_s=fleet.period_s, temperatures_c=[warm_c]))
+        summaries.append(summarise_samples([samples], period_s=fleet.period_s, temperatures_c=[warm_c]))
     read_out = fit_fleet_model(stack_summaries(summaries))
     usual = learn_usual_misfits(summaries, read_out, full_scale_a=fleet.full_scale_a)
     names = tuple(trips[0].currents_a)

@@ -6,7 +6,7 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from ecu_node.parameters import VehicleParameters, encode_parameters
-from ecu_node.update.state import ParameterSet, State, read_state, write_state
+from ecu_node.update.state import ParameterSet, VehicleState, read_state, write_state
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 
@@ -22,5 +22,5 @@ def put_on_trial(vehicle: Path, parameters: VehicleParameters, *, days: int = 36
 
 def new_vehicle(folder: Path, in_force: ParameterSet | None = None) -> Path:
     folder.mkdir()
-    write_state(folder, State(vehicle="v1", latest=NOW, root="{}", in_force=in_force))
+    write_state(folder, VehicleState(vehicle="v1", latest=NOW, root="{}", in_force=in_force))
     return folder

@@ -23,7 +23,7 @@ from ecu_node.parameters import FileReference, VehicleParameters
 from ecu_node.update.client import update
 from ecu_node.update.signers import public_key_of
 from ecu_node.update.sources import open_source
-from ecu_node.update.state import State, add_decision, read_state
+from ecu_node.update.state import VehicleState, add_decision, read_state
 from ecu_node.update.store import conclude, end_expired
 from tests.update.damage import a_folder, a_pipe, cut, huge, without, zeros
 from tests.update.repo import Repo, pass_trial
@@ -367,7 +367,7 @@ def test_inspect_fails_where_the_set_in_force_has_expired(
 ) -> None:
     found = read_state(state)
     assert found.in_force is not None
-    late: State = replace(found, latest=found.in_force.expires)
+    late: VehicleState = replace(found, latest=found.in_force.expires)
     monkeypatch.setattr("ecu_node.update.state.read_state", lambda _: late)
     code, _, err = repo.node("inspect", "--state", state)
     assert code == 1

@@ -16,7 +16,7 @@ import pytest
 from msgspec.structs import replace
 
 from ecu_node.parameters import VehicleParameters
-from ecu_node.update.state import State, read_state
+from ecu_node.update.state import VehicleState, read_state
 from ecu_node.update.store import conclude
 from tests.ecu_node.vehicles import LAYOUT
 from tests.update.repo import Repo
@@ -49,7 +49,7 @@ def command(
     return lambda work: [sys.executable, "-m", "ecu_node", "update", str(repo.path), *options, str(work)]
 
 
-def timeless(folder: Path) -> State:
+def timeless(folder: Path) -> VehicleState:
     """The state, but for the time of the last change."""
     return replace(read_state(folder), latest=datetime(2026, 1, 1, tzinfo=UTC))
 

@@ -16,7 +16,7 @@ from ecu_node.core.corrector import Corrector
 from ecu_node.core.status import Reason, TrustError
 from ecu_node.database import VehicleDatabase
 from ecu_node.parameters import VehicleParameters
-from ecu_node.update.state import State, locked, read_state, write_state
+from ecu_node.update.state import VehicleState, locked, read_state, write_state
 from ecu_node.update.store import ParameterStore
 from ecu_node.update.trial import ParameterTrial, TrialResult
 from tests.update.damage import a_folder, cut, without, zeros
@@ -131,7 +131,7 @@ def test_state_that_could_not_be_read_for_a_moment_is_read_again(
 ) -> None:
     """Else a revocation would not be heeded before the next start."""
 
-    def broken_disk(folder: Path) -> State:
+    def broken_disk(folder: Path) -> VehicleState:
         raise TrustError(Reason.NO_PARAMETERS, f"{folder}: Input/output error")
 
     running = Running(correcting, database)

@@ -15,7 +15,7 @@ from calibrator.drives.align import Samples
 from calibrator.estimator.fleet_identification import held_out_snr_db, read_outs
 from calibrator.published.state_space import StateSpaceModel
 from calibrator.summaries.filter_bank import FilterBank
-from calibrator.summaries.summariser import summarise
+from calibrator.summaries.summariser import summarise_samples
 
 __all__ = [
     "INPUT_NAMES",
@@ -160,7 +160,7 @@ def bank_model(bank: FilterBank, drive: Samples) -> StateSpaceModel:
     StateSpaceModel
         With the state of the vehicle's mean inputs as initial state.
     """
-    summary = summarise([drive], period_s=PERIOD_S, bank=bank)
+    summary = summarise_samples([drive], period_s=PERIOD_S, bank=bank)
     (coefficients,), (offset_a,) = read_outs(summary.total[None], summary.branches)
     (A, B), M = bank.system(), len(bank.input_names)
     mean_inputs = summary.total[-1, :M] / summary.total[-1, -1]

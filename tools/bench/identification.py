@@ -25,7 +25,7 @@ from calibrator.drives.align import Samples
 from calibrator.estimator.fleet_identification import choose_filter_bank, held_out_snr_db, read_outs
 from calibrator.published.state_space import StateSpaceModel, simulation_snr_db
 from calibrator.summaries.filter_bank import FilterBank
-from calibrator.summaries.summariser import summarise
+from calibrator.summaries.summariser import summarise_samples
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # run as a script, the tools are not found otherwise
 from bench.row import Row
@@ -140,11 +140,11 @@ def _compared(ours: _Result, name: str, peer: _Result) -> list[Row]:
 
 def _parts(bank: FilterBank, drive: Samples) -> list[Row]:
     """Where the time goes, by the median of repetitions."""
-    batch = [summarise([drive], period_s=PERIOD_S, bank=bank)] * 100
+    batch = [summarise_samples([drive], period_s=PERIOD_S, bank=bank)] * 100
     moments, branches = np.stack([summary.total for summary in batch]), batch[0].branches
     names = ("of it filters and moments", "of it read-out and its judgement, a vehicle of 100 at once")
     times_s = (
-        _median_s(lambda: summarise([drive], period_s=PERIOD_S, bank=bank)),
+        _median_s(lambda: summarise_samples([drive], period_s=PERIOD_S, bank=bank)),
         _median_s(lambda: (read_outs(moments, branches), held_out_snr_db(batch))) / len(batch),
     )
     parts = [Row(name=name, value=1e3 * s, unit="ms") for name, s in zip(names, times_s, strict=True)]

@@ -23,7 +23,7 @@ from calibrator.summaries.identity import store_identity, write_identity
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore
-from calibrator.summaries.summariser import summarise
+from calibrator.summaries.summariser import summarise_samples
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.summaries.zero_current import ZeroCurrent
 from calibrator.terminal.progress import progress_bar
@@ -94,7 +94,7 @@ def _trips(database: VehicleDatabase, branches: int, minutes: float) -> tuple[li
         fleet_inputs=samples[0].input_names,
         notices=(),
     )
-    return [summarise([item], period_s=layout.period_s) for item in samples], equipment
+    return [summarise_samples([item], period_s=layout.period_s) for item in samples], equipment
 
 
 def _write(

@@ -10,7 +10,7 @@ from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.summaries.moments import DriveSummary
-from calibrator.summaries.summariser import summarise
+from calibrator.summaries.summariser import summarise_samples
 
 PERIOD_S = 1.0
 INPUTS = 3
@@ -87,7 +87,9 @@ def samples_of(inputs: Array, currents_a: Array) -> Samples:
 def summaries_of(faults: Faults, conditions: Conditions | None = None, *, seed: int = 0) -> Sequence[DriveSummary]:
     """One drive of each vehicle of a fleet, summarised."""
     rng, conditions = np.random.default_rng(seed), conditions or Conditions()
-    return [summarise([drive_of(rng, faults.take(j), conditions)], period_s=PERIOD_S) for j in range(len(faults))]
+    return [
+        summarise_samples([drive_of(rng, faults.take(j), conditions)], period_s=PERIOD_S) for j in range(len(faults))
+    ]
 
 
 def no_faults(vehicles: int, branches: int) -> Faults:

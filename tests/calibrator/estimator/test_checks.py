@@ -12,8 +12,8 @@ from calibrator.drives.align import Samples
 from calibrator.estimator.checks import find_misfits, learn_usual_misfits
 from calibrator.faults import Faults, measured_currents, true_currents
 from calibrator.summaries.moments import DriveSummary
-from calibrator.summaries.summariser import summarise
-from ecu_node.parameters import Finding
+from calibrator.summaries.summariser import summarise_samples
+from ecu_node.parameters import SensorFinding
 from tests.calibrator.estimator.simulated_drives import (
     INPUTS,
     PERIOD_S,
@@ -77,14 +77,14 @@ def a_fleet(K: int, bend: Bend | None = None, branch: int = 0, load_a: Array | f
     drives = [
         a_drive(10 + j, faults.take(j), *((bend, branch, load_a) if j == BAD else (None,))) for j in range(len(faults))
     ]
-    return [summarise([drive], period_s=PERIOD_S, temperatures_c=[WARM_C]) for drive in drives]
+    return [summarise_samples([drive], period_s=PERIOD_S, temperatures_c=[WARM_C]) for drive in drives]
 
 
 def read_out(K: int) -> Array:
     return np.vstack([read_out_of(K), np.zeros(K)])
 
 
-def checked(summaries: Sequence[DriveSummary], K: int) -> list[tuple[Finding, ...]]:
+def checked(summaries: Sequence[DriveSummary], K: int) -> list[tuple[SensorFinding, ...]]:
     usual = learn_usual_misfits(summaries, read_out(K), full_scale_a=FULL_SCALE_A)
     return find_misfits(summaries, read_out(K), usual, full_scale_a=FULL_SCALE_A, branches=BRANCHES[:K])
 
@@ -116,7 +116,7 @@ def test_load_in_proportion_to_a_current_looks_like_two_gains() -> None:
     loaded = drives[BAD].currents_a.copy()
     loaded[:, 0] += 0.08 * np.abs(loaded[:, 1])
     drives[BAD] = replace(drives[BAD], currents_a=loaded)
-    (finding,) = checked([summarise([drive], period_s=PERIOD_S) for drive in drives], 2)[BAD]
+    (finding,) = checked([summarise_samples([drive], period_s=PERIOD_S) for drive in drives], 2)[BAD]
     assert finding.cause == "sign"
     assert "or a load without a sensor takes 8 % of" in finding.text
 
@@ -129,7 +129,7 @@ def test_gain_errors_offsets_and_a_constant_load_are_no_finding(K: int) -> None:
 def test_misfit_that_all_vehicles_have_is_usual() -> None:
     faults = no_faults(9, 2)
     bent = [a_drive(j, faults.take(j), lambda x, _: x + 0.03 * x**2 / FULL_SCALE_A) for j in range(9)]
-    assert checked([summarise([drive], period_s=PERIOD_S) for drive in bent], 2) == [()] * 9
+    assert checked([summarise_samples([drive], period_s=PERIOD_S) for drive in bent], 2) == [()] * 9
 
 
 def test_finding_does_not_depend_on_the_order_of_the_branches() -> None:
@@ -154,5 +154,5 @@ def test_summaries_without_fit_sums_have_no_findings() -> None:
 def test_vehicle_that_stands_still_has_no_findings() -> None:
     summaries = a_fleet(2)
     still = samples_of(np.zeros((SAMPLES, INPUTS)), np.zeros((SAMPLES, 2)))
-    found = checked([*summaries, summarise([still], period_s=PERIOD_S)], 2)
+    found = checked([*summaries, summarise_samples([still], period_s=PERIOD_S)], 2)
     assert found == [()] * 10

@@ -19,7 +19,7 @@ from calibrator.estimator.fleet_identification import (
 from calibrator.published.state_space import StateSpaceModel, simulation_snr_db
 from calibrator.summaries.filter_bank import FilterBank, low_pass_bank, plain_bank
 from calibrator.summaries.moments import BLOCK_S, DriveSummary
-from calibrator.summaries.summariser import summarise
+from calibrator.summaries.summariser import summarise_samples
 
 BLOCK = round(BLOCK_S / PERIOD_S)
 LEAD_IN = 600
@@ -29,7 +29,7 @@ GAINS = np.random.default_rng(0).normal(size=(4, 3))
 
 
 def summary_of(drive: Samples, bank: FilterBank = FILTERED) -> DriveSummary:
-    return summarise([drive], period_s=PERIOD_S, bank=bank)
+    return summarise_samples([drive], period_s=PERIOD_S, bank=bank)
 
 
 def by_samples(drive: Samples) -> tuple[Array, Array, Array]:

@@ -6,7 +6,7 @@ import pytest
 from calibrator.drive import Array
 from calibrator.estimator.evidence import LEAST_GAIN, VehicleRegressions, junction_regression, stack_summaries
 from calibrator.summaries.moments import DriveSummary
-from calibrator.summaries.summariser import summarise
+from calibrator.summaries.summariser import summarise_samples
 from tests.calibrator.estimator.simulated_drives import PERIOD_S, coloured, samples_of
 
 
@@ -15,7 +15,7 @@ def law_of(*summaries: DriveSummary) -> VehicleRegressions:
 
 
 def summary_of_currents(currents_a: Array) -> DriveSummary:
-    return summarise([samples_of(np.zeros((len(currents_a), 0)), currents_a)], period_s=PERIOD_S)
+    return summarise_samples([samples_of(np.zeros((len(currents_a), 0)), currents_a)], period_s=PERIOD_S)
 
 
 def smooth(rng: np.random.Generator, samples: int) -> Array:

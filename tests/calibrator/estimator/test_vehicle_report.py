@@ -11,7 +11,7 @@ from calibrator.estimator.evidence import EvidenceRows, evidence_names, reported
 from calibrator.estimator.fleet_estimate import FleetEstimate
 from calibrator.estimator.vehicle_report import deciding_evidence, explained, impossible
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import BranchParameters, Explanation, Finding, HardwareFault
+from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, SensorFinding
 from tests.ecu_node.vehicles import parameters_for
 
 NAMES = ("battery", "motor")
@@ -31,7 +31,7 @@ def of(
 
 
 def estimate(
-    *explanations: Explanation, held_back: tuple[str, str] = ("", ""), findings: tuple[Finding, ...] = ()
+    *explanations: Explanation, held_back: tuple[str, str] = ("", ""), findings: tuple[SensorFinding, ...] = ()
 ) -> FleetEstimate:
     """Of one vehicle, whose most probable explanation is the estimate."""
 
@@ -135,10 +135,10 @@ def test_what_would_decide(explanations: tuple[Explanation, ...], held_back: tup
 
 
 def test_finding_says_why_its_branch_is_not_corrected() -> None:
-    finding = Finding(branch="motor", cause="clipped", probability=0.98, text="the motor sensor clips at 100 A")
+    finding = SensorFinding(branch="motor", cause="clipped", probability=0.98, text="the motor sensor clips at 100 A")
     found = estimate(of(1.0, drift=(0, 0.1)), held_back=("", "does not fit"), findings=(finding,))
     assert advice(found) == "the motor sensor clips at 100 A"
-    load = Finding(branch=None, cause="switching", probability=0.9, text="a load is switched")
+    load = SensorFinding(branch=None, cause="switching", probability=0.9, text="a load is switched")
     assert advice(replace(found, findings=[(load,)])) == "a load is switched"
     assert "a check of the motor sensor would decide" in advice(replace(found, findings=[()]))
 
@@ -168,7 +168,7 @@ def test_explanation_in_words_names_sensors_vehicle_and_findings(database: Vehic
             branches={**plain.branches, "motor": held},
             hardware_fault=HardwareFault(suspected=True, drift=-0.06, offset_a={"motor": 2.0}, probability=0.9),
             explanations=[of(0.6, drift=(0.1, 0.2)), Explanation(probability=0.4)],
-            findings=[Finding(branch="motor", cause="step", probability=0.8, text="the motor gain stepped")],
+            findings=[SensorFinding(branch="motor", cause="step", probability=0.8, text="the motor gain stepped")],
             deciding_evidence="a check would decide",
         )
     )

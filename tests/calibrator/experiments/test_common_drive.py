@@ -14,14 +14,14 @@ from calibrator.experiments.common_drive import (
     noise_sd_a,
 )
 from calibrator.experiments.figures import figure_rows, judge
-from calibrator.experiments.methods import PERFECT, POSTERIOR, THRESHOLD, TREE, Method
+from calibrator.experiments.methods import PERFECT, POSTERIOR, THRESHOLD, TREE, ComparedMethod
 from calibrator.faults import slopes_and_intercepts
 from tests.calibrator.experiments.small_trials import smooth_drive
 
 CASE = CommonCase(vehicles=100, training_vehicles=1000)
 
 
-def rates(case: CommonCase, *methods: Method, figure: str = "recovery_rate") -> list[float]:
+def rates(case: CommonCase, *methods: ComparedMethod, figure: str = "recovery_rate") -> list[float]:
     """Figure of some methods on one trial."""
     trial = common_trial(smooth_drive(), case, 0)
     judged = [figure_rows([judge(method.estimate(trial), trial)])[0].set_index("figure") for method in methods]

@@ -16,9 +16,9 @@ from calibrator.errors import FleetError
 from calibrator.experiments.common_drive import CommonCase
 from calibrator.experiments.experiments import CALIBRATION, EXPERIMENTS, Experiment, Setting, fleet_for
 from calibrator.experiments.methods import LEFT_IN, PERFECT, POSTERIOR
-from calibrator.experiments.pages import headline, result_markdown, result_table, write_result
+from calibrator.experiments.pages import headline, result_markdown, result_table, write_page
 from calibrator.experiments.recorded_trips import RecordedCase, RecordedFleet
-from calibrator.experiments.runner import ALL, ExperimentResult, pool_confidences, read_results, run_experiment
+from calibrator.experiments.runner import ALL, ExperimentResult, pool_confidences, read_records, run_experiment
 from tests.calibrator.experiments.small_trials import LAYOUT, small_fleet, smooth_drive
 
 RUN = [name for name in EXPERIMENTS if name != CALIBRATION.name]
@@ -57,7 +57,7 @@ def test_new_experiment_is_one_row(fleet: RecordedFleet, tmp_path: Path) -> None
         settings=tuple(Setting(x=a, case=RecordedCase(unmeasured_a=(a, 0.0))) for a in (0.0, 5.0)),
     )
     result = run_experiment(row, fleet, repetitions=1)
-    write_result(tmp_path / "results", result)
+    write_page(tmp_path / "results", result)
     assert result.figures["x"].unique().tolist() == [0.0, 5.0]
     assert result.settings["sparsity"] == 80.0
     assert "unmeasured_a" not in result.settings
@@ -88,10 +88,10 @@ def test_rows_of_every_kind_run_and_are_written(name: str, fleet: RecordedFleet,
     row = EXPERIMENTS[name].small()
     result = run_experiment(row, fleet if row.recorded else smooth_drive(samples=2000), repetitions=1)
     result = replace(result, made="calibrator 1.0")
-    write_result(tmp_path / "results", result)
+    write_page(tmp_path / "results", result)
     assert list(dict.fromkeys(zip(result.figures["series"], result.figures["x"], result.figures["method"], strict=True))
     ) == [(s.series, s.x, method.name) for s in row.settings for method in s.methods or row.methods]  # fmt: skip
-    (read,) = read_results(tmp_path / "results", EXPERIMENTS)
+    (read,) = read_records(tmp_path / "results", EXPERIMENTS)
     for name_, table in (("figures", result.figures), ("tenths", result.tenths)):
         pd.testing.assert_frame_equal(getattr(read, name_), table, check_dtype=False)
     assert (read.settings, read.made) == (result.settings, result.made)
@@ -142,7 +142,7 @@ def test_captions_explain_only_columns_that_are_there(snr: ExperimentResult) -> 
 def test_damaged_record_is_named(tmp_path: Path) -> None:
     (tmp_path / "snr.json").write_bytes(b'{"name": 3}')
     with pytest.raises(FleetError, match=r"snr\.json: not a record of an experiment: .*run the experiment again"):
-        read_results(tmp_path, ["real", "snr"])
+        read_records(tmp_path, ["real", "snr"])
 
 
 def test_flags_are_booleans_in_records_and_words_on_pages(snr: ExperimentResult) -> None:
@@ -152,8 +152,8 @@ def test_flags_are_booleans_in_records_and_words_on_pages(snr: ExperimentResult)
 
 
 def test_index_lists_the_results_of_the_folder_in_order(snr: ExperimentResult, tmp_path: Path) -> None:
-    write_result(tmp_path / "results", snr)
-    write_result(tmp_path / "results", replace(snr, experiment=EXPERIMENTS["classifier"]))
+    write_page(tmp_path / "results", snr)
+    write_page(tmp_path / "results", replace(snr, experiment=EXPERIMENTS["classifier"]))
     index = (tmp_path / "results.md").read_text()
     assert index.index("(results/classifier.md)") < index.index("(results/snr.md)")
     assert "2 repetitions, seed 0, drive smooth" in index

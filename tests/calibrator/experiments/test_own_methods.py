@@ -10,7 +10,7 @@ from rich.console import Console
 
 from calibrator.errors import FleetError
 from calibrator.experiments.experiments import EXPERIMENTS
-from calibrator.experiments.methods import PERFECT, POSTERIOR, Estimate, Method
+from calibrator.experiments.methods import PERFECT, POSTERIOR, ComparedMethod, Estimate
 from calibrator.experiments.pages import headline, result_markdown, result_table
 from calibrator.experiments.runner import ExperimentResult, run_experiment
 from calibrator.experiments.trial import Trial
@@ -46,7 +46,7 @@ def sure(estimate: Estimate) -> Estimate:
     return replace(estimate, confidence=np.full(N, 0.8))
 
 
-def run(*methods: Method) -> ExperimentResult:
+def run(*methods: ComparedMethod) -> ExperimentResult:
     return run_experiment(EXPERIMENTS["classifier"].small(), smooth_drive(), methods=methods, repetitions=1)
 
 

@@ -9,7 +9,7 @@ from calibrator.errors import DriveError
 from calibrator.published.state_space import (
     StateSpaceModel,
     choose_order,
-    identify,
+    identify_model,
     pooled_poles,
     simulation_snr_db,
 )
@@ -87,7 +87,7 @@ def test_snr_is_infinite_for_an_exact_and_nan_for_a_constant_channel() -> None:
 def test_known_system_is_found_through_noise(order: int, snr_db: float, least_db: float, slope: float) -> None:
     for seed in range(3):
         inputs, clean, noisy = recording(order, snr_db, seed)
-        model = identify(inputs[:TRAIN], noisy[:TRAIN], order=order)
+        model = identify_model(inputs[:TRAIN], noisy[:TRAIN], order=order)
         simulated = model.simulate(inputs, initial_state=model.x0)[TRAIN:]
         centred = clean[TRAIN:] - clean[TRAIN:].mean(axis=0)
         slopes = np.sum(centred * simulated, axis=0) / np.sum(centred**2, axis=0)
@@ -99,7 +99,7 @@ def test_known_system_is_found_through_noise(order: int, snr_db: float, least_db
 def test_order_is_chosen_as_the_system_has_it_and_the_snr_is_that_of_the_simulation(order: int) -> None:
     inputs, _, noisy = recording(order, 30, 2)
     assert choose_order(inputs, noisy) == order
-    model = identify(inputs, noisy, order=order)
+    model = identify_model(inputs, noisy, order=order)
     simulated = model.simulate(inputs, initial_state=model.x0)
     np.testing.assert_allclose(model.snr_db, simulation_snr_db(noisy, simulated), atol=1e-3)
 
@@ -109,7 +109,7 @@ def test_constant_equal_and_hardly_moving_inputs_and_a_dead_current_do_no_harm()
     blip = np.zeros(SAMPLES)
     blip[0] = 1.0  # as an air conditioning that was being switched off
     inputs = np.column_stack([inputs, inputs[:, 0], np.full(SAMPLES, 12.0), np.zeros(SAMPLES), blip])
-    model = identify(inputs, np.column_stack([noisy, np.zeros(SAMPLES)]), order=4)
+    model = identify_model(inputs, np.column_stack([noisy, np.zeros(SAMPLES)]), order=4)
     simulated = model.simulate(inputs, initial_state=model.x0)
     assert simulation_snr_db(noisy, simulated[:, :BRANCHES]).min() > 29.0
     np.testing.assert_allclose(simulated[:, BRANCHES], 0.0, atol=1e-6)
@@ -120,7 +120,7 @@ def test_samples_outside_the_mask_are_not_used() -> None:
     inputs, clean, noisy = recording(4, 30, 8)
     valid = (np.arange(SAMPLES) + 100) % 1000 >= 7
     spoilt_inputs, spoilt = np.where(valid[:, None], inputs, np.nan), np.where(valid[:, None], noisy, np.nan)
-    model = identify(spoilt_inputs, spoilt, order=4, valid=valid)
+    model = identify_model(spoilt_inputs, spoilt, order=4, valid=valid)
     assert simulation_snr_db(clean, model.simulate(inputs, initial_state=model.x0)).min() > 40.0
 
 
@@ -129,7 +129,7 @@ def test_growth_and_pure_noise_give_stable_models(growth: float) -> None:
     inputs, noise = smooth_inputs(9, 2000), np.random.default_rng(10).normal(size=(2000, 2))
     currents = noise if growth == 1.0 else growth ** np.arange(2000.0)[:, None] * [1.0, -1.0] + inputs[:, :2]
     for order in (1, 2, 4, 8):
-        model = identify(inputs, currents, order=order)
+        model = identify_model(inputs, currents, order=order)
         assert np.abs(np.linalg.eigvals(model.A)).max() < 1.0
         assert np.isfinite(model.simulate(inputs)).all()
 
@@ -148,9 +148,9 @@ def test_vehicles_together_have_the_poles_of_their_system() -> None:
 def test_drives_with_too_few_valid_samples_in_a_row_are_refused() -> None:
     inputs, _, noisy = recording(4, 20, 0)
     with pytest.raises(DriveError, match=r"only 11 stretches of 20 valid samples in a row, at least 360 are needed"):
-        identify(inputs[:30], noisy[:30], order=4)
+        identify_model(inputs[:30], noisy[:30], order=4)
     with pytest.raises(DriveError, match=r"only 0 stretches of 20 valid samples"):
-        identify(inputs, noisy, order=4, valid=np.arange(SAMPLES) % 10 != 0)
+        identify_model(inputs, noisy, order=4, valid=np.arange(SAMPLES) % 10 != 0)
     (short, currents), alone = (inputs[:15], noisy[:15]), np.ones(15, bool)
     with pytest.raises(DriveError, match=r"only 0 stretches of 20 valid samples"):
         pooled_poles([(short, currents, alone)] * 2, [2])

@@ -12,7 +12,7 @@ from calibrator.errors import FleetError
 from calibrator.report.fleet_table import FleetTable, read_details, read_fleet_table
 from calibrator.report.overview import WorkshopRow, overview_of, steps_to_take, workshop_list
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import Finding
+from ecu_node.parameters import SensorFinding
 from tests.calibrator.report.results_at_hand import EVIL, sensor, six_vehicles, vehicle, write_result
 
 
@@ -85,8 +85,8 @@ def test_workshop_list_has_hardware_then_sensors_then_what_many_share(
     tmp_path: Path, database: VehicleDatabase
 ) -> None:
     vehicles = six_vehicles(database)
-    load = Finding(branch="battery", cause="load", probability=0.99, text="5 A without a sensor.")
-    inverted = Finding(branch="motor", cause="inverted", probability=0.9, text="its sign is turned.")
+    load = SensorFinding(branch="battery", cause="load", probability=0.99, text="5 A without a sensor.")
+    inverted = SensorFinding(branch="motor", cause="inverted", probability=0.9, text="its sign is turned.")
     vehicles[1] = replace(vehicles[1], findings=[load, inverted])
     rows = workshop(read_fleet_table(write_result(tmp_path / "r", vehicles)))
     assert [(row.vehicle, row.branch, row.cause, row.probability) for row in rows] == [

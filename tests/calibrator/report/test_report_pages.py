@@ -18,7 +18,7 @@ from calibrator.errors import FleetError
 from calibrator.report import page as page_module
 from calibrator.report.page import fleet_report, vehicle_report
 from ecu_node.database import VehicleDatabase
-from ecu_node.parameters import Finding, HardwareFault
+from ecu_node.parameters import HardwareFault, SensorFinding
 from tests.calibrator.report.results_at_hand import (
     EVIL,
     sensor,
@@ -222,8 +222,8 @@ def test_a_result_without_a_vehicle_is_refused(tmp_path: Path) -> None:
 def test_findings_are_in_the_workshop_list_and_with_the_vehicle(tmp_path: Path, database: VehicleDatabase) -> None:
     vehicles = six_vehicles(database)
     findings = [
-        Finding(branch="motor", cause="inverted", probability=0.993, text="motor: its sign is turned."),
-        Finding(cause="load", probability=0.9, text="5 A flow where <no> sensor is."),
+        SensorFinding(branch="motor", cause="inverted", probability=0.993, text="motor: its sign is turned."),
+        SensorFinding(cause="load", probability=0.9, text="5 A flow where <no> sensor is."),
     ]
     vehicles[4] = replace(
         vehicles[4],

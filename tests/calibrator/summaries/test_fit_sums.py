@@ -6,7 +6,7 @@ import pytest
 from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.summaries.fit_sums import LEVEL_EDGES_A, FitSums, find_spikes, second_differences
-from calibrator.summaries.summariser import summarise
+from calibrator.summaries.summariser import summarise_samples
 from tests.calibrator.estimator.simulated_drives import PERIOD_S, coloured, samples_of
 
 SAMPLES = 1800
@@ -20,7 +20,7 @@ def a_drive(seed: int = 0, K: int = 3) -> Samples:
 
 
 def fit_of(*drives: Samples, temperatures_c: list[Array] | None = None) -> FitSums:
-    fit = summarise(list(drives), period_s=PERIOD_S, temperatures_c=temperatures_c).fit
+    fit = summarise_samples(list(drives), period_s=PERIOD_S, temperatures_c=temperatures_c).fit
     assert fit is not None
     return fit
 
@@ -42,7 +42,7 @@ def test_levels_are_sums_of_the_samples_at_each_level() -> None:
 def test_all_levels_together_are_the_moments() -> None:
     drive = a_drive()
     valid = np.random.default_rng(1).random(SAMPLES) > 0.1
-    summary = summarise([replace(drive, valid=valid)], period_s=PERIOD_S)
+    summary = summarise_samples([replace(drive, valid=valid)], period_s=PERIOD_S)
     assert summary.fit is not None
     for k in range(3):
         np.testing.assert_allclose(summary.fit.levels[k, :, :-1].sum(axis=0), summary.total[-1], atol=1e-7)
@@ -81,7 +81,7 @@ def test_spikes_are_labelled_by_branch_and_sign_and_left_out() -> None:
     bad = drive.currents_a.copy()
     bad[[200, 700, 1100], 1] += 50.0
     bad[[400, 401, 402], 2] -= 40.0
-    summary = summarise([replace(drive, currents_a=bad)], period_s=PERIOD_S)
+    summary = summarise_samples([replace(drive, currents_a=bad)], period_s=PERIOD_S)
     assert summary.fit is not None
     np.testing.assert_array_equal(summary.fit.spikes.sum(axis=0), [[0, 0], [3, 0], [0, 3]])
     kept = np.setdiff1d(np.arange(SAMPLES), [200, 400, 401, 402, 700, 1100])
@@ -115,7 +115,7 @@ def test_spikes_are_found_whatever_the_gains(gain: float) -> None:
 
 
 def test_joined_blocks_hold_the_same_sums() -> None:
-    summary = summarise([a_drive()], period_s=PERIOD_S, temperatures_c=[np.linspace(0.0, 30.0, SAMPLES)])
+    summary = summarise_samples([a_drive()], period_s=PERIOD_S, temperatures_c=[np.linspace(0.0, 30.0, SAMPLES)])
     fit, samples = summary.fit, summary.moments[:, -1, -1]
     assert fit is not None
     joined = fit.joined(np.arange(0, len(samples), 2), samples)

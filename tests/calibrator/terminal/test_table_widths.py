@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from calibrator.experiments.pages import result_table
-from calibrator.experiments.runner import read_results
+from calibrator.experiments.runner import read_records
 
 RESULTS = sorted((Path(__file__).parents[3] / "docs" / "results").glob("*.json"))
 
@@ -16,7 +16,7 @@ RESULTS = sorted((Path(__file__).parents[3] / "docs" / "results").glob("*.json")
 @pytest.mark.parametrize("width", [80, 60])
 def test_a_table_of_results_is_as_wide_as_the_terminal_and_nothing_is_cut(path: Path, width: int) -> None:
     out = io.StringIO()
-    (result,) = read_results(path.parent, [path.stem])
+    (result,) = read_records(path.parent, [path.stem])
     Console(width=width, file=out).print(result_table(result))
     lines = out.getvalue().splitlines()
     assert max(map(len, lines)) <= width
