@@ -173,7 +173,7 @@ class Fleet:
             Drives by vehicle. Index: seconds, or a DatetimeIndex, rising; gaps over 60 s count as 60 s. Columns: every
             branch of the junction, positive into it [A], and the inputs; NaN where a sample is bad.
         junction : Junction
-            Says which columns are branches. One made by :meth:`calibrator.Junction.from_layout` also has derived inputs.
+            Says which columns are branches. One of :meth:`calibrator.Junction.from_layout` also has derived inputs.
         inputs : sequence of str or None
             Columns that the currents depend on (speed, torque, demands of auxiliaries ...). None: those of the layout,
             or all columns that are no branches, which all vehicles must have.
