@@ -311,7 +311,7 @@ def _measure_misfits(summaries: Sequence[DriveSummary], read_out: Array, full_sc
     model = _over_fleet_model(residual, read_out)
     samples, weights = residual.samples, residual.weights
     causes = [
-        *_by_level(residual, levels, zero_a=model.zero_a, full_scale_a=full_scale_a),
+        *_by_level(residual, levels, zero_a=model.zero_a, full_scale_a=full_scale_a, has_fleet=len(read_out) > 1),
         _step(residual),
         _drifting(residual, middle / samples[fleet.blocks.vehicle], least=0.0),
         _drifting(residual, warm_c, least=WARMING_K),
@@ -421,12 +421,15 @@ def _over_fleet_model(residual: _Residual, read_out: Array) -> _OverModel:
     )
 
 
-def _by_level(residual: _Residual, levels: Array, *, zero_a: Array, full_scale_a: float) -> list[_Causes]:
+def _by_level(
+    residual: _Residual, levels: Array, *, zero_a: Array, full_scale_a: float, has_fleet: bool
+) -> list[_Causes]:
     """Quadratic, cubic, two gains by sign, a bend: a column h that depends on the level of one of the currents.
 
     The current at which h is taken has noise n in it, which is in r, too: E[h n] = var(n) E[h'] if normal (Stein).
     Of y everything is noise that z does not explain, as the current of a branch without a sensor: the likelihood of
     y - b h(y) = g^T z has the factor prod |1 - b h'(y)| of a transformed variable, which a straight h leaves alone.
+    In a fleet what noise makes is part of what is usual, and counted there.
     """
     fleet, z, (N, K) = residual.fleet, residual.z, zero_a.shape
     count = levels[..., -2]
@@ -447,15 +450,17 @@ def _by_level(residual: _Residual, levels: Array, *, zero_a: Array, full_scale_a
         square = np.einsum("nksl,nkl->nks", h**2, count)
         alone = square - _dot(_solve(gram, with_all[..., z]), with_all[..., z])
         with_r = with_all[..., residual.y] - np.einsum("nksi,ni->nks", with_all[..., z], residual.law)
-        with_r += residual.noise[:, :, None] * np.einsum("nksl,nkl->nks", slope, count)
+        if not has_fleet:
+            with_r += residual.noise[:, :, None] * np.einsum("nksl,nkl->nks", slope, count)
         beyond = np.einsum("nksl,nkl->nks", h != 0.0, count)
         usable = moving & (alone > ALONE * square) & (beyond >= FEWEST)
         size = np.where(usable, with_r, 0.0) / np.where(usable, alone, 1.0)
         explained_a2 = size * with_r
         stretch = np.zeros((N, K, h.shape[2]))
-        factor = np.maximum(np.abs(1.0 - size[:, own, :, None] * slope[:, own]), LEAST_STRETCH)
-        stretch[:, own] = np.minimum(np.einsum("nsl,nl->ns", np.log(factor), count[:, own]), 0.0)
-        stretch /= residual.samples[:, None, None]
+        if not has_fleet:
+            factor = np.maximum(np.abs(1.0 - size[:, own, :, None] * slope[:, own]), LEAST_STRETCH)
+            stretch[:, own] = np.minimum(np.einsum("nsl,nl->ns", np.log(factor), count[:, own]), 0.0)
+            stretch /= residual.samples[:, None, None]
         left = 1.0 - explained_a2 / residual.square_a2[:, None, None]
         best = (stretch - 0.5 * np.log(np.maximum(left, RIDGE))).reshape(N, -1).argmax(axis=1)
         at = (np.arange(N), *np.unravel_index(best, size.shape[1:]))

@@ -18,7 +18,7 @@ import calibrator
 from calibrator import Fleet, FleetCalibrator, Junction, read_log
 from calibrator.artificial.builtin_drives import builtin_trip
 from calibrator.drives import align
-from calibrator.errors import DriveError, FleetError
+from calibrator.errors import ContradictionError, DriveError, FleetError
 from calibrator.estimator.results import read_results
 from calibrator.summaries.store import SummaryStore
 from ecu_node.database import VehicleDatabase
@@ -134,7 +134,7 @@ def test_constructor_only_stores_as_in_scikit_learn() -> None:
     assert repr(plain) == "FleetCalibrator(harm_limit=0.01, trusted=['V1'])"
     assert clone(plain).get_params() == plain.get_params()
     assert plain.set_params(workers=1).workers == 1
-    with pytest.raises(ValueError, match="Invalid parameter 'x' for estimator FleetCalibrator"):
+    with pytest.raises(ContradictionError, match="no parameter 'x'; there are harm_limit, trusted"):
         plain.set_params(x=1)
     with pytest.raises(FleetError, match="has learned nothing yet; call fit"):
         plain.summary()
