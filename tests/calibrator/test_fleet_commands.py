@@ -94,6 +94,7 @@ def test_store_made_by_import_gives_the_same_parameters_as_the_logs(fleet: Path,
         assert row["drift"] == pytest.approx(expected["drift"], abs=1e-9)
 
 
+@pytest.mark.long
 def test_nothing_is_learnt_from_a_vehicle_that_is_held_out(fleet: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     shutil.copytree(fleet / "logs", other)

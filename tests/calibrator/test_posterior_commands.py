@@ -105,6 +105,7 @@ def test_a_vehicle_of_which_nothing_can_be_told_names_its_explanations(strict: P
         assert not any(branch.apply for branch in item.branches.values())
 
 
+@pytest.mark.long
 def test_trusted_vehicles_are_taken_for_faultless(fleet: Path, tmp_path: Path) -> None:
     truth = read_truth(fleet / "truth.json").vehicles
     sound = [name for name, vehicle in truth.items() if not any([*vehicle.drift.values(), *vehicle.offset_a.values()])]
@@ -117,6 +118,7 @@ def test_trusted_vehicles_are_taken_for_faultless(fleet: Path, tmp_path: Path) -
     assert all(row["drift"] == 0.0 and row["offset_a"] == 0.0 for row in rows)
 
 
+@pytest.mark.long
 def test_a_bench_reading_of_a_sensor_is_heeded_and_recorded(fleet: Path, tmp_path: Path) -> None:
     vehicle, truth = next(
         (name, vehicle)

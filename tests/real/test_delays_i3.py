@@ -32,6 +32,7 @@ def test_battery_and_motor_are_told_apart_to_half_a_millisecond_on_all_32_trips(
     assert 0.7 < rms(two.error_s / two.sd_s) < 1.5
 
 
+@pytest.mark.long
 def test_with_the_auxiliaries_as_third_branch_the_motor_is_found_as_well(three: DelayErrors) -> None:
     assert three.known.shape == (27, 2)
     assert three.known[:, 0].all()

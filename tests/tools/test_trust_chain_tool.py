@@ -21,6 +21,7 @@ def short_trials(folder: Path) -> Path:
     return layout
 
 
+@pytest.mark.long
 def test_no_vehicle_of_a_fleet_is_made_worse(tmp_path: Path) -> None:
     options = ["--layout", str(short_trials(tmp_path)), "--vehicles", "24", "--minutes", "5", "--unseen-minutes", "3"]
     result = CliRunner().invoke(trust_chain.app, [*options, "--unmeasured", "2", "0.5", "--json"])

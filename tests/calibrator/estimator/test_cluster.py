@@ -23,6 +23,7 @@ def store(database: VehicleDatabase, tmp_path_factory: pytest.TempPathFactory) -
     return small_store(tmp_path_factory.mktemp("fleet") / "store", database, random_faults(VEHICLES))
 
 
+@pytest.mark.long
 def test_cluster_that_loses_a_worker_gives_the_same_result(store: SummaryStore, tmp_path: Path) -> None:
     here = calibrate(store.url, tmp_path / "here", "--workers", 2)
     assert here.returncode == 0, here.stderr

@@ -162,6 +162,7 @@ def test_given_pole_is_used_and_the_vehicle_that_has_another_is_named(store: Pat
     assert json.loads(run_identify(store, "--bank", bank, "--json").stdout) == figures
 
 
+@pytest.mark.long
 def test_bank_is_chosen_that_simulates_the_fleet(store: Path) -> None:
     run = run_identify(store)
     assert run.exit_code == 0, run.output

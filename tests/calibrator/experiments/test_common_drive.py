@@ -95,6 +95,7 @@ def test_perfect_classifier_beats_the_tree_and_the_tree_the_threshold() -> None:
     assert rates(CASE, PERFECT, figure="failed") == [0.0]
 
 
+@pytest.mark.long
 def test_default_recovers_as_many_as_the_published_method_with_a_perfect_classifier() -> None:
     default, published = rates(CASE, POSTERIOR, PERFECT)
     assert default > published - 0.1
