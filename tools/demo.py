@@ -44,7 +44,7 @@ HELD_OUT = 3
 """Vehicles with most faults, from which the fleet learns nothing; the first that is corrected drives at the end."""
 MINUTES = 4
 """Length of the trip that each vehicle is calibrated on. [min]"""
-SECONDS = 20.0
+SECONDS = 12.0
 """Length of the live drive. [s]"""
 MARKER = ".made-by-demo"
 
