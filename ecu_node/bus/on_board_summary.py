@@ -67,6 +67,8 @@ from ecu_node.summary import (
 
 MOST_BATCHES = 48
 """Of a file: two hours at 10 Hz, so that no file that is written again and again grows large."""
+MOST_AT_ONCE = 64
+"""Frames that are taken in one look, so that a flood of them delays no correction; what the bus cannot keep is a gap."""
 DRIVE_GAP_S = 60.0
 """Nothing on the bus for so long ends a drive. [s]"""
 _MOST_ZERO = 20_000
@@ -317,7 +319,9 @@ class OnBoardSummary:
 
     def look(self, now_s: float) -> None:
         """Take the frames that have come, and do a little of what is to be done; on the steady clock. [s]"""
-        while self._bus is not None and (message := self._bus.receive(0.0)) is not None:
+        for _ in range(MOST_AT_ONCE):
+            if self._bus is None or (message := self._bus.receive(0.0)) is None:
+                break
             if not message.is_remote_frame:
                 key = FrameKey(message.arbitration_id, message.is_extended_id)
                 self.take(key, message.data, message.timestamp or time.time())
