@@ -68,7 +68,7 @@ from ecu_node.summary import (
 MOST_BATCHES = 48
 """Of a file: two hours at 10 Hz, so that no file that is written again and again grows large."""
 MOST_AT_ONCE = 64
-"""Frames that are taken in one look, so that a flood of them delays no correction; what the bus cannot keep is a gap."""
+"""Frames taken in one look, so that a flood of them delays no correction; what the bus cannot keep is a gap."""
 DRIVE_GAP_S = 60.0
 """Nothing on the bus for so long ends a drive. [s]"""
 _MOST_ZERO = 20_000
