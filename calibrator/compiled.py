@@ -41,11 +41,10 @@ SOURCES = (
     "estimator/decision.py",
     "estimator/posterior.py",
     "estimator/prior.py",
-    "recordings/asc.py",
     "recordings/blf.py",
-    "recordings/candump.py",
     "recordings/decode.py",
     "recordings/frame_arrays.py",
+    "recordings/text_logs.py",
     "summaries/filter_bank.py",
     "summaries/summariser.py",
 )

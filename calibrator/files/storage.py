@@ -13,7 +13,17 @@ from typing import Any, BinaryIO
 from ecu_node.documents import write_atomically
 from ecu_node.errors import UserError
 
-__all__ = ["DISK_FULL", "Entry", "Storage", "StorageError", "is_url", "local_copy", "open_storage", "walk"]
+__all__ = [
+    "DISK_FULL",
+    "Entry",
+    "Storage",
+    "StorageError",
+    "copied_file",
+    "is_url",
+    "local_copy",
+    "open_storage",
+    "walk",
+]
 
 OBJECT_STORAGE = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "memory"})
 """Kinds of storage in which a file appears only when it is complete, and which need no folders."""
@@ -249,23 +259,27 @@ def walk(storage: Storage) -> Iterator[tuple[Storage, list[Entry]]]:
 
 @contextmanager
 def local_copy(url: str) -> Iterator[Path]:
-    """A file as one of this machine: itself, or a copy that is gone after the block.
-
-    Errors of the user that name the copy come out with the URL that the user knows.
-    """
+    """A file as one of this machine: itself, or a copy that is gone after the block."""
     if not is_url(url):
         yield Path(url)
         return
     folder, _, name = url.rpartition("/")
     storage = Storage(url=folder)
-    with tempfile.TemporaryDirectory(prefix="copy-") as temporary:
-        copy = Path(temporary) / name
-        filesystem, root = storage._filesystem()
+    filesystem, root = storage._filesystem()
+    with copied_file(name, url) as copy:
         try:
             filesystem.get_file(f"{root}/{name}", str(copy))
         except Exception as error:  # noqa: BLE001
             raise storage._failed(name, "read", error) from None
+        yield copy
+
+
+@contextmanager
+def copied_file(name: str, shown: str) -> Iterator[Path]:
+    """Where to put a copy that is gone after the block; errors of the user name what is shown in its place."""
+    with tempfile.TemporaryDirectory(prefix="copy-") as folder:
+        copy = Path(folder) / name
         try:
             yield copy
         except UserError as error:
-            raise type(error)(str(error).replace(str(copy), url)) from None
+            raise type(error)(str(error).replace(str(copy), shown)) from None

@@ -93,53 +93,50 @@ def read_blf(file: BinaryIO, name: str) -> Frames:
     """
     parts: list[Frames] = []
     try:
-        parts.extend(_parts(file))
+        size, start_ns = _file_header(file)
+        tail, fd = b"", False
+        for batch in _batches(file):
+            contents = [tail, *(content for content, _ in batch)]
+            data = np.frombuffer(b"".join(contents), np.uint8)
+            ended = _WIDE
+            while ended == _WIDE:
+                columns = FrameColumns.of(len(data) // _OBJECT_HEADER_BYTES + 1, fd=fd)
+                ended, rows, end, wrong_size = _take_apart(data, start_ns, _FD_LENGTHS, columns)
+                fd = fd or ended == _WIDE
+            parts.append(columns.frames(rows=rows))
+            if ended != _SOUND:
+                container = int(np.searchsorted(np.cumsum([*map(len, contents[:-1])]), end, side="right")) - 1
+                impossible = f"an object of {wrong_size} bytes, which is impossible for its type"
+                what = impossible if ended == _IMPOSSIBLE else "something that is no object"
+                raise _DamageError(batch[max(container, 0)][1], f"a container holds {what}")
+            tail = data[end:].tobytes()
+        if tail.strip(b"\0"):
+            raise _DamageError(file.tell(), "the last object is cut")
+        if size >= file.tell() + _LONGEST_PADDING:
+            raise _DamageError(file.tell(), f"the file ends, but its header says {size} bytes")
     except _DamageError as damage:
-        frames = sum(map(len, parts))
         raise LogError(
-            f"{name}: truncated or damaged BLF: {damage}; {frames} frames before it are readable; "
+            f"{name}: truncated or damaged BLF: {damage}; {sum(map(len, parts))} frames before it are readable; "
             f"copy the file again, or save the readable part with the tool that recorded it"
         ) from None
     return concatenate_frames(parts)
 
 
-def _parts(file: BinaryIO) -> Iterator[Frames]:
-    """Frames of some containers at a time; those before a damage come before its error."""
-    size, start_ns = _file_header(file)
-    containers, tail, damage, fd = _containers(file), b"", None, False
-    while damage is None:
-        batch: list[tuple[bytes, int]] = []
-        try:
-            while sum(len(content) for content, _ in batch) < BATCH_BYTES:
-                batch.append(next(containers))
-        except StopIteration:
-            pass
-        except _DamageError as error:
-            damage = error
-        if not batch:
-            break
-        contents = [tail, *(content for content, _ in batch)]
-        data = np.frombuffer(b"".join(contents), np.uint8)
-        ended = _WIDE
-        while ended == _WIDE:
-            columns = FrameColumns.of(len(data) // _OBJECT_HEADER_BYTES + 1, fd=fd)
-            ended, rows, end, wrong_size = _take_apart(data, start_ns, _FD_LENGTHS, columns)
-            fd = fd or ended == _WIDE
-        yield columns.frames(rows=rows)
-        if ended != _SOUND:
-            container = int(np.searchsorted(np.cumsum([*map(len, contents[:-1])]), end, side="right")) - 1
-            wrong = f"an object of {wrong_size} bytes, which is impossible for its type"
-            raise _DamageError(
-                batch[max(container, 0)][1],
-                f"a container holds {wrong if ended == _IMPOSSIBLE else 'something that is no object'}",
-            )
-        tail = data[end:].tobytes()
-    if damage is not None:
-        raise damage
-    if tail.strip(b"\0"):
-        raise _DamageError(file.tell(), "the last object is cut")
-    if size >= file.tell() + _LONGEST_PADDING:
-        raise _DamageError(file.tell(), f"the file ends, but its header says {size} bytes")
+def _batches(file: BinaryIO) -> Iterator[list[tuple[bytes, int]]]:
+    """Some containers at a time; those before a damage come before its error."""
+    batch: list[tuple[bytes, int]] = []
+    try:
+        for container in _containers(file):
+            batch.append(container)
+            if sum(len(content) for content, _ in batch) >= BATCH_BYTES:
+                yield batch
+                batch = []
+    except _DamageError:
+        if batch:
+            yield batch
+        raise
+    if batch:
+        yield batch
 
 
 def _file_header(file: BinaryIO) -> tuple[int, int]:

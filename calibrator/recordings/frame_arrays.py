@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibrator.drive import Array, Mask
 
-__all__ = ["EXTENDED_BIT", "FrameCollector", "Frames", "LogTime", "concatenate_frames", "frame_key", "repaired_time"]
+__all__ = ["EXTENDED_BIT", "Frames", "LogTime", "concatenate_frames", "frame_key", "frames_of", "repaired_time"]
 
 EXTENDED_BIT = 1 << 31
 """Set in a frame's key where the identifier has 29 bits, as in Linux' ``can_id``."""
@@ -91,31 +91,32 @@ class Frames:
 
 
 _COLUMNS = ("time_ns", "key", "channel", "length", "data")
-_COUNTS = ("error_frames", "remote_frames", "damaged")
 
 
 def concatenate_frames(parts: Sequence[Frames]) -> Frames:
     """Join the pieces of one log; counts add up, channels are merged by name."""
+    parts = parts or [FrameColumns.of(0, fd=False).frames()]
     if len(parts) == 1:
         return parts[0]
-    parts = parts or [FrameCollector().frames()]
     channels = tuple(dict.fromkeys(name for part in parts for name in part.channels))
     width = max(part.data.shape[1] for part in parts)
-    same = [np.array([channels.index(name) for name in part.channels], np.uint32)[part.channel] for part in parts]
-    data = [
-        np.pad(part.data, ((0, 0), (0, width - part.data.shape[1]))) for part in parts if part.data.shape[1] < width
-    ]
-    padded = iter(data)
-    columns: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts]) for name in ("time_ns", "key", "length")
-    }
-    counts: dict[str, Any] = {name: sum(getattr(part, name) for part in parts) for name in _COUNTS}
     return Frames(
-        **columns,
-        **counts,
-        channel=np.concatenate(same),
-        data=np.concatenate([part.data if part.data.shape[1] == width else next(padded) for part in parts]),
+        time_ns=np.concatenate([part.time_ns for part in parts]),
+        key=np.concatenate([part.key for part in parts]),
+        channel=np.concatenate(
+            [np.array([channels.index(name) for name in part.channels], np.uint32)[part.channel] for part in parts]
+        ),
+        length=np.concatenate([part.length for part in parts]),
+        data=np.concatenate(
+            [
+                part.data if (lacking := width - part.data.shape[1]) == 0 else np.pad(part.data, ((0, 0), (0, lacking)))
+                for part in parts
+            ]
+        ),
         channels=channels,
+        error_frames=sum(part.error_frames for part in parts),
+        remote_frames=sum(part.remote_frames for part in parts),
+        damaged=sum(part.damaged for part in parts),
     )
 
 
@@ -171,55 +172,27 @@ class FrameColumns(NamedTuple):
         )
 
 
-class FrameCollector:
-    """Takes messages of python-can one by one and gives them back as :class:`Frames`."""
-
-    def __init__(self) -> None:
-        self._rows: list[tuple[int, int, int, bytes | bytearray]] = []
-        self._channels: dict[str, int] = {}
-        self.counts = dict.fromkeys(_COUNTS, 0)
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def add(self, message: can.Message) -> None:
-        """Take one message; one with an impossible length, identifier or time stamp is counted as damaged."""
-        if message.is_error_frame:
-            self.counts["error_frames"] += 1
-        elif message.is_remote_frame:
-            self.counts["remote_frames"] += 1
-        elif not _is_possible(message):
-            self.counts["damaged"] += 1
+def frames_of(messages: Sequence[can.Message]) -> Frames:
+    """Messages of python-can as frames; those of an impossible length, identifier or time stamp are damaged."""
+    columns = FrameColumns.of(len(messages), fd=any(len(message.data) > CLASSIC_BYTES for message in messages))
+    channels: dict[str, int] = {}
+    for row, message in enumerate(messages):
+        size = len(message.data)
+        if message.is_error_frame or message.is_remote_frame:
+            columns.kind[row] = ERROR if message.is_error_frame else REMOTE
+        elif not (
+            (size <= FD_BYTES if message.is_fd else size == min(message.dlc, CLASSIC_BYTES))
+            and 0 <= message.arbitration_id <= LARGEST_IDENTIFIER
+            and 0.0 <= message.timestamp <= 1e-9 * LATEST_TIME_STAMP_NS
+        ):
+            columns.kind[row] = DAMAGED
         else:
-            key = frame_key(message.arbitration_id, extended=message.is_extended_id)
-            channel = self._channels.setdefault(str(message.channel), len(self._channels))
-            self._rows.append((round(message.timestamp * 1e9), key, channel, message.data))
-
-    def frames(self) -> Frames:
-        """Everything taken so far."""
-        time_ns, key, channel, payload = zip(*self._rows, strict=True) if self._rows else ((), (), (), ())
-        length = np.fromiter(map(len, payload), np.uint8, len(payload))
-        width = FD_BYTES if np.any(length > CLASSIC_BYTES) else CLASSIC_BYTES
-        joined = b"".join(bytes(data).ljust(width, b"\0") for data in payload)
-        return Frames(
-            time_ns=np.array(time_ns, np.int64),
-            key=np.array(key, np.uint32),
-            channel=np.array(channel, np.uint32),
-            length=length,
-            data=np.frombuffer(joined, np.uint8).reshape(-1, width),
-            channels=tuple(self._channels),
-            **self.counts,
-        )
-
-
-def _is_possible(message: can.Message) -> bool:
-    """Whether the payload has the length that a classic frame says, or fits into any, and identifier and time do."""
-    size = len(message.data)
-    return (
-        (size <= FD_BYTES if message.is_fd else size == min(message.dlc, CLASSIC_BYTES))
-        and 0 <= message.arbitration_id <= LARGEST_IDENTIFIER
-        and 0.0 <= message.timestamp <= 1e-9 * LATEST_TIME_STAMP_NS
-    )
+            columns.kind[row], columns.time_ns[row] = DATA, round(message.timestamp * 1e9)
+            columns.key[row] = frame_key(message.arbitration_id, extended=message.is_extended_id)
+            columns.channel[row] = channels.setdefault(str(message.channel), len(channels))
+            columns.length[row] = size
+            columns.data[row, :size] = np.frombuffer(message.data, np.uint8)
+    return columns.frames(tuple(channels))
 
 
 # ---- time

@@ -23,10 +23,8 @@ from typing import TextIO
 import can
 
 from calibrator.errors import LogError
-from calibrator.recordings.asc import read_plain_asc
 from calibrator.recordings.blf import read_blf
-from calibrator.recordings.candump import is_candump, read_candump
-from calibrator.recordings.frame_arrays import CLASSIC_BYTES, FrameCollector, Frames, concatenate_frames
+from calibrator.recordings.frame_arrays import CLASSIC_BYTES, Frames, concatenate_frames, frames_of
 from calibrator.recordings.gvret import read_gvret
 from calibrator.recordings.log_files import (
     UNREADABLE,
@@ -36,12 +34,12 @@ from calibrator.recordings.log_files import (
     read_undamaged,
     readable,
     reason_of,
-    remedy_for,
     suffix_of,
     text_head,
 )
 from calibrator.recordings.mf4 import read_mf4
 from calibrator.recordings.tables import TABLE_SUFFIXES, is_table
+from calibrator.recordings.text_logs import is_candump, read_candump, read_plain_asc
 
 __all__ = ["LOG_SUFFIXES", "is_log", "read_frames"]
 
@@ -50,6 +48,8 @@ _NO_TEXT = frozenset(range(32)) - frozenset(b"\t\n\v\f\r\x1a")
 """Control characters; the last one kept ends text files of old systems."""
 _LOOKED_AT = 4096
 """Bytes: of random ones, a tenth are control characters."""
+_AT_A_TIME = 10_000
+"""Messages of python-can that are kept at a time: they take more memory than arrays."""
 _RELATIVE = re.compile(r"^base\s+\w+\s+timestamps\s+relative", re.MULTILINE | re.IGNORECASE)
 
 
@@ -142,25 +142,27 @@ def _read_by_python_can(path: Path, reader: Callable[[TextIO], Iterable[can.Mess
 
     Binary data under the name of a text are refused, as python-can skips whatever it does not know.
     """
-    collector = FrameCollector()
     with open_log(path) as file:
         if _NO_TEXT.intersection(read_undamaged(file, _LOOKED_AT)[0]):
             raise LogError(
                 f"{path}: not a {suffix_of(path)} log but binary data; give the file the suffix of its format"
             )
+    parts, messages = list[Frames](), list[can.Message]()
     with open_log(path) as file:
         text = _CountedLines(file, encoding="latin-1")
         try:
             for message in reader(text):
-                collector.add(message)
+                messages.append(message)
+                if len(messages) == _AT_A_TIME:
+                    parts.append(frames_of(messages))
+                    messages.clear()
         except Exception as error:  # noqa: BLE001 (python-can lets through whatever its parsing meets)
-            unreadable, taken = isinstance(error, UNREADABLE), len(collector)
-            remedy = remedy_for(path, taken) if unreadable else "copy the file again, or cut it there"
+            before = sum(map(len, parts)) + len(frames_of(messages))
             raise LogError(
-                f"{path}: damaged {'after' if unreadable else 'at'} line {text.count} ({reason_of(error)}); "
-                f"{taken} frames before it are readable; {remedy}"
+                f"{path}: damaged {'after' if isinstance(error, UNREADABLE) else 'at'} line {text.count} "
+                f"({reason_of(error)}); {before} frames before it are readable; copy the file again, or cut it there"
             ) from None
-    return collector.frames()
+    return concatenate_frames([*parts, frames_of(messages)])
 
 
 class _CountedLines(io.TextIOWrapper):

@@ -5,6 +5,7 @@
 
 import csv
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,12 @@ from calibrator.drive import Array
 from calibrator.errors import LogError
 from calibrator.recordings.frame_arrays import (
     CLASSIC_BYTES,
+    DAMAGED,
+    DATA,
     EXTENDED_BIT,
-    FD_BYTES,
     LARGEST_IDENTIFIER,
     LATEST_TIME_STAMP_NS,
+    FrameColumns,
     Frames,
 )
 from calibrator.recordings.log_files import MAX_DAMAGED_SHARE, open_log, read_rows, reason_of
@@ -55,7 +58,8 @@ def read_gvret(path: Path) -> Frames:
     time_us, length = (pd.to_numeric(rows[key], errors="coerce").to_numpy() for key in ("Time Stamp", "LEN"))
     key, extended = _hexadecimal(rows["ID"]), rows["Extended"].str.lower() == "true"
     bytes_ = [_hexadecimal(rows[name]) for name in rows.columns if re.fullmatch(r"D\d+", name)]
-    width = FD_BYTES if len(bytes_) > CLASSIC_BYTES else CLASSIC_BYTES
+    columns = FrameColumns.of(len(rows), fd=len(bytes_) > CLASSIC_BYTES)
+    width = columns.data.shape[1]
     data = np.full((len(rows), width), np.nan)
     data[:, : len(bytes_)] = np.column_stack(bytes_)
     within = np.arange(width) < length[:, None]
@@ -65,16 +69,14 @@ def read_gvret(path: Path) -> Frames:
     if damaged > MAX_DAMAGED_SHARE * len(rows):
         line = f"line {np.argmin(sound) + 2}" if not sound.all() else "a line with too many cells"
         raise LogError(f"{path}: {line} is damaged, and {damaged} of {len(rows) + left_out} are; save the log again")
-    number, channels = pd.factorize(rows["Bus"].fillna(""))
-    return Frames(
-        time_ns=np.rint(1e3 * time_us[sound]).astype(np.int64),
-        key=key[sound].astype(np.uint32) | np.where(extended[sound], np.uint32(EXTENDED_BIT), np.uint32(0)),
-        channel=number[sound].astype(np.uint32),
-        length=length[sound].astype(np.uint8),
-        data=np.where(within, data, 0.0)[sound].astype(np.uint8),
-        channels=tuple(map(str, channels)),
-        damaged=damaged,
-    )
+    columns.channel[:], channels = pd.factorize(rows["Bus"].fillna(""))
+    columns.kind[:] = np.where(sound, DATA, DAMAGED)
+    columns.time_ns[sound] = np.rint(1e3 * time_us[sound])
+    columns.key[sound] = key[sound].astype(np.uint32) | np.where(extended[sound], np.uint32(EXTENDED_BIT), np.uint32(0))
+    columns.length[sound] = length[sound]
+    columns.data[sound] = np.where(within, data, 0.0)[sound]
+    frames = columns.frames(tuple(map(str, channels)))
+    return replace(frames, damaged=damaged)
 
 
 def _hexadecimal(texts: "pd.Series[str]") -> Array:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 
 import can
 
-from calibrator.recordings.frame_arrays import FrameCollector, Frames
+from calibrator.recordings.frame_arrays import Frames, frames_of
 from ecu_node.bus.adapters import connect
 from ecu_node.errors import BusError
 
@@ -54,14 +54,12 @@ def record_bus(interface: str, channel: str | None, duration_s: float) -> Frames
         raise BusError(
             f"{interface}:{channel}: cannot listen to the bus: {reason}; check --interface and --channel"
         ) from None
-    collector = FrameCollector()
-    for message in messages:
-        collector.add(message)
-    if not len(collector):
+    frames = frames_of(messages)
+    if not len(frames):
         raise BusError(
             f"{interface}:{channel}: no frame in {duration_s:g} s; check that something is sent, or listen longer"
         )
-    return collector.frames()
+    return frames
 
 
 def play_frames(

@@ -6,34 +6,30 @@ A file inside an archive has the path ``fleet.zip/V0001/monday.log``, as if the 
 import codecs
 import gzip
 import io
-import shlex
 import shutil
-import tempfile
 import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, TextIO, cast
 
 import pandas as pd
 
 from calibrator.errors import LogError
-from ecu_node.errors import UserError
+from calibrator.files.storage import copied_file
 
 __all__ = [
     "MAX_DAMAGED_SHARE",
     "UNREADABLE",
     "exists",
-    "file_on_disk",
     "files_in",
     "open_log",
     "read_rows",
     "read_undamaged",
     "readable",
     "reason_of",
-    "remedy_for",
     "suffix_of",
     "text_blocks",
     "text_head",
@@ -124,14 +120,6 @@ def reason_of(error: BaseException) -> str:
     return str(text).splitlines()[0]
 
 
-def remedy_for(path: Path, frames: int) -> str:
-    """What to do with a text log of which only the first frames can be read."""
-    if not frames or not path.name.lower().endswith(".gz"):
-        return "copy the file again"
-    part = f"'gzip -dc {shlex.quote(path.name)} > {shlex.quote(path.stem)}'"
-    return f"copy the file again, or keep the readable part, {part}, and remove {path.name}"
-
-
 def exists(path: Path) -> bool:
     """Whether there is such a file, alone or in an archive."""
     archive = _archive(path)
@@ -166,35 +154,23 @@ def readable(path: Path) -> Iterator[Path]:
 
     Errors of the user that name the copy come out with the path that the user knows.
     """
-    archive = _archive(path)
-    if archive is None and not (path.name.lower().endswith(".gz") and suffix_of(path) in _BINARY):
+    archive, packed = _archive(path), path.name.lower().endswith(".gz") and suffix_of(path) in _BINARY
+    if archive is None and not packed:
         yield path
         return
-    with tempfile.TemporaryDirectory(prefix="recording-") as folder:
-        copy = Path(folder) / path.name
+    with copied_file(path.name[:-3] if packed else path.name, str(path)) as copy:
         try:
-            if archive is None:
-                copy = copy.with_suffix("")
-                with open_log(path) as packed, copy.open("wb") as file:
-                    shutil.copyfileobj(packed, file)
-            else:
-                with zipfile.ZipFile(archive) as members, copy.open("wb") as file:
-                    shutil.copyfileobj(members.open(path.relative_to(archive).as_posix()), file)
+            with ExitStack() as opened:
+                source: Any = path.open("rb") if archive is None else zipfile.ZipFile(archive)
+                opened.enter_context(source)
+                if archive is not None:
+                    source = opened.enter_context(source.open(path.relative_to(archive).as_posix()))
+                if packed:
+                    source = opened.enter_context(gzip.open(source))
+                shutil.copyfileobj(source, opened.enter_context(copy.open("wb")))
         except _NO_ARCHIVE as error:
             raise LogError(f"{path}: cannot be unpacked: {str(error).strip(chr(39))}; copy the file again") from None
-        try:
-            if archive is not None and copy.name.lower().endswith(".gz"):
-                with readable(copy) as inner:
-                    yield inner
-            else:
-                yield copy
-        except UserError as error:
-            raise type(error)(str(error).replace(str(copy), str(path))) from None
-
-
-def file_on_disk(path: Path) -> Path:
-    """The file itself, or the archive that it is in."""
-    return _archive(path) or path
+        yield copy
 
 
 def _archive(path: Path) -> Path | None:

@@ -42,6 +42,7 @@ __all__ = [
     "read_recording",
 ]
 
+_NOTHING = Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_))
 _MOST_LISTED = 12
 """Identifiers listed in a message: enough to recognise the bus, short enough for one line."""
 MOST_STRAY = 0.05
@@ -100,13 +101,13 @@ class RecordingReport:
 
     def notices(self) -> list[Notice]:
         """Return what a user should know; empty if the log is whole and sound."""
-        absent = [item.name for item in self.channels if not item.frames]
+        absent = ", ".join(item.name for item in self.channels if not item.frames)
         spoilt = [
             Notice(text=f"{item.name}: {{}} of {{}} frames not usable", counts=(item.not_good, item.frames))
             for item in self.channels
             if item.not_good
         ]
-        return [*([Notice(text=f"no frames of {', '.join(absent)}")] if absent else []), *spoilt, *self.log_notices()]
+        return [*([Notice(text=f"no frames of {absent}")] if absent else []), *spoilt, *self.log_notices()]
 
     def log_notices(self) -> list[Notice]:
         """Return those of the notices that concern the log as a whole, not single channels."""
@@ -199,9 +200,14 @@ def _recording(source: "SignalSource", vehicle: str, name: str) -> Recording:
         ChannelReport(name=key, signal=signals[key], frames=len(c.time_s), not_good=int(np.sum(~c.good)))
         for key, c in (branches | inputs).items()
     )
-    available = {key: channel for key, channel in inputs.items() if channel.good.any()}
-    drive = Drive(vehicle=vehicle, name=name, branches=_present(branches), inputs=available)
-    return Recording(drive=drive, corrected=_present(corrected), report=source.report(channels))
+    drive = Drive(
+        vehicle=vehicle,
+        name=name,
+        branches={key: channel for key, channel in branches.items() if channel.time_s.size},
+        inputs={key: channel for key, channel in inputs.items() if channel.good.any()},
+    )
+    corrected = {key: channel for key, channel in corrected.items() if channel.time_s.size}
+    return Recording(drive=drive, corrected=corrected, report=source.report(channels))
 
 
 class SignalSource(ABC):
@@ -268,7 +274,7 @@ class SignalSource(ABC):
         signals = {item.name: item.signal for item in layout.input}
         channels = {name: self.samples(signals.get(name, name))[0] for name in base_inputs(layout, names)}
         if not channels or not all(channel.good.any() for channel in channels.values()):
-            return Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_))
+            return _NOTHING
         time_s = max(channels.values(), key=lambda channel: len(channel.time_s)).time_s
         values, good = {}, np.ones(len(time_s), np.bool_)
         for name, channel in channels.items():
@@ -300,11 +306,9 @@ class FrameSource(SignalSource):
         self.frames = frames.take(self.time.order) if self.time.disordered or self.time.clock_steps else frames
         self._messages: dict[str, tuple[Frames, Array, Mask]] = {}
         self.ignored: Counter[str] = Counter()
-        if database.layout.bus:
-            known = {bus.channel for bus in database.layout.bus}
-            counts = np.bincount(frames.channel, minlength=len(frames.channels)).tolist()
-            found = zip(frames.channels, counts, strict=True)
-            self.ignored.update({channel: count for channel, count in found if channel not in known and count})
+        self._named = [bus.channel for bus in database.layout.bus]
+        if self._named:
+            self._ignore(frames.channel, self._named)
 
     def samples(self, signal_name: str) -> tuple[Channel, Mapping[str, Mask]]:  # noqa: D102 (as above)
         message, signal = self.database.signal(signal_name)
@@ -322,19 +326,23 @@ class FrameSource(SignalSource):
         names = [branch.source for branch in self.database.layout.branch if not branch.computed]
         messages = [self.database.signal(name)[0] for name in names]
         expected = ", ".join(dict.fromkeys(f"{message.name} ({_hex(_key(message))})" for message in messages))
-        wanted = [f" on {', '.join(names)}" if self.database.layout.bus else "" for names in self._channels()]
+        here, wanted = (
+            f" on {', '.join(names)}" if self._named else "" for names in (self.frames.channels, self._named)
+        )
         keys = np.unique(self.frames.key).tolist()
         more = f" and {len(keys) - _MOST_LISTED} more" if len(keys) > _MOST_LISTED else ""
         return (
-            f"it has the identifiers {', '.join(map(_hex, keys[:_MOST_LISTED]))}{more}{wanted[0]}; expected "
-            f"{expected or 'signals of the inputs'}{wanted[1]}"
+            f"it has the identifiers {', '.join(map(_hex, keys[:_MOST_LISTED]))}{more}{here}; expected "
+            f"{expected or 'signals of the inputs'}{wanted}"
         )
 
-    def _channels(self) -> tuple[Sequence[str], Sequence[str]]:
-        """Channels of the log, and of the layout."""
-        return self.frames.channels, [bus.channel for bus in self.database.layout.bus]
-
     def report(self, channels: tuple[ChannelReport, ...]) -> RecordingReport:  # noqa: D102 (as above)
+        here = self.frames.channels
+        lacking = ", ".join(channel for channel in self._named if channel not in here)
+        unfit = (
+            f"no channel {lacking} in it, which has {', '.join(here)}",
+            "correct channel in [[bus]], or record that bus",
+        )
         return RecordingReport(
             channels=channels,
             frames=len(self.frames),
@@ -344,14 +352,8 @@ class FrameSource(SignalSource):
             disordered=self.time.disordered,
             clock_steps=self.time.clock_steps,
             ignored=dict(self.ignored),
-            unfit=self._unfit(),
+            unfit=unfit if lacking else (),
         )
-
-    def _unfit(self) -> tuple[str, ...]:
-        here, named = self._channels()
-        lacking = ", ".join(channel for channel in named if channel not in here)
-        what = f"no channel {lacking} in it, which has {', '.join(here)}"
-        return (what, "correct channel in [[bus]], or record that bus") if lacking else ()
 
     def _of_message(self, signal_name: str) -> tuple[Frames, Array, Mask]:
         """Frames of the message of a signal, their times, and whether their end-to-end protection is right."""
@@ -379,9 +381,13 @@ class FrameSource(SignalSource):
                 f'write [[bus]] with name = "hv", channel = "{channels[main]}", dbc = "{self.database.layout.dbc}" in '
                 f"place of dbc"
             )
-        strays = {bus: count for bus, count in zip(channels, counts.tolist(), strict=True) if bus != channels[main]}
-        self.ignored.update({bus: count for bus, count in strays.items() if count})
+        self._ignore(channel, [channels[main]])
         return np.asarray(channel == main)
+
+    def _ignore(self, channel: NDArray[np.uint32], known: Sequence[str]) -> None:
+        """Count frames that come from other channels."""
+        counts = zip(self.frames.channels, np.bincount(channel, minlength=len(self.frames.channels)), strict=True)
+        self.ignored.update({bus: int(count) for bus, count in counts if count and bus not in known})
 
 
 class TableSource(SignalSource):
@@ -425,7 +431,7 @@ class TableSource(SignalSource):
         """A column, in the unit of the DBC where both units are known; see the class above."""
         header = self.table.header(signal_name)
         if header is None:
-            return Channel(time_s=np.zeros(0), value=np.zeros(0), good=np.zeros(0, np.bool_)), {}
+            return _NOTHING, {}
         signal = self.database.signal(signal_name)[1]
         value = self.table.columns[header] * _ratio(self.table.units.get(header, ""), signal.unit or "")
         text = self.table.bad.get(header, np.zeros(len(value), np.bool_))
@@ -459,7 +465,3 @@ def _key(message: Message) -> int:
 
 def _hex(key: int) -> str:
     return f"0x{key & ~EXTENDED_BIT:08X}" if key & EXTENDED_BIT else f"0x{key:03X}"
-
-
-def _present(channels: Mapping[str, Channel]) -> dict[str, Channel]:
-    return {name: channel for name, channel in channels.items() if channel.time_s.size}

@@ -24,7 +24,6 @@ from calibrator.drive import Array, Mask
 from calibrator.drives.charge import GAP_PERIODS
 from calibrator.errors import LogError
 from calibrator.files.layout_files import check_formulas
-from calibrator.recordings.candump import is_candump
 from calibrator.recordings.frame_arrays import repaired_time
 from calibrator.recordings.log_files import (
     UNREADABLE,
@@ -37,6 +36,7 @@ from calibrator.recordings.log_files import (
     text_head,
 )
 from calibrator.recordings.mf4 import is_bus_log, read_mf4_table
+from calibrator.recordings.text_logs import is_candump
 from ecu_node.core.signals import AMPERE, usual_unit
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError

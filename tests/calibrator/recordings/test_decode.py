@@ -1,5 +1,5 @@
 from collections.abc import Sequence
-from math import inf, isfinite, nan
+from math import isfinite, nan
 from typing import Any, Literal
 
 import cantools
@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from calibrator.recordings.decode import decode_signal, p01_is_sound, raw_values, signal_range
+from calibrator.recordings.decode import decode_signal, p01_is_sound
 from ecu_node.errors import DatabaseError
 from ecu_node.summary import means_not_available
 
@@ -74,14 +74,6 @@ def by_cantools(message: Message, row: bytes) -> dict[str, Any]:
     values = message.decode(row, decode_choices=False, allow_truncated=True)
     assert isinstance(values, dict)
     return values
-
-
-def decoded_by_cantools(message: Message, row: bytes, *, scaling: bool = True) -> float:
-    values = message.decode(row, decode_choices=False, scaling=scaling)
-    assert isinstance(values, dict)
-    value = values["S"]
-    assert isinstance(value, int | float)
-    return value
 
 
 SIZES = st.sampled_from([1, 2, 7, 8, 12, 48, 64])
@@ -180,40 +172,6 @@ def test_a_frame_of_any_length_is_good_where_cantools_finds_the_signal(
         assert decoded.good[k] == isfinite(value)
 
 
-@given(signals(), st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=5))
-def test_every_signal_decodes_as_cantools_decodes_it(pair: tuple[Message, Signal], rows: list[bytes]) -> None:
-    message, signal = pair
-    rows = [row[: message.length] for row in rows]
-    decoded = decode_signal(message, signal, *payloads(rows, 64 if message.length > 8 else 8))
-    expected = np.array([decoded_by_cantools(message, row) for row in rows], np.float64)
-    np.testing.assert_allclose(decoded.value, expected, rtol=1e-15)
-    assert decoded.present.all()
-    assert np.array_equal(decoded.good, np.isfinite(expected))
-
-
-@given(signals(), st.binary(min_size=64, max_size=64))
-def test_raw_values_are_those_of_cantools_to_the_bit(pair: tuple[Message, Signal], row: bytes) -> None:
-    message, signal = pair
-    row = row[: message.length]
-    raw, _ = raw_values(signal, *payloads([row], 64))
-    expected = decoded_by_cantools(message, row, scaling=False)
-    assert raw[0] == expected or np.isnan(raw[0])
-
-
-def test_a_frame_too_short_for_the_signal_is_present_but_not_good() -> None:
-    message, signal = one_signal(16, 16, scale=0.1)
-    decoded = decode_signal(message, signal, *payloads([b"\1\1\1\1", b"\1\1\1"], 8))
-    assert decoded.present.tolist() == [True, True]
-    assert decoded.good.tolist() == [True, False]
-    assert np.isnan(decoded.value[1])
-
-
-def test_a_signal_beyond_eight_bytes_is_not_good_in_classic_frames() -> None:
-    message, signal = one_signal(128, 16, size=64)
-    decoded = decode_signal(message, signal, *payloads([bytes(8)], 8))
-    assert not decoded.good.any()
-
-
 @pytest.mark.parametrize("code", [-32768, 0x8000])
 def test_the_code_for_not_available_is_not_good_however_the_dbc_writes_it(code: int) -> None:
     message, signal = one_signal(0, 16, signed=True, scale=0.02, choices={code: "SNA", 1: "Standby"})
@@ -253,54 +211,6 @@ def test_a_value_outside_the_range_of_the_dbc_is_not_good(limits: tuple[float, f
     assert decoded.good.tolist() == good
 
 
-def ranged_signal(minimum: float | None, maximum: float | None) -> Signal:
-    return one_signal(0, 16, scale=0.02, limits=(minimum, maximum))[1]
-
-
-@pytest.mark.parametrize(
-    ("minimum", "maximum", "low", "high"),
-    [
-        (-5.0, 7.0, -5.0, 7.0),
-        (None, 7.0, -inf, 7.0),
-        (0, 0, -inf, inf),
-        (None, None, -inf, inf),
-    ],
-)
-def test_range_is_what_the_dbc_says(minimum: float | None, maximum: float | None, low: float, high: float) -> None:
-    limits = signal_range(ranged_signal(minimum, maximum))
-    assert (limits.low, limits.high) == (low, high)
-
-
-def test_a_negative_factor_turns_the_range_round() -> None:
-    limits = signal_range(ranged_signal(-5.0, 7.0), -2.0)
-    assert (limits.low, limits.high) == (-14.0, 10.0)
-
-
-def test_limits_hold_with_rounding_and_nothing_beyond_does() -> None:
-    value = np.array([-5.0, 7.0 + 1e-9, 7.02, -5.02, np.nan, np.inf])
-    assert signal_range(ranged_signal(-5.0, 7.0)).holds(value).tolist() == [True, True, False, False, False, False]
-
-
-def test_the_limit_itself_is_good_in_spite_of_rounding() -> None:
-    message, signal = one_signal(0, 16, scale=0.1, limits=(0.0, 6553.3))
-    decoded = decode_signal(message, signal, *payloads([(65533).to_bytes(2, "little")], 8))
-    assert decoded.good.all()
-
-
-def test_a_multiplexed_signal_is_present_only_on_its_page() -> None:
-    database = cantools.database.load_string(MULTIPLEXED)
-    assert isinstance(database, Database)
-    message = database.get_message_by_name("Mux")
-    rows = [bytes([page, 7, 0, 0, 0, 0, 0, 0]) for page in (0, 1, 2, 0x10, 0x11)]
-    first = decode_signal(message, message.get_signal_by_name("First"), *payloads(rows, 8))
-    second = decode_signal(message, message.get_signal_by_name("Second"), *payloads(rows, 8))
-    assert first.present.tolist() == [True, False, False, True, False]
-    assert second.present.tolist() == [False, True, False, False, True]
-    assert first.good.tolist() == first.present.tolist()
-    np.testing.assert_allclose(first.value[first.good], 0.7)
-    np.testing.assert_allclose(second.value[second.good], 0.5)
-
-
 def test_extended_multiplexing_of_a_dbc_is_pages_within_pages() -> None:
     database = cantools.database.load_string(NESTED)
     assert isinstance(database, Database)
@@ -309,15 +219,6 @@ def test_extended_multiplexing_of_a_dbc_is_pages_within_pages() -> None:
     decoded = decode_signal(message, message.get_signal_by_name("SubPage"), *payloads(rows, 8))
     assert decoded.good.tolist() == decoded.present.tolist() == [False, True, True, True, False, False]
     np.testing.assert_allclose(decoded.value[decoded.good], 0.5)
-
-
-def test_a_frame_too_short_for_its_multiplexer_is_not_good() -> None:
-    database = cantools.database.load_string(MULTIPLEXED)
-    assert isinstance(database, Database)
-    message = database.get_message_by_name("Mux")
-    decoded = decode_signal(message, message.get_signal_by_name("First"), *payloads([b""], 8))
-    assert decoded.present.tolist() == [True]
-    assert decoded.good.tolist() == [False]
 
 
 def test_a_number_of_more_than_64_bits_is_refused() -> None:
@@ -336,13 +237,6 @@ def test_the_crc_of_profile_1_agrees_with_the_e2e_package(content: bytes, data_i
     data, length = payloads([bytes(right), bytes(wrong)], 64)
     expected = [e2e_p01_check(row, data_id, length=len(row)) for row in (right, wrong)]
     assert p01_is_sound(data, length, data_id).tolist() == expected == [True, False]
-
-
-def test_a_counter_of_15_is_wrong() -> None:
-    row = bytearray(b"\0\x0f\1\2")
-    e2e_p01_protect(row, 1, length=4, increment_counter=False)
-    assert not p01_is_sound(*payloads([bytes(row)], 8), 1).any()
-    assert not e2e_p01_check(row, 1, length=4)
 
 
 def test_a_frame_without_room_for_crc_and_counter_is_wrong() -> None:

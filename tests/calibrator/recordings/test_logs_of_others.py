@@ -447,6 +447,9 @@ def test_mistake_with_a_log_is_one_line(
     require_one_line(calibrator("kirchhoff", tmp_path / name, "--layout", layout), words)
 
 
+PYTHON_CAN = [f"python-can {kind}" for kind in ("CSV", "ASC", "BLF", "TRC", "MF4", "candump")]
+DAMAGED = [*PYTHON_CAN, "SavvyCAN, packed", "candump -ta", "archive"]
+"""A log of each reader."""
 DAMAGES: dict[str, Callable[[bytes], bytes]] = {
     "empty": lambda _: b"",
     "cut at its end": lambda whole: whole[: len(whole) // 2 + 7],
@@ -456,7 +459,7 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("program", [name for name in LOGS if name != "folder"])
+@pytest.mark.parametrize("program", DAMAGED)
 def test_damaged_log_is_one_line_or_counted(tmp_path: Path, layout: Path, program: str, damage: str) -> None:
     name, write = LOGS[program]
     log = tmp_path / name

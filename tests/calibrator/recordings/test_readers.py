@@ -1,16 +1,13 @@
 from pathlib import Path
 
-import can
 import numpy as np
 import pytest
 
 from calibrator.drive import Array, Channel, Drive
 from calibrator.errors import LogError
 from calibrator.recordings.canlog import encode_message, write_candump, write_drive_log
-from calibrator.recordings.frames import read_frames
-from calibrator.recordings.readers import drive_from_frames, read_drive, read_recording
+from calibrator.recordings.readers import read_drive, read_recording
 from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.errors import DatabaseError
 from ecu_node.layout import read_layout
 
 POWER_DBC = """VERSION ""
@@ -100,17 +97,6 @@ def test_power_is_divided_by_the_latest_voltage_at_or_before_it(
     np.testing.assert_allclose(motor.value[1:], [-10_000 / 400.0, -10_000 / 200.0])
 
 
-def test_corrected_power_is_divided_by_the_voltage_too(tmp_path: Path, power_database: VehicleDatabase) -> None:
-    dbc = POWER_DBC + 'BO_ 4 Better: 8 B\n SG_ Better : 0|16@1- (0.5,0) [-1000|1000] "kW" A\n'
-    (tmp_path / "power.dbc").write_text(dbc.replace("BU_: A", "BU_: A B"))
-    (tmp_path / "power.toml").write_text(POWER_LAYOUT + 'corrected = "Better.Better"\n')
-    database = read_database(read_layout(tmp_path / "power.toml"))
-    log = log_of(tmp_path / "x.log", [(0.0, "002#A00F"), (0.1, "001#1400"), (0.11, "004#1600")])
-    recording = read_recording(log, database, vehicle="v", name="d")
-    assert recording.drive.branches["motor"].value.tolist() == [-10_000 / 400.0]
-    assert recording.corrected["motor"].value.tolist() == [-11_000 / 400.0]
-
-
 def test_codes_with_any_name_and_those_of_the_layout_are_no_currents_as_on_the_node(
     tmp_path: Path, power_database: VehicleDatabase
 ) -> None:
@@ -157,27 +143,12 @@ def test_a_voltage_older_than_the_timeout_makes_the_current_not_good(
     assert motor.good.tolist() == [True, False]
 
 
-def test_no_voltage_or_zero_voltage_makes_the_current_not_good(tmp_path: Path, power_database: VehicleDatabase) -> None:
-    zero = log_of(tmp_path / "x.log", [(0.0, "002#0000"), (0.1, "001#1400")])
-    none = log_of(tmp_path / "y.log", [(0.1, "001#1400")])
-    assert not read_motor(zero, power_database).good.any()
-    assert not read_motor(none, power_database).good.any()
-
-
 def test_a_log_without_any_branch_lists_what_it_has_and_what_is_expected(
     tmp_path: Path, database: VehicleDatabase
 ) -> None:
     path = log_of(tmp_path / "x.log", [(0.0, "7FF#00"), (0.1, "18DAF110#00")])
     with pytest.raises(LogError, match=r"x\.log: no branch .* 0x7FF, 0x18DAF110; expected HV_Battery \(0x110\)"):
         read_drive(path, database, vehicle="v", name="d")
-
-
-def test_absent_branches_and_inputs_are_reported(tmp_path: Path, database: VehicleDatabase) -> None:
-    drive = Drive(vehicle="v", name="d", branches={"battery": steady([1.0, 2.0])}, inputs={})
-    write_drive_log(tmp_path / "d.log", drive, database)
-    recording = read_recording(tmp_path / "d.log", database, vehicle="v", name="d")
-    assert set(recording.drive.branches) == {"battery"}
-    assert "no frames of motor, auxiliary, dcdc, motor_rear, torque" in str(recording.report.notices()[0])
 
 
 def test_an_input_that_is_never_available_is_left_out_and_reported(tmp_path: Path, database: VehicleDatabase) -> None:
@@ -204,48 +175,3 @@ def test_corrected_frames_are_read_beside_the_measured_ones(tmp_path: Path, data
     recording = read_recording(tmp_path / "d.log", database, vehicle="v", name="d")
     np.testing.assert_allclose(recording.drive.branches["motor"].value, [-10.0, -20.0])
     np.testing.assert_allclose(recording.corrected["motor"].value, [-9.0, -18.0])
-
-
-def test_another_message_on_another_bus_does_no_harm(tmp_path: Path, power_database: VehicleDatabase) -> None:
-    path = tmp_path / "x.log"
-    path.write_text("(1.000000) can0 00000003#0100\n(1.100000) can1 00000004#0200\n")
-    assert read_drive(path, power_database, vehicle="v", name="d").branches["battery"].good.all()
-
-
-def test_disorder_and_clock_steps_are_reported(tmp_path: Path, power_database: VehicleDatabase) -> None:
-    lines = [(t, "00000003#0100") for t in (0.0, 0.2, 0.1, 5000.0)]
-    report = read_recording(log_of(tmp_path / "x.log", lines), power_database, vehicle="v", name="d").report
-    assert [*map(str, report.notices()[-2:])] == [
-        "1 frames out of order, sorted",
-        "the clock was set 1 times, each step became a gap of 60 s",
-    ]
-
-
-def test_a_dbc_without_the_named_signal_is_refused_with_the_signals_it_has(tmp_path: Path) -> None:
-    (tmp_path / "power.dbc").write_text(POWER_DBC.replace("SG_ Current", "SG_ Amperes"))
-    (tmp_path / "power.toml").write_text(POWER_LAYOUT)
-    with pytest.raises(DatabaseError, match=r"message Batt has no signal 'Current', .*it has Amperes"):
-        read_database(read_layout(tmp_path / "power.toml"))
-
-
-@pytest.mark.parametrize("suffix", [".asc", ".blf", ".trc"])
-def test_the_format_of_the_log_does_not_change_the_drive(
-    tmp_path: Path, database: VehicleDatabase, suffix: str
-) -> None:
-    rng = np.random.default_rng(3)
-    written = Drive(vehicle="v", name="d", branches={"battery": steady(rng.normal(0, 100, 50).tolist())}, inputs={})
-    write_drive_log(tmp_path / "d.log", written, database)
-    with can.Logger(tmp_path / f"d{suffix}") as log:
-        for message in can.LogReader(tmp_path / "d.log"):
-            message.channel = 0
-            log.on_message_received(message)
-    one = read_drive(tmp_path / "d.log", database, vehicle="v", name="d").branches["battery"]
-    other = read_drive(tmp_path / f"d{suffix}", database, vehicle="v", name="d").branches["battery"]
-    np.testing.assert_array_equal(one.value, other.value)
-    np.testing.assert_allclose(one.time_s, other.time_s, atol=1e-3)
-
-
-def test_frames_of_a_bus_and_of_a_file_give_the_same_drive(tmp_path: Path, power_database: VehicleDatabase) -> None:
-    path = log_of(tmp_path / "x.log", [(0.0, "002#A00F"), (0.1, "001#1400")])
-    one = drive_from_frames(read_frames(path), power_database, vehicle="v", name="d", where="bus")
-    np.testing.assert_array_equal(one.drive.branches["motor"].value, read_motor(path, power_database).value)

@@ -12,8 +12,7 @@ import pandas as pd
 import pytest
 from asammdf import MDF, Signal
 
-from calibrator.errors import LogError
-from calibrator.recordings.tables import is_table, layout_from_branches, read_table
+from calibrator.recordings.tables import is_table, read_table
 from tests.calibrator.command_here import calibrator
 
 ROWS = 100
@@ -142,12 +141,6 @@ def test_rows_that_cannot_be_used_are_counted(tmp_path: Path) -> None:
     assert "2 damaged lines or frames left out" in found["notices"]
 
 
-def test_what_was_found_of_a_table_is_said(tmp_path: Path) -> None:
-    csv(frame(time=np.arange(ROWS) * 100), sep=";", decimal=",")(tmp_path / "x.csv")
-    (found,) = [text for text in before(tmp_path / "x.csv", "--branches", BRANCHES)["notices"] if "rows" in text]
-    assert found == "100 rows, columns between ';', decimal ',', utf-8-sig; time 'time' in ms"
-
-
 def test_times_without_their_fractions_are_said(tmp_path: Path) -> None:
     csv(frame(time=TIME_S.astype(int)))(tmp_path / "x.csv")
     told = " ".join(before(tmp_path / "x.csv", "--branches", BRANCHES)["notices"])
@@ -166,13 +159,6 @@ def test_column_of_texts_is_named_beside_the_others(tmp_path: Path) -> None:
         table = (tmp_path / "x.csv",) if command == "kirchhoff" else ("--log", tmp_path / "x.csv")
         assert why in calibrator(command, *table, "--layout", tmp_path / "car.toml").stdout
     assert why.partition(": ")[2] in calibrator("layout", "init", tmp_path / "x.csv").stderr
-
-
-def test_rate_of_the_table_gives_period_and_timeouts(tmp_path: Path) -> None:
-    csv(frame().rename(columns={"time": "t [min]"}).assign(**{"t [min]": np.arange(ROWS) / 6}))(tmp_path / "x.csv")
-    layout = layout_from_branches(BRANCHES, table=read_table(tmp_path / "x.csv")).layout
-    assert (layout.period_s, layout.branch[0].timeout_s) == (10.0, 35.0)
-    assert before(tmp_path / "x.csv", "--branches", BRANCHES)["valid"] == ROWS
 
 
 @pytest.mark.parametrize(("step", "rows", "seconds"), [(1, 100, 99), (10, 100, 990), (10, 7000, 69.99), (500, 9, 4)])
@@ -208,12 +194,6 @@ def powers() -> pd.DataFrame:
 def test_layout_names_columns_in_place_of_signals(tmp_path: Path) -> None:
     (tmp_path / "car.toml").write_text(LAYOUT)
     csv(powers())(tmp_path / "x.csv")
-    require_sum(before(tmp_path / "x.csv", "--layout", tmp_path / "car.toml"))
-
-
-def test_unit_of_the_layout_stands_where_the_header_has_none(tmp_path: Path) -> None:
-    (tmp_path / "car.toml").write_text(LAYOUT.replace('"Ibat"', '"Ibat", unit = "mA"'))
-    csv(powers().rename(columns={"Ibat [A]": "Ibat"}).assign(Ibat=1e3 * BATTERY_A))(tmp_path / "x.csv")
     require_sum(before(tmp_path / "x.csv", "--layout", tmp_path / "car.toml"))
 
 
@@ -262,23 +242,6 @@ def test_formula_of_columns_is_a_branch(tmp_path: Path) -> None:
     require_sum(before(tmp_path / "x.csv", "--branches", "battery=Ibat,-motor=Imot,-heater=P*1000/Ubat"))
 
 
-def test_tables_are_imported(tmp_path: Path) -> None:
-    (tmp_path / "car.toml").write_text(LAYOUT)
-    for vehicle in ("V1", "V2"):
-        (tmp_path / "fleet" / vehicle).mkdir(parents=True)
-        powers().to_parquet(tmp_path / "fleet" / vehicle / "monday.parquet")
-        csv(powers(), sep=";")(tmp_path / "fleet" / vehicle / "tuesday.csv.gz")
-    options = ("--layout", tmp_path / "car.toml")
-    done = calibrator("import", tmp_path / "fleet", *options, "--out", tmp_path / "store", "--json")
-    assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
-    assert [(d["vehicle"], d["name"], d["branches"]) for d in report["drives"]] == [
-        (vehicle, name, ["battery", "motor", "heater"]) for vehicle in ("V1", "V2") for name in ("monday", "tuesday")
-    ]
-    again = calibrator("import", tmp_path / "fleet", *options, "--out", tmp_path / "store", "--json")
-    assert len(json.loads(again.stdout)["already_there"]) == 4
-
-
 @pytest.mark.parametrize(
     ("text", "branches", "words"),
     [
@@ -312,27 +275,6 @@ def test_damaged_table_is_one_line(tmp_path: Path, suffix: str) -> None:
     assert done.returncode == 1
     assert f"x{suffix}: not a readable" in done.stderr
     assert len(done.stderr.splitlines()) == 1, done.stderr
-
-
-def test_damaged_description_in_a_feather_is_one_line(tmp_path: Path) -> None:
-    frame().to_feather(tmp_path / "x.feather")
-    whole = (tmp_path / "x.feather").read_bytes()
-    (tmp_path / "x.feather").write_bytes(whole.replace(b'{"index_columns"', b'\0"index_columns"'))
-    done = calibrator("kirchhoff", tmp_path / "x.feather", "--branches", BRANCHES)
-    assert done.returncode == 1
-    assert "x.feather: not a readable table: " in done.stderr
-
-
-def test_folder_of_tables_is_refused_where_one_is_needed(tmp_path: Path) -> None:
-    for name in ("x.csv", "y.csv"):
-        csv(frame())(tmp_path / name)
-    done = calibrator("kirchhoff", tmp_path, "--branches", BRANCHES)
-    assert "2 files in it; give one table, or import the folder as drives" in done.stderr
-
-
-def test_table_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match=r"x\.csv: no such file; give a table that is there"):
-        read_table(tmp_path / "x.csv")
 
 
 def test_log_of_frames_is_no_table_for_a_layout_without_dbc(tmp_path: Path) -> None:
