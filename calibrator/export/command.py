@@ -19,13 +19,7 @@ from calibrator.export.core import (
     s_records,
 )
 from calibrator.export.tool_formats import a2l_text, cdfx_document, csv_text, dcm_text
-from calibrator.files.folders import (
-    made_folder,
-    remove_abandoned,
-    require_own_file,
-    require_possible_file,
-    write_files,
-)
+from calibrator.files.folders import require_possible_file, write_files
 from calibrator.options import ExportFormat
 from calibrator.terminal.options import JsonOption, LayoutOption
 from calibrator.terminal.progress import shown
@@ -63,13 +57,10 @@ def export(
     reading = shown(params, "read parameters", len(params), "files") if len(params) > 1 else params
     tables = [read_checked(path, database, vehicle) for path in reading]
     content = _content(tables, format_, output, elf)
-    require_own_file(output)
+    require_possible_file(output)
     if output.exists() and not replace and output.read_bytes() != content:
         raise ExportError(f"{output}: exists; choose another --output, or replace it with --replace")
-    require_possible_file(output)
-    with made_folder(output.parent):
-        remove_abandoned([output])
-        write_files({output: content})
+    write_files({output: content})
     notices = []
     if format_ is ExportFormat.C and (foreign := foreign_protection(database)):
         notices.append(

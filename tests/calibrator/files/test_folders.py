@@ -47,35 +47,12 @@ def test_what_a_killed_process_left_is_removed_and_that_of_a_running_one_stays(t
     assert sorted(path.name for path in tmp_path.iterdir()) == [".out.partial-1", "out"]
 
 
-def test_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("1")
-    with (
-        pytest.raises(FleetError, match=r"file/out: cannot be made: .*file is a file; choose another folder"),
-        whole_folder(tmp_path / "file" / "out"),
-    ):
-        pass
-
-
 @pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
 @pytest.mark.parametrize("name", ["x", "x/y/z"])
 def test_folder_in_which_the_system_makes_nothing_is_refused(require: Callable[[Path], None], name: str) -> None:
     # No right forbids it to root; only trying tells.
     with pytest.raises(FleetError, match=rf"^/proc/{name}: nothing can be made in /proc: .*; choose another folder$"):
         require(Path("/proc") / name)
-
-
-@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
-def test_trial_leaves_nothing_behind(require: Callable[[Path], None], tmp_path: Path) -> None:
-    for out in (tmp_path, tmp_path / "a", tmp_path / "a" / "b" / "c"):
-        require(out)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("require", [require_new_folder, require_possible_folder])
-def test_name_that_is_too_long_is_refused_at_the_start(require: Callable[[Path], None], tmp_path: Path) -> None:
-    with pytest.raises(FleetError, match=r"nothing can be made in .*: File name too long"):
-        require(tmp_path / "good" / ("x" * 300))
-    assert not list(tmp_path.iterdir())
 
 
 def test_link_is_not_replaced_wherever_it_leads(tmp_path: Path) -> None:
