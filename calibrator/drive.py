@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Array", "Channel", "Complex", "Drive", "DriveFile", "Mask"]
+__all__ = ["Array", "Channel", "Complex", "Drive", "DriveFile", "Equipment", "Mask"]
 
 Array = NDArray[np.floating[Any]]
 """Real numbers; always double precision in practice."""
@@ -87,3 +87,21 @@ class DriveFile:
     place: str
     size: int = 0
     version: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Equipment:
+    """Which branches and model inputs a fleet has, and what it lacks of the layout's.
+
+    Attributes
+    ----------
+    branches, inputs, fleet_inputs : tuple of str
+        Names of its branches, and of its model inputs: for each vehicle, and for the model that all share.
+    notices : tuple of str
+        What the layout has and the fleet lacks.
+    """
+
+    branches: tuple[str, ...]
+    inputs: tuple[str, ...]
+    fleet_inputs: tuple[str, ...]
+    notices: tuple[str, ...]

@@ -11,11 +11,13 @@ import re
 import zlib
 from array import array
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import msgspec
 
-from ecu_node.database import VehicleDatabase
-from ecu_node.layout import SignalName
+if TYPE_CHECKING:
+    from ecu_node.database import VehicleDatabase
+    from ecu_node.layout import SignalName
 
 # ---- what a block is
 
@@ -88,7 +90,7 @@ def means_not_available(name: str) -> bool:
     return _NOT_AVAILABLE.fullmatch(spaced.strip().lower()) is not None
 
 
-def codes_of_no_value(database: VehicleDatabase, name: SignalName) -> frozenset[int]:
+def codes_of_no_value(database: "VehicleDatabase", name: "SignalName") -> frozenset[int]:
     """Raw codes of a signal that are no values.
 
     Parameters

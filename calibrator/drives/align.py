@@ -36,7 +36,6 @@ MAX_SAMPLES = 20_000_000
 """23 days at 0.1 s; a drive that claims more has a wrong time."""
 
 _STALE, _NOT_GOOD = "stale", "not good"
-_UNDEFINED, _UNCOVERED = "undefined", "uncovered"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,10 +54,6 @@ class Samples:
         Inputs in the unit of the DBC; NaN where not valid.
     valid : ndarray of bool, shape (T,)
         Whether the instant may be used.
-    masked : mapping of str to int
-        How many instants are not valid for which reason; an instant may have several. ``stale``: frames too far apart.
-        ``not good``: frames there, but labelled as not good. ``undefined``: a derived input has no finite value.
-        ``uncovered``: instants of the drive outside the span that all channels cover; these are not among the T.
     """
 
     branch_names: tuple[str, ...]
@@ -67,7 +62,6 @@ class Samples:
     currents_a: Array
     inputs: Array
     valid: Mask
-    masked: Mapping[str, int]
 
     def with_inputs(self, names: Sequence[str]) -> "Samples":
         """Return the same samples with those of the inputs that are among some names, in their order."""
@@ -154,7 +148,13 @@ def align(drive: Drive, layout: Layout, branches: Sequence[str], *, inputs: Sequ
     """
     names = tuple(layout.model_inputs if inputs is None else inputs)
     recorded = sorted(base_inputs(layout, names))
-    _require(drive, branches, recorded)
+    missing = [name for name in branches if name not in drive.branches]
+    missing += [name for name in recorded if name not in drive.inputs]
+    if missing:
+        raise DriveError(
+            f"vehicle {drive.vehicle}, drive {drive.name}: no {', '.join(missing)}; it has "
+            f"{', '.join([*drive.branches, *drive.inputs])}; choose branches and inputs that all drives have"
+        )
     limits = {branch.name: branch.timeout_s for branch in layout.branch if branch.name in branches}
     limits |= dict.fromkeys(recorded, layout.max_age_s)
     channels = {name: drive.branches[name] for name in branches} | {name: drive.inputs[name] for name in recorded}
@@ -166,10 +166,8 @@ def align(drive: Drive, layout: Layout, branches: Sequence[str], *, inputs: Sequ
         if base_inputs(layout, [item.name]) <= recorded_inputs.keys():
             recorded_inputs[item.name] = evaluate_formula(item.formula, recorded_inputs)
     matrix = np.column_stack([np.zeros((len(time_s), 0)), *(recorded_inputs[name] for name in names)])
-    reasons[_UNDEFINED] = ~np.all(np.isfinite(matrix), axis=1) & ~(reasons[_STALE] | reasons[_NOT_GOOD])
-    valid = ~np.any(list(reasons.values()), axis=0)
+    valid = np.all(np.isfinite(matrix), axis=1) & ~(reasons[_STALE] | reasons[_NOT_GOOD])
     currents_a = np.column_stack([values[name] for name in branches])
-    masked = {reason: int(mask.sum()) for reason, mask in reasons.items()}
     return Samples(
         branch_names=tuple(branches),
         input_names=names,
@@ -177,7 +175,6 @@ def align(drive: Drive, layout: Layout, branches: Sequence[str], *, inputs: Sequ
         currents_a=np.where(valid[:, None], currents_a, np.nan),
         inputs=np.where(valid[:, None], matrix, np.nan),
         valid=valid,
-        masked=masked | {_UNCOVERED: max(int(drive.duration_s / layout.period_s) + 1 - len(time_s), 0)},
     )
 
 
@@ -245,16 +242,6 @@ def at_instants(channel: Channel, time_s: Array, limit_s: float) -> tuple[Array,
     value, label = _interpolated(channel, time_s, limit_s)
     good_s = channel.time_s[channel.good]
     return value, (label == 0) & (time_s >= good_s[0]) & (time_s <= good_s[-1])
-
-
-def _require(drive: Drive, branches: Sequence[str], inputs: Sequence[str]) -> None:
-    missing = [name for name in branches if name not in drive.branches]
-    missing += [name for name in inputs if name not in drive.inputs]
-    if missing:
-        raise DriveError(
-            f"vehicle {drive.vehicle}, drive {drive.name}: no {', '.join(missing)}; it has "
-            f"{', '.join([*drive.branches, *drive.inputs])}; choose branches and inputs that all drives have"
-        )
 
 
 def _time_base(good_s: Sequence[Array], period_s: float, where: str) -> Array:

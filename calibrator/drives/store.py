@@ -31,6 +31,7 @@ __all__ = [
     "is_plain_name",
     "iterate_drives",
     "list_drives",
+    "name_problem",
     "read_drive_file",
     "recording_digest",
     "require_plain_name",
@@ -58,6 +59,15 @@ def is_plain_name(name: str) -> bool:
     return _PLAIN_NAME.fullmatch(name) is not None and not name.endswith((" ", "."))
 
 
+def name_problem(name: str, what: str) -> str:
+    """Why a vehicle or drive cannot have a name; empty if it can; as :func:`require_plain_name`."""
+    expected = (
+        "expected 1 to 64 letters A to Z, digits, blanks or _ . + @ -, not starting with a dash, dot, +, @ or blank, "
+        "not ending with a dot or blank; rename it"
+    )
+    return "" if is_plain_name(name) else f"{what} {name[:80]!r} cannot be used; {expected}"
+
+
 def require_plain_name(name: str, what: str) -> None:
     """Refuse the name of a vehicle or drive that cannot be a file name on every system.
 
@@ -68,11 +78,8 @@ def require_plain_name(name: str, what: str) -> None:
         and blanks, does not start with a letter, a digit or ``_``, or ends with a dot or a blank. `what` is named so,
         and is the start of the message.
     """
-    if not is_plain_name(name):
-        raise DriveError(
-            f"{what} {name[:80]!r} cannot be used; expected 1 to 64 letters A to Z, digits, blanks or _ . + @ -, "
-            f"not starting with a dash, dot, +, @ or blank, not ending with a dot or blank; rename it"
-        )
+    if problem := name_problem(name, what):
+        raise DriveError(problem)
 
 
 def write_drive(store: str | Path, drive: Drive, layout: Layout) -> str:

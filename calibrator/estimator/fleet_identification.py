@@ -27,8 +27,8 @@ from calibrator.published.state_space import pooled_poles, snr_from_power, solve
 from calibrator.sources.fleet_source import Equipment, FleetSource, find_fleet, probe_equipment, read_vehicles
 from calibrator.summaries.filter_bank import FilterBank, Poles, low_pass_bank, low_passes
 from calibrator.summaries.moments import DriveSummary
-from calibrator.summaries.summariser import Summariser
-from calibrator.summaries.vehicle_summary import read_samples, read_vehicle_summary
+from calibrator.summaries.summarise_fleet import read_samples, read_vehicle_summary
+from calibrator.summaries.summariser import summarise_samples
 from calibrator.terminal.progress import shown
 from calibrator.terminal.text import dumps, left_out_text, table
 from ecu_node.database import VehicleDatabase
@@ -168,12 +168,8 @@ def _error_db(bank: FilterBank, vehicles: Sequence[Sequence[Samples]], settling:
     """Mean over vehicles and branches of the power of the simulation error on held-out blocks, over the signal's."""
     summaries = []
     for drives in vehicles:
-        summariser = Summariser(bank, branches=drives[0].currents_a.shape[1], settling=settling)
-        for drive in drives:
-            summariser.add(drive.inputs, drive.currents_a, drive.valid)
-            summariser.end_drive()
         with suppress(DriveError):  # no block: this vehicle cannot judge
-            summaries.append(summariser.summary())
+            summaries.append(summarise_samples(drives, period_s=bank.period_s, bank=bank, settling=settling))
     snr_db = held_out_snr_db(summaries) if summaries else np.zeros(0)
     ratio = 10.0 ** (-snr_db[np.isfinite(snr_db)] / 10.0)
     return float(np.mean(10.0 * np.log10(ratio + TINY))) if ratio.size else np.inf

@@ -217,7 +217,6 @@ def summarise_junction(drives: Sequence[Drive], branches: Sequence[str], databas
         summary=summary,
         delays=delays,
         zero_current=zero_current_offsets(drives, branches, database),
-        recorded=frozenset(),
     )
 
 

@@ -376,7 +376,6 @@ def record_vehicles(
                 currents_a=np.where(steps_a > 0.0, np.rint(seen / safe) * safe, seen),
                 inputs=np.column_stack(list(inputs.values())),
                 valid=np.ones(len(trip), dtype=bool),
-                masked={},
             )
         )
     return replace(vehicles, samples=samples)

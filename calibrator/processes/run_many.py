@@ -37,10 +37,11 @@ from threadpoolctl import threadpool_limits
 
 from calibrator.errors import FleetError, internal_error
 from calibrator.terminal.options import TIME_LIMIT_S
+from calibrator.terminal.progress import progress_bar
 from ecu_node.errors import UserError
 from ecu_node.program import load_python_can
 
-__all__ = ["Failed", "Workers", "run_many", "try_many"]
+__all__ = ["Failed", "Workers", "run_many", "try_many", "try_many_shown"]
 
 AHEAD_PER_WORKER = 4
 """Items in flight: others go on while one takes long, and few results wait in memory. [1]"""
@@ -50,6 +51,7 @@ MEMORY_SHARE, LEAST_MEMORY_BYTES = 0.8, 1 << 30
 """Of the machine's memory for all processes that read; each may use this much at least. [1], [byte]"""
 PRELOADED = ["numba", "numpy", "pandas", "pyarrow.parquet", "threadpoolctl"]
 """Slow to import, so imported once, for all processes. Not this package: the fork server may find another copy."""
+MEGABYTE = 1_000_000
 REMEDY = "remove the file if it is damaged, cut it if it is long"
 
 _Item = TypeVar("_Item")
@@ -145,6 +147,29 @@ def try_many(
         a fault of the program. The others go on.
     """
     yield from _outcomes(partial(_attempt, function), items, workers, limit_s=limit_s)
+
+
+def try_many_shown(
+    function: Callable[[_Item], _Result],
+    items: Iterable[_Item],
+    workers: Workers,
+    *,
+    limit_s: float,
+    label: str,
+    size: int,
+    size_of: Callable[[_Item], int],
+) -> "Generator[tuple[_Item, _Result | Failed], None, None]":
+    """As :func:`try_many`, with a bar of the progress; `size` is that of all items. [byte]"""
+    done, total = 0, size // MEGABYTE + 1
+    with (
+        progress_bar(label, total, "MB") as progress,
+        closing(try_many(function, items, workers, limit_s=limit_s)) as outcomes,
+    ):
+        for item, outcome in outcomes:
+            yield item, outcome
+            done += size_of(item)
+            progress(done / MEGABYTE)
+        progress(total)
 
 
 def _attempt(function: Callable[[_Item], _Result], item: _Item) -> "_Result | Failed":

@@ -11,25 +11,24 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import TypeVar
 
-from calibrator.drive import Drive, DriveFile
+from calibrator.drive import Drive, DriveFile, Equipment
 from calibrator.drives.align import choose_inputs
 from calibrator.drives.fleet_id import read_fleet_ids
-from calibrator.drives.store import DRIVES_FOLDER, is_drive_file, is_plain_name, read_drive_file, require_plain_name
+from calibrator.drives.store import DRIVES_FOLDER, is_drive_file, is_plain_name, name_problem, read_drive_file
 from calibrator.errors import DriveError, FleetError, LogError
 from calibrator.files.storage import Entry, Storage, is_url, local_copy, open_storage, walk
-from calibrator.processes.run_many import Failed, Workers, try_many
+from calibrator.processes.run_many import Failed, Workers, try_many, try_many_shown
 from calibrator.recordings.frames import LOG_SUFFIXES, is_log
 from calibrator.recordings.log_files import files_in
 from calibrator.recordings.readers import read_drive
 from calibrator.terminal.options import TIME_LIMIT_S
-from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import few, few_reasons
 from ecu_node.database import VehicleDatabase
 from ecu_node.errors import UserError
-from ecu_node.layout import Layout
 from ecu_node.summary import SUFFIX, SummaryFile, decode_summary
 
 __all__ = [
@@ -48,7 +47,6 @@ _Vehicle = TypeVar("_Vehicle")
 LOGS_FOLDER = "logs"
 PROBED_VEHICLES = 7
 """How many vehicles are looked at to learn which branches and inputs the fleet has."""
-MEGABYTE = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,43 +79,31 @@ class FleetSource:
         return self.place.rstrip("/").rpartition("/")[2] if is_url(self.place) else Path(self.place).resolve().name
 
 
-@dataclass(frozen=True, kw_only=True)
-class Equipment:
-    """Which branches and model inputs a fleet has, and what it lacks of the layout's."""
-
-    branches: tuple[str, ...]
-    inputs: tuple[str, ...]
-    fleet_inputs: tuple[str, ...]
-    notices: tuple[str, ...]
+_Place = Storage | list[DriveFile]
+"""Where the drives of a vehicle are: a folder, which is listed again when it is its turn, or single files."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Names:
-    """Branches and inputs that a drive has."""
+class _Vehicles(Mapping[str, tuple[DriveFile, ...]]):
+    """Drives by vehicle; a large fleet is the names of its folders in memory."""
 
-    branches: tuple[str, ...]
-    inputs: tuple[str, ...]
-
-
-class _Folders(Mapping[str, tuple[DriveFile, ...]]):
-    """Drives by vehicle: a folder is listed again when it is its turn, so a large fleet is its names in memory."""
-
-    def __init__(self, folders: Mapping[str, "Storage | Sequence[DriveFile]"]) -> None:
-        self._folders = dict(sorted(folders.items()))
+    def __init__(self, places: Mapping[str, _Place]) -> None:
+        self._places = dict(sorted(places.items()))
 
     def __getitem__(self, vehicle: str) -> tuple[DriveFile, ...]:
-        folder = self._folders[vehicle]
-        drives = _drives_of(vehicle, folder, folder.contents()[1]) if isinstance(folder, Storage) else folder
-        return tuple(_without_twins(drives)[0])
+        place = self._places[vehicle]
+        if isinstance(place, Storage):
+            logs = [entry for entry in place.contents()[1] if _is_log(place, entry.name)]
+            place = _drives(vehicle, place.url, logs)
+        return tuple(twins[0] for _, twins in sorted(_by_name(place).items()) if len(twins) == 1)
 
     def __contains__(self, vehicle: object) -> bool:
-        return vehicle in self._folders
+        return vehicle in self._places
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._folders)
+        return iter(self._places)
 
     def __len__(self) -> int:
-        return len(self._folders)
+        return len(self._places)
 
 
 def find_fleet(place: str | Path) -> FleetSource:
@@ -169,124 +155,90 @@ def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
     FleetSource
         The drives, none perhaps, and what is left out; nothing is opened.
     """
-    search = _Search()
+    places: dict[str, dict[str, _Place]] = {}
+    sizes, strays, problems = Counter[str](), dict[str, str](), list[str]()
+
+    def add(url: str, logs: Sequence[Entry], folder: Storage | None) -> None:
+        vehicle = _folder_name(url).removesuffix(".zip")
+        what = [name_problem(vehicle, f"{url}: the folder's name, which names the vehicle,")]
+        what += [
+            name_problem(_drive_name(entry.name), f"{url}/{entry.name}: the file's name, which names the drive,")
+            for entry in logs
+        ]
+        problems.extend(filter(None, what))
+        if what[0]:
+            return
+        mine, drives = places.setdefault(vehicle, {}), _drives(vehicle, url, logs)
+        known = mine.get(url, [])
+        if isinstance(known, Storage):
+            return  # the whole folder was given as well
+        mine[url] = folder or list(dict.fromkeys([*known, *drives]))
+        sizes[vehicle] += sum(entry.size for entry in logs)
+        for name, twins in _by_name(drives if folder else [*known, *drives]).items():
+            if len(set(twins)) > 1:
+                where = " and ".join(item.place for item in twins)
+                problems.append(f"vehicle {vehicle}: drive {name} is in {where}; remove or rename one")
+
     for argument in arguments:
         try:
-            search.look_at(open_storage(argument), str(argument))
-        except UserError as error:
-            search.problems.append(str(error))
-    return search.fleet()
-
-
-@dataclass(kw_only=True)
-class _Search:
-    """What was found so far."""
-
-    folders: "dict[str, dict[str, Storage | list[DriveFile]]]" = field(default_factory=dict)
-    """Of each vehicle its drives by the folder that they are in; more than one is a problem."""
-    sizes: Counter[str] = field(default_factory=Counter)
-    strays: dict[str, str] = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
-
-    def look_at(self, storage: Storage, shown: str) -> None:
-        """Look for logs in a folder, an archive, or take a log."""
-        path = Path(storage.url)
-        if storage.is_local and not path.exists():
-            raise LogError(f"{shown}: no such file or folder; give logs that are there")
-        if storage.is_local and path.is_file() and path.suffix.lower() != ".zip":
-            self._add_files([path])
-            return
-        found, beside = False, list[str]()
-        if storage.is_local and path.is_file():
-            found = self._add_files(inner for inner in files_in(path) if is_log(inner))
-        for folder, files in walk(storage) if not found else ():
-            logs = [entry for entry in files if _is_log(folder, entry.name)]
-            for entry in files:
-                if folder.is_local and entry.name.lower().endswith(".zip"):
-                    inside = files_in(Path(folder.url) / entry.name)
-                    found = self._add_files(inner for inner in inside if is_log(inner)) or found
-            if logs and folder.url == storage.url:
-                beside = [entry.name for entry in logs]
-            elif logs:
-                found = True
-                self._add_folder(folder, logs)
-        if beside and found:
-            for name in beside:
-                self.strays[f"{storage.url}/{name}"] = (
-                    f"{storage.url}/{name}: lies beside folders with logs; move it into that of its vehicle, or name "
-                    f"the file itself if it is of the vehicle {_folder_name(storage.url)}"
+            storage, beside, is_found = open_storage(argument), list[Entry](), False
+            for url, logs, folder in _logs_in(storage, str(argument)):
+                if folder is not None and url == storage.url:
+                    beside = logs
+                else:
+                    add(url, logs, folder)
+                    is_found = True
+            if beside and not is_found:
+                add(storage.url, beside, storage)
+            elif not is_found:
+                raise LogError(f"{argument}: no logs in it; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
+            for entry in beside if is_found else ():
+                strays[f"{storage.url}/{entry.name}"] = (
+                    f"{storage.url}/{entry.name}: lies beside folders with logs; move it into that of its vehicle, or "
+                    f"name the file itself if it is of the vehicle {_folder_name(storage.url)}"
                 )
-        elif beside:
-            self._add_folder(storage, [entry for entry in storage.contents()[1] if entry.name in set(beside)])
-        elif not found:
-            raise LogError(f"{shown}: no logs in it; expected {', '.join(LOG_SUFFIXES)}, each also with .gz")
-
-    def _add_folder(self, folder: Storage, logs: Sequence[Entry]) -> None:
-        vehicle = _folder_name(folder.url)
-        if not self._may_be(vehicle, f"{folder.url}: the folder's name, which names the vehicle,"):
-            return
-        for entry in logs:
-            self._may_be(_drive_name(entry.name), f"{folder.url}/{entry.name}: the file's name, which names the drive,")
-        if folder.url not in self.folders.get(vehicle, {}):
-            self.sizes[vehicle] += sum(entry.size for entry in logs)
-        self.folders.setdefault(vehicle, {})[folder.url] = folder
-        self.problems += _without_twins(_drives_of(vehicle, folder, logs))[1]
-
-    def _add_files(self, paths: Iterable[Path]) -> bool:
-        """Add single files, and those of archives; whether there are any."""
-        any_found = False
-        for path in paths:
-            any_found = True
-            vehicle = path.resolve().parent.name.removesuffix(".zip")
-            if not (
-                self._may_be(vehicle, f"{path}: the folder's name, which names the vehicle,")
-                and self._may_be(_drive_name(path.name), f"{path}: the file's name, which names the drive,")
-            ):
-                continue
-            mine = self.folders.setdefault(vehicle, {}).setdefault(str(path.resolve().parent), [])
-            if isinstance(mine, Storage):
-                continue  # its whole folder was given as well
-            on_disk = next(item for item in (path, *path.parents) if item.is_file())
-            status = on_disk.stat()
-            entry = DriveFile(
-                vehicle=vehicle,
-                name=_drive_name(path.name),
-                place=str(path),
-                size=status.st_size if on_disk == path else 0,
-                version=f"{status.st_size}-{status.st_mtime_ns}",
-            )
-            if entry not in mine:
-                mine.append(entry)
-                self.sizes[vehicle] += entry.size
-        return any_found
-
-    def _may_be(self, name: str, what: str) -> bool:
-        """Whether a vehicle or drive may be called so; if not, that is a problem."""
-        try:
-            require_plain_name(name, what)
         except UserError as error:
-            self.problems.append(str(error))
-            return False
-        return True
+            problems.append(str(error))
+    single = [place for mine in places.values() for place in mine.values() if isinstance(place, list)]
+    given = {item.place for place in single for item in place}
+    problems += [text for place, text in strays.items() if place not in given]
+    problems += [
+        f"two vehicles with one name: {vehicle} is in {' and in '.join(mine)}; rename one folder, or move the logs "
+        f"into one if it is the same vehicle"
+        for vehicle, mine in places.items()
+        if len(mine) > 1
+    ]
+    vehicles = {vehicle: next(iter(mine.values())) for vehicle, mine in places.items() if len(mine) == 1}
+    left_out = {f"problem {k + 1}": text for k, text in enumerate(dict.fromkeys(problems))}
+    sizes_ = {vehicle: sizes[vehicle] for vehicle in vehicles}
+    return FleetSource(place="", vehicles=_Vehicles(vehicles), left_out=left_out, sizes=sizes_)
 
-    def fleet(self) -> FleetSource:
-        """All that is of one vehicle without doubt."""
-        folders = {vehicle: next(iter(places.values())) for vehicle, places in self.folders.items()}
-        given = {item.place for places in self.folders.values() for drives in places.values()
-                 if not isinstance(drives, Storage) for item in drives}  # fmt: skip
-        problems = [*self.problems, *(text for place, text in self.strays.items() if place not in given)]
-        for vehicle, places in self.folders.items():
-            if len(places) > 1:
-                del folders[vehicle]
-                problems.append(
-                    f"two vehicles with one name: {vehicle} is in {' and in '.join(places)}; rename one folder, or "
-                    f"move the logs into one if it is the same vehicle"
-                )
-            elif not isinstance(folders[vehicle], Storage):
-                problems += _without_twins(folders[vehicle])[1]  # type: ignore[arg-type]
-        left_out = {f"problem {k + 1}": text for k, text in enumerate(dict.fromkeys(problems))}
-        sizes = {vehicle: self.sizes[vehicle] for vehicle in folders}
-        return FleetSource(place="", vehicles=_Folders(folders), left_out=left_out, sizes=sizes)
+
+def _logs_in(storage: Storage, shown: str) -> Iterator[tuple[str, list[Entry], Storage | None]]:
+    """Folders with logs, of a folder, an archive or a single log: path or URL, logs, and the folder if it is one."""
+    path = Path(storage.url)
+    if storage.is_local and not path.exists():
+        raise LogError(f"{shown}: no such file or folder; give logs that are there")
+    if storage.is_local and path.is_file():
+        yield from _in_archive(path) if path.suffix.lower() == ".zip" else [(str(path.parent), [_entry(path)], None)]
+        return
+    for folder, files in walk(storage):
+        if logs := [entry for entry in files if _is_log(folder, entry.name)]:
+            yield folder.url, logs, folder
+        for entry in files:
+            if folder.is_local and entry.name.lower().endswith(".zip"):
+                yield from _in_archive(Path(folder.url) / entry.name)
+
+
+def _in_archive(path: Path) -> Iterator[tuple[str, list[Entry], None]]:
+    version = _entry(path).version
+    for folder, logs in groupby(filter(is_log, files_in(path)), key=lambda inner: inner.parent):
+        yield str(folder), [Entry(log.name, 0, version) for log in logs], None
+
+
+def _entry(path: Path) -> Entry:
+    status = path.stat()
+    return Entry(path.name, status.st_size, f"{status.st_size}-{status.st_mtime_ns}")
 
 
 def _is_log(folder: Storage, name: str) -> bool:
@@ -304,34 +256,27 @@ def _drive_name(file: str) -> str:
     return Path(file.removesuffix(".gz")).stem
 
 
-def _drives_of(vehicle: str, folder: Storage, files: Iterable[Entry]) -> list[DriveFile]:
-    """Drives of the vehicle whose folder this is."""
+def _drives(vehicle: str, folder: str, logs: Iterable[Entry]) -> list[DriveFile]:
+    """Drives of a vehicle of these logs in a folder."""
     return [
         DriveFile(
             vehicle=vehicle,
             name=_drive_name(entry.name),
-            place=f"{folder.url}/{entry.name}",
+            place=f"{folder}/{entry.name}",
             size=entry.size,
             version=entry.version,
         )
-        for entry in files
-        if _is_log(folder, entry.name) and is_plain_name(_drive_name(entry.name))
+        for entry in logs
+        if is_plain_name(_drive_name(entry.name))
     ]
 
 
-def _without_twins(drives: Sequence[DriveFile]) -> tuple[list[DriveFile], list[str]]:
-    """Drives, sorted, that one file claims, and what is to be said of the others."""
-    places: dict[str, list[DriveFile]] = {}
-    for drive in sorted(drives, key=lambda item: (item.name, item.place)):
-        places.setdefault(drive.name, []).append(drive)
-    kept = [twins[0] for twins in places.values() if len(twins) == 1]
-    problems = [
-        f"vehicle {twins[0].vehicle}: drive {name} is in {' and '.join(item.place for item in twins)}; remove or "
-        f"rename one"
-        for name, twins in places.items()
-        if len(twins) > 1
-    ]
-    return kept, problems
+def _by_name(drives: Iterable[DriveFile]) -> dict[str, list[DriveFile]]:
+    """Drives by their names, which several files may claim."""
+    found: dict[str, list[DriveFile]] = {}
+    for drive in sorted(drives, key=lambda item: item.place):
+        found.setdefault(drive.name, []).append(drive)
+    return found
 
 
 def is_onboard(entry: DriveFile) -> bool:
@@ -366,13 +311,10 @@ def load_drive(entry: DriveFile, database: VehicleDatabase) -> Drive:
         return read_drive(path, database, vehicle=entry.vehicle, name=entry.name)
 
 
-ReadVehicle = Callable[[Sequence[DriveFile], "Equipment", VehicleDatabase], _Vehicle]
-
-
 def read_vehicles(
-    read: "ReadVehicle[_Vehicle]",
+    read: Callable[..., _Vehicle],
     fleet: FleetSource,
-    equipment: "Equipment",
+    equipment: Equipment,
     database: VehicleDatabase,
     *,
     workers: Workers,
@@ -385,7 +327,8 @@ def read_vehicles(
     Parameters
     ----------
     read : callable
-        Makes what a method needs of a vehicle from its drives; of module level, as it goes to other processes.
+        Makes what a method needs of a vehicle from its DriveFiles, `equipment` and `database`; of module level, as it
+        goes to other processes.
     fleet, equipment, database : FleetSource, Equipment, VehicleDatabase
         The fleet, its branches and inputs, DBC and layout.
     workers : Workers
@@ -410,29 +353,27 @@ def read_vehicles(
         If no vehicle can be used.
     """
     chosen = list(fleet.vehicles) if names is None else names
-    read_one = partial(_read_one, read=read, equipment=equipment, database=database)
-    found, left_out, done = list[_Vehicle](), dict(fleet.left_out), 0.0
-    sizes = [fleet.sizes.get(name, 0) / MEGABYTE for name in chosen]
-    outcomes = try_many(read_one, (fleet.vehicles[name] for name in chosen), workers, limit_s=limit_s)
-    with progress_bar(label, int(sum(sizes)) + 1, "MB") as progress, closing(outcomes):
-        for name, size, (_, outcome) in zip(chosen, sizes, outcomes, strict=True):
+    read_one = partial(read, equipment=equipment, database=database)
+    found, left_out = list[_Vehicle](), dict(fleet.left_out)
+    outcomes = try_many_shown(
+        read_one,
+        (fleet.vehicles[name] for name in chosen),
+        workers,
+        limit_s=limit_s,
+        label=label,
+        size=sum(fleet.sizes.get(name, 0) for name in chosen),
+        size_of=lambda drives: sum(drive.size for drive in drives),
+    )
+    with closing(outcomes):
+        for name, (_, outcome) in zip(chosen, outcomes, strict=True):
             if isinstance(outcome, Failed):
                 left_out[name] = outcome.reason
             else:
                 found.append(outcome)
-            done += size
-            progress(done)
-        progress(int(sum(sizes)) + 1)
     if not found:
         reason = next((left_out[name] for name in chosen if name in left_out), next(iter(left_out.values()), ""))
         raise FleetError(f"{fleet.place}: no vehicle has enough usable data; the first says: {reason}")
     return found, left_out
-
-
-def _read_one(
-    entries: Sequence[DriveFile], *, read: "ReadVehicle[_Vehicle]", equipment: "Equipment", database: VehicleDatabase
-) -> _Vehicle:
-    return read(entries, equipment, database)
 
 
 def probe_equipment(
@@ -478,20 +419,32 @@ def probe_equipment(
     layout = database.layout
     names, errors = [_names_in(drive) for drive in drives], list[str]()
     if not names:
-        names, errors = _probed(fleet, database, limit_s)
+        first = (entries[0] for entries in fleet.vehicles.values() if entries)
+        with closing(try_many(partial(_names, database=database), first, Workers(), limit_s=limit_s)) as read:
+            for _, outcome in read:
+                if isinstance(outcome, Failed):
+                    errors.append(outcome.reason)
+                else:
+                    names.append(outcome)
+                if len(names) == PROBED_VEHICLES:
+                    break
     if not names:
         raise FleetError(
             f"{fleet.place}: none of the first {len(errors)} vehicles can be read; the first says: {errors[0]}"
         )
-    seen = Counter(name for each in names for name in each.branches)
+    seen = Counter(name for has, _ in names for name in has)
     found = [name for name in layout.branch_names if 2 * seen[name] > len(names)]
+    chosen = tuple(found if branches is None else branches)
     if branches is not None and len(branches) < 2:
         raise FleetError(
             f"--branches {','.join(branches)}: a junction has two branches or more; name all that are measured, or "
             f"leave --branches out"
         )
-    chosen = _distinct(branches, layout) if branches is not None else tuple(found)
-    available = {name for each in names for name in each.inputs}
+    for name in chosen:
+        layout.find_branch(name)
+    if twice := sorted({name for name in chosen if chosen.count(name) > 1}):
+        raise FleetError(f"branch {', '.join(twice)} is asked for twice; name each branch once")
+    available = {name for _, inputs in names for name in inputs}
     inputs, missing_inputs = choose_inputs(layout, available) if modelled else ((), ())
     wanted = layout.fleet_inputs or layout.model_inputs
     fleet_inputs = choose_inputs(layout, available, names=wanted)[0] if modelled else ()
@@ -513,39 +466,14 @@ def probe_equipment(
     return Equipment(branches=chosen, inputs=inputs, fleet_inputs=fleet_inputs, notices=notices)
 
 
-def _distinct(branches: Sequence[str], layout: Layout) -> tuple[str, ...]:
-    """Branches asked for; refused if the layout lacks one or one is there twice."""
-    for name in branches:
-        layout.find_branch(name)
-    twice = sorted({name for name in branches if branches.count(name) > 1})
-    if twice:
-        raise FleetError(f"branch {', '.join(twice)} is asked for twice; name each branch once")
-    return tuple(branches)
+def _names(entry: DriveFile, database: VehicleDatabase) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Branches and inputs that a drive has."""
+    if not is_onboard(entry):
+        return _names_in(load_drive(entry, database))
+    with local_copy(entry.place) as path:
+        record = read_onboard_record(path, database)
+    return tuple(record.branches), tuple(record.recorded)
 
 
-def _probed(fleet: FleetSource, database: VehicleDatabase, limit_s: float) -> tuple[list[_Names], list[str]]:
-    """Names in the first drive of the first vehicles that can be read, and the errors met before."""
-    found: list[_Names] = []
-    errors: list[str] = []
-    first = (drives[0] for drives in fleet.vehicles.values() if drives)
-    with closing(try_many(partial(_names, database=database), first, Workers(), limit_s=limit_s)) as read:
-        for _, names in read:
-            if isinstance(names, Failed):
-                errors.append(names.reason)
-            else:
-                found.append(names)
-            if len(found) == PROBED_VEHICLES:
-                break
-    return found, errors
-
-
-def _names(entry: DriveFile, database: VehicleDatabase) -> _Names:
-    if is_onboard(entry):
-        with local_copy(entry.place) as path:
-            record = read_onboard_record(path, database)
-        return _Names(branches=tuple(record.branches), inputs=tuple(record.recorded))
-    return _names_in(load_drive(entry, database))
-
-
-def _names_in(drive: Drive) -> _Names:
-    return _Names(branches=tuple(drive.branches), inputs=tuple(drive.inputs))
+def _names_in(drive: Drive) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    return tuple(drive.branches), tuple(drive.inputs)

@@ -10,11 +10,10 @@ from calibrator.drive import DriveFile
 from calibrator.drives.fleet_id import read_fleet_ids, write_fleet_ids
 from calibrator.drives.store import has_drive, write_drive
 from calibrator.files.storage import Storage, local_copy, open_storage
-from calibrator.processes.run_many import Failed, Workers, try_many
+from calibrator.processes.run_many import Failed, Workers, try_many_shown
 from calibrator.recordings.readers import read_recording
-from calibrator.sources.fleet_source import MEGABYTE, find_logs
+from calibrator.sources.fleet_source import find_logs
 from calibrator.terminal.options import TIME_LIMIT_S
-from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import Notice, dumps, left_out_text, merged_notices, table
 from ecu_node.database import VehicleDatabase
 
@@ -93,9 +92,11 @@ def import_logs(
     left_out, drives, already_there = dict(found.left_out), list[ImportedDrive](), list[str]()
     read = partial(_import_one, database=database, store=open_storage(store).url)
     entries = (log for vehicle in found.vehicles for log in found.vehicles[vehicle])
-    outcomes, done = try_many(read, entries, workers, limit_s=limit_s), 0.0
-    total = int(sum(found.sizes.values()) / MEGABYTE) + 1
-    with progress_bar("import", total, "MB") as progress, closing(outcomes):
+    size = sum(found.sizes.values())
+    outcomes = try_many_shown(
+        read, entries, workers, limit_s=limit_s, label="import", size=size, size_of=lambda log: log.size
+    )
+    with closing(outcomes):
         for log, outcome in outcomes:
             if isinstance(outcome, ImportedDrive):
                 drives.append(outcome)
@@ -104,9 +105,6 @@ def import_logs(
                 left_out[f"{log.vehicle}/{log.name}"] = outcome.reason if named else f"{log.place}: {outcome.reason}"
             else:
                 already_there.append(f"{log.vehicle}/{log.name}")
-            done += log.size / MEGABYTE
-            progress(done)
-        progress(total)
     if drives:
         _note_fleets(open_storage(store), logs)
     return ImportReport(store=str(store), drives=tuple(drives), already_there=tuple(already_there), left_out=left_out)

@@ -61,7 +61,7 @@ def summarise(
 def info(store: StoreArgument, json: JsonOption = False) -> None:
     """Tell how many vehicles, drives and hours a store holds, of what, and how large it is."""
     with importing():
-        from calibrator.summaries.store_report import look_at_store
+        from calibrator.summaries.store import look_at_store
 
     print_report(look_at_store(store), json=json)
 
@@ -70,7 +70,7 @@ def info(store: StoreArgument, json: JsonOption = False) -> None:
 def check(store: StoreArgument, json: JsonOption = False) -> None:
     """Read all of a store; exit code 1 if something in it is damaged, or counts twice."""
     with importing():
-        from calibrator.summaries.store_report import look_at_store
+        from calibrator.summaries.store import look_at_store
 
     report = look_at_store(store, whole=True)
     print_report(report, json=json)
@@ -82,6 +82,6 @@ def check(store: StoreArgument, json: JsonOption = False) -> None:
 def compact(store: StoreArgument, json: JsonOption = False) -> None:
     """Put the files of each bucket together, and remove damaged records, whose drives are then summarised again."""
     with importing():
-        from calibrator.summaries.store_report import compact_store
+        from calibrator.summaries.store import compact_store
 
     print_report(compact_store(store), json=json)

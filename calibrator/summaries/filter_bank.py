@@ -14,18 +14,17 @@ gone. A bank without poles has nothing to settle: its columns are the plain inpu
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrator.compiled import compiled, inlined
+from calibrator.compiled import compiled
 from calibrator.drive import Array, Complex, Mask
 from calibrator.errors import DriveError
 
-__all__ = ["BankState", "FilterBank", "low_pass_bank", "low_passes", "plain_bank", "read_bank"]
+__all__ = ["FilterBank", "low_pass_bank", "low_passes", "plain_bank", "read_bank"]
 
 LONGEST_HOLD_S = 1.0
 """Time that an input may keep its last valid value: currents of a drive seldom change more within. [s]"""
@@ -99,11 +98,6 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         slowest = max((float(np.hypot(*pole)) for pole in self.poles), default=0.0)
         return int(np.ceil(np.log(UNSETTLED) / np.log(slowest))) if slowest > 0.0 else 0
 
-    @property
-    def holding(self) -> int:
-        """Samples that an input may keep its last valid value."""
-        return round(LONGEST_HOLD_S / self.period_s)
-
     def system(self) -> tuple[Array, Array]:
         """Return A (n, n) and B (n, M); the states in the order of the columns that follow the inputs."""
         M = len(self.input_names)
@@ -116,31 +110,8 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         gains = np.concatenate([1.0 - real, 1.0 - pairs.real, -pairs.imag])
         return A, np.kron(gains[:, None], np.eye(M))
 
-    def start(self, *, settling: int = 0) -> "BankState":
-        """State before the first sample of a drive.
-
-        Parameters
-        ----------
-        settling : int
-            Samples after a start that are not used, if they are more than :attr:`settling`: that of another bank, to be
-            compared with.
-
-        Returns
-        -------
-        BankState
-            To run the bank from.
-        """
-        (real, pairs), M = _by_kind(self.complex_poles), len(self.input_names)
-        return BankState(
-            states=np.zeros(self.states),
-            held=np.zeros(M),
-            counters=np.array([NEVER, 0]),
-            limits=np.array([self.holding, max(settling, self.settling)]),
-            poles=(np.repeat(real, M), np.repeat(pairs.real, M), np.repeat(pairs.imag, M)),
-        )
-
-    def run(self, inputs: Array, valid: Mask, state: "BankState") -> tuple[Array, Mask]:
-        """Filter the next samples of a drive, however many.
+    def run(self, inputs: Array, valid: Mask, *, settling: int = 0) -> tuple[Array, Mask]:
+        """Filter a drive.
 
         Parameters
         ----------
@@ -148,8 +119,9 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             Inputs; finite where valid.
         valid : ndarray of bool of shape (T,)
             Samples that may be used.
-        state : BankState
-            Where the last piece of the drive ended; it is carried on in place.
+        settling : int
+            Samples after a start that are not used, if they are more than :attr:`settling`: that of another bank, to be
+            compared with.
 
         Returns
         -------
@@ -159,7 +131,10 @@ class FilterBank(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             Valid samples of settled filters.
         """
         columns, used = np.zeros((len(inputs), self.width)), np.zeros(len(inputs), np.bool_)
-        state.run_into(columns, used, inputs, valid)
+        real, pairs = _by_kind(self.complex_poles)
+        samples = np.ascontiguousarray(inputs, np.float64), np.ascontiguousarray(valid)
+        limits = np.array([round(LONGEST_HOLD_S / self.period_s), max(settling, self.settling)])
+        _filter(samples, np.concatenate([real, pairs]), len(real), limits, (columns, used))
         return columns, used
 
     def to_json(self) -> bytes:
@@ -241,106 +216,36 @@ def _described(pole: complex, period_s: float) -> str:
     return time_s if pole.imag == 0.0 else f"{frequency_hz:.3g} Hz ({time_s})"
 
 
-# ---- samples through the bank
-
-NEVER = np.iinfo(np.int64).max
-"""Samples since the last valid input, where there was none."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BankState:
-    """What a bank remembers between two pieces of a drive: running it changes the first three arrays.
-
-    Attributes
-    ----------
-    states : ndarray of shape (n,)
-        Real poles first, then the real and the imaginary parts of the others; per pole all inputs.
-    held : ndarray of shape (M,)
-        Last valid input.
-    counters : ndarray of int of shape (2,)
-        Samples since the last valid input, and samples until the filters have settled.
-    limits : ndarray of int of shape (2,)
-        Samples that an input may keep its value, and samples after a start that are not used.
-    poles : tuple of ndarray
-        One per state: real poles, real parts of the others, their imaginary parts.
-    """
-
-    states: Array
-    held: Array
-    counters: NDArray[np.int64]
-    limits: NDArray[np.int64]
-    poles: tuple[Array, Array, Array]
-
-    @property
-    def settling(self) -> int:
-        """Samples after a start that are not used."""
-        return int(self.limits[1])
-
-    def run_into(self, columns: Array, used: Mask, inputs: Array, valid: Mask) -> None:
-        """Filter as :meth:`.FilterBank.run`, into the first W columns of rows at hand; those not used become zero."""
-        samples = (np.ascontiguousarray(inputs, np.float64), np.ascontiguousarray(valid))
-        memory = (self.states, self.held, self.counters)
-        _filter(samples, self.poles, self.limits, memory, (columns, used))
-
-
 @compiled
 def _filter(
-    samples: tuple[Array, Mask],
-    poles: tuple[Array, Array, Array],
-    limits: NDArray[np.int64],
-    memory: tuple[Array, Array, NDArray[np.int64]],
-    out: tuple[Array, Mask],
+    samples: tuple[Array, Mask], poles: Complex, real: int, limits: NDArray[np.int64], out: tuple[Array, Mask]
 ) -> None:
-    """Run the bank, sample by sample; poles (one per state) are real ones, real parts and imaginary parts of pairs."""
+    """Run the bank, sample by sample; after so many real poles come those of which a pair has two columns."""
     inputs, valid = samples
     columns, used = out
-    low, re, im = poles
-    states, held, counters = memory
-    inputs_of_states = np.empty(len(states))
-    _spread(held, inputs_of_states)
+    M, m = inputs.shape[1], len(poles)
+    states, held = np.zeros((m, M), np.complex128), np.zeros(M)
+    age, unsettled = limits[0] + 1, 0  # samples since the last valid input, and until the filters have settled
     for t in range(len(inputs)):
         if valid[t]:
             held[:] = inputs[t]
-            _spread(held, inputs_of_states)
-            if counters[0] > limits[0]:
-                states[: len(low) + len(re)] = inputs_of_states[: len(low) + len(re)]
-                states[len(low) + len(re) :] = 0.0
-                counters[1] = limits[1]
-            counters[0] = 0
-        elif counters[0] <= limits[0]:
-            counters[0] += 1
-        used[t] = valid[t] and counters[1] == 0
+            if age > limits[0]:
+                for p in range(m):
+                    states[p] = held
+                unsettled = limits[1]
+            age = 0
+        elif age <= limits[0]:
+            age += 1
+        used[t] = valid[t] and unsettled == 0
         if used[t]:
-            _copy(held, columns[t])
-            _copy(states, columns[t, len(held) :])
-        else:
-            columns[t] = 0.0
-        if counters[0] <= limits[0]:
-            counters[1] = max(counters[1] - 1, 0)
-            _step(states, inputs_of_states, low, re, im)
-
-
-@inlined
-def _spread(held: Array, inputs_of_states: Array) -> None:
-    """Give every state its input; per pole there are all of them."""
-    for m in range(len(held)):
-        for i in range(m, len(inputs_of_states), len(held)):
-            inputs_of_states[i] = held[m]
-
-
-@inlined
-def _copy(values: Array, row: Array) -> None:
-    for i in range(len(values)):
-        row[i] = values[i]
-
-
-@inlined
-def _step(states: Array, u: Array, low: Array, re: Array, im: Array) -> None:
-    """Next states; what they differ from the input by turns and shrinks."""
-    first, second = len(low), len(low) + len(re)
-    for i in range(first):
-        states[i] = u[i] + low[i] * (states[i] - u[i])
-    for i in range(len(re)):
-        x, y = states[first + i] - u[first + i], states[second + i]
-        states[first + i] = u[first + i] + re[i] * x - im[i] * y
-        states[second + i] = im[i] * x + re[i] * y
+            columns[t, :M] = held
+            for p in range(m):
+                columns[t, M * (p + 1) : M * (p + 2)] = states[p].real
+                if p >= real:
+                    imaginary = M * (p + 1 + m - real)
+                    columns[t, imaginary : imaginary + M] = states[p].imag
+        if age <= limits[0]:
+            unsettled = max(unsettled - 1, 0)
+            for p in range(m):
+                for i in range(M):
+                    states[p, i] = held[i] + poles[p] * (states[p, i] - held[i])

@@ -4,17 +4,16 @@ import hashlib
 
 import msgspec
 
+from calibrator.drive import Equipment
 from calibrator.errors import DriveError, FleetError
 from calibrator.files.storage import Storage
-from calibrator.sources.fleet_source import Equipment
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.moments import BLOCK_S
 from ecu_node.database import VehicleDatabase
-from ecu_node.layout import Layout
 
 __all__ = ["SCHEMA_VERSION", "StoreIdentity", "bucket_of", "read_identity", "store_identity", "write_identity"]
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 FILE = "summaries.json"
 FEWEST_BUCKETS, MOST_BUCKETS = 16, 32_768
 """Of a store: few vehicles are lost with one that is not finished, and a folder can still be listed."""
@@ -33,7 +32,7 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     layout, layout_sha256, dbc_sha256 : str
         Names and digests of what the signals mean.
     branches, inputs, fleet_inputs : tuple of str
-        Branches and model inputs of the fleet, see :class:`~calibrator.sources.fleet_source.Equipment`.
+        Branches and model inputs of the fleet, see :class:`~calibrator.drive.Equipment`.
     notices : tuple of str
         What the layout has and the fleet lacks.
     bank : FilterBank
@@ -174,50 +173,34 @@ def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> 
                 f"{where}: schema version {version!r}, expected {SCHEMA_VERSION}; summarise the drives again"
             )
         identity = msgspec.convert(raw, StoreIdentity)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, DriveError) as error:
         raise FleetError(f"{where}: not a store of summaries: {error}; summarise the drives again") from None
-    except DriveError as error:
-        raise FleetError(f"{where}: {error}; summarise the drives again") from None
-    if database is not None:
-        _require_made_with(identity, database, where)
-        _require_known_names(identity, database.layout, where)
-    if not FEWEST_BUCKETS <= identity.buckets <= MOST_BUCKETS:
-        raise FleetError(
-            f"{where}: {identity.buckets} buckets, expected {FEWEST_BUCKETS} to {MOST_BUCKETS}; summarise the drives "
-            f"again, into another store"
-        )
+    if problem := _problem(identity, database):
+        raise FleetError(f"{where}: {problem}; summarise the drives again, into another store")
     return identity
 
 
-def _require_made_with(identity: StoreIdentity, database: VehicleDatabase, where: str) -> None:
-    layout = database.layout
-    if (identity.layout_sha256, identity.dbc_sha256) != (layout.digest, database.digest):
-        what = "layout" if identity.layout_sha256 != layout.digest else "DBC"
-        raise FleetError(
-            f"{where}: made with another {what} than {layout.path if what == 'layout' else layout.dbc_path}; "
-            f"summarise the drives again with this one"
-        )
-    if identity.block_s != BLOCK_S:
-        raise FleetError(
-            f"{where}: blocks of {identity.block_s:g} s, expected {BLOCK_S:g} s; summarise the drives again"
-        )
-
-
-def _require_known_names(identity: StoreIdentity, layout: Layout, where: str) -> None:
-    """Refuse branches and inputs that the layout does not have, too few of them, or one twice."""
-    inputs = {item.name for item in layout.input} | {item.name for item in layout.derived}
-    for what, names, known, fewest in (
-        ("branches", identity.branches, set(layout.branch_names), 2),
-        ("inputs", identity.inputs, inputs, 1),
-        ("fleet_inputs", identity.fleet_inputs, inputs, 0),
-    ):
-        if len(names) < fewest or len(set(names)) < len(names) or not known.issuperset(names):
-            raise FleetError(
-                f"{where}: {what} {', '.join(names) or 'none'}; expected {fewest} or more different ones of "
-                f"{', '.join(sorted(known))}; summarise the drives again, into another store"
+def _problem(identity: StoreIdentity, database: VehicleDatabase | None) -> str:
+    """Why a store cannot be used with a layout, or at all; empty if it can."""
+    wrong = {
+        f"{identity.buckets} buckets, expected {FEWEST_BUCKETS} to {MOST_BUCKETS}": not (
+            FEWEST_BUCKETS <= identity.buckets <= MOST_BUCKETS
+        ),
+        f"blocks of {identity.block_s:g} s, expected {BLOCK_S:g} s": identity.block_s != BLOCK_S,
+    }
+    if database is not None:
+        layout = database.layout
+        wrong[f"made with another layout than {layout.path}"] = identity.layout_sha256 != layout.digest
+        wrong[f"made with another DBC than {layout.dbc_path}"] = identity.dbc_sha256 != database.digest
+        inputs = {item.name for item in layout.input} | {item.name for item in layout.derived}
+        for what, names, known, fewest in (
+            ("branches", identity.branches, set(layout.branch_names), 2),
+            ("inputs", identity.inputs, inputs, 1),
+            ("fleet_inputs", identity.fleet_inputs, inputs, 0),
+            ("inputs of the bank", identity.bank.input_names, set(identity.fleet_inputs), len(identity.fleet_inputs)),
+        ):
+            shown = f"{what} {', '.join(names) or 'none'}"
+            wrong[f"{shown}; expected {fewest} or more different ones of {', '.join(sorted(known))}"] = (
+                len(names) < fewest or len(set(names)) < len(names) or not known.issuperset(names)
             )
-    if identity.bank.input_names != identity.fleet_inputs:
-        raise FleetError(
-            f"{where}: a filter bank of {', '.join(identity.bank.input_names) or 'no input'}; expected one of the "
-            f"fleet_inputs, {', '.join(identity.fleet_inputs)}; summarise the drives again, into another store"
-        )
+    return next((text for text, is_wrong in wrong.items() if is_wrong), "")

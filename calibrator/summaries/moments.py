@@ -1,20 +1,51 @@
 """DriveSummary: all that the estimator needs of recorded drives, of a size that does not grow with their sampling rate.
 
 Per block of :data:`BLOCK_S` the second moments of (columns of a filter bank, measured currents, 1). Summaries of drives
-add up, and the spread between blocks tells how sure everything is that is computed from them.
+add up, and the spread between blocks tells how sure everything is that is computed from them. Second moments cannot
+tell a bent sensor from a gain error; the :class:`FitSums` beside them can, and :mod:`calibrator.estimator.checks` reads
+them.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from calibrator.drive import Array
+from calibrator.drive import Array, Mask
 from calibrator.errors import DriveError
-from calibrator.summaries.fit_sums import FitSums
-from ecu_node.summary import BLOCK_S
+from ecu_node.summary import BLOCK_S, LEVELS_A
 
-__all__ = ["BLOCK_S", "DriveSummary", "common_bank"]
+__all__ = ["BLOCK_S", "LEVEL_EDGES_A", "DriveSummary", "FitSums", "common_bank"]
+
+LEVEL_EDGES_A: Array = np.array([*(-a for a in reversed(LEVELS_A)), *LEVELS_A], np.float64)
+"""Edges of the L = 33 levels of a measured current: symmetric, denser near zero, whole amperes. [A]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitSums:
+    """Sums that tell whether linear sensors explain the drives: B blocks, K branches, M inputs, L levels.
+
+    Attributes
+    ----------
+    levels : ndarray of shape (K, L, M + K + 2)
+        By level of branch k, see :data:`LEVEL_EDGES_A`: sums of (inputs, measured currents [A], 1) and of the square of
+        the measured current k [A^2].
+    fast_a2 : ndarray of shape (B, K, K)
+        Sums of products of the second differences of the measured currents. [A^2]
+    spikes : ndarray of shape (B, K, 2)
+        Samples left out of all sums as upward and downward spikes of one branch.
+    temperature_c : ndarray of shape (B,)
+        Mean temperature of the sensors; NaN where it is not known. [degC]
+    starts : ndarray of bool of shape (B,)
+        Whether a drive starts with the block.
+    """
+
+    levels: Array
+    fast_a2: Array
+    spikes: Array
+    temperature_c: Array
+    starts: Mask
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,40 +123,65 @@ class DriveSummary:
                 f"summaries of {self.branches} and {other.branches} branches with moments of shape "
                 f"{self.moments.shape[1:]} and {other.moments.shape[1:]} do not add up; summarise the drives alike"
             )
-        return DriveSummary(
+        fits = None if self.fit is None or other.fit is None else (self.fit, other.fit)
+        return replace(
+            self,
             moments=np.concatenate([self.moments, other.moments]),
             noise_a2=np.concatenate([self.noise_a2, other.noise_a2]),
-            branches=self.branches,
-            period_s=self.period_s,
-            bank=self.bank,
-            fit=None if self.fit is None or other.fit is None else self.fit + other.fit,
+            fit=fits
+            and FitSums(
+                levels=fits[0].levels + fits[1].levels,
+                **_by_block(lambda name: np.concatenate([getattr(fit, name) for fit in fits])),
+            ),
         )
 
-    def take_branches(self, order: Sequence[int]) -> "DriveSummary":
-        """Return the same summary for some branches, in another order."""
-        columns = [*range(self.inputs), *(self.inputs + k for k in order), self.inputs + self.branches]
-        return DriveSummary(
-            moments=self.moments[:, columns][:, :, columns],
-            noise_a2=self.noise_a2[:, list(order)],
-            branches=len(order),
-            period_s=self.period_s,
-            bank=self.bank,
-            fit=None if self.fit is None else self.fit.take_branches(order),
+    def take_branches(self, order: Sequence[int], inputs: Sequence[int] | None = None) -> "DriveSummary":
+        """Return the same summary for some branches, in another order, and some of the inputs, or all."""
+        chosen, M = list(order), self.inputs
+        columns = [*(range(M) if inputs is None else inputs), *(M + k for k in chosen), M + self.branches]
+        return replace(
+            self,
+            moments=np.ascontiguousarray(self.moments[:, columns][:, :, columns]),
+            noise_a2=self.noise_a2[:, chosen],
+            branches=len(chosen),
+            fit=self.fit
+            and replace(
+                self.fit,
+                levels=self.fit.levels[chosen][:, :, [*columns, -1]],
+                fast_a2=self.fit.fast_a2[:, chosen][:, :, chosen],
+                spikes=self.fit.spikes[:, chosen],
+            ),
         )
+
+    def shortened(self, most: int) -> "DriveSummary":
+        """Return the same with neighbouring blocks added until there are few enough; means are by samples."""
+        count, samples, fit = len(self.moments), self.moments[:, -1, -1], self.fit
+        if count <= most:
+            return self
+        first = np.arange(0, count, -(-count // most))
+        added = np.add.reduceat(samples, first)
+        return replace(
+            self,
+            moments=np.add.reduceat(self.moments, first),
+            noise_a2=np.add.reduceat(self.noise_a2 * samples[:, None], first) / added[:, None],
+            fit=fit
+            and FitSums(
+                levels=fit.levels,
+                fast_a2=np.add.reduceat(fit.fast_a2, first),
+                spikes=np.add.reduceat(fit.spikes, first),
+                temperature_c=np.add.reduceat(fit.temperature_c * samples, first) / added,
+                starts=np.logical_or.reduceat(fit.starts, first),
+            ),
+        )
+
+
+def _by_block(value: Callable[[str], Any]) -> dict[str, Any]:
+    """A value for each array of fit sums that has a row per block."""
+    return {name: value(name) for name in ("fast_a2", "spikes", "temperature_c", "starts")}
 
 
 def common_bank(summaries: Sequence[DriveSummary]) -> str:
-    """Identity of the filter bank that all summaries were made with.
-
-    Parameters
-    ----------
-    summaries : sequence of DriveSummary
-        At least one.
-
-    Returns
-    -------
-    str
-        Identity of the bank.
+    """Identity of the filter bank that all summaries, at least one, were made with.
 
     Raises
     ------

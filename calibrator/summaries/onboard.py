@@ -8,9 +8,8 @@ from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
 from calibrator.errors import DriveError
 from calibrator.sources.fleet_source import read_onboard_record
-from calibrator.summaries.fit_sums import LEVEL_EDGES_A, FitSums
 from calibrator.summaries.identity import StoreIdentity
-from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.moments import LEVEL_EDGES_A, DriveSummary, FitSums
 from calibrator.summaries.vehicle_summary import VehicleSummary
 from calibrator.summaries.zero_current import ZeroCurrent
 from ecu_node.database import VehicleDatabase
@@ -53,66 +52,61 @@ def read_onboard(
     if lacking := [x for x in (*store.branches, *store.fleet_inputs) if x not in {*record.branches, *record.inputs}]:
         raise DriveError(f"{path}: no {', '.join(lacking)} in it; summarise it with branches that it has")
     try:
-        summary = _summary(record, store)
+        summary = _summary(record, store.bank.identity)
     except (ValueError, IndexError) as error:
         raise DriveError(f"{path}: damaged: {error}; copy it again from the vehicle") from None
+    delay_sd_s, zero_a, zero_sd_a = (
+        np.array([missing if x is None else x for x in values])
+        for values, missing in ((record.delay_sd_s, np.inf), (record.zero_offset_a, np.nan), (record.zero_sd_a, np.nan))
+    )
     place = [record.branches.index(branch) for branch in store.branches]
-    sd_s = np.array([np.inf if value is None else value for value in record.delay_sd_s], np.float64)[place]
-    delays = BranchDelays(
-        branches=store.branches, delay_s=np.array(record.delay_s)[place], sd_s=sd_s, known=np.isfinite(sd_s)
-    )
-    zero = (
-        np.array([np.nan if x is None else x for x in row])[place] for row in (record.zero_offset_a, record.zero_sd_a)
-    )
-    offset_a, zero_sd_a = zero
+    sd_s = delay_sd_s[place]
     return VehicleSummary(
         vehicle=vehicle,
         drives=(name,),
-        summary=summary,
-        delays=delays,
-        zero_current=ZeroCurrent(offset_a=offset_a, sd_a=zero_sd_a),
-        recorded=frozenset(record.recorded),
+        summary=summary.take_branches(place, [record.inputs.index(each) for each in store.fleet_inputs]),
+        delays=BranchDelays(
+            branches=store.branches, delay_s=np.array(record.delay_s)[place], sd_s=sd_s, known=np.isfinite(sd_s)
+        ),
+        zero_current=ZeroCurrent(offset_a=zero_a[place], sd_a=zero_sd_a[place]),
     )
 
 
-def _summary(record: SummaryFile, store: StoreIdentity) -> DriveSummary:
+def _summary(record: SummaryFile, bank: str) -> DriveSummary:
     """Moments from means and covariances; ValueError or IndexError if there are too few or too many numbers."""
     B, M, K = len(record.count), len(record.inputs), len(record.branches)
     p = M + K + 1
-    count = np.array(record.count, np.float64)
-    mean, covariance = np.zeros((B, p)), np.zeros((B, p, p))
-    mean[:, :-1], mean[:, -1] = _numbers(record.mean, B, p - 1), 1.0
-    lower = np.tril_indices(p - 1)
-    covariance[:, lower[0], lower[1]] = covariance[:, lower[1], lower[0]] = _numbers(
-        record.covariance, B, (p - 1) * p // 2
-    )
-    moments = count[:, None, None] * (covariance + mean[:, :, None] * mean[:, None, :])
-    branches = [record.branches.index(name) for name in store.branches]
-    columns = [*(record.inputs.index(name) for name in store.fleet_inputs), *(M + k for k in branches), p - 1]
-    lower = np.tril_indices(K)
-    fast = np.zeros((B, K, K))
-    fast[:, lower[0], lower[1]] = fast[:, lower[1], lower[0]] = _numbers(record.fast_a2, B, K * (K + 1) // 2)
+    count, mean, covariance = np.array(record.count, np.float64), np.ones((B, p)), np.zeros((B, p, p))
+    mean[:, :-1] = _numbers(record.mean, B, p - 1)
+    covariance[:, :-1, :-1] = _symmetric(record.covariance, B, p - 1)
     levels, visited = np.zeros((K, len(LEVEL_EDGES_A) + 1, p + 1)), [len(chosen) for chosen in record.levels]
     sums = np.split(_numbers(record.level_sums, sum(visited), p + 1), np.cumsum(visited)[:-1])
     for k, chosen in enumerate(record.levels):
         levels[k, chosen] = sums[k]
-    fit = FitSums(
-        levels=levels[branches][:, :, [*columns, p]],
-        fast_a2=fast[:, branches][:, :, branches],
-        spikes=_numbers(record.spikes, B, 2 * K).reshape(B, K, 2)[:, branches],
-        temperature_c=_numbers(record.temperature_c, B, 1)[:, 0],
-        starts=np.array(record.starts, np.bool_),
-    )
-    if not B or len(fit.starts) != B or not (np.isfinite(moments).all() and (count > 0.0).all()):
-        raise ValueError("impossible numbers")
-    return DriveSummary(
-        moments=np.ascontiguousarray(moments[:, columns][:, :, columns]),
-        noise_a2=_numbers(record.noise_a2, B, K)[:, branches],
-        branches=len(branches),
+    summary = DriveSummary(
+        moments=count[:, None, None] * (covariance + mean[:, :, None] * mean[:, None, :]),
+        noise_a2=_numbers(record.noise_a2, B, K),
+        branches=K,
         period_s=record.period_s,
-        bank=store.bank.identity,
-        fit=fit,
+        bank=bank,
+        fit=FitSums(
+            levels=levels,
+            fast_a2=_symmetric(record.fast_a2, B, K),
+            spikes=_numbers(record.spikes, B, 2 * K).reshape(B, K, 2),
+            temperature_c=_numbers(record.temperature_c, B, 1)[:, 0],
+            starts=np.array(record.starts, np.bool_).reshape(B),
+        ),
     )
+    if not B or not (np.isfinite(summary.moments).all() and (count > 0.0).all()):
+        raise ValueError("impossible numbers")
+    return summary
+
+
+def _symmetric(content: bytes, rows: int, size: int) -> Array:
+    """Symmetric matrices of their lower triangles, shape (rows, size, size)."""
+    full, lower = np.zeros((rows, size, size)), np.tril_indices(size)
+    full[:, lower[0], lower[1]] = full[:, lower[1], lower[0]] = _numbers(content, rows, len(lower[0]))
+    return full
 
 
 def _numbers(content: bytes, rows: int, columns: int) -> Array:

@@ -1,44 +1,69 @@
-"""One record of a store: what one reading of a vehicle's drives gave. Records of a vehicle add up."""
+"""Records of a store: what one reading of a vehicle's drives gave, as Parquet, one row each.
+
+Moments are symmetric, so their upper triangles are stored, row by row, one block after the other. A record has at most
+:data:`MOST_BLOCKS` blocks: of longer drives neighbouring blocks are added, so a vehicle's size on disk and in memory
+does not grow with the hours that it is driven between two summaries. Records of a vehicle add up.
+"""
 
 import hashlib
-import math
+import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import reduce
-from operator import add
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from calibrator.drive import Array
 from calibrator.drives.delays import BranchDelays
 from calibrator.drives.store import require_plain_name
-from calibrator.errors import DriveError
-from calibrator.summaries.vehicle_summary import LEAST_DURATION_S, VehicleSummary
-from calibrator.summaries.zero_current import ZeroCurrent, weighted_mean
+from calibrator.errors import DriveError, FleetError
+from calibrator.summaries.identity import StoreIdentity
+from calibrator.summaries.moments import LEVEL_EDGES_A, DriveSummary, FitSums
+from calibrator.summaries.vehicle_summary import VehicleSummary, added_summaries, too_short
+from calibrator.summaries.zero_current import ZeroCurrent
 from calibrator.terminal.text import counted
 
-__all__ = [
-    "IMPOSSIBLE",
-    "MOST_MOMENT",
-    "MOST_VARIANCE_A2",
-    "Known",
-    "Outline",
-    "Record",
-    "added_summaries",
-    "drives_digest",
-    "joined_records",
-    "name_problem",
-    "outline_of",
-    "stored_problem",
-]
+__all__ = ["SCHEMA", "Outline", "Record", "decode_records", "drives_digest", "encode_records", "joined_records"]
 
 IMPOSSIBLE = "its summary holds impossible numbers; look at its recordings, and summarise them again"
 """Why a vehicle is left out."""
 FEWEST_BLOCKS = 4
 """Fewer do not tell how sure anything is; a node's own are of several minutes. [1]"""
+MOST_BLOCKS = 256
+"""Of a record: two hours and more; their spread is known to a tenth. [1]"""
 MOST_MOMENT, MOST_VARIANCE_A2 = 1e30, 1e10
 """Far beyond what any vehicle's recordings give: sums of products in any unit, variance of a current [A^2]."""
+
+_FLOATS, _NAMES = pa.list_(pa.float64()), pa.list_(pa.string())
+SCHEMA = pa.schema(
+    [
+        pa.field("vehicle", pa.string(), nullable=False),
+        pa.field("drives", _NAMES, nullable=False),
+        pa.field("sources", _NAMES, nullable=False),
+        pa.field("digests", _NAMES),
+        pa.field("problem", pa.string()),
+        pa.field("duration_s", pa.float64(), metadata={"unit": "s"}),
+        pa.field("moments", _FLOATS, metadata={"shape": "(B, p (p + 1) / 2), p: filtered inputs, branches [A], 1"}),
+        pa.field("noise_a2", _FLOATS, metadata={"shape": "(B, K)", "unit": "A^2"}),
+        pa.field("levels", _FLOATS, metadata={"shape": "(K, L, p + 1), p and the square of the current", "unit": "A"}),
+        pa.field("fast_a2", _FLOATS, metadata={"shape": "(B, K, K)", "unit": "A^2"}),
+        pa.field("spikes", _FLOATS, metadata={"shape": "(B, K, 2)"}),
+        pa.field("temperature_c", _FLOATS, metadata={"shape": "(B,), NaN where not known", "unit": "degC"}),
+        pa.field("starts", pa.list_(pa.bool_()), metadata={"shape": "(B,)"}),
+        pa.field("delay_reference", pa.string()),
+        pa.field("delay_s", _FLOATS, metadata={"shape": "(K,)", "unit": "s"}),
+        pa.field("delay_sd_s", _FLOATS, metadata={"shape": "(K,), infinite where not known", "unit": "s"}),
+        pa.field("zero_offset_a", _FLOATS, metadata={"shape": "(K,), NaN where there was no window", "unit": "A"}),
+        pa.field("zero_sd_a", _FLOATS, metadata={"shape": "(K,)", "unit": "A"}),
+    ]
+)
+_ABOUT = ["vehicle", "drives", "sources", "digests", "problem", "duration_s"]
+"""Columns without numbers of drives."""
+_NUMBERS = [field.name for field in SCHEMA if field.type in {_FLOATS, pa.list_(pa.bool_())}]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,9 +81,9 @@ class Record:
     digests : tuple of str
         What each drive holds, see :func:`.recording_digest`; none of drives that could not be read.
     found : VehicleSummary or None
-        What they tell; None if they cannot be used.
+        What they tell; None if they cannot be used, or were not asked for.
     problem : str
-        Why not; empty if they can.
+        Why they cannot be used; empty if they can.
     damaged: bool
         Whether they could be used, but what is stored of them makes no sense: their vehicle is left out.
     """
@@ -70,36 +95,26 @@ class Record:
     problem: str = ""
     damaged: bool = False
     digests: tuple[str, ...] = ()
+    duration_s: float = 0.0
+    """Usable data in them, as stored. [s]"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Known:
-    """Which drives a record is of; attributes as of :class:`Record`."""
-
-    vehicle: str
-    drives: tuple[str, ...]
-    sources: tuple[str, ...]
-    digests: tuple[str, ...]
-    problem: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Outline:
-    """What there is of one vehicle.
-
-    Attributes
-    ----------
-    vehicle : str
-        Name.
-    drives : tuple of str
-        Names of the drives that can be used.
-    problem : str
-        Why the vehicle cannot be calibrated; empty if it can.
-    """
+class Outline(NamedTuple):
+    """What there is of one vehicle: names of the drives that can be used, and why it cannot be calibrated, if so."""
 
     vehicle: str
     drives: tuple[str, ...]
     problem: str
+
+    @classmethod
+    def of(cls, records: Sequence[Record]) -> "Outline":
+        """Outline of a vehicle from its records, which need not hold what their drives tell."""
+        usable = [record for record in records if not record.problem]
+        drives = tuple(name for record in usable for name in record.drives)
+        problem = next((record.problem for record in records if record.damaged), "")
+        if not usable:
+            problem = problem or records[-1].problem
+        return cls(records[0].vehicle, drives, problem or too_short(sum(r.duration_s for r in usable), len(drives)))
 
 
 def drives_digest(records: Sequence[Record]) -> str:
@@ -110,100 +125,199 @@ def drives_digest(records: Sequence[Record]) -> str:
     return hashlib.blake2b(repr(known).encode(), digest_size=16).hexdigest()
 
 
-def name_problem(vehicle: str) -> str:
-    """Why a vehicle of this name cannot be used, as its parameter file is named after it; empty if it can."""
-    try:
-        require_plain_name(vehicle, "vehicle")
-    except DriveError as error:
-        return str(error)
-    return ""
-
-
-def stored_problem(text: str) -> str:
-    """The problem of a record as one line, whatever is stored."""
-    return " ".join(text.split()) or "no reason is stored; summarise its drives again"
-
-
-def outline_of(vehicle: str, rows: Sequence[Mapping[str, Any]]) -> Outline:
-    """Outline of a vehicle from the rows of its records, without their moments."""
-    usable = [row for row in rows if row["problem"] is None]
-    drives = tuple(name for row in usable for name in row["drives"] or ())
-    return Outline(vehicle=vehicle, drives=drives, problem=name_problem(vehicle) or _problem_of(rows, usable, drives))
-
-
-def _problem_of(rows: Sequence[Mapping[str, Any]], usable: Sequence[Mapping[str, Any]], drives: Sequence[str]) -> str:
-    if not usable:
-        return stored_problem(rows[-1]["problem"])
-    durations_s = [row["duration_s"] for row in usable]
-    if not all(value is not None and math.isfinite(value) and value > 0.0 for value in durations_s):
-        return IMPOSSIBLE
-    return _too_short(sum(durations_s), drives)
-
-
-def _too_short(duration_s: float, drives: Sequence[str]) -> str:
-    """Why so much data cannot be used; empty if it can."""
-    if duration_s >= LEAST_DURATION_S:
-        return ""
-    found = f"{duration_s:.1f} s of usable data in {counted(len(drives), 'drive')}"
-    return f"{found}; at least {LEAST_DURATION_S:.0f} s are needed"
-
-
 def joined_records(records: Sequence[Record]) -> VehicleSummary:
-    """All that the records of one vehicle tell.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Of one vehicle, at least one.
-
-    Returns
-    -------
-    VehicleSummary
-        With the blocks of all of them; delays are those of the record that tells them best, as drives are aligned with
-        their own; readings in zero-current windows are averaged by their precision.
+    """All that the records of one vehicle, at least one, tell; see :func:`.added_summaries`.
 
     Raises
     ------
     DriveError
         If none can be used, one is damaged, or they are too short together.
     """
-    for record in records:
-        if record.damaged:
-            raise DriveError(record.problem)
     usable = [record.found for record in records if record.found is not None]
+    if problem := next((record.problem for record in records if record.damaged), ""):
+        raise DriveError(problem)
     if not usable:
         raise DriveError(records[-1].problem)
     found = added_summaries(usable)
-    if problem := _too_short(found.summary.duration_s, found.drives):
+    summary, drives = found.summary, len(found.drives)
+    if problem := too_short(summary.duration_s, drives):
         raise DriveError(problem)
-    if len(found.summary.moments) < FEWEST_BLOCKS:
-        raise DriveError(
-            f"{counted(len(found.summary.moments), 'block')} in {counted(len(found.drives), 'drive')}; at least "
-            f"{FEWEST_BLOCKS} are needed"
-        )
-    if not np.abs(found.summary.moments).max() < MOST_MOMENT or found.summary.variance_a2.max() > MOST_VARIANCE_A2:
+    if len(summary.moments) < FEWEST_BLOCKS:
+        blocks = f"{counted(len(summary.moments), 'block')} in {counted(drives, 'drive')}"
+        raise DriveError(f"{blocks}; at least {FEWEST_BLOCKS} are needed")
+    if not np.abs(summary.moments).max() < MOST_MOMENT or summary.variance_a2.max() > MOST_VARIANCE_A2:
         raise DriveError(IMPOSSIBLE)
     return found
 
 
-def added_summaries(parts: Sequence[VehicleSummary]) -> VehicleSummary:
-    """Summary of all drives of several summaries of one vehicle, at least one."""
-    return VehicleSummary(
-        vehicle=parts[0].vehicle,
-        drives=tuple(name for part in parts for name in part.drives),
-        summary=reduce(add, [part.summary for part in parts]),
-        delays=_best_delays([part.delays for part in parts]),
-        zero_current=_mean_reading([part.zero_current for part in parts]),
-        recorded=frozenset.intersection(*(part.recorded for part in parts)),
+# ---- as Parquet
+
+
+def encode_records(records: Sequence[Record], identity: StoreIdentity) -> bytes:
+    """Write records, which have the inputs and branches of the store, as a Parquet file."""
+    buffer = io.BytesIO()
+    table = pa.Table.from_pylist([_row(record, identity) for record in records], schema=SCHEMA)
+    pq.write_table(table, buffer, compression="snappy", use_dictionary=False, write_statistics=["vehicle"])
+    return buffer.getvalue()
+
+
+_upper = cache(np.triu_indices)
+
+
+def _row(record: Record, identity: StoreIdentity) -> dict[str, Any]:
+    row = {name: getattr(record, name) for name in ("vehicle", "drives", "sources", "digests")}
+    if record.found is None:
+        return {**row, "problem": record.problem}
+    found, summary = record.found, record.found.summary.shortened(MOST_BLOCKS)
+    upper = _upper(summary.moments.shape[1])
+    place = [found.delays.branches.index(name) for name in identity.branches]
+    return {
+        **row,
+        "duration_s": summary.duration_s,
+        "moments": summary.moments[:, upper[0], upper[1]].ravel(),
+        "noise_a2": summary.noise_a2.ravel(),
+        **({} if summary.fit is None else {name: value.ravel() for name, value in vars(summary.fit).items()}),
+        "delay_reference": found.delays.branches[0],
+        "delay_s": found.delays.delay_s[place],
+        "delay_sd_s": np.where(found.delays.known, found.delays.sd_s, np.inf)[place],
+        "zero_offset_a": found.zero_current.offset_a,
+        "zero_sd_a": found.zero_current.sd_a,
+    }
+
+
+def decode_records(
+    contents: Sequence[bytes], identity: StoreIdentity, where: str, *, whole: bool = True
+) -> list[Record]:
+    """Read records from Parquet files.
+
+    Parameters
+    ----------
+    contents : sequence of bytes
+        The files.
+    identity : StoreIdentity
+        Of their store.
+    where : str
+        Of the files, for messages.
+    whole : bool
+        Whether to read what the drives tell, too, and not only which they are.
+
+    Returns
+    -------
+    list of Record
+        In the order of the files. One whose numbers make no sense, or are too few or too many, is damaged.
+
+    Raises
+    ------
+    FleetError
+        If a file is cut or no such file.
+    """
+    found: list[Record] = []
+    for content in contents:
+        reason = "its columns are not those of summaries"
+        try:
+            file = pq.ParquetFile(pa.BufferReader(content), pre_buffer=False)
+            if file.schema_arrow.equals(SCHEMA):
+                table = file.read(columns=None if whole else _ABOUT, use_threads=False)
+                table.validate(full=True)
+                found += _records(table, identity, whole=whole)
+                continue
+        except (pa.ArrowException, OSError):
+            reason = "it is cut, or no Parquet file"
+        raise FleetError(f"{where}: damaged file of summaries: {reason}; remove it and summarise again")
+    return found
+
+
+def _records(table: pa.Table, identity: StoreIdentity, *, whole: bool) -> list[Record]:
+    rows, found = table.drop_columns(_NUMBERS if whole else []).to_pylist(), []
+    numbers = {name: _values(table, name) for name in _NUMBERS} if whole else {}
+    bank = identity.bank.identity
+    for place, row in enumerate(rows):
+        drives, sources, digests = (tuple(x or "" for x in row[n] or ()) for n in ("drives", "sources", "digests"))
+        record = Record(
+            vehicle=row["vehicle"] or "",
+            drives=drives,
+            sources=sources if len(sources) == len(drives) else ("",) * len(drives),
+            digests=digests,
+            found=None,
+        )
+        if row["problem"] is not None:
+            text = " ".join(row["problem"].split())
+            found.append(replace(record, problem=text or "no reason is stored; summarise its drives again"))
+            continue
+        try:
+            require_plain_name(record.vehicle, "vehicle")  # its parameter file is named after it
+            if not (0.0 < (row["duration_s"] or 0.0) < np.inf and len(sources) == len(drives)):
+                raise ValueError
+            own = {name: each[place] for name, each in numbers.items()}
+            vehicle = _vehicle(row, own, identity, bank) if whole else None
+            found.append(replace(record, found=vehicle, duration_s=row["duration_s"]))
+        except DriveError as error:
+            found.append(replace(record, problem=str(error), damaged=True))
+        except (ValueError, TypeError):
+            found.append(replace(record, problem=IMPOSSIBLE, damaged=True))
+    return found
+
+
+def _values(table: pa.Table, name: str) -> list[Array]:
+    """Numbers in each row of a column of lists: NaN for what is none, nothing where there is no list."""
+    lists = table.column(name).combine_chunks()
+    values = np.asarray(lists.values.to_numpy(zero_copy_only=False), np.float64)
+    return [values[start:stop] for start, stop in pairwise(lists.offsets.to_numpy().tolist())]
+
+
+def _vehicle(
+    row: Mapping[str, Any], numbers: Mapping[str, Array], identity: StoreIdentity, bank: str
+) -> VehicleSummary:
+    """What a row tells; ValueError or TypeError if its numbers are too few, too many or impossible.
+
+    Buckets come from disks and tools that may have spoilt them.
+    """
+    K, L = len(identity.branches), len(LEVEL_EDGES_A) + 1
+    p = identity.bank.width + K + 1
+    noise_a2 = numbers["noise_a2"].reshape(-1, K)
+    B, upper = len(noise_a2), _upper(p)
+    moments, fit = np.empty((B, p, p)), None
+    moments[:, upper[0], upper[1]] = moments[:, upper[1], upper[0]] = numbers["moments"].reshape(B, len(upper[0]))
+    squares = np.diagonal(moments, axis1=1, axis2=2)
+    possible = np.abs(moments).max() < MOST_MOMENT and squares.min() >= 0.0 and squares[:, -1].min() > 0.0
+    possible &= 0.0 <= noise_a2.min() <= noise_a2.max() <= MOST_VARIANCE_A2
+    if numbers["levels"].size:
+        fit = FitSums(
+            levels=numbers["levels"].reshape(K, L, p + 1),
+            fast_a2=numbers["fast_a2"].reshape(B, K, K),
+            spikes=numbers["spikes"].reshape(B, K, 2),
+            temperature_c=numbers["temperature_c"].reshape(B),
+            starts=numbers["starts"].reshape(B) > 0.0,
+        )
+        possible &= max(np.abs(fit.levels).max(), np.abs(fit.fast_a2).max()) < MOST_MOMENT
+        possible &= 0.0 <= fit.spikes.min() <= fit.spikes.max() < np.inf and fit.levels[..., -1].min() >= 0.0
+        possible &= not np.isinf(fit.temperature_c).any()
+    delay_s, sd_s, zero_a, zero_sd_a = (
+        numbers[name].reshape(K) for name in ("delay_s", "delay_sd_s", "zero_offset_a", "zero_sd_a")
     )
-
-
-def _best_delays(parts: Sequence[BranchDelays]) -> BranchDelays:
-    """Delays of the record that knows most of them, and these best: records may have different reference branches."""
-    return max(parts, key=lambda part: (int(part.known.sum()), -float(part.sd_s[part.known].sum())))
-
-
-def _mean_reading(parts: Sequence[ZeroCurrent]) -> ZeroCurrent:
-    pairs: list[tuple[Array, Array]] = [(part.offset_a, part.sd_a) for part in parts]
-    offset_a, sd_a = weighted_mean(*pairs)
-    return ZeroCurrent(offset_a=offset_a, sd_a=sd_a)
+    has_zero = ~(np.isnan(zero_a) & np.isnan(zero_sd_a))
+    possible &= bool((np.isposinf(sd_s) | ((sd_s >= 0.0) & np.isfinite(delay_s))).all())
+    possible &= bool((np.isfinite(zero_a) & (zero_sd_a > 0.0) & np.isfinite(zero_sd_a))[has_zero].all())
+    if not possible:
+        raise ValueError
+    first = identity.branches.index(row["delay_reference"])
+    order = [first, *(k for k in range(K) if k != first)]
+    return VehicleSummary(
+        vehicle=row["vehicle"],
+        drives=tuple(row["drives"]),
+        summary=DriveSummary(
+            moments=moments,
+            noise_a2=noise_a2,
+            branches=K,
+            period_s=identity.bank.period_s,
+            bank=bank,
+            fit=fit,
+        ),
+        delays=BranchDelays(
+            branches=tuple(identity.branches[k] for k in order),
+            delay_s=delay_s[order],
+            sd_s=sd_s[order],
+            known=np.isfinite(sd_s[order]),
+        ),
+        zero_current=ZeroCurrent(offset_a=zero_a, sd_a=zero_sd_a),
+    )

@@ -10,26 +10,35 @@ do not count if a run was killed before.
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
+from calibrator.drive import Equipment
 from calibrator.drives.store import is_plain_name
 from calibrator.errors import FleetError
-from calibrator.files.storage import Storage
-from calibrator.sources.fleet_source import Equipment, FleetSource
+from calibrator.files.storage import Storage, open_storage
+from calibrator.sources.fleet_source import FleetSource
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity, bucket_of, read_identity, store_identity, write_identity
-from calibrator.summaries.record import Known, Outline, Record
-from calibrator.summaries.table import decode_known, decode_outlines, decode_records, encode_records
-from calibrator.terminal.text import few
+from calibrator.summaries.record import Outline, Record, decode_records, encode_records
+from calibrator.terminal.progress import progress_bar
+from calibrator.terminal.text import counted, dumps, few, reasons_text
 from ecu_node.database import VehicleDatabase
+from ecu_node.errors import UserError
 
-__all__ = ["SummaryStore", "open_store", "require_store_or_nothing"]
+__all__ = [
+    "CompactReport",
+    "StoreReport",
+    "SummaryStore",
+    "compact_store",
+    "look_at_store",
+    "open_store",
+    "require_store_or_nothing",
+]
 
 _FILE = re.compile(r"(?P<bucket>[0-9]{5})-(?P<number>[0-9]{5})(?P<whole>\.whole)?\.parquet")
-_Row = TypeVar("_Row", Record, Known, Outline)
+Records = Mapping[str, Sequence[Record]]
+"""By vehicle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,9 +61,20 @@ class SummaryStore:
         """Where the store is, for messages."""
         return self.storage.url
 
+    @property
+    def _files(self) -> Storage:
+        return self.storage.folder("buckets")
+
     def bucket_of(self, vehicle: str) -> int:
         """Bucket of a vehicle."""
         return bucket_of(vehicle, self.identity.buckets)
+
+    def by_bucket(self, vehicles: Iterable[str]) -> dict[int, list[str]]:
+        """Vehicles by the bucket that they are in."""
+        found: dict[int, list[str]] = defaultdict(list)
+        for vehicle in vehicles:
+            found[self.bucket_of(vehicle)].append(vehicle)
+        return dict(sorted(found.items()))
 
     def buckets(self) -> list[int]:
         """Buckets in which there are vehicles, in order.
@@ -76,99 +96,88 @@ class SummaryStore:
                 found.add(int(parts["bucket"]))
         return sorted(found)
 
+    def files(self, bucket: int) -> tuple[list[str], list[str]]:
+        """Files of a bucket that count, and those that do not any more, in the order of their addition."""
+        names = [name for name in self._files.names(f"{bucket:05d}-") if _FILE.fullmatch(name)]
+        first = max((k for k, name in enumerate(names) if ".whole." in name), default=0)
+        return names[first:], names[:first]
+
     def versions(self) -> dict[str, str]:
         """What tells whether a file was changed, by name."""
         return {entry.name: entry.version for entry in self._files.contents()[1]}
-
-    def by_bucket(self, vehicles: Iterable[str]) -> dict[int, list[str]]:
-        """Vehicles by the bucket that they are in."""
-        found: dict[int, list[str]] = defaultdict(list)
-        for vehicle in vehicles:
-            found[self.bucket_of(vehicle)].append(vehicle)
-        return dict(sorted(found.items()))
-
-    def read(self, bucket: int) -> dict[str, list[Record]]:
-        """Records of a bucket by vehicle, in the order of their names, and of their addition; none if it is empty.
-
-        Raises
-        ------
-        UserError
-            If the bucket cannot be read or is damaged.
-        """
-        return self._by_vehicle(bucket, lambda content, where: decode_records(content, self.identity, where))
-
-    def known(self, bucket: int) -> dict[str, list[Known]]:
-        """Which drives the records of a bucket are of, as :meth:`read` but without their moments."""
-        return self._by_vehicle(bucket, decode_known)
-
-    def outlines(self, bucket: int) -> list[Outline]:
-        """What there is of each vehicle of a bucket; raises as :meth:`read`."""
-        return self._rows(bucket, decode_outlines)
-
-    def write(self, bucket: int, records: Mapping[str, Sequence[Record]]) -> None:
-        """Replace a bucket, whole or not at all; UserError if it cannot be written."""
-        old = self._names(bucket)
-        self._files.write(_file(bucket, _next(old), whole=True), self._encoded(records))
-        for name in old:
-            self._files.remove(name)
-
-    def append(self, bucket: int, records: Mapping[str, Sequence[Record]]) -> None:
-        """Add records to a bucket, whole or not at all; UserError if they cannot be written."""
-        self._files.write(_file(bucket, _next(self._names(bucket)), whole=False), self._encoded(records))
-
-    def files(self, bucket: int) -> tuple[list[str], list[str]]:
-        """Files of a bucket that count, and those that do not any more, in the order of their addition."""
-        names = self._names(bucket)
-        first = max((k for k, name in enumerate(names) if ".whole." in name), default=0)
-        return names[first:], names[:first]
 
     def size_bytes(self) -> int:
         """Size of its files. [byte]"""
         return sum(entry.size for entry in self._files.contents()[1])
 
-    def locked(self) -> AbstractContextManager[None]:
-        """While no other process of this machine does the same; other storage than folders has no locks."""
-        return self.storage.locked()
+    def read(self, bucket: int, *, whole: bool = True) -> dict[str, list[Record]]:
+        """Records of a bucket by vehicle, in the order of their names, and of their addition; none if it is empty.
 
-    @property
-    def _files(self) -> Storage:
-        return self.storage.folder("buckets")
+        Parameters
+        ----------
+        bucket : int
+            Number of the bucket.
+        whole : bool
+            Whether to read what their drives tell, too, and not only which they are.
 
-    def _names(self, bucket: int) -> list[str]:
-        return [name for name in self._files.names(f"{bucket:05d}-") if _FILE.fullmatch(name)]
-
-    def _encoded(self, records: Mapping[str, Sequence[Record]]) -> bytes:
-        return encode_records([record for vehicle in sorted(records) for record in records[vehicle]], self.identity)
-
-    def _rows(self, bucket: int, decode: "Callable[[Sequence[bytes], str], list[_Row]]") -> "list[_Row]":
-        """What the files of a bucket hold; refuse vehicles of another one, but not names that no vehicle may have."""
-        names = self.files(bucket)[0]
+        Raises
+        ------
+        UserError
+            If the bucket cannot be read, is damaged, or holds vehicles of another one.
+        """
+        names, found = self.files(bucket)[0], dict[str, list[Record]]()
         where = f"{self._files.url}/{names[0] if len(names) == 1 else f'{bucket:05d}-*.parquet'}" if names else ""
-        rows = decode([self._files.read(name) for name in names], where)
-        for name in {row.vehicle for row in rows}:
-            right = self.bucket_of(name)
-            if right != bucket and is_plain_name(name):
+        contents = [self._files.read(name) for name in names]
+        for record in decode_records(contents, self.identity, where, whole=whole):
+            found.setdefault(record.vehicle, []).append(record)
+        for name in found:
+            if (right := self.bucket_of(name)) != bucket and is_plain_name(name):
                 raise FleetError(
                     f"{where}: vehicle {name} belongs into bucket {right:05d}; this file was renamed or copied: remove "
                     f"it and summarise again"
                 )
-        return rows
-
-    def _by_vehicle(
-        self, bucket: int, decode: "Callable[[Sequence[bytes], str], list[_Row]]"
-    ) -> "dict[str, list[_Row]]":
-        found: dict[str, list[_Row]] = {}
-        for row in self._rows(bucket, decode):
-            found.setdefault(row.vehicle, []).append(row)
         return dict(sorted(found.items()))
 
+    def outlines(self, bucket: int) -> list[Outline]:
+        """What there is of each vehicle of a bucket; raises as :meth:`read`."""
+        return [Outline.of(records) for records in self.read(bucket, whole=False).values()]
 
-def _file(bucket: int, number: int, *, whole: bool) -> str:
-    return f"{bucket:05d}-{number:05d}{'.whole' if whole else ''}.parquet"
+    def write(self, bucket: int, records: Records) -> None:
+        """Replace a bucket, whole or not at all; UserError if it cannot be written."""
+        self._put(bucket, records, whole=True)
 
+    def append(self, bucket: int, records: Records) -> None:
+        """Add records to a bucket, whole or not at all; UserError if they cannot be written."""
+        self._put(bucket, records, whole=False)
 
-def _next(names: Sequence[str]) -> int:
-    return int(names[-1][6:11]) + 1 if names else 0
+    def _put(self, bucket: int, records: Records, *, whole: bool) -> None:
+        old = [name for names in self.files(bucket)[::-1] for name in names]
+        number = int(old[-1][6:11]) + 1 if old else 0
+        content = encode_records([record for name in sorted(records) for record in records[name]], self.identity)
+        self._files.write(f"{bucket:05d}-{number:05d}{'.whole' * whole}.parquet", content)
+        for name in old if whole else ():
+            self._files.remove(name)
+
+    def change(
+        self, bucket: int, change: Callable[[Record], Record | None], new: Sequence[Record] = (), *, whole: bool = False
+    ) -> None:
+        """Add records to a bucket, and put what a function makes of each in its place; None: it is removed.
+
+        The function must not look at what drives tell. Only where it changes something, or `whole` says so, the bucket
+        is written anew. Other processes of this machine wait meanwhile; other storage than folders has no locks.
+        """
+        added = {record.vehicle: [record] for record in new}
+        with self.storage.locked():
+            old = [record for records in self.read(bucket, whole=False).values() for record in records]
+            if not whole and all(change(record) is record for record in old):
+                if added:
+                    self.append(bucket, added)
+                return
+            records = {
+                name: [left for record in items if (left := change(record)) is not None]
+                for name, items in self.read(bucket).items()
+            }
+            self.write(bucket, records | {name: [*records.get(name, ()), *items] for name, items in added.items()})
 
 
 def require_store_or_nothing(storage: Storage) -> None:
@@ -237,4 +246,134 @@ def open_store(
         assert identity is not None
     if difference := identity.difference(wanted):
         raise FleetError(f"{storage.url}: these drives cannot be added to this store: {difference}; use another store")
+    return SummaryStore(storage=storage, identity=identity)
+
+
+# ---- ``calibrator store``
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoreReport:
+    """What a store holds; sizes in bytes, durations in hours."""
+
+    store: str
+    layout: str
+    branches: tuple[str, ...]
+    inputs: tuple[str, ...]
+    vehicles: int
+    unusable: int
+    drives: int
+    hours: float
+    files: int
+    size_bytes: int
+    faults: Mapping[str, str]
+
+    def as_json(self) -> str:
+        """The report as JSON."""
+        return dumps(vars(self))
+
+    def as_text(self) -> str:
+        """The report for people."""
+        lines = [
+            f"{self.store}: {counted(self.vehicles, 'vehicle')}, {self.unusable} of them without usable drives; "
+            f"{counted(self.drives, 'drive')}, {self.hours:.1f} h; {counted(self.files, 'file')}, "
+            f"{self.size_bytes / 1e6:.1f} MB",
+            f"layout {self.layout}; branches {', '.join(self.branches)}; inputs {few(self.inputs)}",
+        ]
+        return "\n".join([*lines, *([reasons_text("faults:", self.faults)] if self.faults else [])])
+
+
+def look_at_store(place: str, *, whole: bool = False) -> StoreReport:
+    """Look at a store.
+
+    Parameters
+    ----------
+    place : str
+        Path or URL.
+    whole : bool
+        Whether to read all that it holds, and to look for damage and for recordings that several vehicles have; else
+        names of vehicles and drives only.
+
+    Returns
+    -------
+    StoreReport
+        What was found; faults by vehicle or file.
+
+    Raises
+    ------
+    FleetError
+        If it is no store.
+    """
+    store, faults, seen, files = _open(place), dict[str, str](), list[tuple[bool, int, float]](), 0
+    owners, buckets = dict[str, str](), store.buckets()
+    with progress_bar("look at vehicles", len(buckets), "buckets") as progress:
+        for done, bucket in enumerate(buckets, 1):
+            current, old = store.files(bucket)
+            files += len(current) + len(old)
+            faults |= dict.fromkeys(old, "does not count any more, as a run was killed: 'calibrator store compact'")
+            try:
+                for name, records in store.read(bucket, whole=whole).items():
+                    outline = Outline.of(records)
+                    seen.append((bool(outline.problem), len(outline.drives), sum(r.duration_s for r in records)))
+                    for record in records if whole else ():
+                        if record.damaged:
+                            faults[name] = record.problem
+                        for digest in record.digests if not record.problem else ():
+                            if (other := owners.setdefault(digest, name)) != name:
+                                faults[name] = f"has a recording that {other} has as well; remove it where it is wrong"
+            except UserError as error:
+                faults[f"bucket {bucket:05d}"] = str(error)
+            progress(done)
+    return StoreReport(
+        store=place,
+        layout=store.identity.layout,
+        branches=store.identity.branches,
+        inputs=store.identity.fleet_inputs,
+        vehicles=len(seen),
+        unusable=sum(unusable for unusable, _, _ in seen),
+        drives=sum(drives for _, drives, _ in seen),
+        hours=sum(duration_s for _, _, duration_s in seen) / 3600.0,
+        files=files,
+        size_bytes=store.size_bytes(),
+        faults=faults,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompactReport:
+    """What was put together: numbers of buckets written anew and of damaged records removed."""
+
+    store: str
+    buckets: int
+    removed: int
+
+    def as_json(self) -> str:
+        """The report as JSON."""
+        return dumps(vars(self))
+
+    def as_text(self) -> str:
+        """The report for people."""
+        done = f"{counted(self.buckets, 'bucket')} written anew, {counted(self.removed, 'damaged record')} removed"
+        return f"{self.store}: {done}"
+
+
+def compact_store(place: str) -> CompactReport:
+    """Make one file of each bucket, without damaged records. FleetError if it is no store."""
+    store, merged, removed = _open(place), 0, 0
+    buckets = store.buckets()
+    with progress_bar("put files together", len(buckets), "buckets") as progress:
+        for done, bucket in enumerate(buckets, 1):
+            damaged = sum(record.damaged for records in store.read(bucket).values() for record in records)
+            if damaged or sum(map(len, store.files(bucket))) > 1:
+                store.change(bucket, lambda record: None if record.damaged else record, whole=True)
+                merged, removed = merged + 1, removed + damaged
+            progress(done)
+    return CompactReport(store=place, buckets=merged, removed=removed)
+
+
+def _open(place: str) -> SummaryStore:
+    storage = open_storage(place)
+    identity = read_identity(storage)
+    if identity is None:
+        raise FleetError(f"{place}: no store of summaries there; make one with 'calibrator summarise --out'")
     return SummaryStore(storage=storage, identity=identity)

@@ -5,19 +5,20 @@ A recording counts once. One that two vehicles have counts for neither, as it ca
 """
 
 import hashlib
-from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import groupby
 from pathlib import Path
+from typing import NamedTuple
 
-from calibrator.drive import Drive, DriveFile
+from calibrator.drive import Drive, DriveFile, Equipment
+from calibrator.drives.align import Samples
 from calibrator.drives.store import recording_digest
 from calibrator.files.storage import local_copy, open_storage
-from calibrator.processes.run_many import Failed, Workers, try_many
+from calibrator.processes.run_many import Failed, Workers, try_many_shown
 from calibrator.sources.fleet_source import (
-    MEGABYTE,
     FleetSource,
     find_fleet,
     is_onboard,
@@ -27,29 +28,46 @@ from calibrator.sources.fleet_source import (
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.identity import StoreIdentity
 from calibrator.summaries.onboard import read_onboard
-from calibrator.summaries.record import Known, Record, added_summaries
+from calibrator.summaries.record import Record
 from calibrator.summaries.store import SummaryStore, open_store, require_store_or_nothing
-from calibrator.summaries.vehicle_summary import VehicleSummary, summarise_drives
+from calibrator.summaries.vehicle_summary import VehicleSummary, added_summaries, aligned_drives, summarise_drives
 from calibrator.terminal.options import TIME_LIMIT_S
-from calibrator.terminal.progress import progress_bar
 from calibrator.terminal.text import counted, dumps, left_out_text
 from ecu_node.database import VehicleDatabase
 
-__all__ = ["Added", "SummariseReport", "add_drives", "summarise_fleet"]
+__all__ = [
+    "SummariseReport",
+    "add_drives",
+    "read_samples",
+    "read_vehicle_summary",
+    "summarise_fleet",
+]
 
 COPY = "same recording as"
 """How the problem of a recording begins that is there already."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class SummariseReport:
-    """What was summarised."""
+    """What was summarised.
+
+    Attributes
+    ----------
+    store : str
+        Path or URL of the store.
+    vehicles, drives : int
+        Vehicles whose drives were read, and these drives; those that were in the store already are not.
+    left_out : dict of str to str
+        Vehicles whose drives could not be used, files whose vehicle is unclear, and why.
+    notices : list of str
+        What else the user should know.
+    """
 
     store: str
-    vehicles: int
-    drives: int
-    left_out: Mapping[str, str]
-    notices: tuple[str, ...]
+    vehicles: int = 0
+    drives: int = 0
+    left_out: dict[str, str] = field(default_factory=dict)
+    notices: list[str] = field(default_factory=list)
 
     def as_json(self) -> str:
         """The report as JSON."""
@@ -109,34 +127,9 @@ def summarise_fleet(
     source = find_fleet(fleet)
     equipment = probe_equipment(source, database, branches, limit_s=time_limit_s)
     store = open_store(storage, equipment, database, source, bank=bank)
-    added = add_drives(store, source, database, workers=workers, time_limit_s=time_limit_s)
-    return SummariseReport(
-        store=out,
-        vehicles=added.vehicles,
-        drives=added.drives,
-        left_out={**source.left_out, **added.problems},
-        notices=(*equipment.notices, *added.notices),
-    )
-
-
-@dataclass(kw_only=True)
-class Added:
-    """What was added to a store.
-
-    Attributes
-    ----------
-    vehicles, drives : int
-        Vehicles whose drives were read, and these drives; those that were in the store already are not.
-    problems : dict of str to str
-        Vehicles whose drives could not be used, and why.
-    notices : list of str
-        What else the user should know.
-    """
-
-    vehicles: int = 0
-    drives: int = 0
-    problems: dict[str, str] = field(default_factory=dict)
-    notices: list[str] = field(default_factory=list)
+    report = add_drives(store, source, database, workers=workers, time_limit_s=time_limit_s)
+    report.store, report.notices = out, [*equipment.notices, *report.notices]
+    return report
 
 
 def add_drives(
@@ -147,7 +140,7 @@ def add_drives(
     workers: Workers,
     time_limit_s: float = TIME_LIMIT_S,
     exactly: bool = False,
-) -> Added:
+) -> SummariseReport:
     """Summarise the drives of a fleet that a store does not have yet.
 
     Parameters
@@ -165,41 +158,53 @@ def add_drives(
 
     Returns
     -------
-    Added
+    SummariseReport
         What was read. A vehicle whose drives cannot be used has a record that says why.
     """
     if exactly:
-        _remove_others(store, fleet)
-    waiting, added, owners, seen = deque[_Work](), Added(), _Owners(), 0.0
-    entries = _entries(store, fleet, waiting, owners, retry=not exactly)
-    outcomes = try_many(
-        partial(_read_record, store=store.identity, database=database), entries, workers, limit_s=time_limit_s
+        for bucket in store.buckets():
+            store.change(bucket, partial(_without_others, fleet=fleet))
+    report, owners = SummariseReport(store=store.url, left_out=dict(fleet.left_out)), _Owners()
+    read = partial(_read_record, store=store.identity, database=database)
+    tasks = _tasks(store, fleet, owners, retry=not exactly)
+    outcomes = try_many_shown(
+        read,
+        tasks,
+        workers,
+        limit_s=time_limit_s,
+        label="summarise drives",
+        size=sum(fleet.sizes.values()),
+        size_of=lambda task: task.size,
     )
-    total = int(sum(fleet.sizes.values()) / MEGABYTE) + 1
-    with progress_bar("summarise drives", total, "MB") as progress, closing(outcomes):
-        for (drives, _), outcome in outcomes:
-            while not waiting[0].versions:
-                seen += waiting.popleft().size
-            work = waiting[0]
-            work.records.append(_unusable(drives, outcome.reason) if isinstance(outcome, Failed) else outcome)
-            done = seen + sum(fleet.sizes.get(record.vehicle, 0) for record in work.records)
-            progress(done / MEGABYTE)
-            if len(work.records) == len(work.versions):
-                _keep(store, work, added, owners)
-                seen += waiting.popleft().size
-        progress(total)
-    _mark_copies(store, added, owners)
-    return added
+    with closing(outcomes):
+        for bucket, group in groupby(outcomes, key=lambda pair: pair[0].bucket):
+            records, versions = list[Record](), dict[str, Mapping[str, str]]()
+            for task, outcome in group:
+                is_read = not isinstance(outcome, Failed)
+                records.append(outcome if is_read else _record(task.drives, problem=outcome.reason))  # type: ignore[union-attr,arg-type]
+                versions[task.drives[0].vehicle] = task.versions
+            _keep(store, bucket, records, versions, report)
+            for record in records:
+                owners.add(record.vehicle, record.digests)
+    for bucket in store.by_bucket(set().union(*owners.shared.values())):
+        store.change(bucket, owners.without_copies)
+        for records_ in store.read(bucket, whole=False).values():
+            report.left_out.update({r.vehicle: r.problem for r in records_ if r.problem.startswith(COPY)})
+    return report
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Work:
-    """What is to be read for a bucket: versions of all drives by vehicle; and the records of them so far."""
+class _Task(NamedTuple):
+    """What is read at a time: new drives of one vehicle.
+
+    ``digests`` are those of its other recordings, ``versions`` of all its drives, ``size`` that of the fleet since the
+    task before. [byte]
+    """
 
     bucket: int
+    drives: tuple[DriveFile, ...]
+    digests: frozenset[str]
+    versions: Mapping[str, str]
     size: int
-    versions: Mapping[str, Mapping[str, str]]
-    records: list[Record] = field(default_factory=list)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,54 +216,68 @@ class _Owners:
 
     def add(self, vehicle: str, digests: Iterable[str]) -> None:
         """Note the recordings of a vehicle."""
-        for digest in digests:
-            other = self.first.setdefault(_key(digest), vehicle)
-            if other != vehicle:
-                self.shared.setdefault(_key(digest), {other}).add(vehicle)
+        for key in map(_key, digests):
+            if (other := self.first.setdefault(key, vehicle)) != vehicle:
+                self.shared.setdefault(key, {other}).add(vehicle)
+
+    def without_copies(self, record: Record) -> Record:
+        """A record, without its summary if several vehicles have a recording of it."""
+        sharing = set[str]().union(*(self.shared.get(_key(digest), ()) for digest in record.digests))
+        if not sharing - {record.vehicle}:
+            return record
+        others = ", ".join(sorted(sharing - {record.vehicle}))
+        problem = f"{COPY} {others}; it cannot be told whose it is: remove it where it does not belong"
+        return record if record.problem == problem else replace(record, found=None, problem=problem)
 
 
 def _key(digest: str) -> int:
     return int(digest[:16], 16)
 
 
-def _entries(
-    store: SummaryStore, fleet: FleetSource, waiting: deque[_Work], owners: _Owners, *, retry: bool
-) -> Iterator[tuple[tuple[DriveFile, ...], frozenset[str]]]:
-    """Drives to read, vehicle by vehicle, with the digests of those that it has; ``waiting`` gets their buckets."""
+def _tasks(store: SummaryStore, fleet: FleetSource, owners: _Owners, *, retry: bool) -> Iterator[_Task]:
+    """Drives to read, bucket by bucket; owners are told of those that the store has."""
+    size = 0
     for bucket, names in store.by_bucket(fleet.vehicles).items():
-        records, new, versions = store.known(bucket), [], {}
+        records = store.read(bucket, whole=False)
         for name in names:
             drives = fleet.vehicles[name]
-            there = {drive.name: drive.version for drive in drives}
-            kept = [k for k in records.get(name, ()) if _stays(k, there) and not _is_tried_again(k, retry=retry)]
+            versions = {drive.name: drive.version for drive in drives}
+            kept = [k for k in records.get(name, ()) if _stays(k, versions) and not _is_tried_again(k, retry=retry)]
             digests = frozenset(digest for record in kept for digest in record.digests)
             owners.add(name, digests)
+            size += fleet.sizes.get(name, 0)
             known = {drive for record in kept for drive in record.drives}
             if wanted := tuple(drive for drive in drives if drive.name not in known):
-                versions[name] = there
-                new.append((wanted, digests))
-        waiting.append(_Work(bucket=bucket, size=sum(fleet.sizes.get(n, 0) for n in names), versions=versions))
-        yield from new
+                yield _Task(bucket, wanted, digests, versions, size)
+                size = 0
 
 
-def _is_tried_again(record: Known, *, retry: bool) -> bool:
+def _is_tried_again(record: Record, *, retry: bool) -> bool:
     """Whether a record without a summary is to be made anew, though its drives did not change."""
     return bool(record.problem) and (retry or record.problem.startswith(COPY))
 
 
-def _stays(record: Known | Record, versions: Mapping[str, str]) -> bool:
+def _stays(record: Record, versions: Mapping[str, str]) -> bool:
     """Whether a record is still right, or cannot be made anew as not all of its drives are given."""
     known = zip(record.drives, record.sources, strict=True)
     return not versions.keys() >= set(record.drives) or all(versions[drive] == source for drive, source in known)
 
 
-def _read_record(
-    work: tuple[tuple[DriveFile, ...], frozenset[str]], *, store: StoreIdentity, database: VehicleDatabase
-) -> Record:
-    """Record of some drives of one vehicle, which has others with these digests already."""
-    entries, known = work
+def _without_others(record: Record, *, fleet: FleetSource) -> Record | None:
+    """A record, but not of drives that are not, or no longer, those of the fleet."""
+    versions = (
+        {drive.name: drive.version for drive in fleet.vehicles[record.vehicle]}
+        if record.vehicle in fleet.vehicles
+        else {}
+    )
+    known = zip(record.drives, record.sources, strict=True)
+    return record if all(versions.get(drive) == source for drive, source in known) else None
+
+
+def _read_record(task: _Task, *, store: StoreIdentity, database: VehicleDatabase) -> Record:
+    """Record of some drives of one vehicle."""
     made, drives, digests = dict[str, VehicleSummary](), dict[str, Drive](), list[str]()
-    for entry in entries:
+    for entry in task.drives:
         if is_onboard(entry):
             with local_copy(entry.place) as path:
                 digests.append(hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest())
@@ -267,94 +286,68 @@ def _read_record(
             drive = load_drive(entry, database)
             digests.append(recording_digest(drive))
             drives[digests[-1]] = drive
-    new = [drive for digest, drive in drives.items() if digest not in known]
+    new = [drive for digest, drive in drives.items() if digest not in task.digests]
     parts = [summarise_drives(new, store.equipment, database, bank=store.bank)] if new else []
-    parts += [summary for digest, summary in made.items() if digest not in known]
+    parts += [summary for digest, summary in made.items() if digest not in task.digests]
     if not parts:
-        return _unusable(entries, f"{COPY} one that this vehicle has already; it counts once", tuple(digests))
-    names = tuple(entry.name for entry in entries)
+        return _record(task.drives, digests, problem=f"{COPY} one that this vehicle has already; it counts once")
+    return _record(task.drives, digests, found=added_summaries(parts))
+
+
+def _record(
+    drives: Sequence[DriveFile], digests: Sequence[str] = (), *, found: VehicleSummary | None = None, problem: str = ""
+) -> Record:
+    vehicle, names = drives[0].vehicle, tuple(entry.name for entry in drives)
     return Record(
-        vehicle=entries[0].vehicle,
+        vehicle=vehicle,
         drives=names,
-        sources=tuple(entry.version for entry in entries),
+        sources=tuple(entry.version for entry in drives),
         digests=tuple(digests),
-        found=replace(added_summaries(parts), vehicle=entries[0].vehicle, drives=names),
-    )
-
-
-def _unusable(entries: Sequence[DriveFile], problem: str, digests: tuple[str, ...] = ()) -> Record:
-    return Record(
-        vehicle=entries[0].vehicle,
-        drives=tuple(entry.name for entry in entries),
-        sources=tuple(entry.version for entry in entries),
-        digests=digests,
-        found=None,
+        found=found and replace(found, vehicle=vehicle, drives=names),
         problem=problem,
     )
 
 
-def _keep(store: SummaryStore, work: _Work, added: Added, owners: _Owners) -> None:
-    """Put the new records of a bucket into the store, beside what others have put there meanwhile."""
-    new = {record.vehicle: record for record in work.records}
+def _keep(
+    store: SummaryStore,
+    bucket: int,
+    new: Sequence[Record],
+    versions: Mapping[str, Mapping[str, str]],
+    report: SummariseReport,
+) -> None:
+    """Put new records into a bucket, beside what others have put there meanwhile."""
+    read = {record.vehicle: set(record.drives) for record in new}
 
-    def is_replaced(old: Known | Record) -> bool:
-        record = new.get(old.vehicle)
-        return record is not None and (
-            not _stays(old, work.versions[old.vehicle]) or bool(set(old.drives) & set(record.drives))
+    def kept(old: Record) -> Record | None:
+        is_right = old.vehicle not in read or (
+            _stays(old, versions[old.vehicle]) and read[old.vehicle].isdisjoint(old.drives)
         )
+        return old if is_right else None
 
-    with store.locked():
-        if any(is_replaced(old) for records in store.known(work.bucket).values() for old in records):
-            records = {
-                name: [old for old in items if not is_replaced(old)] for name, items in store.read(work.bucket).items()
-            }
-            for name, record in new.items():
-                records[name] = [*records.get(name, ()), record]
-            store.write(work.bucket, records)
-        else:
-            store.append(work.bucket, {name: [record] for name, record in new.items()})
-    for record in work.records:
-        owners.add(record.vehicle, record.digests)
-        added.vehicles += 1
-        added.drives += len(record.drives)
+    store.change(bucket, kept, new)
+    for record in new:
+        report.vehicles += 1
+        report.drives += len(record.drives)
         if record.problem:
-            added.problems[record.vehicle] = record.problem
-        if len(set(record.digests)) < len(record.digests):
-            twins = [name for k, name in enumerate(record.drives) if record.digests.count(record.digests[k]) > 1]
-            added.notices.append(
+            report.left_out[record.vehicle] = record.problem
+        twins = [n for n, d in zip(record.drives, record.digests, strict=False) if record.digests.count(d) > 1]
+        if twins:
+            report.notices.append(
                 f"vehicle {record.vehicle}: drives {', '.join(twins)} hold the same recording, which counts once"
             )
 
 
-def _mark_copies(store: SummaryStore, added: Added, owners: _Owners) -> None:
-    """Take away the summaries of recordings that several vehicles have."""
-    for bucket in store.by_bucket(set().union(*owners.shared.values())):
-        with store.locked():
-            records = store.read(bucket)
-            marked = {name: [_marked(record, owners) for record in items] for name, items in records.items()}
-            if marked != records:
-                store.write(bucket, marked)
-        copies = [record for items in marked.values() for record in items if record.problem.startswith(COPY)]
-        added.problems.update({record.vehicle: record.problem for record in copies})
+# ---- vehicles whose drives are still to be loaded
 
 
-def _marked(record: Record, owners: _Owners) -> Record:
-    sharing = set[str]().union(*(owners.shared.get(_key(digest), ()) for digest in record.digests)) - {record.vehicle}
-    if not sharing:
-        return record
-    problem = f"{COPY} {', '.join(sorted(sharing))}; it cannot be told whose it is: remove it where it does not belong"
-    return replace(record, found=None, problem=problem)
+def read_samples(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> list[Samples]:
+    """Load the drives of one vehicle as aligned samples, delays taken out; UserError if they cannot be used."""
+    return aligned_drives([load_drive(entry, database) for entry in entries], equipment, database)[1]
 
 
-def _remove_others(store: SummaryStore, fleet: FleetSource) -> None:
-    """Remove what a store has of drives that are not, or no longer, those of the fleet."""
-
-    def is_right(record: Known | Record) -> bool:
-        drives = fleet.vehicles.get(record.vehicle, ())
-        versions = {drive.name: drive.version for drive in drives}
-        return all(versions.get(d) == source for d, source in zip(record.drives, record.sources, strict=True))
-
-    for bucket in store.buckets():
-        if not all(is_right(record) for records in store.known(bucket).values() for record in records):
-            records = store.read(bucket).items()
-            store.write(bucket, {name: [item for item in items if is_right(item)] for name, items in records})
+def read_vehicle_summary(
+    entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase, *, bank: FilterBank | None = None
+) -> VehicleSummary:
+    """Load the drives of one vehicle and summarise them; UserError if they cannot be used."""
+    found = summarise_drives([load_drive(entry, database) for entry in entries], equipment, database, bank=bank)
+    return replace(found, vehicle=entries[0].vehicle, drives=tuple(entry.name for entry in entries))

@@ -1,202 +1,38 @@
-"""Second moments of drives, made of drives as a whole or of pieces as they come."""
+"""Samples of drives into their summary: filtered, without spikes, summed by blocks; with sums for the check of fit."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from calibrator.compiled import compiled
 from calibrator.drive import Array, Mask
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
 from calibrator.summaries.filter_bank import FilterBank, plain_bank
-from calibrator.summaries.fit_sums import LEVEL_EDGES_A, LEVEL_OF_AMPERE, FitSums, find_spikes, second_differences
-from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.moments import BLOCK_S, LEVEL_EDGES_A, DriveSummary, FitSums
 from ecu_node.summary import (
     BATCH_SAMPLES,
-    BLOCK_S,
     DIFFERENCE_GAIN,
+    FEWEST_FOR_GAINS,
+    LEAST_EDGE,
     LEAST_SHARE,
+    LEAST_SPIKE_A,
+    LEVELS_A,
+    MAD_TO_SD,
     MEDIAN_EXCESS,
     NORMAL_MEDIAN,
+    OTHERS_MOVE,
+    SPIKE_SDS,
+    SPIKE_WINDOW,
+    STEP_OF_SPIKE,
 )
 
-__all__ = ["Summariser", "summarise_samples"]
+__all__ = ["find_spikes", "second_differences", "summarise_samples"]
 
-
-class Summariser:
-    """Makes the summary of the drives of one vehicle from pieces of any length, in a memory of fixed size per block.
-
-    Where a drive is cut into pieces makes no difference: blocks are counted from its start.
-
-    Parameters
-    ----------
-    bank : FilterBank
-        Makes the columns from the inputs.
-    branches : int
-        Number of branches K.
-    settling : int
-        Samples after the start of a drive that are not used, if they are more than the bank needs.
-    block_s : float
-        Length of a block. [s]
-    """
-
-    def __init__(self, bank: FilterBank, *, branches: int, settling: int = 0, block_s: float = BLOCK_S) -> None:
-        self.bank = bank
-        self.branches = branches
-        self._block_s = block_s
-        self._block = max(round(block_s / bank.period_s), 1)
-        self._columns = bank.width + branches + 1
-        rows = self._block * max(BATCH_SAMPLES // self._block, 1)
-        self._table = np.zeros((rows, self._columns))
-        self._used = np.zeros(rows, np.bool_)
-        self._currents = np.full((rows, branches), np.nan)
-        self._temperature_c = np.full(rows, np.nan)
-        self._filled = 0
-        self._settling = settling
-        self._state = bank.start(settling=settling)
-        self._moments: list[Array] = []
-        self._noise: list[Array] = []
-        self._levels = np.zeros((branches, len(LEVEL_EDGES_A) + 1, self._columns + 1))
-        self._fast: list[Array] = []
-        self._spikes: list[Array] = []
-        self._block_c: list[Array] = []
-        self._starts: list[Mask] = []
-        self._drive_starts = True
-
-    def add(
-        self,
-        inputs: Array,
-        currents_a: Array,
-        valid: Mask,
-        *,
-        temperature_c: Array | None = None,
-    ) -> None:
-        """Take the next samples of a drive.
-
-        Parameters
-        ----------
-        inputs : ndarray of shape (T, M)
-            Inputs, finite where valid.
-        currents_a : ndarray of shape (T, K)
-            Measured branch currents, positive into the junction, finite where valid. [A]
-        valid : ndarray of bool of shape (T,)
-            Samples that may be used.
-        temperature_c : ndarray of shape (T,) or None
-            Temperature of the sensors; None: not known. [degC]
-
-        Raises
-        ------
-        DriveError
-            If the arrays do not belong together, or are not of the bank's inputs.
-        """
-        self._require_shapes(inputs, currents_a, valid)
-        start = 0
-        while start < len(inputs):
-            stop = start + min(len(self._table) - self._filled, len(inputs) - start)
-            part = slice(start, stop)
-            rows = slice(self._filled, self._filled + stop - start)
-            self._temperature_c[rows] = np.nan if temperature_c is None else temperature_c[part]
-            self._take(inputs[part], currents_a[part], valid[part])
-            if self._filled == len(self._table):
-                self._close()
-            start = stop
-
-    def end_drive(self) -> None:
-        """End a drive: its last block is closed, short as it may be, and the filters forget it."""
-        self._close()
-        self._drive_starts = True
-        self._state = self.bank.start(settling=self._settling)
-
-    def summary(self) -> DriveSummary:
-        """Return the summary of the drives that ended.
-
-        Raises
-        ------
-        DriveError
-            If no block has enough valid samples.
-        """
-        moments = np.concatenate([np.zeros((0, self._columns, self._columns)), *self._moments])
-        if not len(moments):
-            raise DriveError(
-                f"no {self._block_s:.0f} s of drive in which {LEAST_SHARE:.0%} of the samples are valid"
-                f"{self._settled()}"
-            )
-        return DriveSummary(
-            moments=moments,
-            noise_a2=np.concatenate(self._noise),
-            branches=self.branches,
-            period_s=self.bank.period_s,
-            bank=self.bank.identity,
-            fit=FitSums(
-                levels=self._levels.copy(),
-                fast_a2=np.concatenate(self._fast),
-                spikes=np.concatenate(self._spikes),
-                temperature_c=np.concatenate(self._block_c),
-                starts=np.concatenate(self._starts),
-            ),
-        )
-
-    def _require_shapes(self, inputs: Array, currents_a: Array, valid: Mask) -> None:
-        T = len(inputs)
-        found = [inputs.shape, currents_a.shape, valid.shape]
-        wanted = [(T, len(self.bank.input_names)), (T, self.branches), (T,)]
-        if found != wanted:
-            raise DriveError(
-                f"inputs, currents and mask of shapes {', '.join(map(str, found))}; "
-                f"expected {', '.join(map(str, wanted))}"
-            )
-
-    def _settled(self) -> str:
-        settling_s = self._state.settling * self.bank.period_s
-        return f" once its filter bank has settled, {settling_s:.0f} s after a start" if settling_s else ""
-
-    def _take(self, inputs: Array, currents_a: Array, valid: Mask) -> None:
-        rows = slice(self._filled, self._filled + len(inputs))
-        table, used = self._table[rows], self._used[rows]
-        self._state.run_into(table, used, inputs, valid)
-        _put(np.ascontiguousarray(currents_a, np.float64), used, table, self.bank.width)
-        self._currents[rows] = currents_a
-        self._filled = rows.stop
-
-    def _close(self) -> None:
-        """Sum the blocks of the table without their spikes; the rest of the last one counts as not valid."""
-        filled, length = self._filled, self._block
-        if not filled:
-            return
-        blocks = -(-filled // length)
-        self._table[filled : blocks * length] = 0.0
-        self._used[filled : blocks * length] = False
-        used, first = self._used[: blocks * length], self.bank.width
-        currents = np.ascontiguousarray(self._table[: blocks * length, first : self._columns - 1])
-        spikes = find_spikes(currents, used)
-        marked = spikes.any(axis=1)
-        if marked.any():
-            self._table[: blocks * length][marked] = 0.0
-            currents[marked] = 0.0
-            used &= ~marked
-        kept = self._used[: blocks * length].reshape(blocks, length).sum(axis=1) >= LEAST_SHARE * length
-        table = self._table[: blocks * length].reshape(blocks, length, -1)
-        table = table if kept.all() else table[kept]
-        self._moments.append(np.swapaxes(table, 1, 2) @ table)
-        self._noise.append(_white_noise_a2(self._currents[:filled], length)[kept])
-        used = used.reshape(blocks, length)
-        _add_levels(table, used[kept], first, LEVEL_OF_AMPERE, self._levels)
-        fast = second_differences(currents.reshape(blocks, length, -1), used)[kept]
-        self._fast.append(np.swapaxes(fast, 1, 2) @ fast)
-        upward, downward = ((sign * spikes > 0).reshape(blocks, length, -1).sum(axis=1)[kept] for sign in (1, -1))
-        self._spikes.append(np.stack([upward, downward], axis=2).astype(np.float64))
-        self._sum_temperature(used, kept)
-        self._starts.append(self._drive_starts & (np.arange(len(table)) == 0))
-        self._drive_starts = self._drive_starts and not len(table)
-        self._filled = 0
-
-    def _sum_temperature(self, used: Mask, kept: Mask) -> None:
-        """Mean temperature of each block that is kept."""
-        warm = self._temperature_c[: used.size].reshape(used.shape)
-        known = used & np.isfinite(warm)
-        with np.errstate(invalid="ignore"):
-            self._block_c.append((np.where(known, warm, 0.0).sum(axis=1) / known.sum(axis=1))[kept])
+LEVEL_OF_AMPERE: NDArray[np.int64] = np.searchsorted(LEVELS_A, np.arange(LEVELS_A[-1] + 1), side="right")
+"""Distance of the level of so many whole amperes from the middle one."""
 
 
 def summarise_samples(
@@ -205,6 +41,7 @@ def summarise_samples(
     period_s: float,
     bank: FilterBank | None = None,
     temperatures_c: Sequence[Array] | None = None,
+    settling: int = 0,
     block_s: float = BLOCK_S,
 ) -> DriveSummary:
     """Summarise the drives of one vehicle.
@@ -219,6 +56,8 @@ def summarise_samples(
         Filters of the inputs; None: the plain inputs.
     temperatures_c : sequence of ndarray of shape (T,), or None
         Temperature of the sensors in each drive, NaN where it is not known. [degC]
+    settling : int
+        Samples after the start of a drive that are not used, if they are more than the bank needs.
     block_s : float
         Length of a block. [s]
 
@@ -232,34 +71,68 @@ def summarise_samples(
     DriveError
         If no block has enough valid samples, or the bank is of other inputs or of another period.
     """
-    used = plain_bank(drives[0].input_names, period_s=period_s) if bank is None else bank
-    _require_fitting(used, drives, period_s)
-    summariser = Summariser(used, branches=drives[0].currents_a.shape[1], block_s=block_s)
+    bank = plain_bank(drives[0].input_names, period_s=period_s) if bank is None else bank
+    K, W = drives[0].currents_a.shape[1], bank.width
+    length = max(round(block_s / period_s), 1)
+    batch = length * max(BATCH_SAMPLES // length, 1)
+    parts: list[tuple[Array, ...]] = []
+    levels = np.zeros((K, len(LEVEL_EDGES_A) + 1, W + K + 2))
     for number, drive in enumerate(drives):
-        warm = None if temperatures_c is None else temperatures_c[number]
-        summariser.add(drive.inputs, drive.currents_a, drive.valid, temperature_c=warm)
-        summariser.end_drive()
-    return summariser.summary()
-
-
-def _require_fitting(bank: FilterBank, drives: Sequence[Samples], period_s: float) -> None:
-    for drive in drives:
         if (drive.input_names, period_s) != (bank.input_names, bank.period_s):
             raise DriveError(
                 f"a drive of the inputs {', '.join(drive.input_names)} every {period_s:g} s, a filter bank of "
                 f"{', '.join(bank.input_names)} every {bank.period_s:g} s; align the drive with the bank's inputs, or "
                 "make a bank for the fleet's"
             )
-
-
-@compiled
-def _put(currents: Array, used: Mask, table: Array, first: int) -> None:
-    """Put currents and 1 into the rows that are used, from a column on."""
-    for t in range(len(currents)):
-        if used[t]:
-            for k in range(currents.shape[1]):
-                table[t, first + k] = currents[t, k]
-            table[t, first + currents.shape[1]] = 1.0
+        T, blocks = len(drive.valid), -(-len(drive.valid) // length)
+        table, used = np.zeros((blocks * length, W + K + 1)), np.zeros(blocks * length, np.bool_)
+        table[:T, :W], used[:T] = bank.run(drive.inputs, drive.valid, settling=settling)
+        table[:T, W:-1] = np.where(used[:T, None], drive.currents_a, 0.0)
+        currents = np.ascontiguousarray(table[:, W:-1])
+        spikes = np.zeros(currents.shape, np.int8)
+        for start in range(0, len(used), batch):
+            part = slice(start, start + batch)
+            spikes[part] = find_spikes(currents[part], used[part])
+        marked = spikes.any(axis=1)
+        table[marked], currents[marked] = 0.0, 0.0
+        used &= ~marked
+        table[used, -1] = 1.0
+        use = used.reshape(blocks, length)
+        kept = use.sum(axis=1) >= LEAST_SHARE * length
+        rows = table.reshape(blocks, length, -1)
+        rows = rows if kept.all() else rows[kept]
+        _add_levels(rows, use[kept], W, LEVEL_OF_AMPERE, levels)
+        fast = second_differences(currents.reshape(blocks, length, K), use)[kept]
+        upward, downward = ((sign * spikes > 0).reshape(blocks, length, K).sum(axis=1)[kept] for sign in (1, -1))
+        warm_c = np.full(blocks * length, np.nan)
+        if temperatures_c is not None:
+            warm_c[:T] = temperatures_c[number]
+        is_known = use & np.isfinite(warm_c.reshape(blocks, length))
+        with np.errstate(invalid="ignore"):  # NaN where no temperature of a block is known
+            mean_c = np.where(is_known, warm_c.reshape(blocks, length), 0.0).sum(axis=1) / is_known.sum(axis=1)
+        parts.append(
+            (
+                np.swapaxes(rows, 1, 2) @ rows,
+                _white_noise_a2(np.ascontiguousarray(drive.currents_a, np.float64), length)[kept],
+                np.swapaxes(fast, 1, 2) @ fast,
+                np.stack([upward, downward], axis=2).astype(np.float64),
+                mean_c[kept],
+                np.arange(len(rows)) == 0,
+            )
+        )
+    moments, noise_a2, fast_a2, spikes_, temperature_c, starts = map(np.concatenate, zip(*parts, strict=True))
+    if not len(moments):
+        settling_s = max(settling, bank.settling) * period_s
+        settled = f" once its filter bank has settled, {settling_s:.0f} s after a start" if settling_s else ""
+        raise DriveError(f"no {block_s:.0f} s of drive in which {LEAST_SHARE:.0%} of the samples are valid{settled}")
+    return DriveSummary(
+        moments=moments,
+        noise_a2=noise_a2,
+        branches=K,
+        period_s=period_s,
+        bank=bank.identity,
+        fit=FitSums(levels=levels, fast_a2=fast_a2, spikes=spikes_, temperature_c=temperature_c, starts=starts),
+    )
 
 
 @compiled
@@ -298,3 +171,81 @@ def _white_noise_a2(currents: Array, length: int) -> Array:
             scale = np.median(third[k, :n]) / NORMAL_MEDIAN
             noise[block, k] = scale**2 / DIFFERENCE_GAIN / (1.0 + MEDIAN_EXCESS / n)
     return noise
+
+
+def second_differences(currents_a: Array, used: Mask) -> Array:
+    """Distance of each sample from the mean of its neighbours; zero where one of the three is not used.
+
+    Parameters
+    ----------
+    currents_a : ndarray of shape (..., T, K)
+        Measured currents. [A]
+    used : ndarray of bool of shape (..., T)
+        Samples that may be used.
+
+    Returns
+    -------
+    ndarray of shape (..., T - 2, K)
+        White noise of variance s^2 has 1.5 s^2 here; currents that change slowly have nothing. [A]
+    """
+    inner = used[..., 1:-1] & used[..., :-2] & used[..., 2:]
+    distance = currents_a[..., 1:-1, :] - 0.5 * (currents_a[..., :-2, :] + currents_a[..., 2:, :])
+    return np.asarray(np.where(inner[..., None], distance, 0.0))
+
+
+def find_spikes(currents_a: Array, used: Mask) -> NDArray[np.int8]:
+    """Label spikes: samples at which one branch, and it alone, leaves the junction law and its own neighbours.
+
+    Parameters
+    ----------
+    currents_a : ndarray of shape (T, K)
+        Measured currents of neighbouring samples, zero where not used; some minutes. [A]
+    used : ndarray of bool of shape (T,)
+        Samples that may be used.
+
+    Returns
+    -------
+    ndarray of int of shape (T, K)
+        1 for an upward, -1 for a downward spike, 0 for none. A Hampel test of the residual of the junction law, whose
+        gains are those of these samples.
+    """
+    found = np.zeros(currents_a.shape, np.int8)
+    K = currents_a.shape[1]
+    kept = used
+    for _ in range(2):  # the second time with gains that the spikes did not bend
+        if kept.sum() < FEWEST_FOR_GAINS * K:
+            return found
+        weights = _junction_weights(currents_a, kept)
+        residual = currents_a @ weights
+        change = np.abs(np.diff(residual))[used[1:] & used[:-1]]
+        if not change.max(initial=0.0) > max(STEP_OF_SPIKE * float(np.median(change)), LEAST_SPIKE_A):
+            return found  # mostly: what follows takes longer
+        far = residual - median_filter(residual, SPIKE_WINDOW, mode="nearest")
+        spread = MAD_TO_SD * float(np.median(np.abs(far[kept])))
+        suspects = used & (np.abs(far) > max(SPIKE_SDS * spread, LEAST_SPIKE_A))
+        kept = used & ~suspects
+    at, half = np.flatnonzero(suspects), SPIKE_WINDOW // 2
+    near = np.clip(at[:, None] + np.arange(-half, half + 1), 0, len(used) - 1)
+    around = (currents_a * weights)[near]  # (spikes, window, K)
+    moves = around - np.median(around, axis=1, keepdims=True)
+    own, nearby = moves[:, half], np.abs(moves[:, half - 1 : half + 2]).max(axis=1)
+    steps = np.diff(moves, axis=1) * np.sign(own)[:, None]
+    edge = np.minimum(steps[:, :half].max(axis=1), -steps[:, half:].min(axis=1))
+    for k in range(K):
+        height = np.abs(own[:, k])
+        alone = (nearby.sum(axis=1) - nearby[:, k] < OTHERS_MOVE * height) & (edge[:, k] > LEAST_EDGE * height)
+        found[at[alone], k] = np.sign(own[alone, k] * weights[k])
+    return found
+
+
+def _junction_weights(currents_a: Array, kept: Mask) -> Array:
+    """Weights of the branches in the junction law, that of the branch that moves most being one, by least squares."""
+    x = currents_a if kept.all() else currents_a[kept]
+    mean = x.mean(axis=0)
+    gram = x.T @ x - len(x) * np.outer(mean, mean)
+    first = int(np.argmax(np.diag(gram)))
+    others = [k for k in range(len(gram)) if k != first]
+    weights = np.zeros(len(gram))
+    weights[first] = 1.0
+    weights[others] = -np.linalg.lstsq(gram[np.ix_(others, others)], gram[others, first], rcond=1e-9)[0]
+    return weights

@@ -1,30 +1,32 @@
 """From the drives of one vehicle to its summary: delays between branches, zero-current windows, second moments."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import numpy as np
 
-from calibrator.drive import Array, Channel, Drive, DriveFile
+from calibrator.drive import Array, Channel, Drive, Equipment
 from calibrator.drives.align import Samples, align
 from calibrator.drives.delays import BranchDelays, estimate_delays, without_delays
 from calibrator.errors import DriveError
-from calibrator.sources.fleet_source import Equipment, load_drive
 from calibrator.summaries.filter_bank import FilterBank
 from calibrator.summaries.moments import DriveSummary
 from calibrator.summaries.summariser import summarise_samples
-from calibrator.summaries.zero_current import ZeroCurrent, zero_current_offsets
+from calibrator.summaries.zero_current import ZeroCurrent, weighted_mean, zero_current_offsets
 from calibrator.terminal.text import counted
 from ecu_node.database import VehicleDatabase
 from ecu_node.layout import Layout
 
 __all__ = [
     "VehicleSummary",
+    "added_summaries",
+    "aligned_drives",
     "most_moving_first",
-    "read_samples",
-    "read_vehicle_summary",
     "require_possible",
     "summarise_drives",
+    "too_short",
 ]
 
 LEAST_DURATION_S = 120.0
@@ -50,8 +52,6 @@ class VehicleSummary:
         Of its branches; the reference is the branch that moves most.
     zero_current : ZeroCurrent
         What the sensors showed while the contactors were open.
-    recorded : frozenset of str
-        Recorded inputs of which every drive has good samples.
     """
 
     vehicle: str
@@ -59,38 +59,33 @@ class VehicleSummary:
     summary: DriveSummary
     delays: BranchDelays
     zero_current: ZeroCurrent
-    recorded: frozenset[str]
 
 
-def read_samples(entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase) -> list[Samples]:
-    """Read the drives of one vehicle as aligned samples, delays taken out.
+def added_summaries(parts: Sequence[VehicleSummary]) -> VehicleSummary:
+    """Summary of all drives of several summaries of one vehicle, at least one.
 
-    Parameters
-    ----------
-    entries, equipment, database
-        As for :func:`read_vehicle_summary`.
-
-    Returns
-    -------
-    list of Samples
-        One per drive, with the inputs of the fleet model.
-
-    Raises
-    ------
-    UserError
-        If a drive cannot be read, or there is too little valid data; the message says which and how much.
+    Delays are those of the part that knows most of them, and these best, as drives are aligned with their own; readings
+    in zero-current windows are averaged by their precision.
     """
-    return _aligned([load_drive(entry, database) for entry in entries], equipment, database).samples
+    offset_a, sd_a = weighted_mean(*((part.zero_current.offset_a, part.zero_current.sd_a) for part in parts))
+    delays = [part.delays for part in parts]
+    return VehicleSummary(
+        vehicle=parts[0].vehicle,
+        drives=tuple(name for part in parts for name in part.drives),
+        summary=reduce(add, [part.summary for part in parts]),
+        delays=max(delays, key=lambda part: (int(part.known.sum()), -float(part.sd_s[part.known].sum()))),
+        zero_current=ZeroCurrent(offset_a=offset_a, sd_a=sd_a),
+    )
 
 
-def read_vehicle_summary(
-    entries: Sequence[DriveFile], equipment: Equipment, database: VehicleDatabase, *, bank: FilterBank | None = None
+def summarise_drives(
+    drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase, *, bank: FilterBank | None = None
 ) -> VehicleSummary:
-    """Read the drives of one vehicle and summarise them.
+    """Summarise the drives of one vehicle.
 
     Parameters
     ----------
-    entries : sequence of DriveFile
+    drives : sequence of Drive
         Drives of one vehicle.
     equipment : Equipment
         Branches and model inputs of the fleet.
@@ -106,40 +101,28 @@ def read_vehicle_summary(
 
     Raises
     ------
-    UserError
-        If a drive cannot be read, or there is too little valid data; the message says which and how much.
+    DriveError
+        If there is too little valid data; the message says how much.
     """
-    found = summarise_drives([load_drive(entry, database) for entry in entries], equipment, database, bank=bank)
-    return replace(found, vehicle=entries[0].vehicle, drives=tuple(entry.name for entry in entries))
-
-
-def summarise_drives(
-    drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase, *, bank: FilterBank | None = None
-) -> VehicleSummary:
-    """Summarise drives of one vehicle that were read already; as :func:`read_vehicle_summary`."""
-    vehicle = _aligned(drives, equipment, database)
+    delays, samples = aligned_drives(drives, equipment, database)
+    name, temperatures_c = database.layout.temperature, None
+    if name is not None:
+        temperatures_c = [
+            _temperature_c(drive.inputs.get(name), part) for drive, part in zip(drives, samples, strict=True)
+        ]
     return VehicleSummary(
         vehicle=drives[0].vehicle,
         drives=tuple(drive.name for drive in drives),
-        summary=summarise_samples(
-            vehicle.samples, period_s=database.layout.period_s, bank=bank, temperatures_c=vehicle.temperatures_c
-        ),
-        delays=vehicle.delays,
+        summary=summarise_samples(samples, period_s=database.layout.period_s, bank=bank, temperatures_c=temperatures_c),
+        delays=delays,
         zero_current=zero_current_offsets(drives, equipment.branches, database),
-        recorded=frozenset.intersection(*(_recorded(drive) for drive in drives)),
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _AlignedDrives:
-    """Delays of the branches of one vehicle, its drives on one time base without them, temperatures if recorded."""
-
-    delays: BranchDelays
-    samples: list[Samples]
-    temperatures_c: list[Array] | None
-
-
-def _aligned(drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase) -> _AlignedDrives:
+def aligned_drives(
+    drives: Sequence[Drive], equipment: Equipment, database: VehicleDatabase
+) -> tuple[BranchDelays, list[Samples]]:
+    """Delays of the branches of one vehicle, and its drives on one time base without them; as summarise_drives."""
     layout = database.layout
     for drive in drives:
         require_possible(drive, layout)
@@ -148,17 +131,17 @@ def _aligned(drives: Sequence[Drive], equipment: Equipment, database: VehicleDat
         align(without_delays(drive, delays.by_branch()), layout, equipment.branches, inputs=equipment.fleet_inputs)
         for drive in drives
     ]
-    duration_s = layout.period_s * sum(int(part.valid.sum()) for part in samples)
-    if duration_s < LEAST_DURATION_S:
-        raise DriveError(
-            f"{duration_s:.1f} s of usable data in {counted(len(drives), 'drive')}; at least "
-            f"{LEAST_DURATION_S:.0f} s are needed"
-        )
-    temperatures_c = None
-    if layout.temperature is not None:
-        pairs = zip(drives, samples, strict=True)
-        temperatures_c = [_temperature_c(drive.inputs.get(layout.temperature), part) for drive, part in pairs]
-    return _AlignedDrives(delays=delays, samples=samples, temperatures_c=temperatures_c)
+    if problem := too_short(layout.period_s * sum(int(part.valid.sum()) for part in samples), len(drives)):
+        raise DriveError(problem)
+    return delays, samples
+
+
+def too_short(duration_s: float, drives: int) -> str:
+    """Why so much data cannot be used; empty if it can."""
+    if duration_s >= LEAST_DURATION_S:
+        return ""
+    found = f"{duration_s:.1f} s of usable data in {counted(drives, 'drive')}"
+    return f"{found}; at least {LEAST_DURATION_S:.0f} s are needed"
 
 
 def _temperature_c(channel: Channel | None, samples: Samples) -> Array:
@@ -180,10 +163,6 @@ def require_possible(drive: Drive, layout: Layout) -> None:
     for name, channel in drive.inputs.items():
         if not np.isfinite(channel.value[channel.good]).all():
             raise DriveError(f"drive {drive.name}: input {name} has values that are no numbers; import it again")
-
-
-def _recorded(drive: Drive) -> frozenset[str]:
-    return frozenset(name for name, channel in drive.inputs.items() if channel.good.any())
 
 
 def most_moving_first(drives: Sequence[Drive], branches: Sequence[str]) -> tuple[str, ...]:

@@ -747,7 +747,7 @@ def _second_differences(blocks: Sequence[_Column], used: Sequence[Sequence[bool]
 
 
 def _find_spikes(currents: list[_Column], used: Sequence[bool]) -> Generator[None, None, dict[int, list[int]]]:
-    """As :func:`calibrator.summaries.fit_sums.find_spikes`; returns by sample the sign of each branch's spike."""
+    """As :func:`calibrator.summaries.summariser.find_spikes`; returns by sample the sign of each branch's spike."""
     K, count, found, half = len(currents), len(used), dict[int, list[int]](), SPIKE_WINDOW // 2
     kept, suspects, weights = list(used), list[int](), list[float]()
     for _ in range(2):  # the second time with gains that the spikes did not bend

@@ -63,7 +63,6 @@ def checked(fleet: RecordedFleet, branches: int, seed: int, bends: dict[int, Ben
             currents_a=i_m + rng.normal(0.0, 0.4, i_m.shape),
             inputs=np.column_stack(list(inputs.values())),
             valid=np.ones(len(trip), bool),
-            masked={},
         ).with_inputs(fleet.database.layout.fleet_inputs)
         warm_c = 10.0 + 25.0 * np.sqrt(share)
         summaries.append(summarise_samples([samples], period_s=fleet.period_s, temperatures_c=[warm_c]))

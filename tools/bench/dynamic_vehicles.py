@@ -140,7 +140,6 @@ def recorded(
             currents_a=clean + noise,
             inputs=inputs[WARM_UP:],
             valid=np.ones(samples, bool),
-            masked={},
         ),
     )
 

@@ -25,7 +25,7 @@ from calibrator.drives.align import choose_inputs
 from calibrator.drives.store import list_drives, write_drive
 from calibrator.recordings.readers import read_recording
 from calibrator.sources.fleet_source import Equipment, load_drive
-from calibrator.summaries.vehicle_summary import read_vehicle_summary
+from calibrator.summaries.summarise_fleet import read_vehicle_summary
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout, split_signal
 

@@ -20,7 +20,7 @@ from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
 from calibrator.recordings.frames import read_frames
 from calibrator.sources.fleet_source import find_fleet, probe_equipment
-from calibrator.summaries.vehicle_summary import read_vehicle_summary
+from calibrator.summaries.summarise_fleet import read_vehicle_summary
 from ecu_node.bus.on_board_summary import OnBoardSummary
 from ecu_node.core.signals import FrameKey
 from ecu_node.database import VehicleDatabase, read_database

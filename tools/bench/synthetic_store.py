@@ -136,7 +136,6 @@ def _record(name: str, trip: DriveSummary, faults: Faults, branches: tuple[str, 
             summary=_measured(trip, faults),
             delays=BranchDelays(branches=branches, delay_s=zeros, sd_s=zeros, known=np.ones(K, bool)),
             zero_current=ZeroCurrent(offset_a=nothing, sd_a=nothing),
-            recorded=frozenset(),
         ),
     )
 

@@ -80,7 +80,6 @@ def samples_of(inputs: Array, currents_a: Array) -> Samples:
         currents_a=currents_a,
         inputs=inputs,
         valid=np.ones(T, bool),
-        masked={},
     )
 
 

@@ -34,7 +34,7 @@ def summary_of(drive: Samples, bank: FilterBank = FILTERED) -> DriveSummary:
 
 def by_samples(drive: Samples) -> tuple[Array, Array, Array]:
     """Columns with the constant, currents, and the number of the block, of the blocks that are in the summary."""
-    columns, used = FILTERED.run(drive.inputs, drive.valid, FILTERED.start())
+    columns, used = FILTERED.run(drive.inputs, drive.valid)
     block = np.arange(len(used)) // BLOCK
     kept = np.unique(block[used], return_counts=True)
     good = kept[0][kept[1] >= 0.2 * BLOCK]

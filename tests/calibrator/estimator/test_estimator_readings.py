@@ -71,7 +71,6 @@ def vehicles_that_showed(offset_a: float, sd_a: float) -> list[VehicleSummary]:
             summary=summary,
             delays=delays,
             zero_current=ZeroCurrent(offset_a=np.array([shown[name][0], NAN]), sd_a=np.array([shown[name][1], NAN])),
-            recorded=frozenset(),
         )
         for name, summary in zip(VEHICLES, summaries_of(no_faults(2, 2)), strict=True)
     ]

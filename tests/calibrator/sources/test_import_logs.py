@@ -64,17 +64,6 @@ def test_a_damaged_drive_in_the_store_is_not_taken_for_imported(
     assert "remove it and import it again" in report.left_out["V001/drive"]
 
 
-def test_a_drive_of_another_layout_is_not_taken_for_imported(
-    fleet: Path, tmp_path: Path, database: VehicleDatabase
-) -> None:
-    imported([fleet / "logs" / "V001"], tmp_path / "store", database)
-    text = LAYOUT.read_text().replace('"hv_powertrain.dbc"', f'"{LAYOUT.parent / "hv_powertrain.dbc"}"')
-    (tmp_path / "other.toml").write_text(text + "\n# changed\n")
-    other = read_database(read_layout(tmp_path / "other.toml"))
-    report = imported([fleet / "logs" / "V001"], tmp_path / "store", other)
-    assert "made with layout hv_powertrain" in report.left_out["V001/drive"]
-
-
 def test_the_store_knows_which_artificial_fleet_its_drives_are_of(
     fleet: Path, tmp_path: Path, database: VehicleDatabase
 ) -> None:

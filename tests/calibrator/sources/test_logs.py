@@ -70,10 +70,3 @@ def test_an_argument_that_does_not_exist_or_has_no_logs_is_a_problem(tmp_path: P
     missing, empty = found.left_out.values()
     assert "nothing: no such file or folder" in missing
     assert "empty: no logs in it" in empty
-
-
-def test_a_folder_name_that_cannot_name_a_vehicle_is_a_problem(tmp_path: Path) -> None:
-    make(tmp_path / "V*1" / "a.log")
-    found = find_logs([tmp_path])
-    assert not found.vehicles
-    assert "'V*1' cannot be used" in found.left_out["problem 1"]

@@ -62,7 +62,6 @@ def record_of(name: str, summary: DriveSummary, drives: Sequence[str] = ("d1",),
             known=np.ones(K, bool),
         ),
         zero_current=ZeroCurrent(offset_a=np.array([np.nan, shown_a]), sd_a=np.array([np.nan, 0.0 * shown_a + 0.1])),
-        recorded=frozenset({"speed", "torque"}),
     )
     return Record(vehicle=name, drives=tuple(drives), sources=("1-2",) * len(drives), found=found)
 

@@ -1,10 +1,7 @@
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from calibrator.drive import Array
@@ -37,7 +34,7 @@ def inputs_of(seed: int, samples: int = SAMPLES) -> Array:
 
 def test_columns_are_the_inputs_and_each_input_through_each_pole() -> None:
     u = inputs_of(0)
-    columns, used = bank_of().run(u, np.ones(SAMPLES, bool), bank_of().start())
+    columns, used = bank_of().run(u, np.ones(SAMPLES, bool))
     poles = [complex(*pole) for pole in (*POLES[1:3], POLES[0], POLES[3])]
     filtered = [lfilter([0.0, 1.0 - p], [1.0, -p], u, axis=0, zi=u[:1].astype(complex))[0] for p in poles]
     expected = np.hstack([u, *(x.real for x in filtered), *(x.imag for x in filtered[2:])])
@@ -54,51 +51,25 @@ def test_columns_are_the_states_of_the_system() -> None:
     model = StateSpaceModel(
         A=A, B=B, C=np.eye(n), D=np.zeros((n, len(NAMES))), x0=nothing, offset_a=nothing, snr_db=nothing
     )
-    columns, used = bank.run(u, np.ones(SAMPLES, bool), bank.start())
+    columns, used = bank.run(u, np.ones(SAMPLES, bool))
     np.testing.assert_allclose(columns[used][:, len(NAMES) :], model.simulate(u)[used], atol=1e-11)
 
 
 def test_a_bank_without_poles_is_the_plain_inputs_from_the_first_sample_on() -> None:
     u = inputs_of(2)
     bank = plain_bank(NAMES, period_s=PERIOD_S)
-    columns, used = bank.run(u, np.ones(SAMPLES, bool), bank.start())
+    columns, used = bank.run(u, np.ones(SAMPLES, bool))
     assert used.all()
     np.testing.assert_array_equal(columns, u)
 
 
-@settings(derandomize=True, deadline=None, max_examples=40)
-@given(cuts=st.lists(st.integers(0, SAMPLES), max_size=12), seed=st.integers(0, 100))
-def test_a_drive_in_pieces_gives_what_it_gives_as_a_whole(cuts: list[int], seed: int) -> None:
-    u, bank = inputs_of(seed), bank_of()
-    valid = np.random.default_rng(seed).random(SAMPLES) > 0.02
-    valid[300 : 300 + 5 * (seed % 5)] = False
-    u[~valid] = np.nan
-    whole, used = bank.run(u, valid, bank.start())
-    state = bank.start()
-    edges = [0, *sorted(cuts), SAMPLES]
-    pieces = [bank.run(u[a:b], valid[a:b], state) for a, b in pairwise(edges)]
-    np.testing.assert_array_equal(np.concatenate([columns for columns, _ in pieces]), whole)
-    np.testing.assert_array_equal(np.concatenate([part for _, part in pieces]), used)
-
-
-def test_nothing_depends_on_what_comes_later() -> None:
-    u, valid = inputs_of(3), np.ones(SAMPLES, bool)
-    changed, other = u.copy(), valid.copy()
-    changed[500:], other[550:] = 0.0, False
-    columns = [bank_of().run(x, v, bank_of().start())[0][:500] for x, v in ((u, valid), (changed, other))]
-    np.testing.assert_array_equal(columns[0], columns[1])
-
-
 def test_an_error_in_the_start_is_nearly_gone_when_samples_are_used() -> None:
     u, bank = inputs_of(4, 2 * SAMPLES), bank_of(POLES[1:3])
-    valid = np.ones(SAMPLES, bool)
-    before = bank.start()
-    bank.run(u[:SAMPLES], valid, before)
-    error = np.abs(before.states - np.tile(u[SAMPLES], 2))
-    known, _ = bank.run(u[SAMPLES:], valid, before)
-    started, used = bank.run(u[SAMPLES:], valid, bank.start())
+    known, _ = bank.run(u, np.ones(2 * SAMPLES, bool))
+    started, used = bank.run(u[SAMPLES:], np.ones(SAMPLES, bool))
     first = int(np.flatnonzero(used)[0])
-    left = np.abs(known - started)[first, len(NAMES) :]
+    error = np.abs(known[SAMPLES, len(NAMES) :] - np.tile(u[SAMPLES], 2))
+    left = np.abs(known[SAMPLES:] - started)[first, len(NAMES) :]
     assert first == bank.settling
     np.testing.assert_array_less(left, UNSETTLED * error)
     assert left[-1] > 0.9 * UNSETTLED * error[-1]
@@ -109,8 +80,8 @@ def test_through_a_short_gap_inputs_keep_their_last_value() -> None:
     gap = slice(400, 400 + HOLDING)
     spoilt, held = u.copy(), u.copy()
     spoilt[gap], held[gap], valid[gap] = np.nan, u[399], False
-    columns, used = bank_of().run(spoilt, valid, bank_of().start())
-    expected, settled = bank_of().run(held, np.ones(SAMPLES, bool), bank_of().start())
+    columns, used = bank_of().run(spoilt, valid)
+    expected, settled = bank_of().run(held, np.ones(SAMPLES, bool))
     np.testing.assert_array_equal(used, settled & valid)
     np.testing.assert_array_equal(columns[used], expected[used])
 
@@ -119,30 +90,11 @@ def test_after_a_long_gap_the_filters_start_again() -> None:
     u, valid = inputs_of(6, 1000), np.ones(1000, bool)
     gap = slice(400, 401 + HOLDING)
     u[gap], valid[gap] = np.nan, False
-    columns, used = bank_of().run(u, valid, bank_of().start())
-    fresh, settled = bank_of().run(u[gap.stop :], valid[gap.stop :], bank_of().start())
+    columns, used = bank_of().run(u, valid)
+    fresh, settled = bank_of().run(u[gap.stop :], valid[gap.stop :])
     np.testing.assert_array_equal(columns[gap.stop :], fresh)
     np.testing.assert_array_equal(used[gap.stop :], settled)
     assert used[:400].any()
-
-
-def test_a_drive_that_starts_with_invalid_samples_starts_at_its_first_valid_one() -> None:
-    u, valid = inputs_of(7), np.ones(SAMPLES, bool)
-    late = np.vstack([np.full((3, len(NAMES)), np.nan), u])
-    columns, _ = bank_of().run(late, np.concatenate([np.zeros(3, bool), valid]), bank_of().start())
-    np.testing.assert_array_equal(columns[3:], bank_of().run(u, valid, bank_of().start())[0])
-
-
-def test_identity_is_that_of_poles_names_and_period() -> None:
-    banks = [
-        bank_of(),
-        bank_of(POLES[1:]),
-        plain_bank(NAMES, period_s=PERIOD_S),
-        plain_bank(NAMES, period_s=0.2),
-        plain_bank(NAMES[::-1], period_s=PERIOD_S),
-    ]
-    assert len({bank.identity for bank in banks}) == len(banks)
-    assert bank_of().identity == bank_of().identity
 
 
 def test_a_bank_file_brings_the_same_bank_back(tmp_path: Path) -> None:

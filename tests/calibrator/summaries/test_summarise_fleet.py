@@ -3,7 +3,6 @@
 import shutil
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from calibrator.processes.run_many import Workers
 from calibrator.sources.fleet_source import Equipment, find_fleet
 from calibrator.summaries.record import joined_records
 from calibrator.summaries.store import SummaryStore, open_store
-from calibrator.summaries.summarise_fleet import Added, add_drives
+from calibrator.summaries.summarise_fleet import SummariseReport, add_drives
 from ecu_node.database import VehicleDatabase
 
 LAYOUT = Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"
@@ -38,7 +37,9 @@ def write(store: Path, vehicle: str, name: str, database: VehicleDatabase, *, sc
     write_drive(store, Drive(vehicle=vehicle, name=name, branches=branches, inputs=inputs), database.layout)
 
 
-def add(drives: Path, out: Path, database: VehicleDatabase, *, exactly: bool = False) -> tuple[Added, SummaryStore]:
+def add(
+    drives: Path, out: Path, database: VehicleDatabase, *, exactly: bool = False
+) -> tuple[SummariseReport, SummaryStore]:
     fleet = find_fleet(drives)
     store = open_store(open_storage(out), EQUIPMENT, database, fleet)
     return add_drives(store, fleet, database, workers=Workers(), exactly=exactly), store
@@ -52,12 +53,12 @@ def drives_in(store: SummaryStore) -> dict[str, list[tuple[str, ...]]]:
     }
 
 
-def test_each_drive_is_read_once(tmp_path: Path, database: VehicleDatabase) -> None:
+def test_each_drive_is_read_once_and_again_when_it_was_changed(tmp_path: Path, database: VehicleDatabase) -> None:
     drives, out = tmp_path / "drives", tmp_path / "summaries"
     for vehicle in ("V1", "V2"):
         write(drives, vehicle, "a", database)
     first, store = add(drives, out, database)
-    assert (first.vehicles, first.drives, first.problems) == (2, 2, {})
+    assert (first.vehicles, first.drives, first.left_out) == (2, 2, {})
     again, _ = add(drives, out, database)
     assert (again.vehicles, again.drives) == (0, 0)
     write(drives, "V2", "b", database)
@@ -66,31 +67,13 @@ def test_each_drive_is_read_once(tmp_path: Path, database: VehicleDatabase) -> N
     assert drives_in(store) == {"V1": [("a",)], "V2": [("a",), ("b",)]}
     bucket = store.bucket_of("V2")
     assert store.files(bucket) == ([f"{bucket:05d}-00000.parquet", f"{bucket:05d}-00001.parquet"], [])
-
-
-def test_two_drives_added_one_after_the_other_are_as_both_at_once(tmp_path: Path, database: VehicleDatabase) -> None:
-    for name in ("a", "b"):
-        write(tmp_path / "both", "V1", name, database)
-    _, at_once = add(tmp_path / "both", tmp_path / "s1", database)
-    for name in ("a", "b"):
-        write(tmp_path / "later", "V1", name, database)
-        _, later = add(tmp_path / "later", tmp_path / "s2", database)
-    totals = [joined_records(store.read(store.bucket_of("V1"))["V1"]).summary.total for store in (at_once, later)]
-    np.testing.assert_allclose(totals[1], totals[0], rtol=2e-3)
-    assert totals[1][-1, -1] == totals[0][-1, -1]
-
-
-def test_a_drive_that_was_changed_is_read_again(tmp_path: Path, database: VehicleDatabase) -> None:
-    drives, out = tmp_path / "drives", tmp_path / "summaries"
-    write(drives, "V1", "a", database)
-    _, store = add(drives, out, database)
     before = joined_records(store.read(store.bucket_of("V1"))["V1"]).summary.total
     write(drives, "V1", "a", database, scale=1.5)
-    again, store = add(drives, out, database)
-    assert again.drives == 1
+    shutil.rmtree(drives / "drives" / "V2")
+    changed, store = add(drives, out, database, exactly=True)
+    assert (changed.drives, drives_in(store)) == (1, {"V1": [("a",)]})
     after = joined_records(store.read(store.bucket_of("V1"))["V1"]).summary.total
     assert after[1, 1] == pytest.approx(2.25 * before[1, 1], rel=1e-6)
-    assert drives_in(store) == {"V1": [("a",)]}
 
 
 def test_a_bad_drive_costs_its_vehicle_and_is_tried_again(tmp_path: Path, database: VehicleDatabase) -> None:
@@ -101,11 +84,11 @@ def test_a_bad_drive_costs_its_vehicle_and_is_tried_again(tmp_path: Path, databa
     whole = path.read_bytes()
     path.write_bytes(whole[:1000])
     added, store = add(drives, out, database)
-    assert list(added.problems) == ["V1"]
-    assert "not a drive" in added.problems["V1"]
+    assert list(added.left_out) == ["V1"]
+    assert "not a drive" in added.left_out["V1"]
     path.write_bytes(whole)
     again, store = add(drives, out, database)
-    assert (again.vehicles, again.problems) == (1, {})
+    assert (again.vehicles, again.left_out) == (1, {})
     assert drives_in(store) == {"V1": [("a",)], "V2": [("a",)]}
 
 
@@ -121,51 +104,7 @@ def test_going_on_does_not_try_again_what_could_not_be_used(tmp_path: Path, data
     assert (again.vehicles, store.versions()) == (0, before)
     write(drives, "V1", "a", database)
     mended, _ = add(drives, out, database, exactly=True)
-    assert (mended.vehicles, mended.problems) == (1, {})
-
-
-def test_drives_that_change_while_they_are_read_stay_with_their_vehicle(
-    tmp_path: Path, database: VehicleDatabase
-) -> None:
-    drives, out = tmp_path / "drives", tmp_path / "summaries"
-    for number in range(6):
-        write(drives, f"V{number}", "a", database)
-    add(drives, out, database)
-    for number in (1, 3):
-        write(drives, f"V{number}", "b", database)
-    fleet = find_fleet(drives)
-    store = open_store(open_storage(out), EQUIPMENT, database, fleet)
-    stop = threading.Event()
-
-    def touch() -> None:
-        while not stop.wait(0.01):
-            for number in (0, 2, 4):
-                (drives / "drives" / f"V{number}" / "a.parquet").touch()
-
-    toucher = threading.Thread(target=touch)
-    toucher.start()
-    add_drives(store, fleet, database, workers=Workers())
-    stop.set()
-    toucher.join()
-    found = {
-        name: (bucket, {record.vehicle for record in records}, {d for record in records for d in record.drives})
-        for bucket in store.buckets()
-        for name, records in store.read(bucket).items()
-    }
-    for number in range(6):
-        name, expected = f"V{number}", {"a", "b"} if number in {1, 3} else {"a"}
-        assert found[name] == (store.bucket_of(name), {name}, expected)
-
-
-def test_a_store_that_is_to_hold_these_drives_alone_loses_the_others(tmp_path: Path, database: VehicleDatabase) -> None:
-    drives, out = tmp_path / "drives", tmp_path / "summaries"
-    for vehicle in ("V1", "V2"):
-        write(drives, vehicle, "a", database)
-    add(drives, out, database)
-    (drives / "drives" / "V1" / "a.parquet").unlink()
-    (drives / "drives" / "V1").rmdir()
-    _, store = add(drives, out, database, exactly=True)
-    assert drives_in(store) == {"V2": [("a",)]}
+    assert (mended.vehicles, mended.left_out) == (1, {})
 
 
 def test_drives_of_other_branches_cannot_be_added(tmp_path: Path, database: VehicleDatabase) -> None:
@@ -193,7 +132,7 @@ def test_recording_of_two_vehicles_counts_for_neither(tmp_path: Path, database: 
     copy(drives, "V1/a", "V2/b")
     for _ in range(2):  # the second run finds nothing else
         added, store = add(drives, out, database)
-        reasons = {name: text.partition(";")[0] for name, text in added.problems.items()}
+        reasons = {name: text.partition(";")[0] for name, text in added.left_out.items()}
         assert reasons == {"V1": "same recording as V2", "V2": "same recording as V1"}
         usable = {
             (record.vehicle, *record.drives)
@@ -205,7 +144,7 @@ def test_recording_of_two_vehicles_counts_for_neither(tmp_path: Path, database: 
         assert usable == {("V2", "a"), ("V3", "a")}
     (drives / "drives" / "V2" / "b.parquet").unlink()
     added, store = add(drives, out, database, exactly=True)
-    assert (added.problems, drives_in(store)) == ({}, {name: [("a",)] for name in ("V1", "V2", "V3")})
+    assert (added.left_out, drives_in(store)) == ({}, {name: [("a",)] for name in ("V1", "V2", "V3")})
 
 
 def test_recording_that_a_vehicle_has_twice_counts_once(tmp_path: Path, database: VehicleDatabase) -> None:

@@ -10,7 +10,7 @@ from calibrator.drive import Channel, Drive
 from calibrator.drives.store import write_drive
 from calibrator.errors import DriveError
 from calibrator.sources.fleet_source import Equipment, find_fleet
-from calibrator.summaries.vehicle_summary import read_vehicle_summary
+from calibrator.summaries.summarise_fleet import read_vehicle_summary
 from ecu_node.database import VehicleDatabase
 
 EQUIPMENT = Equipment(branches=("battery", "motor"), inputs=("speed",), fleet_inputs=("speed",), notices=())

@@ -3,14 +3,13 @@
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
 from calibrator.drive import Array, Channel, Drive
 from calibrator.summaries.zero_current import zero_current_offsets
-from ecu_node.database import VehicleDatabase, read_database
-from ecu_node.layout import Contactor, read_layout
+from ecu_node.database import read_database
+from ecu_node.layout import read_layout
 
 DATABASE = read_database(read_layout(Path(__file__).parents[3] / "dbc" / "hv_powertrain.toml"))
 OFFSETS_A = {"battery": 12.5, "motor": -3.0}
@@ -47,25 +46,6 @@ def test_offsets_are_read_with_their_uncertainty() -> None:
     assert (found.sd_a < 0.1).all()
 
 
-def test_a_state_in_steps_that_are_no_binary_fractions_is_known_as_open() -> None:
-    plain = drive()
-    state = plain.inputs["contactor_state"]
-    scaled = replace(plain, inputs={"contactor_state": replace(state, value=3.0 * 0.1 * (state.value == 0.0))})
-    contactor = Contactor(input="contactor_state", open=[0.3])
-    database = replace(DATABASE, layout=msgspec.structs.replace(DATABASE.layout, contactor=contactor))
-    found, same = (
-        zero_current_offsets([drives], tuple(OFFSETS_A), vehicle)
-        for drives, vehicle in ((scaled, database), (plain, DATABASE))
-    )
-    np.testing.assert_array_equal(found.offset_a, same.offset_a)
-
-
-def test_windows_of_several_drives_add_up() -> None:
-    one = zero_current_offsets([drive()], tuple(OFFSETS_A), DATABASE)
-    four = zero_current_offsets([drive()] * 4, tuple(OFFSETS_A), DATABASE)
-    assert (four.sd_a < one.sd_a).all()
-
-
 @pytest.mark.parametrize(
     "without",
     [drive(open_s=(0.0, 0.0)), drive(open_s=(10.0, 13.0)), drive(state=False)],
@@ -73,16 +53,6 @@ def test_windows_of_several_drives_add_up() -> None:
 )
 def test_without_a_window_there_is_no_reading(without: Drive) -> None:
     assert np.isnan(zero_current_offsets([without], tuple(OFFSETS_A), DATABASE).offset_a).all()
-
-
-def test_a_layout_without_contactor_knows_no_window() -> None:
-    without = replace(DATABASE, layout=msgspec.structs.replace(DATABASE.layout, contactor=None))
-    assert np.isnan(zero_current_offsets([drive()], tuple(OFFSETS_A), without).offset_a).all()
-
-
-def test_a_branch_that_was_not_recorded_has_no_reading() -> None:
-    found = zero_current_offsets([drive()], ("battery", "dcdc"), DATABASE)
-    assert np.isfinite(found.offset_a).tolist() == [True, False]
 
 
 def test_windows_that_differ_are_believed_less() -> None:
@@ -99,12 +69,6 @@ def test_what_wanders_within_a_window_does_not_average_out() -> None:
         found = zero_current_offsets([shifted(drive(), wander)], ("battery",), DATABASE)
         z.append((found.offset_a[0] - OFFSETS_A["battery"] - wander[:600].mean()) / found.sd_a[0])
     assert np.sqrt(np.mean(np.square(z))) < 1.5
-
-
-def test_an_offset_between_two_steps_of_the_signal_is_within_its_uncertainty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(VehicleDatabase, "current_step_a", lambda _database, _branch: 1.0)
-    found = zero_current_offsets([drive(noise_a=0.0)], tuple(OFFSETS_A), DATABASE)
-    assert (found.sd_a > 1.0 / np.sqrt(12.0)).all()
 
 
 def test_a_gap_in_the_contactor_messages_is_no_window() -> None:

@@ -1,18 +1,39 @@
+"""Samples into summaries: sums are those of the samples, spikes and what is not valid take no part."""
+
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
+from calibrator.drive import Array
 from calibrator.drives.align import Samples
 from calibrator.errors import DriveError
-from calibrator.estimator.evidence import stack_summaries
 from calibrator.summaries.filter_bank import FilterBank, low_passes
-from calibrator.summaries.moments import BLOCK_S, DriveSummary
-from calibrator.summaries.summariser import Summariser, summarise_samples
-from tests.calibrator.estimator.simulated_drives import PERIOD_S, Conditions, drive_of, no_faults, samples_of
+from calibrator.summaries.moments import BLOCK_S, LEVEL_EDGES_A, DriveSummary, FitSums
+from calibrator.summaries.summariser import find_spikes, summarise_samples
+from tests.calibrator.estimator.simulated_drives import (
+    PERIOD_S,
+    Conditions,
+    coloured,
+    drive_of,
+    no_faults,
+    samples_of,
+)
+
+SAMPLES = 1800
+
+
+def coloured_drive(seed: int = 0, K: int = 3) -> Samples:
+    """Currents that change slowly against the sampling, balanced, with noise."""
+    rng = np.random.default_rng(seed)
+    i = 60.0 * coloured(rng, SAMPLES, K, 0.995) @ (np.eye(K) - 1.0 / K)
+    return samples_of(rng.normal(size=(SAMPLES, 2)), i + rng.normal(0.0, 0.4, i.shape))
+
+
+def fit_of(*drives: Samples, temperatures_c: list[Array] | None = None) -> FitSums:
+    fit = summarise_samples(list(drives), period_s=PERIOD_S, temperatures_c=temperatures_c).fit
+    assert fit is not None
+    return fit
 
 
 def a_drive(seed: int, samples: int = 300, noise_a: float = 0.3) -> Samples:
@@ -46,13 +67,6 @@ def test_moments_are_those_of_the_samples() -> None:
     assert summary.duration_s == 300.0
 
 
-def test_summaries_of_drives_add_up() -> None:
-    first, second = a_drive(2), a_drive(3)
-    both = summarise_samples([first, second], period_s=PERIOD_S)
-    alone = [summarise_samples([drive], period_s=PERIOD_S).total for drive in (first, second)]
-    np.testing.assert_allclose(both.total, sum(alone))
-
-
 def test_the_sum_of_summaries_is_the_summary_of_the_drives_together() -> None:
     first, second = a_drive(2), a_drive(3, samples=170)
     warm_c = [20.0 + 0.01 * drive.time_s for drive in (first, second)]
@@ -73,12 +87,6 @@ def test_what_was_summarised_differently_does_not_add_up() -> None:
         plain + plain.take_branches([0, 1])
 
 
-def test_a_fleet_of_different_banks_is_refused() -> None:
-    summaries = [summarise_samples([a_drive(j)], period_s=PERIOD_S, bank=a_bank(3.0 + j)) for j in range(2)]
-    with pytest.raises(DriveError, match="summaries of 2 drives or vehicles made with 2 filter banks"):
-        stack_summaries(summaries)
-
-
 def test_a_bank_of_other_inputs_or_of_another_period_is_refused() -> None:
     drive, bank = a_drive(2), a_bank(3.0)
     with pytest.raises(DriveError, match="align the drive with the bank's inputs"):
@@ -90,43 +98,12 @@ def test_a_bank_of_other_inputs_or_of_another_period_is_refused() -> None:
 @pytest.mark.parametrize("time_constants_s", [(), (2.0, 9.0)])
 def test_moments_of_a_bank_are_those_of_its_columns(time_constants_s: tuple[float, ...]) -> None:
     drive, bank = a_drive(8, samples=3000), a_bank(*time_constants_s)
-    filtered, used = bank.run(drive.inputs, drive.valid, bank.start())
+    filtered, used = bank.run(drive.inputs, drive.valid)
     columns = np.column_stack([filtered, drive.currents_a, np.ones(3000)])[used]
     kept = (used.reshape(-1, 30).sum(axis=1) >= 6).repeat(30)[used]
     np.testing.assert_allclose(
         summarise_samples([drive], period_s=PERIOD_S, bank=bank).total, columns[kept].T @ columns[kept], rtol=1e-10
     )
-
-
-@settings(derandomize=True, deadline=None, max_examples=30)
-@given(cuts=st.lists(st.integers(0, 1700), max_size=8), seed=st.integers(0, 100))
-def test_pieces_of_a_drive_give_the_blocks_of_the_whole(cuts: list[int], seed: int) -> None:
-    drive, rng = a_drive(seed, samples=1700), np.random.default_rng(seed)
-    valid = (rng.random(1700) > 0.03) & (np.arange(1700) // 200 != seed % 8)
-    gaps = replace(drive, valid=valid, currents_a=np.where(valid[:, None], drive.currents_a, np.nan))
-    whole = summarise_samples([gaps, drive], period_s=PERIOD_S, bank=a_bank(2.0, 9.0))
-    summariser = Summariser(a_bank(2.0, 9.0), branches=3)
-    edges = [0, *sorted(cuts), 1700]
-    for samples in (gaps, drive):
-        for a, b in pairwise(edges):
-            summariser.add(samples.inputs[a:b], samples.currents_a[a:b], samples.valid[a:b])
-        summariser.end_drive()
-    assert_same(summariser.summary(), whole)
-
-
-def test_a_drive_can_come_sample_by_sample() -> None:
-    drive = a_drive(9, samples=1700)
-    summariser = Summariser(a_bank(2.0), branches=3)
-    for t in range(1700):
-        summariser.add(drive.inputs[t : t + 1], drive.currents_a[t : t + 1], drive.valid[t : t + 1])
-    summariser.end_drive()
-    assert_same(summariser.summary(), summarise_samples([drive], period_s=PERIOD_S, bank=a_bank(2.0)))
-
-
-def test_a_piece_that_does_not_fit_is_refused() -> None:
-    drive = a_drive(9)
-    with pytest.raises(DriveError, match=r"of shapes \(300, 3\), \(300, 2\), .*; expected \(300, 3\), \(300, 3\)"):
-        Summariser(a_bank(2.0), branches=3).add(drive.inputs, drive.currents_a[:, 1:], drive.valid)
 
 
 def test_a_drive_shorter_than_its_bank_settles_is_refused_with_the_reason() -> None:
@@ -143,15 +120,6 @@ def test_samples_that_are_not_valid_take_no_part() -> None:
     assert np.isfinite(summary.moments).all()
 
 
-def test_branches_can_be_taken_in_another_order() -> None:
-    drive = a_drive(5)
-    order = [2, 0, 1]
-    taken = summarise_samples([drive], period_s=PERIOD_S).take_branches(order)
-    direct = summarise_samples([replace(drive, currents_a=drive.currents_a[:, order])], period_s=PERIOD_S)
-    np.testing.assert_allclose(taken.moments, direct.moments)
-    np.testing.assert_allclose(taken.noise_a2, direct.noise_a2)
-
-
 @pytest.mark.parametrize("samples", [30, 300])
 def test_white_noise_is_measured_without_bias(samples: int) -> None:
     rng = np.random.default_rng(6)
@@ -164,13 +132,66 @@ def test_white_noise_is_measured_without_bias(samples: int) -> None:
     assert np.mean(np.concatenate(variance)) == pytest.approx(4.0, rel=0.03)
 
 
-def test_slow_currents_are_not_taken_for_noise() -> None:
-    t = np.arange(600.0)
-    currents = np.column_stack([100.0 * np.sin(t / 30.0), np.zeros(600)])
-    assert summarise_samples([samples_of(np.zeros((600, 0)), currents)], period_s=PERIOD_S).noise_a2.max() < 1e-3
-
-
 def test_a_drive_without_enough_valid_samples_is_refused() -> None:
     drive = a_drive(7, samples=60)
     with pytest.raises(DriveError, match="no 30 s of drive in which 20% of the samples are valid"):
         summarise_samples([replace(drive, valid=np.zeros(60, bool))], period_s=PERIOD_S)
+
+
+def test_levels_are_sums_of_the_samples_at_each_level() -> None:
+    drive = coloured_drive()
+    levels = fit_of(drive).levels
+    columns = np.column_stack([drive.inputs, drive.currents_a, np.ones(SAMPLES)])
+    for k in range(3):
+        x = drive.currents_a[:, k]
+        # at an edge itself a sample belongs to the level farther from zero
+        level = np.where(x > 0.0, np.searchsorted(LEVEL_EDGES_A, x, "right"), np.searchsorted(LEVEL_EDGES_A, x, "left"))
+        for number in range(len(LEVEL_EDGES_A) + 1):
+            there = level == number
+            np.testing.assert_allclose(levels[k, number, :-1], columns[there].sum(axis=0), atol=1e-8)
+            np.testing.assert_allclose(levels[k, number, -1], np.sum(x[there] ** 2), atol=1e-8)
+
+
+def test_fast_changes_tell_white_noise() -> None:
+    fit = fit_of(coloured_drive())
+    weights = np.ones(3)  # in the sum of the currents nothing but noise is left
+    variance = weights @ fit.fast_a2.sum(axis=0) @ weights / 1.5 / SAMPLES
+    assert variance == pytest.approx(3 * 0.4**2, rel=0.1)
+
+
+def test_spikes_are_labelled_by_branch_and_sign_and_left_out() -> None:
+    drive = coloured_drive()
+    bad = drive.currents_a.copy()
+    bad[[200, 700, 1100], 1] += 50.0
+    bad[[400, 401, 402], 2] -= 40.0
+    summary = summarise_samples([replace(drive, currents_a=bad)], period_s=PERIOD_S)
+    assert summary.fit is not None
+    np.testing.assert_array_equal(summary.fit.spikes.sum(axis=0), [[0, 0], [3, 0], [0, 3]])
+    kept = np.setdiff1d(np.arange(SAMPLES), [200, 400, 401, 402, 700, 1100])
+    columns = np.column_stack([drive.inputs, drive.currents_a, np.ones(SAMPLES)])[kept]
+    np.testing.assert_allclose(summary.total, columns.T @ columns)
+
+
+def test_current_that_really_flows_is_no_spike() -> None:
+    drive = coloured_drive()
+    pulse = np.zeros((SAMPLES, 3))
+    pulse[[200, 700, 1100]] = [100.0, -60.0, -40.0]
+    assert not find_spikes(drive.currents_a + pulse, drive.valid).any()
+
+
+def test_delay_that_is_left_makes_no_spikes() -> None:
+    drive = coloured_drive()
+    steps = 80.0 * (np.arange(SAMPLES) // 100 % 2)
+    late = np.roll(steps, 1)
+    late[0] = steps[0]
+    moved = drive.currents_a + np.column_stack([steps, -late, 0.0 * steps])
+    assert not find_spikes(moved, drive.valid).any()
+
+
+@pytest.mark.parametrize("gain", [-1.0, 0.4, 1.8])
+def test_spikes_are_found_whatever_the_gains(gain: float) -> None:
+    bad = coloured_drive().currents_a * [1.0, gain, 1.0]
+    bad[500, 0] += 60.0
+    found = find_spikes(bad, np.ones(SAMPLES, bool))
+    assert np.argwhere(found).tolist() == [[500, 0]]
+    assert found[500, 0] == 1
