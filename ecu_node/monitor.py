@@ -25,7 +25,7 @@ from ecu_node.bus.service import Log, Requests
 from ecu_node.bus.steady_bus import SteadyBus
 from ecu_node.bus.wiring import Mode, branch_signals, key_of, open_bus, received, transmitted
 from ecu_node.core.e2e import Check, Protection, Receiver, protection_of
-from ecu_node.core.junction import REMEMBERED_FRAMES, Auxiliary, Frames, LiveBranch, aligned_currents
+from ecu_node.core.junction import REMEMBERED_FRAMES, Frames, HeardSignal, LiveBranch, aligned_currents
 from ecu_node.core.signals import AMPERE, bit_place, placed_signal, read_codes
 from ecu_node.core.status import Counters, Latency, Quality, Reason, State
 from ecu_node.database import VehicleDatabase, node_database
@@ -177,7 +177,7 @@ class _BranchOnBus:
         self._branch, signals = branch, branch_signals(database, branch, Mode.OVERLAY)
         voltage = None
         if branch.voltage is not None and signals.voltage is not None:
-            voltage = Auxiliary(signals.voltage, branch.timeout_s)
+            voltage = HeardSignal(signals.voltage, branch.timeout_s)
             voltage.follow(placed_signal(*database.signal(branch.voltage)), heard_of(branch.voltage).frames)
         make = partial(LiveBranch, name=branch.name, sign=branch.sign, timeout_s=branch.timeout_s, voltage=voltage)
         self.measured, self.corrected = make(codes=signals.source), make(codes=signals.target)

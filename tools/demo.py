@@ -148,14 +148,20 @@ def corrected_vehicle(result: Path, held_out: list[str]) -> str:
 
 
 def record_live_drive(parameters: Path, vehicle: str, *, log: Path, recording: Path) -> None:
-    """Play a log onto a bus in real time with the node on it, and record what passes."""
+    """Play the first seconds of a log onto a bus in real time with the node on it, and record what passes."""
     interface, channel = choose_bus()
     say(f"bus: {interface} {channel}; {SECONDS:.0f} s in real time")
+    messages = read_frames(log).messages()
+    first = next(messages)
+    frames = chain([first], takewhile(lambda message: message.timestamp < first.timestamp + SECONDS, messages))
     with running_node(parameters, vehicle, interface, channel), can.Bus(channel=channel, interface=interface) as ears:
         notifier = can.Notifier(ears, [can.Logger(recording)], timeout=0.1)
         try:
-            with can.Bus(channel=channel, interface=interface) as mouth:
-                play(log, mouth)
+            with (
+                can.Bus(channel=channel, interface=interface) as mouth,
+                progress_bar("drive", int(SECONDS), "s") as progress,
+            ):
+                play_frames(frames, mouth, progress=lambda _, age_s: progress(int(age_s) + 1))
             time.sleep(0.3)
         finally:
             notifier.stop()
@@ -172,68 +178,29 @@ def choose_bus() -> tuple[str, str]:
 
 @contextmanager
 def running_node(parameters: Path, vehicle: str, interface: str, channel: str) -> Iterator[None]:
-    """The node: a process of its own on SocketCAN; a thread on the virtual bus, which lives in one process."""
-    run_it = node_process if interface == "socketcan" else node_thread
-    with run_it(parameters, vehicle, interface, channel):
-        yield
-
-
-@contextmanager
-def node_process(parameters: Path, vehicle: str, interface: str, channel: str) -> Iterator[None]:
-    """``ecu-node run``, from when it says that it runs until the end of the block."""
-    command = words("ecu-node", "run", "--unsigned", "--params", parameters, "--layout", LAYOUT, "--vehicle", vehicle)
-    command += ["--interface", interface, "--channel", channel]
-    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stderr is not None
-            while "running on" not in (line := process.stderr.readline()):
-                if not line:
-                    raise UserError("the node ended at once")
-                say(line.rstrip())
-            yield
-        finally:
-            process.terminate()
-    if process.returncode:
-        raise UserError(f"the node ended with exit code {process.returncode}")
-
-
-@contextmanager
-def node_thread(parameters: Path, vehicle: str, interface: str, channel: str) -> Iterator[None]:
     """The node's own loop in a thread."""
     database = read_database(read_layout(ROOT / LAYOUT))
     in_force, why_not = choose_parameters(parameters, database, vehicle)
     if why_not is not None:
         raise UserError(why_not)
-    stop = threading.Event()
+    stop, at_work = threading.Event(), threading.Event()
     corrector = wire(database, in_force, time.monotonic())
     bus = SteadyBus(
         lambda: open_bus(database, interface=interface, channel=channel, fd=False, mode=Mode.OVERLAY),
         corrector.counters,
         say,
     )
+    run_node = OverlayNode(bus, corrector, period_s=0.1).run
+    node = threading.Thread(target=run_node, args=(stop.is_set, at_work.set))
+    node.start()
+    at_work.wait()
     try:
-        at_work = threading.Event()
-        run = OverlayNode(bus, corrector, period_s=0.1).run
-        node = threading.Thread(target=run, args=(stop.is_set, at_work.set))
-        node.start()
-        at_work.wait()
-        try:
-            yield
-        finally:
-            stop.set()
-            node.join()
+        yield
     finally:
+        stop.set()
+        node.join()
         bus.close()
     say(f"node: {corrector.counters.text()}")
-
-
-def play(log: Path, bus: can.BusABC) -> None:
-    """Send the first seconds of a log with its timing."""
-    messages = read_frames(log).messages()
-    first = next(messages)
-    frames = chain([first], takewhile(lambda message: message.timestamp < first.timestamp + SECONDS, messages))
-    with progress_bar("drive", int(SECONDS), "s") as progress:
-        play_frames(frames, bus, progress=lambda _, age_s: progress(int(age_s) + 1))
 
 
 def put_in(truth: FleetTruth, vehicle: str) -> str:

@@ -21,9 +21,8 @@ Known faults of the recordings, found in the data and labelled:
   DC/DC converter takes; in sound trips its median is 330 W or more, in trips with a stuck heater signal below 100 W.
 """
 
-import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -39,7 +38,7 @@ from calibrator.recordings.decode import SignalRange, signal_range
 from calibrator.recordings.tables import Table, read_table
 from calibrator.terminal.command_line import command_app, run_tool
 from calibrator.terminal.progress import shown
-from calibrator.terminal.text import told_once
+from calibrator.terminal.text import dumps, told_once
 from ecu_node.core.signals import AMPERE, unit_factor
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.errors import LayoutError, UserError
@@ -94,25 +93,41 @@ def main(
     as_json: Annotated[bool, typer.Option("--json", help="Print the account as JSON.")] = False,
 ) -> None:
     """Turn recordings of a BMW i3 into drives; each file becomes a vehicle named after it."""
-    account = Account()
-    try:
-        for folder in (out, logs):
-            if folder is not None:
-                require_possible_folder(folder)
-        database = read_database(read_layout(layout))
-        _require_names(database)
-        trips = _trips(csv)
-        for name, paths in shown(trips.items(), "import", len(trips), "trips"):
-            try:
-                trip = _import_trip(name, paths, database, out, logs)
-            except UserError as error:
-                account.failed[name] = str(error)
-            else:
-                account.take(name, trip)
-    except UserError as error:
-        account.failed[""] = str(error)
-    _print_account(account, as_json=as_json)
-    raise typer.Exit(1 if account.failed else 0)
+    for folder in (out, logs):
+        if folder is not None:
+            require_possible_folder(folder)
+    database = read_database(read_layout(layout))
+    names = {*database.layout.branch_names, *(item.name for item in database.layout.input)}
+    if missing := [name for name in (*BRANCHES, *INPUTS) if name not in names]:
+        raise LayoutError(f"{layout}: no branch or input named {', '.join(missing)}; use dbc/hv_powertrain.toml")
+    done, already_there, failed = dict[str, ImportedTrip](), list[str](), dict[str, str]()
+    trips = _trips(csv)
+    for name, paths in shown(trips.items(), "import", len(trips), "trips"):
+        try:
+            trip = _import_trip(name, paths, database, out, logs)
+        except UserError as error:
+            failed[name] = str(error)
+            continue
+        if trip is None:
+            already_there.append(name)
+        else:
+            done[name] = trip
+    if as_json:
+        drives = {name: {"duration_s": trip.drive.duration_s, "notices": trip.notices} for name, trip in done.items()}
+        write_output(dumps({"drives": drives, "already_there": already_there, "failed": failed}))
+    else:
+        duration_h = sum(trip.drive.duration_s for trip in done.values()) / 3600.0
+        write_output(
+            "\n".join([
+                *told_once((name, notice) for name, trip in done.items() for notice in trip.notices),
+                f"{len(done)} trips imported, {duration_h:.1f} h; {len(already_there)} already there; "
+                f"{len(failed)} left out",
+                "motor is minus the sum of battery and auxiliary: not independent of the battery's sensor",
+            ])
+        )  # fmt: skip
+    for text in failed.values():
+        say_error(f"import_bmw_i3: {text}")
+    raise typer.Exit(1 if failed else 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,30 +144,6 @@ class ImportedTrip:
 
     drive: Drive
     notices: tuple[str, ...]
-
-
-@dataclass(kw_only=True)
-class Account:
-    """What became of each trip."""
-
-    done: dict[str, ImportedTrip] = field(default_factory=dict)
-    already_there: list[str] = field(default_factory=list)
-    failed: dict[str, str] = field(default_factory=dict)
-
-    def take(self, name: str, trip: ImportedTrip | None) -> None:
-        """Count a trip that was imported now, or before (None)."""
-        if trip is None:
-            self.already_there.append(name)
-        else:
-            self.done[name] = trip
-
-
-def _require_names(database: VehicleDatabase) -> None:
-    layout = database.layout
-    missing = [name for name in BRANCHES if name not in layout.branch_names]
-    missing += [name for name in INPUTS if name not in {item.name for item in layout.input}]
-    if missing:
-        raise LayoutError(f"{layout.path}: no branch or input named {', '.join(missing)}; use dbc/hv_powertrain.toml")
 
 
 def _trips(arguments: Iterable[Path]) -> dict[str, list[Path]]:
@@ -184,39 +175,11 @@ def _import_trip(
     if not in_store:
         write_drive(out, trip.drive, database.layout)
     if log is not None and not log.exists():
-        _write_log(log, trip, database)
+        try:
+            write_drive_log(log, trip.drive, database)
+        except OSError as error:
+            raise LogError(f"{log}: cannot write the log: {error.strerror}; choose another --logs") from None
     return trip
-
-
-def _write_log(path: Path, trip: ImportedTrip, database: VehicleDatabase) -> None:
-    try:
-        write_drive_log(path, trip.drive, database)
-    except OSError as error:
-        raise LogError(f"{path}: cannot write the log: {error.strerror}; choose another --logs") from None
-
-
-def _print_account(account: Account, *, as_json: bool) -> None:
-    done, failed = account.done, account.failed
-    duration_h = sum(trip.drive.duration_s for trip in done.values()) / 3600.0
-    if as_json:
-        values = {
-            "drives": {
-                name: {"duration_s": trip.drive.duration_s, "notices": trip.notices} for name, trip in done.items()
-            },
-            "already_there": account.already_there,
-            "failed": failed,
-        }
-        write_output(json.dumps(values, indent=2))
-    else:
-        lines = told_once((name, notice) for name, trip in done.items() for notice in trip.notices)
-        summary = (
-            f"{len(done)} trips imported, {duration_h:.1f} h; {len(account.already_there)} already there; "
-            f"{len(failed)} left out"
-        )
-        origin = "motor is minus the sum of battery and auxiliary: not independent of the battery's sensor"
-        write_output("\n".join([*lines, summary, origin]))
-    for text in failed.values():
-        say_error(f"import_bmw_i3: {text}")
 
 
 def trip_from_table(table: Table, *, vehicle: str, name: str, ranges: Mapping[str, SignalRange]) -> ImportedTrip:
@@ -253,10 +216,22 @@ def trip_from_table(table: Table, *, vehicle: str, name: str, ranges: Mapping[st
         for key, values in columns.items()
         if (bad := ~np.isfinite(values)).any()
     ]
-    values = _values(columns)
+    voltage = np.where(columns["voltage"] > 0.0, columns["voltage"], np.nan)
+    heater_w, aircon_w = 1e3 * columns["heater"], 1e3 * columns["aircon"]
+    battery, auxiliary = -columns["current"], -(heater_w + aircon_w) / voltage
+    values = {"battery": battery, "auxiliary": auxiliary, "motor": -(battery + auxiliary), "voltage": voltage}
+    values |= {"heater_demand": heater_w, "aircon_demand": aircon_w}
+    values |= {key: columns[key] for key in ("torque", "speed", "acceleration", "accelerator")}
     good = {key: np.isfinite(value) for key, value in values.items()}
     good["heater_demand"] &= _heater_good(columns, notices)
-    _label_ranges(values, good, ranges, notices)
+    for key, limits in ranges.items():
+        beyond = good[key] & ~limits.holds(values[key]) if key in values else np.zeros(0, bool)
+        if beyond.any():
+            good[key][beyond] = False
+            notices.append(
+                f"{key}: {np.sum(beyond)} samples beyond the DBC's {limits.low:g} to {limits.high:g}; "
+                f"labelled as not good"
+            )
     for key, sources in _MADE_OF.items():
         good[key] &= np.logical_and.reduce([good[source] for source in sources])
     if not good["battery"].any():
@@ -269,39 +244,6 @@ def trip_from_table(table: Table, *, vehicle: str, name: str, ranges: Mapping[st
         inputs={key: channels[key] for key in INPUTS},
     )
     return ImportedTrip(drive=drive, notices=tuple(notices))
-
-
-def _values(columns: Mapping[str, Array]) -> dict[str, Array]:
-    """Branch currents and inputs from the columns of the file."""
-    voltage = np.where(columns["voltage"] > 0.0, columns["voltage"], np.nan)
-    heater_w, aircon_w = 1e3 * columns["heater"], 1e3 * columns["aircon"]
-    battery = -columns["current"]
-    auxiliary = -(heater_w + aircon_w) / voltage
-    return {
-        "battery": battery,
-        "auxiliary": auxiliary,
-        "motor": -(battery + auxiliary),
-        "voltage": voltage,
-        "heater_demand": heater_w,
-        "aircon_demand": aircon_w,
-        **{key: columns[key] for key in ("torque", "speed", "acceleration", "accelerator")},
-    }
-
-
-def _label_ranges(
-    values: Mapping[str, Array], good: Mapping[str, Mask], ranges: Mapping[str, SignalRange], notices: list[str]
-) -> None:
-    """Label what the DBC does not allow."""
-    for key, limits in ranges.items():
-        if key not in values:
-            continue
-        beyond = good[key] & ~limits.holds(values[key])
-        if beyond.any():
-            good[key][beyond] = False
-            notices.append(
-                f"{key}: {np.sum(beyond)} samples beyond the DBC's {limits.low:g} to {limits.high:g}; "
-                f"labelled as not good"
-            )
 
 
 def _heater_good(columns: Mapping[str, Array], notices: list[str]) -> Mask:

@@ -1,17 +1,22 @@
-"""MDF 4 files, read in a process of their own that a time limit ends: frames of a bus, or decoded channels.
+"""MDF 4 files, read in another process that a time limit ends: frames of a bus, or decoded channels.
 
 The format is a graph of binary blocks that point at each other; a damaged one can keep its reader busy for ever.
 Needs the extra ``mf4`` (asammdf).
 """
 
+import atexit
 import importlib.util
+import json
 import mmap
+import os
+import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +47,7 @@ _FRAME_CHANNEL = bytes(8) + b"CAN_DataFrame\0"
 """A block of text begins with its count of links, which is 0, then comes the text."""
 BYTES_PER_S = 20_000.0
 """Slowest reading that is still waited for, a tenth of what a slow machine does."""
+_DONE = "done"
 
 
 def is_bus_log(path: Path) -> bool:
@@ -102,25 +108,56 @@ def _converted(path: Path, name: str) -> Iterator[Path]:
     """File of this name that another process made of an MDF 4 file."""
     if importlib.util.find_spec("asammdf") is None:
         raise LogError(f"{path}: reading MF4 needs asammdf; pip install 'hv-current-correction[mf4]'")
-    limit_s = START_S + path.stat().st_size / BYTES_PER_S
     with tempfile.TemporaryDirectory(prefix="mf4-") as folder:
         result = Path(folder) / name
-        command = [sys.executable, "-W", "ignore", "-m", "calibrator.recordings.mf4", str(path), str(result)]
-        try:
-            done = subprocess.run(command, capture_output=True, timeout=limit_s, check=False, text=True)  # noqa: S603
-        except subprocess.TimeoutExpired:
-            raise LogError(
-                f"{path}: reading took more than {limit_s:.0f} s and was ended; the file is damaged, "
-                f"convert it to .blf with the tool that recorded it"
-            ) from None
-        if done.returncode:
-            reason = (done.stderr.strip().splitlines() or ["the reader ended without a word"])[-1]
-            raise LogError(f"{path}: not a readable MF4 file: {reason[:200]}; copy the file again")
+        limit_s = START_S + path.stat().st_size / BYTES_PER_S
+        process = _process(os.getpid())
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(json.dumps([str(path), str(result), limit_s]) + "\n")
+        process.stdin.flush()
+        answer = process.stdout.readline().strip()
+        if not answer:  # it has ended
+            _process.cache_clear()
+            if process.wait() == -signal.SIGALRM:
+                raise LogError(
+                    f"{path}: reading took more than {limit_s:.0f} s and was ended; the file is damaged, "
+                    f"convert it to .blf with the tool that recorded it"
+                )
+            answer = "the reader ended without a word"
+        if answer != _DONE:
+            raise LogError(f"{path}: not a readable MF4 file: {answer[:200]}; copy the file again")
         yield result
 
 
+@cache
+def _process(_pid: int) -> "subprocess.Popen[str]":
+    """The process that reads files for this one, one after the other: to start it takes longer than most of them."""
+    command = [sys.executable, "-W", "ignore", "-m", "calibrator.recordings.mf4"]
+    process = subprocess.Popen(  # noqa: S603
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    atexit.register(process.communicate)  # at the end of its input it ends
+    return process
+
+
+def main() -> None:
+    """What the process does: read a line with path, result and time limit, convert, answer with a line."""
+    answers, sys.stdout = sys.stdout, sys.stderr  # what libraries print is no answer
+    for line in sys.stdin:
+        path, result, limit_s = json.loads(line)
+        signal.setitimer(signal.ITIMER_REAL, limit_s)  # ends the process, whatever it is busy with
+        try:
+            convert(path, result)
+            answer = _DONE
+        except Exception as error:  # noqa: BLE001 (asammdf raises anything for a damaged file; the parent says it)
+            answer = " ".join(f"{type(error).__name__}: {error}".split())
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        print(answer, file=answers, flush=True)
+
+
 def convert(path: str, result: str) -> None:
-    """Write frames (.npz) or decoded channels (.parquet) of `path` to `result`: what the process does."""
+    """Write frames (.npz) or decoded channels (.parquet) of `path` to `result`."""
     from asammdf import MDF  # noqa: PLC0415 (only here: the parent needs neither)
 
     with MDF(path) as mdf:
@@ -186,4 +223,4 @@ def _frames_of_group(signal: Any, start: Any) -> Frames:
 
 
 if __name__ == "__main__":
-    convert(*sys.argv[1:])
+    main()

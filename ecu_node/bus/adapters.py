@@ -7,7 +7,7 @@ An adapter's driver takes 500 kbit/s where nothing is said, which disturbs a bus
 import configparser
 import errno
 import socket
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
@@ -85,6 +85,11 @@ def connect(
     if opened is not None:
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
     return bus
+
+
+def filters_of(keys: Iterable[tuple[int, bool]]) -> list[CanFilter]:
+    """Filters for the kernel to apply: these identifiers, each with whether it has 29 bits."""
+    return [{"can_id": key, "can_mask": 0x1FFFFFFF if long else 0x7FF, "extended": long} for key, long in keys]
 
 
 def error_text(error: Exception) -> str:

@@ -18,17 +18,18 @@ import can
 from can.typechecking import CanFilter
 from cantools.database.can import Message, Signal
 
-from ecu_node.bus.adapters import Settings, connect
+from ecu_node.bus.adapters import Settings, connect, filters_of
 from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault, Signals, correction_plan
-from ecu_node.core.corrector import Corrector, Reader, Source, StatusFields, Target, TargetField
+from ecu_node.core.corrector import Corrector, Source, StatusFields, Target
 from ecu_node.core.e2e import protection_of
-from ecu_node.core.junction import Auxiliary, ExpectedSum, JunctionWatch, LiveBranch
+from ecu_node.core.junction import HeardSignal, JunctionWatch, LiveBranch, Written
 from ecu_node.core.signals import (
     AMPERE,
     VOLT,
     WATT,
     Codes,
     FrameKey,
+    PlacedSignal,
     as_written,
     bit_place,
     exact_code,
@@ -300,16 +301,11 @@ def put_in_force(
     if parameters is None:
         corrector.put_in_force(reason=in_force.reason, parameter_set=0)
         return
-    residual = parameters.junction_residual
-    measured_a, corrected_a = residual.about_expected()
-    expected = ExpectedSum(
-        expected_a=residual.expected_a,
-        predicted_worse_a=corrected_a - measured_a,
-        corrected_a=corrected_a,
-        sd_a=residual.corrected_sd_a,
-        sd_per_a=residual.corrected_sd_per_a,
+    corrector.put_in_force(
+        reason=in_force.reason,
+        parameter_set=parameters.number % PARAMETER_SETS,
+        expected=parameters.junction_residual,
     )
-    corrector.put_in_force(reason=in_force.reason, parameter_set=parameters.number % PARAMETER_SETS, expected=expected)
 
 
 def wire(
@@ -350,14 +346,14 @@ def wire(
     """
     _check_output(database, mode)
     layout, counters = database.layout, Counters()
-    readers: dict[FrameKey, list[Reader]] = defaultdict(list)
+    readers: dict[FrameKey, list[tuple[HeardSignal, PlacedSignal]]] = defaultdict(list)
 
-    def read(name: SignalName, part: Auxiliary | LiveBranch) -> None:
+    def read(name: SignalName, part: HeardSignal | LiveBranch) -> None:
         message, signal = database.signal(name)
-        readers[key_of(message)].append(Reader(part, placed_signal(message, signal)))
+        readers[key_of(message)].append((part, placed_signal(message, signal)))
 
     branches: dict[str, LiveBranch] = {}
-    auxiliaries: dict[SignalName, Auxiliary] = {}
+    auxiliaries: dict[SignalName, HeardSignal] = {}
     for branch in layout.branch:
         signals = branch_signals(database, branch, mode)
         if mode is Mode.GATEWAY or branch.corrected is not None:
@@ -367,7 +363,7 @@ def wire(
             require_reach(signals.target, largest, f"{layout.path}: branch {branch.name}")
         if branch.voltage is not None and signals.voltage is not None and branch.voltage not in auxiliaries:
             timeout_s = max(item.timeout_s for item in layout.branch if item.voltage == branch.voltage)
-            auxiliaries[branch.voltage] = Auxiliary(signals.voltage, timeout_s)
+            auxiliaries[branch.voltage] = HeardSignal(signals.voltage, timeout_s)
             read(branch.voltage, auxiliaries[branch.voltage])
         branches[branch.name] = LiveBranch(
             name=branch.name,
@@ -388,7 +384,7 @@ def wire(
         if item.name == layout.watch.input:
             _, signal = database.signal(item.signal)
             codes = signal_codes(database, item.signal, {usual_unit(signal.unit or ""): 1.0}, "[watch] input")
-            state = Auxiliary(replace(codes, named={}), layout.max_age_s)  # a state's names are no lack of a value
+            state = HeardSignal(replace(codes, named={}), layout.max_age_s)  # a state's names are no lack of a value
             valid = frozenset(int(exact_code(signal, value)) for value in layout.watch.valid)
             watch.is_whole = partial(_has_code, state, valid)
             read(item.signal, state)
@@ -415,7 +411,7 @@ def wire(
     return corrector
 
 
-def _has_code(state: Auxiliary, valid: frozenset[int], now_s: float) -> bool:
+def _has_code(state: HeardSignal, valid: frozenset[int], now_s: float) -> bool:
     return state.code_at(now_s) in valid
 
 
@@ -427,17 +423,17 @@ def _answers(database: VehicleDatabase, branches: Mapping[str, LiveBranch]) -> d
         if branch.corrected is not None:
             corrected[split_signal(branch.corrected)[0]].append(branch)
     for name, inside in corrected.items():
-        message, fields = database.message(name), []
+        message, written = database.message(name), {}
         for branch in inside:
             codes = branch_signals(database, branch, Mode.OVERLAY).target
             not_available = not_available_code(codes, f"{database.layout.path}: branch {branch.name}")
             quality = bit_place(database.signal(branch.quality)[1]) if branch.quality is not None else None
-            fields.append(TargetField(branches[branch.name], codes.place, not_available, quality))
+            written[branches[branch.name]] = Written(codes.place, not_available, quality)
         target = Target(
             key=key_of(message),
             length=message.length,
             fd=is_fd(message),
-            fields=fields,
+            branches=written,
             protection=protection_of(database, message),
         )
         for incoming in dict.fromkeys(key_of(database.signal(branch.source)[0]) for branch in inside):
@@ -517,5 +513,4 @@ def require_fd(database: VehicleDatabase, mode: Mode, *, fd: bool) -> None:
 
 def receive_filters(database: VehicleDatabase, mode: Mode, *, own: bool = True) -> list[CanFilter]:
     """Filters for the kernel to apply: what the node needs of the vehicle, and its own messages as sent by others."""
-    keys = (*received(database), *(transmitted(database, mode) if own else ()))
-    return [{"can_id": key, "can_mask": 0x1FFFFFFF if long else 0x7FF, "extended": long} for key, long in keys]
+    return filters_of((*received(database), *(transmitted(database, mode) if own else ())))

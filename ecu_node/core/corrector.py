@@ -5,107 +5,100 @@ Gateway: a branch's frame goes on to the other bus with its current rewritten in
 its counter stays, so that a receiver sees every frame that was lost or repeated. A frame that fails its check is never
 given a valid CRC. Times are those of one steady clock. [s]
 
-A payload is read as one integer per byte order, in which each signal is a shift and a mask. An answer is the target's
-last message with the branches of the frame written anew; a gateway's frame is the frame itself with its branches
-written anew: one way for both. What does not change from frame to frame is looked up once per length of payload, and
-again whenever a branch is corrected otherwise.
+A payload is read as one integer in which each signal is a shift and a mask. An answer is the target's last message with
+the branches of the frame written anew; a gateway's frame is the frame itself with its branches written anew: one way
+for both. What does not change from frame to frame is looked up once per length of payload, and again whenever a branch
+is corrected otherwise.
 """
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from ecu_node.core.e2e import Check, E2EState, Protection, Receiver
-from ecu_node.core.junction import REMEMBERED_FRAMES, Auxiliary, ExpectedSum, Frames, JunctionWatch, LiveBranch
-from ecu_node.core.signals import BitPlace, Codes, FrameKey, Order, PlacedSignal, as_written
-from ecu_node.core.status import Counters, Quality, Reason, State
+from ecu_node.core.junction import REMEMBERED_FRAMES, Frames, HeardSignal, JunctionWatch, LiveBranch, Written
+from ecu_node.core.signals import BitPlace, Codes, FrameKey, PlacedSignal, as_written
+from ecu_node.core.status import Counters, Reason, State
+from ecu_node.parameters import JunctionResidual
 
 __all__ = ["OF_ONE_DRIVE", "Corrector", "StatusFields"]
 
 _OK, _LAST_USABLE, _CORRUPT = Check.OK, Check.LOST, Check.CORRUPT  # looking up members of an enumeration is slow
 _INVALID, _from_bytes = E2EState.INVALID, int.from_bytes
-_BITS_PER_BYTE = 8
 _LEAST_SILENCE_S = 1.0
 """After a silence of this long, or of a branch's timeout, a message's counter begins anew. [s]"""
 
-
-class Reader(NamedTuple):
-    """Who reads a signal of an incoming message, and where it stands."""
-
-    part: Auxiliary | LiveBranch
-    signal: PlacedSignal
+_Rewrite = Callable[[bytearray, bytearray, float], bytearray]
+"""Takes the payload of a frame, the outgoing payload as it was before, and when the frame came [s]; makes a new
+outgoing one with what becomes of the branches."""
 
 
-class TargetField(NamedTuple):
-    """Where one branch stands in a corrected message."""
+def _signal_by_signal(
+    branches: Mapping[LiveBranch, Written], inside: Collection[LiveBranch], counters: Counters
+) -> _Rewrite:
+    """Write each branch by itself; those that are not inside the payloads, or not now, with what is known of them."""
 
-    branch: LiveBranch
-    place: BitPlace
-    not_available: int
-    """Code for "no value"."""
-    quality: BitPlace | None
+    def rewrite(payload: bytearray, before: bytearray, now_s: float) -> bytearray:
+        made = bytearray(before)
+        for branch, written in branches.items():
+            code = branch.signal.code(payload) if branch in inside and branch.signal is not None else None
+            if code is not None:
+                written.put(made, *branch.convert(code, now_s, counters))
+            elif written.not_available is not None:
+                written.put(made, *branch.published(now_s))
+        return made
 
-
-class _Written:
-    """One branch in outgoing payloads of one length, each read as one integer of the branch's byte order."""
-
-    def __init__(self, field: TargetField, length: int) -> None:
-        self.branch, self.order, self._not_available = field.branch, field.place.order, field.not_available
-        self.word = field.place.in_word(length)
-        payloads = [bytearray(length) for _ in Quality]
-        for quality, payload in zip(Quality, payloads, strict=True):
-            if field.quality is not None:
-                field.quality.put(payload, min(quality, field.quality.highest))
-        self.quality_bits = [int.from_bytes(payload, self.order) for payload in payloads]
-        self.mask = self.word.ones << self.word.shift
-        if field.quality is not None:
-            self.mask |= int.from_bytes(field.quality.mask.to_bytes(length, "little"), self.order)
-
-    def write(self, word: int, out: int | None, quality: Quality) -> int:
-        """The payload with a code, or "no value", and its quality."""
-        code = self._not_available if out is None else out
-        shift, ones, _ = self.word
-        return word & ~self.mask | (code & ones) << shift | self.quality_bits[quality]
-
-    def write_known(self, word: int, now_s: float) -> int:
-        """The payload with what is known of the branch now."""
-        return self.write(word, *self.branch.published(now_s))
+    return rewrite
 
 
-class _Unusual(NamedTuple):
-    """What is done with a branch where the result is no ordinary one."""
+def _in_one_word(
+    branches: Mapping[LiveBranch, Written],
+    inside: Collection[LiveBranch],
+    length: int,
+    made_length: int,
+    otherwise: _Rewrite,
+) -> _Rewrite:
+    """Write all branches at once, if they are in every payload of this length and results are ordinary; else otherwise.
 
-    branch: LiveBranch
-    signal: PlacedSignal
-    written: _Written | None
-    """None where the branch is rewritten in its own place."""
-    counters: Counters
+    Numbers are unsigned: sign bits of two's complements are turned over, in the payload and in the outgoing one.
+    """
+    places = [branch.signal.place for branch in branches if branch.signal is not None and not branch.signal.above]
+    orders = {(place.order, written.place.order) for place, written in zip(places, branches.values(), strict=False)}
+    if len(orders) != 1 or len(places) < len(branches) or not branches.keys() <= {*inside}:
+        return otherwise
+    ((order, to),) = orders
+    cells = []
+    signs, taken, ready = bytearray(length), bytearray(made_length), bytearray(made_length)
+    for place, (branch, written) in zip(places, branches.items(), strict=True):
+        plan, (first, last) = branch.plan, branch.ordinary_codes()
+        if first > last:
+            return otherwise
+        bias = plan.bias + (1 << (plan.shift - 1)) + place.lowest * plan.gain - (written.place.lowest << plan.shift)
+        at, to_at = place.shift_in(length), written.place.shift_in(made_length)
+        ones = (1 << place.length) - 1
+        cells.append((at, ones, first - place.lowest, last - place.lowest, plan.gain, bias, plan.shift, to_at))
+        place.put(signs, place.lowest)
+        written.place.put(ready, written.place.lowest)
+        written.place.put(taken, -1 if written.place.signed else written.place.highest)
+        if written.quality is not None:
+            written.quality.put(ready, min(branch.quality, written.quality.highest))
+            written.quality.put(taken, written.quality.highest)
+    sign_bits, ready_bits = _from_bytes(signs, order), _from_bytes(ready, to)
+    kept_bits = (1 << 8 * made_length) - 1 & ~_from_bytes(taken, to)
 
-    def write(self, word: int, payload: bytearray, now_s: float) -> int:
-        """The outgoing payload with what becomes of the branch in a frame."""
-        code = self.signal.code(payload)
-        if self.written is not None:
-            if code is None:
-                return self.written.write_known(word, now_s)
-            return self.written.write(word, *self.branch.convert(code, now_s, self.counters))
-        if code is None:
-            return word
-        out, _ = self.branch.convert(code, now_s, self.counters)
-        shift, ones, _ = self.signal.place.in_word(len(payload))
-        return word & ~(ones << shift) | ((code if out is None else out) & ones) << shift
+    def rewrite(payload: bytearray, before: bytearray, now_s: float) -> bytearray:
+        word = _from_bytes(payload, order)
+        made = (word if before is payload else _from_bytes(before, to)) & kept_bits | ready_bits
+        word ^= sign_bits
+        for at, ones, first, last, gain, bias, down, to_at in cells:
+            number = word >> at & ones
+            if not first <= number <= last:
+                return otherwise(payload, before, now_s)
+            made ^= (number * gain + bias) >> down << to_at
+        return bytearray(made.to_bytes(made_length, to))
 
-
-_Cell = tuple[int, int, int, int, int, int, int, int, _Unusual]
-"""One branch of a frame, in unsigned numbers: the sign bits of two's complements are turned over. Shift and ones; least
-and greatest number with an ordinary result; gain, bias and shift from number to result; the result's shift in the
-outgoing payload; and what is done with other numbers."""
-
-
-_Pass = tuple[Order, Order, int, int, int, list[_Cell]]
-"""Branches that are read in one byte order and written in one: both orders; sign bits in the frame; bits of the
-outgoing payload that stay; qualities where all results are ordinary, and the sign bits, which these turn over; the
-branches. A plain tuple, as naming its parts would cost a twentieth of a frame's time."""
+    return rewrite
 
 
 class Target:
@@ -119,33 +112,37 @@ class Target:
         Bytes of the message.
     fd : bool
         Whether the DBC sends it as CAN FD.
-    fields : sequence of TargetField
+    branches : mapping of LiveBranch to Written
         The branches written into it.
     protection : Protection or None
         End-to-end protection.
     """
 
     def __init__(
-        self, *, key: FrameKey, length: int, fd: bool, fields: Sequence[TargetField], protection: Protection | None
+        self,
+        *,
+        key: FrameKey,
+        length: int,
+        fd: bool,
+        branches: Mapping[LiveBranch, Written],
+        protection: Protection | None,
     ) -> None:
-        self.key, self.fd = key, fd
+        self.key, self.fd, self.branches = key, fd, branches
         self.data = bytearray(length)
         """The message as it was made last; a new one each time."""
+        self.protect = self.identity = None
         if protection is not None:
             protection.before_first(self.data)
-        self.advance = protection.advance if protection is not None else None
-        self.written = {field.branch: _Written(field, length) for field in fields}
+            self.protect, self.identity = protection.protect, protection.identity
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Ways:
+class _Ways(NamedTuple):
     """What is done with payloads of one length."""
 
     missing: list[LiveBranch]
     """Branches that such a payload is too short for."""
-    in_place: list[_Pass]
-    targets: list[tuple[Target, list[_Pass], list[_Written]]]
-    """Messages that answer it, each with what is done for it, and its branches that are not in these payloads."""
+    in_place: _Rewrite
+    answers: list[tuple[Target, _Rewrite]]
 
 
 class Source:
@@ -155,8 +152,8 @@ class Source:
     ----------
     protection : Protection or None
         End-to-end protection.
-    readers : sequence of Reader
-        Who reads what.
+    readers : sequence of tuple
+        Who reads which signal.
     targets : sequence of Target
         Messages that answer it.
     counters : Counters
@@ -168,6 +165,8 @@ class Source:
     ----------
     targets : tuple of Target
         As given.
+    branches : list of LiveBranch
+        That are read from it.
     timeout_s : float
         Frames that are older when they are read are of no use; infinity for a message without branches. [s]
     """
@@ -176,30 +175,23 @@ class Source:
         self,
         *,
         protection: Protection | None,
-        readers: Sequence[Reader],
+        readers: Sequence[tuple[HeardSignal, PlacedSignal]],
         targets: Sequence[Target],
         counters: Counters,
         pass_on_invalid: bool,
     ) -> None:
         self._receiver = Receiver(protection) if protection is not None else None
         self._seal = protection.seal if protection is not None else None
-        self.targets = tuple(targets)
-        self._branches = [(part, signal) for part, signal in readers if isinstance(part, LiveBranch)]
-        self._counters, self._pass_on_invalid = counters, pass_on_invalid
-        self._history: Frames = deque(maxlen=REMEMBERED_FRAMES)
-        self._silence_s = max([_LEAST_SILENCE_S, *(branch.timeout_s for branch, _ in self._branches)])
+        self._counters, self._pass_on_invalid, self.targets = counters, pass_on_invalid, tuple(targets)
+        self.branches = [part for part, _ in readers if isinstance(part, LiveBranch)]
+        self.timeout_s = max((branch.timeout_s for branch in self.branches), default=float("inf"))
+        self._silence_s = max([_LEAST_SILENCE_S, *(branch.timeout_s for branch in self.branches)])
         self._silent_from_s = float("inf")
-        self._ways: dict[int, _Ways] = {}
-        self.timeout_s = max((branch.timeout_s for branch, _ in self._branches), default=float("inf"))
-        for reader in readers:
-            reader.part.follow(reader.signal, self._history)
-        for branch, _ in self._branches:
-            branch.when_changed.append(self._ways.clear)
-
-    @property
-    def carries_branches(self) -> bool:
-        """Whether a branch is read from it."""
-        return bool(self._branches)
+        self._frames: Frames = deque(maxlen=REMEMBERED_FRAMES)
+        self.ways: dict[int, _Ways] = {}
+        """By length of the payload; to be cleared when a branch is corrected otherwise."""
+        for part, signal in readers:
+            part.follow(signal, self._frames)
 
     @property
     def is_invalid(self) -> bool:
@@ -221,24 +213,20 @@ class Source:
         sequence of Target
             To be sent.
         """
-        ways = self._ways.get(len(payload)) or self._find(len(payload))
+        ways = self.ways.get(len(payload)) or self._find(len(payload))
         is_usable = self._take(payload, now_s, ways) <= _LAST_USABLE
         if not (is_usable or self._pass_on_invalid):
             return ()
-        answers = ways.targets
         if not is_usable or (self._receiver is not None and self._receiver.state is _INVALID):
-            for branch, _ in self._branches:
+            for branch in self.branches:
                 branch.spoil(now_s)
-            answers = [(target, [], list(target.written.values())) for target in self.targets]
-        for target, passes, others in answers:
-            made = self._rewritten(payload, target.data, passes, now_s)
-            for written in others:
-                word = written.write_known(int.from_bytes(made, written.order), now_s)
-                made = bytearray(word.to_bytes(len(made), written.order))
-            if target.advance is not None:
-                target.advance(made)
+            ways = self._find(0)  # nothing is read from it
+        for target, rewrite in ways.answers:
+            made = rewrite(payload, target.data, now_s)
+            if target.protect is not None:
+                target.protect(made, target.identity)
             target.data = made
-        self._counters.answers += len(answers)
+        self._counters.answers += len(self.targets)
         return self.targets
 
     def forward(self, payload: bytearray, now_s: float) -> bytearray | None:
@@ -257,14 +245,14 @@ class Source:
             To be sent on, protected with the counter that the frame came with; None if it is held back. A receiver of
             it judges for itself whether so many frames fail their check that it cannot rely on the message.
         """
-        ways = self._ways.get(len(payload)) or self._find(len(payload))
+        ways = self.ways.get(len(payload)) or self._find(len(payload))
         check = self._take(payload, now_s, ways)
-        if check > _LAST_USABLE and self._branches and not self._pass_on_invalid:
+        if check > _LAST_USABLE and self.branches and not self._pass_on_invalid:
             self._counters.held_back += 1
             return None
         if check is _CORRUPT:
             return payload
-        made = self._rewritten(payload, payload, ways.in_place, now_s)
+        made = ways.in_place(payload, payload, now_s)
         if made == payload:
             return payload
         self._counters.rewritten += 1
@@ -288,74 +276,27 @@ class Source:
                 if check > _LAST_USABLE:
                     return check
             self._silent_from_s = now_s + self._silence_s
-        self._history.append((now_s, payload))
+        self._frames.append((now_s, payload))
         for branch in ways.missing:
             branch.spoil(now_s)
             counters.short += 1
         return check
 
-    def _rewritten(self, payload: bytearray, made: bytearray, passes: Sequence[_Pass], now_s: float) -> bytearray:
-        """The outgoing payload with the branches of a frame; never the same object, but where there are none."""
-        for order, to, signs, keep, good, cells in passes:
-            word = _from_bytes(payload, order)
-            new = (word if made is payload else _from_bytes(made, to)) & keep | good
-            word ^= signs
-            for shift, ones, first, last, gain, bias, down, place, unusual in cells:
-                number = word >> shift & ones
-                if first <= number <= last:
-                    new ^= (number * gain + bias) >> down << place
-                else:
-                    new = unusual.write(new, payload, now_s)
-            made = bytearray(new.to_bytes(len(made), to))
-        return made
-
     def _find(self, length: int) -> _Ways:
         """Find out what is done with payloads of some length. [byte]"""
-        present = [(branch, signal) for branch, signal in self._branches if signal.end <= length]
-        answers = []
-        for target in self.targets:
-            inside = [(*item, target.written[item[0]]) for item in present if item[0] in target.written]
-            others = [target.written[branch] for branch in target.written.keys() - {item[0] for item in inside}]
-            answers.append((target, self._passes(inside, length, len(target.data)), others))
-        found = self._ways[length] = _Ways(
-            missing=[branch for branch, signal in self._branches if signal.end > length],
-            in_place=self._passes([(*item, None) for item in present], length, length),
-            targets=answers,
+        inside = {branch: Written(branch.signal.place) for branch in self.branches
+                  if branch.signal is not None and branch.signal.end <= length}  # fmt: skip
+
+        def way(branches: Mapping[LiveBranch, Written], made_length: int) -> _Rewrite:
+            plain = _signal_by_signal(branches, inside, self._counters)
+            return _in_one_word(branches, inside, length, made_length, plain)
+
+        found = self.ways[length] = _Ways(
+            missing=[branch for branch in self.branches if branch not in inside],
+            in_place=way(inside, length),
+            answers=[(target, way(target.branches, len(target.data))) for target in self.targets],
         )
         return found
-
-    def _passes(
-        self, branches: Sequence[tuple[LiveBranch, PlacedSignal, _Written | None]], length: int, made_length: int
-    ) -> list[_Pass]:
-        """What is done with these branches, per pair of byte orders."""
-        passes: dict[tuple[Order, Order], _Pass] = {}
-        for branch, signal, written in branches:
-            source, plan, order = signal.place.in_word(length), branch.plan, signal.place.order
-            to, place = (order, source) if written is None else (written.order, written.word)
-            first, last = (1, 0) if signal.above else branch.ordinary_codes()
-            _, _, signs, keep, good, cells = passes.get((order, to)) or (
-                order, to, 0, (1 << _BITS_PER_BYTE * made_length) - 1, 0, []
-            )  # fmt: skip
-            cells.append(
-                (
-                    source.shift,
-                    source.ones,
-                    first + source.sign,
-                    last + source.sign,
-                    plan.gain,
-                    plan.bias + (1 << (plan.shift - 1)) - source.sign * plan.gain + (place.sign << plan.shift),
-                    plan.shift,
-                    place.shift,
-                    _Unusual(branch, signal, written, self._counters),
-                )
-            )
-            if first <= last:  # else no number lies between them, and none is ordinary
-                signs |= source.sign << source.shift
-                keep &= ~(place.ones << place.shift if written is None else written.mask)
-                good |= place.sign << place.shift
-                good |= 0 if written is None else written.quality_bits[branch.quality]
-            passes[order, to] = order, to, signs, keep, good, cells
-        return list(passes.values())
 
 
 OF_ONE_DRIVE = frozenset((Reason.BRANCH_STALE, Reason.BRANCH_STUCK))
@@ -428,30 +369,21 @@ class Corrector:
         self.parameter_set = 0
         self.sources: dict[tuple[int, bool], Source] = dict(sources.items())
         """Who takes which frames, by identifier and whether it has 29 bits; no other frame is looked at."""
-        self._looked_s = float("-inf")
-        self._status_fields = status_fields
-        self._silent, self._silent_since_s = True, float("inf")
-        self._was_awake = False
-        self._foreign, self._foreign_until_s = counters.foreign, float("-inf")
-        self._beside = Reason.NONE
-        """What is told beside a state that has no reason."""
-        self._alive = 0
-        self._payload = bytearray(status_fields.length if status_fields is not None else 0)
-        if status_fields is not None and status_fields.protection is not None:
-            status_fields.protection.before_first(self._payload)
-
-    @property
-    def own_keys(self) -> set[tuple[int, bool]]:
-        """Identifiers of the messages that it makes itself: answers and status."""
-        keys: set[tuple[int, bool]] = {target.key for source in self.sources.values() for target in source.targets}
-        return keys if self._status_fields is None else {*keys, self._status_fields.key}
-
-    @property
-    def branch_keys(self) -> set[tuple[int, bool]]:
+        self.branch_keys = {key for key, source in self.sources.items() if source.branches}
         """Identifiers of the messages that carry branches, which a gateway rewrites."""
-        return {key for key, source in self.sources.items() if source.carries_branches}
+        self.own_keys = {target.key for source in self.sources.values() for target in source.targets}
+        """Identifiers of the messages that it makes itself: answers and status."""
+        self._looked_s = self._foreign_until_s = float("-inf")
+        self._silent, self._silent_since_s, self._was_awake = True, float("inf"), False
+        self._foreign, self._alive = counters.foreign, 0
+        self._status_fields, self._payload = status_fields, bytearray()
+        if status_fields is not None:
+            self.own_keys.add(status_fields.key)
+            self._payload = bytearray(status_fields.length)
+            if status_fields.protection is not None:
+                status_fields.protection.before_first(self._payload)
 
-    def put_in_force(self, *, reason: Reason, parameter_set: int, expected: ExpectedSum | None = None) -> None:
+    def put_in_force(self, *, reason: Reason, parameter_set: int, expected: JunctionResidual | None = None) -> None:
         """Begin with what the branches were just given; what was latched is released.
 
         Parameters
@@ -460,32 +392,27 @@ class Corrector:
             NONE if there are parameters that fit.
         parameter_set : int
             Its number as it is published; 0 where there is none.
-        expected : ExpectedSum, optional
+        expected : JunctionResidual, optional
             What they say of the junction's sum.
         """
         self.reason, self.parameter_set = reason, parameter_set
-        self.watch.restart(expected or ExpectedSum())
+        self.watch.restart(*(() if expected is None else (expected,)))
         self.latch(Reason.NONE)
         self.told = self.state()
 
     def look(self, now_s: float) -> None:
         """Look at the whole junction; to be called at least every 0.1 s."""
+        self._looked_s = now_s
         if self.counters.foreign != self._foreign:
             self._foreign, self._foreign_until_s = self.counters.foreign, now_s + _FOREIGN_S
-        self._beside = Reason.FOREIGN_FRAMES if now_s < self._foreign_until_s else Reason.NONE
-        self._look(now_s)
-        self.told = self.state()
-
-    def _look(self, now_s: float) -> None:
-        self._looked_s = now_s
         self._see_whether_asleep(now_s)
         self.watch.look(now_s)
-        if self.reason is not Reason.NONE or self.latched is not Reason.NONE or self._silent:
-            return
-        if stale := [branch.name for branch in self.branches if self._is_missed(branch, now_s)]:
-            self.latch(Reason.BRANCH_STALE, stale)
-        elif verdict := self.watch.verdict():
-            self.latch(*verdict)
+        if not (self.reason or self.latched or self._silent):
+            if stale := [branch.name for branch in self.branches if self._is_missed(branch, now_s)]:
+                self.latch(Reason.BRANCH_STALE, stale)
+            elif self.watch.verdict:
+                self.latch(*self.watch.verdict)
+        self.told = self.state()
 
     @property
     def is_asleep(self) -> bool:
@@ -494,20 +421,20 @@ class Corrector:
 
     def state(self) -> tuple[State, Reason]:
         """What the node does, and why."""
-        reason = self.reason if self.reason is not Reason.NONE else self.latched
-        if reason is not Reason.NONE:
+        if reason := self.reason or self.latched:
             return State.PASSING_THROUGH, reason
         if self.is_asleep:
             return State.ASLEEP, Reason.NONE
+        beside = Reason.FOREIGN_FRAMES if self._looked_s < self._foreign_until_s else Reason.NONE
         applied = [branch for branch in self.branches if branch.fault.applied]
         if self.shadow or not applied:
-            return State.SHADOW if applied else State.PASSING_THROUGH, self._beside
+            return State.SHADOW if applied else State.PASSING_THROUGH, beside
         if any(branch.is_fitted and not branch.seen for branch in self.branches):
             return State.STARTING, Reason.NONE
         is_invalid = any(source.is_invalid for source in self.sources.values())
         if is_invalid or any(branch.lacks_input(self._looked_s) for branch in applied):
             return State.PARTLY_CORRECTING, Reason.E2E_INVALID if is_invalid else Reason.INPUT_MISSING
-        return State.CORRECTING, self._beside
+        return State.CORRECTING, beside
 
     def status(self) -> tuple[StatusFields, bytes] | None:
         """Make the status message from the last look; None if the layout has none."""
@@ -524,7 +451,7 @@ class Corrector:
         self._alive += 1
         sums = self.watch.sums
         for key, (codes, missing) in fields.sums.items():
-            total_a = None if sums is None else sums.measured_a if key == "sum_measured" else sums.corrected_a
+            total_a = None if sums is None else getattr(sums, f"{key.removeprefix('sum_')}_a")
             codes.place.put(payload, missing if total_a is None else codes.nearest(as_written(total_a)))
         if fields.protection is not None:
             fields.protection.advance(payload)
@@ -562,6 +489,8 @@ class Corrector:
     def latch(self, reason: Reason, branches: Sequence[str] = ()) -> None:
         """Pass measured values through for this reason, which these branches explain; NONE: as the parameters say."""
         self.latched, self.latched_branches = reason, tuple(branches)
-        active = self.reason is Reason.NONE and reason is Reason.NONE and not self.shadow
+        active = not (self.reason or reason or self.shadow)
         for branch in self.branches:
             branch.activate(active=active, doubted=reason is Reason.SUM_IMPLAUSIBLE and branch.name in branches)
+        for source in self.sources.values():
+            source.ways.clear()

@@ -6,9 +6,10 @@ P11, computed by autosar-e2e, and a counter with a CRC-8 (fastcrc), as control u
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple, TypeVar
+from functools import partial
+from typing import Any, NamedTuple
 
 from cantools.database.can import Message
 from e2e import p01, p02, p04, p05, p06, p07, p11
@@ -53,11 +54,7 @@ class E2EState(IntEnum):
     INVALID = 2
 
 
-_T = TypeVar("_T")
 _OK = Check.OK  # looking up members of an enumeration is slow
-
-
-_NEVER_INVALID = E2EWindow(window=1, min_ok=0, max_error=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,26 +71,34 @@ class Protection:
         Number of codes of the counter, which runs from 0.
     max_step : int
         Largest step of the counter from one frame to the next that is used.
-    is_sound : callable
-        Whether the CRC of a payload is right; the counter is not looked at.
     counter : BitPlace
         Where the counter stands: within one byte, or in whole bytes, the most significant one first.
-    seal : callable
-        Writes CRC, length and data identifier, as the profile has them, into a payload; its counter stays.
-    advance : callable
-        The same after the counter of the payload has counted on.
+    check, protect : callable
+        Take payload and identity, as those of autosar-e2e: whether the CRC is right; count on (unless
+        ``increment_counter=False``), and write CRC, length and data identifier, as the profile has them.
+    identity : int or bytes
+        Data identifier, or the list of them.
+    windows : tuple of E2EWindow
+        By :class:`E2EState`: what makes a message in it VALID.
     """
 
     header_mask: int
     least_bytes: int
     modulus: int
     max_step: int
-    is_sound: Callable[[bytearray], bool]
     counter: BitPlace
-    seal: Callable[[bytearray], None]
-    advance: Callable[[bytearray], None]
-    windows: tuple[E2EWindow, E2EWindow, E2EWindow] = (_NEVER_INVALID, _NEVER_INVALID, _NEVER_INVALID)
-    """By :class:`E2EState`: what makes a message in it VALID."""
+    check: Callable[..., bool]
+    protect: Callable[..., None]
+    identity: int | bytes
+    windows: tuple[E2EWindow, E2EWindow, E2EWindow]
+
+    def is_sound(self, payload: bytearray) -> bool:
+        """Whether the CRC of a payload is right; the counter is not looked at."""
+        return self.check(payload, self.identity)
+
+    def is_intact(self, payload: bytearray) -> bool:
+        """Whether a payload is long enough, its CRC right, and its counter possible."""
+        return len(payload) >= self.least_bytes and self.is_sound(payload) and self.counter_of(payload) < self.modulus
 
     def counter_of(self, payload: bytes | bytearray) -> int:
         """Read the counter of a payload of at least ``least_bytes``."""
@@ -103,6 +108,14 @@ class Protection:
     def before_first(self, payload: bytearray) -> None:
         """Prepare an empty payload so that its counter is 0 after it has first advanced."""
         self.counter.put(payload, self.modulus - 1)
+
+    def seal(self, payload: bytearray) -> None:
+        """Write all but the counter, which stays."""
+        self.protect(payload, self.identity, increment_counter=False)
+
+    def advance(self, payload: bytearray) -> None:
+        """Count on, and write all else."""
+        self.protect(payload, self.identity)
 
 
 class Receiver:
@@ -125,15 +138,12 @@ class Receiver:
         self._protection = protection
         self._expected = -1  # the first intact frame may have any counter
         self._past: deque[Check] = deque(maxlen=max(window.window for window in protection.windows))
-        self._is_steady = False  # VALID, and all that is remembered was in order
-        self._is_sound, self._least_bytes, self._modulus = (
-            protection.is_sound,
-            protection.least_bytes,
-            protection.modulus,
-        )
         place = protection.counter
+        self._is_short = place.end - place.first == 1
+        self._is_steady = False  # VALID, all that is remembered was in order, and the counter is within a byte
+        self._check, self._identity, self._least_bytes = protection.check, protection.identity, protection.least_bytes
         self._byte, self._shift, self._ones = place.first, place.shift, place.highest
-        self._whole_bytes = slice(place.first, place.end) if place.end - place.first > 1 else None
+        self._modulus = protection.modulus
 
     def check(self, payload: bytearray) -> Check:
         """Check one frame and remember its counter.
@@ -150,12 +160,10 @@ class Receiver:
             first intact frame is OK with any counter.
         """
         if self._is_steady and len(payload) >= self._least_bytes:
-            if self._whole_bytes is None:
-                counter = payload[self._byte] >> self._shift & self._ones
-            else:
-                counter = int.from_bytes(payload[self._whole_bytes])
-            if counter == self._expected and self._is_sound(payload):
-                self._expected = counter + 1 if counter + 1 < self._modulus else 0
+            counter = payload[self._byte] >> self._shift & self._ones
+            if counter == self._expected and self._check(payload, self._identity):
+                counter += 1
+                self._expected = counter if counter < self._modulus else 0
                 return _OK
         check = self._checked(payload)
         self._judge(check)
@@ -169,17 +177,13 @@ class Receiver:
             self.state = E2EState.INVALID
 
     def _checked(self, payload: bytearray) -> Check:
-        if len(payload) < self._least_bytes or not self._is_sound(payload):
+        if not self._protection.is_intact(payload):
             return Check.CORRUPT
-        counter, modulus = self._protection.counter_of(payload), self._modulus
-        if counter >= modulus:
-            return Check.CORRUPT
-        before, self._expected = self._expected, (counter + 1) % modulus
-        step = 1 if before < 0 else (counter - before + 1) % modulus
-        if step == 0:
-            return Check.REPEATED
-        if step == 1:
-            return _OK
+        counter, before = self._protection.counter_of(payload), self._expected
+        self._expected = (counter + 1) % self._modulus
+        step = 1 if before < 0 else (counter - before + 1) % self._modulus
+        if step <= 1:
+            return _OK if step else Check.REPEATED
         return Check.LOST if step <= self._protection.max_step else Check.JUMPED
 
     def _judge(self, check: Check) -> None:
@@ -193,8 +197,8 @@ class Receiver:
             self.state = E2EState.VALID
         elif self.state is E2EState.VALID or errors > allowed.max_error:
             self.state = E2EState.INVALID
-        whole = len(self._past) == self._past.maxlen
-        self._is_steady = whole and self.state is E2EState.VALID and max(self._past) <= Check.LOST
+        is_valid = self.state is E2EState.VALID and len(self._past) == self._past.maxlen
+        self._is_steady = self._is_short and is_valid and max(self._past) <= Check.LOST
 
 
 class _Profile(NamedTuple):
@@ -259,7 +263,12 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
             f"{where} has {message.length} bytes in the DBC; CAN FD pads it, so that its CRC cannot be checked; "
             f"expected {', '.join(map(str, _FD_LENGTHS))}"
         )
-    protection = _counter_crc8(entry, message, where) if isinstance(entry, CounterCrc8) else _autosar(entry, message)
+    make = _counter_crc8 if isinstance(entry, CounterCrc8) else _autosar
+    protection = Protection(
+        max_step=entry.max_delta_counter,
+        windows=(entry.init, entry.valid, entry.invalid),
+        **make(entry, message, where),  # type: ignore[operator]
+    )
     if entry.max_delta_counter >= protection.modulus:
         raise LayoutError(
             f"{where}: max_delta_counter is {entry.max_delta_counter}, but the counter has {protection.modulus} codes "
@@ -269,58 +278,43 @@ def protection_of(database: VehicleDatabase, message: Message) -> Protection | N
         raise LayoutError(
             f"{where} has {message.length} bytes, too few for the header of {protection.least_bytes} bytes"
         )
-    return replace(protection, windows=(entry.init, entry.valid, entry.invalid))
+    return protection
 
 
 def _data_id(given: dict[str, int], message: Message, highest: int = 0xFFFF) -> int:
     return given.get(message.name, message.frame_id & highest)
 
 
-def _autosar(entry: AutosarProfile, message: Message) -> Protection:
+def _autosar(entry: AutosarProfile, message: Message, _: str) -> dict[str, Any]:
     """Protection by a profile of AUTOSAR."""
-    check, protect, header_bits, counter_byte, counter_bits, modulus = _PROFILES[type(entry)]
+    profile = _PROFILES[type(entry)]
+    header_bits, options = profile.header_bits, {}
     identity: int | bytes
     if isinstance(entry, ProfileP02):
         identity, offset = bytes(entry.data_id_list[message.name]), 0
     else:
         highest = 0xFFFFFFFF if isinstance(entry, ProfileP04 | ProfileP07) else 0xFFFF
         identity, offset = _data_id(entry.data_id, message, highest), entry.offset
-    options = {"offset": offset}
+        options = {"offset": offset} if offset else {}
     if isinstance(entry, ProfileP01 | ProfileP11):
-        options["data_id_mode"] = _DATA_ID_MODES[entry.data_id_mode]
+        if mode := _DATA_ID_MODES[entry.data_id_mode]:
+            options["data_id_mode"] = mode
         if entry.data_id_mode == "nibble":  # it is sent above the counter
             header_bits += 4
-    options = {key: value for key, value in options.items() if value}
-    first = offset + counter_byte
-    last, ones = first + (counter_bits - 1) // 8, (1 << min(counter_bits, 8)) - 1
-
-    def seal(payload: bytearray) -> None:
-        if payload[last] & ones and not options:
-            payload[last] -= 1  # then it counts on to what it was: no keyword argument, half the time
-            protect(payload, identity)
-        else:
-            protect(payload, identity, increment_counter=False, **options)
-
-    return Protection(
-        header_mask=(1 << header_bits) - 1 << 8 * offset,
-        least_bytes=offset + (header_bits + 7) // 8,
-        modulus=modulus,
-        max_step=entry.max_delta_counter,
-        is_sound=_bound(check, identity, options),
-        counter=BitPlace(first=first, end=last + 1, order="big", shift=0, length=counter_bits, signed=False),
-        seal=seal,
-        advance=_bound(protect, identity, options),
-    )
+    first, bits = offset + profile.counter_byte, profile.counter_bits
+    return {
+        "header_mask": (1 << header_bits) - 1 << 8 * offset,
+        "least_bytes": offset + (header_bits + 7) // 8,
+        "modulus": profile.modulus,
+        "counter": BitPlace(first=first, end=first + (bits + 7) // 8, order="big", shift=0, length=bits, signed=False),
+        # keyword arguments would double the time of every frame
+        "check": partial(profile.check, **options) if options else profile.check,
+        "protect": partial(profile.protect, **options) if options else profile.protect,
+        "identity": identity,
+    }
 
 
-def _bound(function: Callable[..., _T], identity: int | bytes, options: dict[str, int]) -> Callable[[bytearray], _T]:
-    """A function of autosar-e2e for one message; keyword arguments would double the time of every frame."""
-    if not options:
-        return lambda payload: function(payload, identity)
-    return lambda payload: function(payload, identity, **options)
-
-
-def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> Protection:
+def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> dict[str, Any]:
     """A counter and a CRC-8, both signals of the DBC; the CRC covers all other bytes, and a data identifier if any."""
     signals = {signal.name: signal for signal in message.signals}
     for name in (entry.counter, entry.crc):
@@ -341,32 +335,29 @@ def _counter_crc8(entry: CounterCrc8, message: Message, where: str) -> Protectio
         raise LayoutError(
             f"{where}: data_id {entry.data_id[message.name]} does not fit into data_id_bytes = {entry.data_id_bytes}"
         )
-    identity = _data_id(entry.data_id, message).to_bytes(2, "little")[: entry.data_id_bytes]
-    before, after = (identity, b"") if entry.data_id_at == "before" else (b"", identity)
     byte = crc_place.first
     counter_byte, shift, ones = counter_place.first, counter_place.shift, counter_place.highest
+    is_before = entry.data_id_at == "before"
 
-    def crc(payload: bytearray) -> int:
-        return crc8(b"".join((before, payload[:byte], payload[byte + 1 :], after)))
+    def crc(payload: bytearray, identity: bytes) -> int:
+        covered = payload[:byte] + payload[byte + 1 :]
+        return crc8(identity + covered if is_before else bytes(covered + identity))
 
-    def seal(payload: bytearray) -> None:
-        payload[byte] = crc(payload)
+    def protect(payload: bytearray, identity: bytes, *, increment_counter: bool = True) -> None:
+        if increment_counter:
+            counter = ((payload[counter_byte] >> shift & ones) + 1) % modulus
+            payload[counter_byte] = payload[counter_byte] & ~(ones << shift) | counter << shift
+        payload[byte] = crc(payload, identity)
 
-    def advance(payload: bytearray) -> None:
-        counter = ((payload[counter_byte] >> shift & ones) + 1) % modulus
-        payload[counter_byte] = payload[counter_byte] & ~(ones << shift) | counter << shift
-        seal(payload)
-
-    return Protection(
-        header_mask=counter_place.mask | crc_place.mask,
-        least_bytes=max(counter_place.end, crc_place.end),
-        modulus=modulus,
-        max_step=entry.max_delta_counter,
-        is_sound=lambda payload: payload[byte] == crc(payload),
-        counter=counter_place,
-        seal=seal,
-        advance=advance,
-    )
+    return {
+        "header_mask": counter_place.mask | crc_place.mask,
+        "least_bytes": max(counter_place.end, crc_place.end),
+        "modulus": modulus,
+        "counter": counter_place,
+        "check": lambda payload, identity: payload[byte] == crc(payload, identity),
+        "protect": protect,
+        "identity": _data_id(entry.data_id, message).to_bytes(2, "little")[: entry.data_id_bytes],
+    }
 
 
 def _algorithm(name: str, where: str) -> Callable[[bytes], int]:

@@ -11,87 +11,75 @@ into the junction [A]; times are those of one steady clock, passed in [s].
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise, takewhile
+from operator import mul
 from typing import NamedTuple
 
 from ecu_node.core.correction import AS_IT_IS, NO_FAULT, IntegerPlan, SensorFault
-from ecu_node.core.signals import Codes, PlacedSignal
+from ecu_node.core.signals import BitPlace, Codes, PlacedSignal
 from ecu_node.core.status import Counters, Quality, Reason
+from ecu_node.parameters import JunctionResidual
 
 REMEMBERED_FRAMES = 1024
 """Frames of a message that are remembered: longer than branches lag each other."""
 
 Frames = deque[tuple[float, bytearray]]
 """Times [s] and payloads of the last intact frames of a message."""
+Currents = Mapping[str, tuple[float, float]]
+"""Measured and corrected, by branch. [A]"""
 
 
-class Past:
+class HeardSignal:
     """A signal in the last frames of its message; read only when it is asked for.
 
-    Parameters
-    ----------
-    signal : PlacedSignal, optional
-        Where it stands.
-    frames : deque
-        Frames that the message's source goes on to add to.
-    """
-
-    def __init__(self, signal: PlacedSignal | None = None, frames: Frames | None = None) -> None:
-        self._signal = signal
-        self._frames: Frames = deque() if frames is None else frames
-        self._read: tuple[float, bytearray] | None = None
-        """The last frame that was read."""
-        self._codes: deque[tuple[float, int]] = deque(maxlen=REMEMBERED_FRAMES)
-
-    def newest_first(self) -> Iterator[tuple[float, int]]:
-        """Times and codes, back from the last frame that has the signal; each frame is read once. [s]"""
-        if self._signal is not None and self._frames and self._frames[-1] is not self._read:
-            new = list(takewhile(lambda frame: frame is not self._read, reversed(self._frames)))
-            self._read = new[0]
-            for time_s, payload in reversed(new):
-                code = self._signal.code(payload)
-                if code is not None:
-                    self._codes.append((time_s, code))
-        return reversed(self._codes)
-
-
-class Auxiliary:
-    """A signal that the node needs beside the currents: a voltage, or the state that the watch depends on.
+    Beside the currents these are voltages, and the state that the watch depends on.
 
     Parameters
     ----------
     codes : Codes
-        Of the signal. [V, or of the state]
+        Of the signal.
     timeout_s : float
         Without a frame for this long its value is not used any more. [s]
     """
 
     def __init__(self, codes: Codes, timeout_s: float) -> None:
-        self._codes, self._timeout_s = codes, timeout_s
-        self._past = Past()
+        self.codes, self.timeout_s = codes, timeout_s
+        self.signal: PlacedSignal | None = None
+        self._frames: Frames = deque()
+        self._read: tuple[float, bytearray] | None = None
+        """The last frame that was read."""
+        self._past: deque[tuple[float, int]] = deque(maxlen=REMEMBERED_FRAMES)
 
     def follow(self, signal: PlacedSignal, frames: Frames) -> None:
-        """Look for the signal in these frames, when it is asked for."""
-        self._past = Past(signal, frames)
+        """Look for the signal in these frames, which its message goes on to add to."""
+        self.signal, self._frames = signal, frames
+
+    def newest_first(self) -> Iterator[tuple[float, int]]:
+        """Times and codes, back from the last frame that has the signal; each frame is read once. [s]"""
+        if self.signal is not None and self._frames and self._frames[-1] is not self._read:
+            new = list(takewhile(lambda frame: frame is not self._read, reversed(self._frames)))
+            self._read = new[0]
+            for time_s, payload in reversed(new):
+                code = self.signal.code(payload)
+                if code is not None:
+                    self._past.append((time_s, code))
+        return reversed(self._past)
 
     def code_at(self, time_s: float) -> int | None:
         """Code in the last frame up to a time [s]; None if there is none, it is no value, or too old."""
-        for seen_s, code in self._past.newest_first():
+        for seen_s, code in self.newest_first():
             if seen_s <= time_s:
-                return code if time_s - seen_s <= self._timeout_s and self._codes.is_value(code) else None
+                return code if time_s - seen_s <= self.timeout_s and self.codes.is_value(code) else None
         return None
 
     def value_at(self, time_s: float) -> float | None:
         """The same as a value. [V]"""
         code = self.code_at(time_s)
-        return None if code is None else float(self._codes.scale) * code + float(self._codes.offset)
+        return None if code is None else float(self.codes.scale) * code + float(self.codes.offset)
 
 
 _LEAST_VOLTAGE_V = 10.0
 """Below this the HV net is switched off, and power / voltage says nothing of the current. [V]"""
-
-
 _FLICKER_STEPS = 4
 """So many steps of one size are no load that was switched."""
 
@@ -107,7 +95,24 @@ class Movement(NamedTuple):
     """Size of a step that it made to and fro, as where frames of somebody else stand between those of the sensor."""
 
 
-class LiveBranch:
+class Written(NamedTuple):
+    """Where a branch stands in an outgoing payload."""
+
+    place: BitPlace
+    not_available: int | None = None
+    """Code for "no value"; None: what is no value stays as it is, as in a gateway."""
+    quality: BitPlace | None = None
+
+    def put(self, payload: bytearray, out: int | None, quality: Quality) -> None:
+        """Write a code, or "no value", and its quality."""
+        code = self.not_available if out is None else out
+        if code is not None:
+            self.place.put(payload, code)
+        if self.quality is not None:
+            self.quality.put(payload, min(quality, self.quality.highest))
+
+
+class LiveBranch(HeardSignal):
     """One branch: state of its sensor, and what is made of it.
 
     Parameters
@@ -122,8 +127,13 @@ class LiveBranch:
         Without a frame for this long the branch is stale. [s]
     start_s : float
         So long after the bus has woken up its first frame may come, if that is longer. [s]
-    voltage : Auxiliary or None
+    voltage : HeardSignal or None
         Of a branch that is a power.
+
+    Attributes
+    ----------
+    plan, quality :
+        What is done now to its codes, and what is said of values.
     """
 
     def __init__(
@@ -134,23 +144,16 @@ class LiveBranch:
         sign: int,
         timeout_s: float,
         start_s: float = 0.0,
-        voltage: Auxiliary | None = None,
+        voltage: HeardSignal | None = None,
     ) -> None:
-        self.name, self.codes, self.timeout_s, self._start_s = name, codes, timeout_s, start_s
-        self.voltage = voltage
-        self.fault = NO_FAULT
-        self.delay_s = 0.0
+        super().__init__(codes, timeout_s)
+        self.name, self.voltage, self._start_s = name, voltage, start_s
+        self.fault, self.delay_s = NO_FAULT, 0.0
+        self.plan = self._passing = self._correcting = AS_IT_IS
         self.quality = Quality.PASSED_THROUGH
-        """Of values."""
-        self._past = Past()
-        self._spoilt_s = float("-inf")
+        self._spoilt_s = self._time_s = self._awake_s = self._waited_s = float("-inf")
         self._is_named = False
-        self._time_s = self._awake_s = self._waited_s = float("-inf")
         self._scale, self._offset = float(sign * codes.scale), float(sign * codes.offset)
-        self._passing = self._correcting = self.plan = AS_IT_IS
-        """What is done now to its codes."""
-        self.when_changed: list[Callable[[], None]] = []
-        """Called when :attr:`plan` has changed."""
 
     def put_in_force(
         self,
@@ -177,23 +180,16 @@ class LiveBranch:
             Since when its frames are waited for; None: not before the first one (a vehicle may lack the branch).
         """
         self.fault, self.delay_s = fault, delay_s
+        self._passing, self._correcting = passing, plan
         self._is_named = expected_since_s is not None
         if expected_since_s is not None:
             self._waited_s = max(self._waited_s, expected_since_s)
-        self._passing, self._correcting = passing, plan
-        self.activate(active=False)
 
-    def activate(self, *, active: bool, doubted: bool = False) -> None:
+    def activate(self, *, active: bool, doubted: bool) -> None:
         """Correct, or pass through; a sensor that is in doubt is never said to be right."""
         corrects = active and self.fault.applied
         self.plan = self._correcting if corrects else self._passing
         self.quality = Quality.CORRECTED if corrects else Quality.IMPLAUSIBLE if doubted else Quality.PASSED_THROUGH
-        for react in self.when_changed:
-            react()
-
-    def follow(self, signal: PlacedSignal, frames: Frames) -> None:
-        """Look for the signal in these frames, when its past is asked for."""
-        self._past = Past(signal, frames)
 
     def spoil(self, now_s: float) -> None:
         """A frame came that must not be used: until the next one there is no value."""
@@ -202,12 +198,12 @@ class LiveBranch:
     @property
     def time_s(self) -> float:
         """When its last frame came [s]; -infinity if none did."""
-        self._time_s = next((seen_s for seen_s, _ in self._past.newest_first()), self._time_s)
+        self._time_s = next((seen_s for seen_s, _ in self.newest_first()), self._time_s)
         return self._time_s
 
     def latest(self) -> tuple[float, int] | None:
         """When its last frame came, and its code; None if that is no value."""
-        found = next(self._past.newest_first(), None)
+        found = next(self.newest_first(), None)
         return found if found is not None and self.codes.is_value(found[1]) else None
 
     @property
@@ -225,9 +221,7 @@ class LiveBranch:
         """Until when its next frame must have come; infinity for a branch that is not fitted. [s]"""
         if self.seen:
             return self.time_s + self.timeout_s
-        if self._is_named:
-            return self._waited_s + max(self.timeout_s, self._start_s)
-        return float("inf")
+        return self._waited_s + max(self.timeout_s, self._start_s) if self._is_named else float("inf")
 
     def is_stale(self, now_s: float) -> bool:
         """Whether its next frame is overdue."""
@@ -282,7 +276,7 @@ class LiveBranch:
 
     def published(self, now_s: float) -> tuple[int | None, Quality]:
         """What is written of it where no frame of it just came."""
-        found = next(self._past.newest_first(), None)
+        found = next(self.newest_first(), None)
         if found is None or now_s - found[0] > self.timeout_s:
             return None, Quality.NOT_AVAILABLE
         if found[0] <= self._spoilt_s:
@@ -302,16 +296,11 @@ class LiveBranch:
         measured_a, corrected_a : float
             Positive into the junction [A]; None if no value is known of then.
         """
-        code = self._code_at(time_s)
-        if code is None:
+        code, volts = self._code_between(time_s), self._volts_at(time_s)
+        if code is None or volts is None:
             return None
-        measured = self._scale * code + self._offset
-        if self.voltage is not None:
-            volts = self.voltage.value_at(time_s)
-            if volts is None or volts < _LEAST_VOLTAGE_V:
-                return None
-            measured /= volts
-        return measured, self.fault.true_current(measured)
+        measured_a = (self._scale * code + self._offset) / volts
+        return measured_a, self.fault.true_current(measured_a)
 
     def moved_a(self, instant_s: float, since_s: float, frames: int) -> Movement:
         """How its corrected current moved in the frames before an instant of the junction.
@@ -332,28 +321,32 @@ class LiveBranch:
         """
         end_s = instant_s + self.delay_s
         codes: list[int] = []
-        for seen_s, code in self._past.newest_first():
+        for seen_s, code in self.newest_first():
             if seen_s > end_s:
                 codes = []  # but for the first one after the instant, towards which it is interpolated
             elif seen_s < end_s - since_s and len(codes) >= frames:
                 break
             if self.codes.is_value(code):
                 codes.append(code)
-        volts = self.voltage.value_at(end_s) if self.voltage is not None else 1.0
-        if not codes or volts is None or volts < (_LEAST_VOLTAGE_V if self.voltage is not None else 0.0):
+        volts = self._volts_at(end_s)
+        if not codes or volts is None:
             return Movement(0.0, 0.0, 0.0)
         per_code_a = abs(self._scale) / volts / (1.0 + self.fault.drift)
-        steps = sorted((abs(later - earlier) for later, earlier in pairwise(codes)), reverse=True)
-        return Movement(
-            distance_a=per_code_a * (max(codes) - min(codes)),
-            step_a=per_code_a * steps[0] if steps else 0.0,
-            flicker_a=per_code_a * steps[_FLICKER_STEPS - 1] if len(steps) >= _FLICKER_STEPS else 0.0,
-        )
+        steps = [per_code_a * abs(later - earlier) for later, earlier in pairwise(codes)]
+        steps = [*sorted(steps, reverse=True), *[0.0] * _FLICKER_STEPS]
+        return Movement(per_code_a * (max(codes) - min(codes)), steps[0], steps[_FLICKER_STEPS - 1])
 
-    def _code_at(self, time_s: float) -> float | None:
+    def _volts_at(self, time_s: float) -> float | None:
+        """What its signal is divided by: 1 for a current; None if the HV net is off, or that is not known. [V]"""
+        if self.voltage is None:
+            return 1.0
+        volts = self.voltage.value_at(time_s)
+        return volts if volts is not None and volts >= _LEAST_VOLTAGE_V else None
+
+    def _code_between(self, time_s: float) -> float | None:
         """Code at a time, between codes too; None if it is not known."""
         later: tuple[float, int] | None = None
-        for sample in self._past.newest_first():
+        for sample in self.newest_first():
             seen_s, code = sample
             if not self.codes.is_value(code):
                 return None
@@ -363,6 +356,38 @@ class LiveBranch:
                 return code + (time_s - seen_s) / (later[0] - seen_s) * (later[1] - code)
             later = sample
         return later[1] if later is not None and later[0] - time_s <= self.timeout_s else None
+
+
+def aligned_currents(
+    branches: Sequence[LiveBranch], delays_s: Mapping[str, float], now_s: float
+) -> tuple[float, dict[str, tuple[float, float]]] | None:
+    """Currents of all fitted branches in the last instant of which all are known.
+
+    Parameters
+    ----------
+    branches : sequence of LiveBranch
+        All branches of the layout.
+    delays_s : mapping of str to float
+        How much later than the junction each is seen; 0 where not named. [s]
+    now_s : float
+        Now. [s]
+
+    Returns
+    -------
+    instant_s : float
+        When, at the junction. [s]
+    currents : dict of str to (float, float)
+        Measured, and as the parameters that are in force make it; positive into the junction. [A]
+        None, instead of both, while a fitted branch is stale or has no value.
+    """
+    fitted = [(branch, delays_s.get(branch.name, 0.0)) for branch in branches if branch.is_fitted]
+    times_s = [branch.time_s - delay_s for branch, delay_s in fitted if not branch.is_stale(now_s) and branch.latest()]
+    if not fitted or len(times_s) < len(fitted):
+        return None
+    instant_s = min(times_s)
+    found = {branch.name: branch.currents_at(instant_s + delay_s) for branch, delay_s in fitted}
+    currents = {name: pair for name, pair in found.items() if pair is not None}
+    return (instant_s, currents) if len(currents) == len(fitted) else None
 
 
 _MOST_MARGINS = 10.0
@@ -393,96 +418,54 @@ _UNKNOWN_SD_SHARE, _UNKNOWN_SD_PER_A = 0.02, 0.05
 throughput. [1]"""
 _NEARLY_AS_GOOD = 1.25
 """Branches that leave so many times what the best one leaves of the sum explain it as well."""
+_NOTHING_EXPECTED = JunctionResidual(measured_a=0.0, corrected_a=0.0)
 
 
-@dataclass(frozen=True, kw_only=True)
-class JunctionSums:
+class JunctionSums(NamedTuple):
     """Sum of all fitted branches in one instant, measured and corrected. [A]"""
 
     measured_a: float
     corrected_a: float
 
 
-def aligned_currents(
-    branches: Sequence[LiveBranch], delays_s: Mapping[str, float], now_s: float
-) -> tuple[float, dict[str, tuple[float, float]]] | None:
-    """Currents of all fitted branches in the last instant of which all are known.
-
-    Parameters
-    ----------
-    branches : sequence of LiveBranch
-        All branches of the layout.
-    delays_s : mapping of str to float
-        How much later than the junction each is seen; 0 where not named. [s]
-    now_s : float
-        Now. [s]
-
-    Returns
-    -------
-    instant_s : float
-        When, at the junction. [s]
-    currents : dict of str to (float, float)
-        Measured, and as the parameters that are in force make it; positive into the junction. [A]
-        None, instead of both, while a fitted branch is stale or has no value.
-    """
-    branches = [branch for branch in branches if branch.is_fitted]
-    latest = [found for branch in branches if not branch.is_stale(now_s) and (found := branch.latest()) is not None]
-    if not branches or len(latest) < len(branches):
-        return None
-    delays = [delays_s.get(branch.name, 0.0) for branch in branches]
-    instant_s = min(seen_s - delay_s for delay_s, (seen_s, _) in zip(delays, latest, strict=True))
-    currents = {
-        branch.name: pair
-        for branch, delay_s in zip(branches, delays, strict=True)
-        if (pair := branch.currents_at(instant_s + delay_s)) is not None
-    }
-    return (instant_s, currents) if len(currents) == len(branches) else None
-
-
 Verdict = tuple[Reason, tuple[str, ...]]
 """Why parameters must not be used any more, and the branches that explain it best, the best one first."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExpectedSum:
-    """What the parameter file says of the sum of right sensors.
-
-    Attributes
-    ----------
-    expected_a : float
-        The load that none of them sees. Sums are judged by how far they are from it. [A]
-    predicted_worse_a : float
-        By how much the calibrator itself expects the corrected sum to be worse, as where one of two offsets that cancel
-        is corrected; added to the margin, up to ten times that. [A]
-    corrected_a : float
-        Root mean square of the corrected sum about that, as the calibrator saw it. [A]
-    sd_a, sd_per_a : float or None
-        Standard deviation of the corrected sum: at rest [A], and per ampere that flows through the junction [1]. Where
-        not known, shares of full scale (or what the calibrator saw, if more) and of the throughput: then only gross
-        faults show.
-    """
-
-    expected_a: float = 0.0
-    predicted_worse_a: float = 0.0
-    corrected_a: float = 0.0
-    sd_a: float | None = None
-    sd_per_a: float | None = None
 
 
 class _Moment(NamedTuple):
     """One instant of the junction; sums are less what is expected."""
 
     time_s: float
-    measured_a: float
     corrected_a: float
     deviations: float
     """The corrected sum in standard deviations, signed."""
-    directed: float
-    """The same, with the sign of the largest current: a gain error keeps its sign in it."""
-    currents_a: Mapping[str, tuple[float, float]]
-    """Measured and corrected, by branch."""
+    currents_a: Currents
     codes: Mapping[str, int]
     """Last code of each branch."""
+    terms: tuple[float, float, float, float, float]
+    """Of the means of a window: measured sum and its square, square of the corrected sum, deviations, and these with
+    the sign of the largest current: a gain error keeps its sign in it."""
+
+
+class _Window:
+    """The moments of the last seconds, and means over them."""
+
+    def __init__(self, length_s: float) -> None:
+        self._length_s, self.moments, self._sums = length_s, deque[_Moment](), [0.0] * 5
+
+    def add(self, moment: _Moment) -> None:
+        self.moments.append(moment)
+        self._sums = [total + term for total, term in zip(self._sums, moment.terms, strict=True)]
+        while moment.time_s - self.moments[0].time_s > self._length_s:
+            old = self.moments.popleft().terms
+            self._sums = [total - term for total, term in zip(self._sums, old, strict=True)]
+
+    def means(self, share: float) -> list[float] | None:
+        """Means of the terms; None while this share of the window is not filled."""
+        moments = self.moments
+        if len(moments) < _LEAST_LOOKS or moments[-1].time_s - moments[0].time_s < share * self._length_s:
+            return None
+        return [total / len(moments) for total in self._sums]
 
 
 class JunctionWatch:
@@ -511,6 +494,8 @@ class JunctionWatch:
         Measured and corrected currents of the last instant that was known, by branch. [A]
     instant_s : float
         That instant. [s]
+    verdict : tuple or None
+        Why the parameters in force must not be used any more; None while they may.
     is_whole : callable
         Whether all currents of the junction are measured now; sums of other times are published, but not judged.
     """
@@ -520,109 +505,91 @@ class JunctionWatch:
     ) -> None:
         self._branches = {branch.name: branch for branch in branches}
         self._window_s, self._margin_a, self._full_scale_a = window_s, margin_a, full_scale_a
-        self._rest_a = _REST_SHARE * full_scale_a
         self.is_whole: Callable[[float], bool] = lambda _: True
-        self.restart(ExpectedSum())
+        self.restart()
 
-    def restart(self, expected: ExpectedSum) -> None:
-        """Forget what was seen, and judge by this from now on."""
-        margins = min(max(expected.predicted_worse_a / self._margin_a, 0.0), _MOST_MARGINS)
+    def restart(self, expected: JunctionResidual = _NOTHING_EXPECTED) -> None:
+        """Forget what was seen, and judge by what the parameter file says of the sum of right sensors from now on.
+
+        What the calibrator itself expects the corrected sum to be worse, as where one of two offsets that cancel is
+        corrected, is added to the margin, up to ten times that. Where the file says no standard deviations, shares of
+        full scale (or what the calibrator saw, if more) and of the throughput are taken: then only gross faults show.
+        """
+        measured_a, corrected_a = expected.about_expected()
+        margins = min(max((corrected_a - measured_a) / self._margin_a, 0.0), _MOST_MARGINS)
         self._expected_a, self._allowed_a = expected.expected_a, self._margin_a * (1.0 + margins)
-        sd_a, sd_per_a = expected.sd_a, expected.sd_per_a
-        if sd_a is None:
-            sd_a = max(_UNKNOWN_SD_SHARE * self._full_scale_a, expected.corrected_a)
-        self._sd_a = max(sd_a, self._margin_a)
-        self._sd_per_a = _UNKNOWN_SD_PER_A if sd_per_a is None else sd_per_a
+        sd_a, sd_per_a = expected.corrected_sd_a, expected.corrected_sd_per_a
+        sd_a = max(_UNKNOWN_SD_SHARE * self._full_scale_a, corrected_a) if sd_a is None else sd_a
+        self._sd_a, self._sd_per_a = max(sd_a, self._margin_a), _UNKNOWN_SD_PER_A if sd_per_a is None else sd_per_a
         self.sums: JunctionSums | None = None
-        self.currents_a: Mapping[str, tuple[float, float]] = {}
+        self.currents_a: Currents = {}
         self.instant_s = self._judged_s = float("-inf")
         self.forget()
 
     def forget(self) -> None:
         """Begin new windows."""
-        self._window: deque[_Moment] = deque()
-        self._recent: deque[_Moment] = deque()
-        """The end of the window, over which the mean of the corrected sum is taken."""
-        self._sum = self._directed = self._measured = self._measured2 = self._corrected2 = 0.0
+        self._window, self._recent = _Window(self._window_s), _Window(_PLAUSIBILITY_WINDOW_S)
         self._jump: tuple[float, int, Verdict] | None = None
         """Instant at which a jump began [s], instants since, and what it looked like then."""
-        self._verdict: Verdict | None = None
+        self.verdict: Verdict | None = None
 
     def look(self, now_s: float) -> JunctionSums | None:
         """Take the sums of now [s]; None while a fitted branch is stale or has no value."""
         self.sums = None
-        branches = list(self._branches.values())
-        found = aligned_currents(branches, {branch.name: branch.delay_s for branch in branches}, now_s)
+        branches = self._branches.values()
+        found = aligned_currents([*branches], {branch.name: branch.delay_s for branch in branches}, now_s)
         if found is None:
             return None
         self.instant_s, self.currents_a = found
-        measured, corrected = zip(*self.currents_a.values(), strict=True)
-        self.sums = JunctionSums(measured_a=sum(measured), corrected_a=sum(corrected))
+        self.sums = JunctionSums(*map(sum, zip(*self.currents_a.values(), strict=True)))
         if not self.is_whole(now_s):
             self.forget()
         elif self.instant_s > self._judged_s and len(self.currents_a) > 1:  # of one branch alone nothing is known
             self._judged_s = self.instant_s
-            self._remember(self.instant_s, self.sums, corrected)
-            self._verdict = self._judge()
+            self._remember(self.sums)
+            self.verdict = self._judge()
         return self.sums
 
-    def _remember(self, instant_s: float, sums: JunctionSums, corrected: Sequence[float]) -> None:
-        """Take one instant into the windows, and those that are too old out of them."""
+    def _remember(self, sums: JunctionSums) -> None:
+        """Take one instant into the windows."""
         measured_a, corrected_a = sums.measured_a - self._expected_a, sums.corrected_a - self._expected_a
-        deviations = corrected_a / self._sum_sd_a(corrected)
+        deviations = corrected_a / self._sum_sd_a()
         deviations = min(max(deviations, -_LARGEST_DEVIATION), _LARGEST_DEVIATION)
-        directed = math.copysign(1.0, max(corrected, key=abs)) * deviations
+        largest = max((corrected for _, corrected in self.currents_a.values()), key=abs)
         latest = {name: self._branches[name].latest() for name in self.currents_a}
         codes = {name: seen[1] for name, seen in latest.items() if seen is not None}
-        moment = _Moment(instant_s, measured_a, corrected_a, deviations, directed, self.currents_a, codes)
-        self._window.append(moment)
-        self._recent.append(moment)
-        self._count(moment, 1)
-        self._sum += deviations
-        self._directed += directed
-        while instant_s - self._window[0].time_s > self._window_s:
-            self._count(self._window.popleft(), -1)
-        while instant_s - self._recent[0].time_s > _PLAUSIBILITY_WINDOW_S:
-            old = self._recent.popleft()
-            self._sum -= old.deviations
-            self._directed -= old.directed
+        terms = measured_a, measured_a**2, corrected_a**2, deviations, math.copysign(deviations, deviations * largest)
+        moment = _Moment(self.instant_s, corrected_a, deviations, self.currents_a, codes, terms)
+        self._window.add(moment)
+        self._recent.add(moment)
 
-    def _count(self, moment: _Moment, times: int) -> None:
-        self._measured += times * moment.measured_a
-        self._measured2 += times * moment.measured_a**2
-        self._corrected2 += times * moment.corrected_a**2
-
-    def _sum_sd_a(self, corrected: Sequence[float]) -> float:
-        """Standard deviation that the sum of these currents may have. [A]"""
-        return math.hypot(self._sd_a, self._sd_per_a * 0.5 * sum(map(abs, corrected)))
-
-    def verdict(self) -> Verdict | None:
-        """Why the parameters in force must not be used any more; None while they may."""
-        return self._verdict
+    def _sum_sd_a(self) -> float:
+        """Standard deviation that the sum may have now. [A]"""
+        throughput_a = 0.5 * sum(abs(corrected) for _, corrected in self.currents_a.values())
+        return math.hypot(self._sd_a, self._sd_per_a * throughput_a)
 
     def _judge(self) -> Verdict | None:
-        recent, window = self._recent, self._window
         if (jump := self._jumped()) is not None:
             return jump
-        is_recent = len(recent) >= _LEAST_LOOKS and recent[-1].time_s - recent[0].time_s >= 0.5 * _PLAUSIBILITY_WINDOW_S
-        if is_recent and max(abs(self._sum), abs(self._directed)) > _MOST_DEVIATIONS * len(recent):
-            return self._explaining()
-        if len(window) < _LEAST_LOOKS or window[-1].time_s - window[0].time_s <= 0.9 * self._window_s:
+        if recent := self._recent.means(0.5):
+            *_, deviations, directed = recent
+            if max(abs(deviations), abs(directed)) > _MOST_DEVIATIONS:
+                return self._explaining()
+        if not (means := self._window.means(0.9)):
             return None
-        mean_a, mean2 = self._measured / len(window), self._measured2 / len(window)
-        if mean2 - mean_a**2 > (_STUCK_SHARE * self._full_scale_a) ** 2 and (stuck := self._stuck()):
+        mean_a, measured2, corrected2, *_ = means
+        if measured2 - mean_a**2 > (_STUCK_SHARE * self._full_scale_a) ** 2 and (stuck := self._stuck()):
             return Reason.BRANCH_STUCK, stuck
-        is_worse = math.sqrt(max(self._corrected2 / len(window), 0.0)) > math.sqrt(max(mean2, 0.0)) + self._allowed_a
+        is_worse = math.sqrt(max(corrected2, 0.0)) > math.sqrt(max(measured2, 0.0)) + self._allowed_a
         return (Reason.CORRECTION_WORSE, ()) if is_worse else None
 
     def _jumped(self) -> Verdict | None:
         """What a jump looked like when it began; None unless there is one, and it has lasted."""
-        instant_s, residual_a = self._recent[-1].time_s, self._recent[-1].corrected_a
-        currents_a = {name: pair[1] for name, pair in self.currents_a.items()}
-        moved = {name: self._branches[name].moved_a(instant_s, _MOVING_S, _MOVING_FRAMES) for name in currents_a}
+        instant_s, residual_a = self.instant_s, self._recent.moments[-1].corrected_a
+        moved = {name: self._branches[name].moved_a(instant_s, _MOVING_S, _MOVING_FRAMES) for name in self.currents_a}
         most = max(moved, key=lambda name: moved[name].distance_a)
         others_a = sum(movement.distance_a for movement in moved.values()) - moved[most].distance_a
-        limit_a = max(_JUMP_DEVIATIONS * self._sum_sd_a([*currents_a.values()]), _JUMP_SHARE * self._full_scale_a)
+        limit_a = max(_JUMP_DEVIATIONS * self._sum_sd_a(), _JUMP_SHARE * self._full_scale_a)
         if max(abs(residual_a), moved[most].flicker_a) - others_a <= limit_a:
             self._jump = None
             return None
@@ -637,23 +604,23 @@ class JunctionWatch:
 
     def _frozen(self, still: Sequence[str], residual_a: float = 0.0) -> tuple[str, ...]:
         """Those of the branches at a constant current that is no rest, and large enough to be what the sum lacks."""
-        least_a = max(self._rest_a, 0.5 * abs(residual_a))
+        least_a = max(_REST_SHARE * self._full_scale_a, 0.5 * abs(residual_a))
         return tuple(name for name in still if abs(self.currents_a[name][1]) > least_a)
 
     def _stuck(self) -> tuple[str, ...]:
         """Branches whose code never changed in the window, unless a gain error of another one explains the sum."""
-        window = self._window
-        still = [name for name, code in window[-1].codes.items() if all(m.codes.get(name) == code for m in window)]
-        measured_a = [moment.measured_a for moment in window]
+        moments = self._window.moments
+        still = [name for name, code in moments[-1].codes.items() if all(m.codes.get(name) == code for m in moments)]
+        measured_a = [moment.terms[0] for moment in moments]
         for name in self.currents_a.keys() - still:
-            fit = _fit([moment.currents_a.get(name, (0.0, 0.0))[0] for moment in window], measured_a)
-            if fit.explains and abs(fit.slope) < _LARGEST_SLOPE:
+            slope, explains = _line([moment.currents_a.get(name, (0.0, 0.0))[0] for moment in moments], measured_a)
+            if explains and abs(slope) < _LARGEST_SLOPE:
                 return ()
         return self._frozen(still)
 
     def _explaining(self) -> Verdict:
         """Which gain error explains the sums since they went wrong best; all branches, if an offset explains them."""
-        moments = list(self._recent)
+        moments = list(self._recent.moments)
         good = (number for number, moment in enumerate(moments) if abs(moment.deviations) < 1.0)
         since = moments[max(good, default=-1) + 1 :]
         moments = since if len(since) >= _LEAST_LOOKS else moments
@@ -661,38 +628,28 @@ class JunctionWatch:
         rows = {name: [moment.currents_a.get(name, (0.0, 0.0))[1] for moment in moments] for name in self.currents_a}
         still = [name for name, row in rows.items() if min(row) == max(row)]
         if frozen := self._frozen(still):
-            fits = [_fit(row, residual) for name, row in rows.items() if name not in still]
-            if any(fit.explains and abs(fit.slope) >= _LARGEST_SLOPE for fit in fits):
+            lines = [_line(row, residual) for name, row in rows.items() if name not in still]
+            if any(explains and abs(slope) >= _LARGEST_SLOPE for slope, explains in lines):
                 return Reason.BRANCH_STUCK, frozen
         left = {name: _left_of_gain(row, residual) for name, row in rows.items()}
-        of_offset = _fit(residual, residual).variance * len(residual)
-        best = min(left.values())
+        of_offset, best = len(residual) * _covariance(residual, residual), min(left.values())
         near = [name for name in left if left[name] <= _NEARLY_AS_GOOD * best or of_offset <= best]
         return Reason.SUM_IMPLAUSIBLE, tuple(sorted(near, key=left.__getitem__))
 
 
 def _left_of_gain(current: Sequence[float], residual: Sequence[float]) -> float:
     """What a gain error of a branch leaves of the squares of the sums."""
-    own = math.fsum(value * value for value in current)
-    both = math.fsum(a * b for a, b in zip(current, residual, strict=True))
-    return math.fsum(value * value for value in residual) - (both * both / own if own else 0.0)
+    own, both = math.fsum(map(mul, current, current)), math.fsum(map(mul, current, residual))
+    return math.fsum(map(mul, residual, residual)) - (both * both / own if own else 0.0)
 
 
-class _Fit(NamedTuple):
-    """A straight line through points."""
-
-    slope: float
-    explains: bool
-    """Whether little is left around it."""
-    variance: float
-    """That of the points."""
+def _covariance(x: Sequence[float], y: Sequence[float]) -> float:
+    mean_x, mean_y = math.fsum(x) / len(x), math.fsum(y) / len(y)
+    return math.fsum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / len(x)
 
 
-def _fit(x: Sequence[float], y: Sequence[float]) -> _Fit:
-    count = len(x)
-    mean_x, mean_y = math.fsum(x) / count, math.fsum(y) / count
-    xx = math.fsum((value - mean_x) ** 2 for value in x) / count
-    yy = math.fsum((value - mean_y) ** 2 for value in y) / count
-    xy = math.fsum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / count
+def _line(x: Sequence[float], y: Sequence[float]) -> tuple[float, bool]:
+    """Slope of a straight line through points, and whether it explains them: little of y is left around it."""
+    xx, xy, yy = _covariance(x, x), _covariance(x, y), _covariance(y, y)
     slope = xy / xx if xx else 0.0
-    return _Fit(slope, yy - slope * xy <= (1.0 - _EXPLAINS) * yy, yy)
+    return slope, slope * xy >= _EXPLAINS * yy

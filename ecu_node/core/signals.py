@@ -97,18 +97,6 @@ class FrameKey(NamedTuple):
     extended: bool
 
 
-class WordField(NamedTuple):
-    """A signal in a whole payload of one length, read as one integer of the signal's byte order.
-
-    ``raw = ((word >> shift & ones) ^ sign) - sign``.
-    """
-
-    shift: int
-    ones: int
-    sign: int
-    """The sign bit of a two's complement; 0 if the signal has none."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class BitPlace:
     """Where the raw integer of one signal stands.
@@ -151,13 +139,9 @@ class BitPlace:
         placed = bytes(self.first) + field.to_bytes(self.end - self.first, self.order)
         return int.from_bytes(placed, "little")
 
-    def in_word(self, payload_bytes: int) -> WordField:
-        """The signal in payloads of some length, which must hold it. [byte]"""
-        ones = (1 << self.length) - 1
-        below = self.first if self.order == "little" else payload_bytes - self.end
-        shift = self.shift + _BITS_PER_BYTE * below
-        sign = 1 << (self.length - 1) if self.signed else 0
-        return WordField(shift, ones, sign)
+    def shift_in(self, payload_bytes: int) -> int:
+        """Bits below the signal in a whole payload of some length [byte], read as one integer of the same order."""
+        return self.shift + _BITS_PER_BYTE * (self.first if self.order == "little" else payload_bytes - self.end)
 
     def extract(self, payload: bytes | bytearray) -> int | None:
         """Read the raw integer.

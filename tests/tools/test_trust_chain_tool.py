@@ -42,9 +42,3 @@ def test_trips_that_end_before_the_trial_does_are_refused() -> None:
     result = CliRunner().invoke(trust_chain.app, ["--layout", str(LAYOUT), "--unseen-minutes", "5"])
     assert result.exit_code != 0
     assert f"--unseen-minutes 5: the trial of {LAYOUT} alone takes 300 s" in str(result.exception)
-
-
-def test_a_layout_that_is_not_there_is_told_in_one_line() -> None:
-    result = CliRunner().invoke(trust_chain.app, ["--layout", "missing.toml"])
-    assert result.exit_code != 0
-    assert "missing.toml" in str(result.exception) + result.output

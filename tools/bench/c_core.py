@@ -9,18 +9,18 @@ python -m bench.c_core fuzz --seconds S   libFuzzer with the sanitizers of memor
 import argparse
 import re
 import subprocess
-import sys
 import tempfile
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from hashlib import sha256
+from itertools import islice, product
 from pathlib import Path
 from random import Random
 from struct import Struct
 
 import ecu_node
-from bench.node_fuzz_vehicles import draw_vehicle
-from bench.row import Row
+from bench.fuzz_vehicles import draw_vehicle
+from bench.row import LAYOUT, Row, show
 from bench.true_parameters import true_parameters
 from calibrator.errors import ExportError
 from calibrator.export.core import Checked, c_text
@@ -33,20 +33,9 @@ from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters
 
 __all__ = [
-    "CORE",
-    "FLAGS",
-    "GOLDEN_SHA256",
-    "RECORD",
-    "all_codes",
-    "build",
-    "check_frames",
-    "drawn_vehicles",
-    "fuzz",
-    "golden",
-    "measure",
-    "run",
-    "vehicle",
-]
+    "CORE", "FLAGS", "GOLDEN_SHA256", "RECORD", "all_codes", "build", "check_frames", "drawn_vehicles", "frames",
+    "fuzz", "golden", "measure", "run", "vehicle",
+]  # fmt: skip
 
 CORE = Path(ecu_node.__file__).parent / "c"
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
@@ -168,14 +157,11 @@ def _record(identifier: int, payload: bytes | None) -> bytes:
 def build(checked: Checked, folder: Path, *, compiler: str = "gcc", flags: tuple[str, ...] = ("-O2",)) -> Path:
     """Compile core, exported data and driver with all warnings as errors; the program."""
     (folder / "hv_calibration.c").write_text(c_text(checked))
-    objects = []
-    for source, more in (
-        (CORE / "hv_correction.c", FLAGS),
-        (folder / "hv_calibration.c", FLAGS),
-        (_HERE / "c_core_driver.c", ()),
-    ):
+    driver, objects = _HERE / "c_core_driver.c", []
+    for source in (CORE / "hv_correction.c", folder / "hv_calibration.c", driver):
         objects.append(folder / f"{source.stem}.o")
-        subprocess.run([compiler, *more, *flags, "-g", f"-I{CORE}", "-c", source, "-o", objects[-1]], check=True)
+        strict = () if source == driver else FLAGS
+        subprocess.run([compiler, *strict, *flags, "-g", f"-I{CORE}", "-c", source, "-o", objects[-1]], check=True)
     subprocess.run([compiler, *flags, *objects, "-o", folder / "driver"], check=True)
     return folder / "driver"
 
@@ -216,19 +202,13 @@ def all_codes(checked: Checked, program: Path, *, voltage: int | None = None, bi
 def widths(folder: Path) -> Iterator[Checked]:
     """Vehicles that have between them signals of 8 to 24 bits, signed and unsigned, with names at an end."""
     for lengths in (range(8, 14), range(14, 20), range(20, 25)):
-        kinds = [(length, sign) for length in lengths for sign in "+-"]
-        dbc, branches = ['VERSION ""', "BU_: Sensor X"], []
-        for number, (length, sign) in enumerate(kinds, start=1):
-            start, offset = ("0", -(1 << length - 2)) if sign == "+" else ("0", 0)
-            dbc += [
-                f"BO_ {number} M{number}: 8 Sensor",
-                f' SG_ I : {start}|{length}@1{sign} (0.5,{offset}) [0|0] "A" X',
-            ]
+        messages, tables, branches = [], [], []
+        for number, (length, sign) in enumerate(product(lengths, "+-"), start=1):
+            signal = f'I : 0|{length}@1{sign} (0.5,{-(1 << length - 2) if sign == "+" else 0}) [0|0] "A" X'
+            messages.append(f"BO_ {number} M{number}: 8 Sensor\n SG_ {signal}\n")
+            tables.append(f'VAL_ {number} I {(1 << length - (sign == "-")) - 1} "SNA";\n')
             branches.append(f'{{ name = "b{number}", sign = 1, signal = "M{number}.I" }}')
-        dbc += [
-            f'VAL_ {n} I {(1 << length - (sign == "-")) - 1} "SNA";' for n, (length, sign) in enumerate(kinds, start=1)
-        ]
-        (folder / "widths.dbc").write_text("\n".join(dbc) + "\n")
+        (folder / "widths.dbc").write_text("".join(['VERSION ""\nBU_: Sensor X\n', *messages, *tables]))
         text = f'schema = 1\nname = "w"\ndbc = "widths.dbc"\nfull_scale_a = 50.0\nbranch = [{", ".join(branches)}]\n'
         (folder / "widths.toml").write_text(text)
         yield vehicle(folder / "widths.toml")
@@ -239,11 +219,7 @@ def drawn_vehicles(rng: Random, folder: Path) -> Iterator[Checked]:
     while True:
         drawn = draw_vehicle(rng)
         for message in (*drawn.sources, *drawn.targets):
-            if (
-                message.protection is not None
-                and 'profile = "P01"' not in message.protection.toml
-                and "P02" not in message.protection.toml
-            ):
+            if message.protection is not None and not re.search('"P0[12]"', message.protection.toml):
                 message.protection = None
         database, parameters = drawn.load(folder)
         checked = Checked(name="drawn", digest="0" * 64, parameters=parameters, database=database)
@@ -275,32 +251,22 @@ def compare(folder: Path, count: int) -> list[Row]:
 
 def measure(folder: Path, count: int = 10_000, flags: Sequence[str] = ("-Os", "-O2")) -> Iterator[Row]:
     """Bytes of code, and instructions of a frame of the project's own battery message, with and without E2E."""
-    layout = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
-    (folder / "bare.toml").write_text(layout.read_text().split("[e2e]")[0])
-    (folder / "hv_powertrain.dbc").write_bytes(layout.with_suffix(".dbc").read_bytes())
-    for flag in flags:
-        for path, what in ((layout, "with E2E P01"), (folder / "bare.toml", "without E2E")):
-            checked = vehicle(path)
-            program, out = build(checked, folder, flags=(flag,)), folder / "callgrind.out"
-            if path == layout:
-                for part in ("hv_correction", "hv_calibration"):
-                    text = subprocess.run(
-                        ["size", folder / f"{part}.o"], capture_output=True, text=True, check=True
-                    ).stdout
-                    size = sum(map(int, text.splitlines()[1].split()[:3]))
-                    yield Row(name=f"C core, gcc {flag}, {part}.o", value=size, unit="byte")
-            identifier = checked.database.message("HV_Battery").frame_id
-            given = [data for key, data in frames(checked.database, _seeded(4), 40 * count) if key == identifier][
-                :count
-            ]
-            command: list[str | Path] = [
-                *("valgrind", "--tool=callgrind", "--collect-atstart=no", "--toggle-collect=hv_forward", "--quiet"),
-                *(f"--callgrind-out-file={out}", program),
-            ]
-            stream = b"".join(_record(identifier, data) for data in given)
-            subprocess.run(command, input=stream, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=True)
-            (total, *_) = re.findall(r"^(?:summary|totals): (\d+)", out.read_text(), flags=re.MULTILINE)
-            yield Row(name=f"C core, gcc {flag}, frame {what}", value=int(total) / count, unit="instructions")
+    (folder / "bare.toml").write_text(LAYOUT.read_text().split("[e2e]")[0])
+    (folder / "hv_powertrain.dbc").write_bytes(LAYOUT.with_suffix(".dbc").read_bytes())
+    for flag, (path, what) in product(flags, ((LAYOUT, "with E2E P01"), (folder / "bare.toml", "without E2E"))):
+        checked = vehicle(path)
+        program, out = build(checked, folder, flags=(flag,)), folder / "callgrind.out"
+        for part in ("hv_correction", "hv_calibration") if path == LAYOUT else ():
+            size = subprocess.run(["size", folder / f"{part}.o"], capture_output=True, text=True, check=True).stdout
+            total = sum(map(int, size.splitlines()[1].split()[:3]))
+            yield Row(name=f"C core, gcc {flag}, {part}.o", value=total, unit="byte")
+        battery = checked.database.message("HV_Battery").frame_id
+        given = (_record(*frame) for frame in frames(checked.database, _seeded(4), 40 * count) if frame[0] == battery)
+        options = ("--collect-atstart=no", "--toggle-collect=hv_forward", "--quiet", f"--callgrind-out-file={out}")
+        command: list[str | Path] = ["valgrind", "--tool=callgrind", *options, program]
+        subprocess.run(command, input=b"".join(islice(given, count)), capture_output=True, check=True)
+        (instructions, *_) = re.findall(r"^(?:summary|totals): (\d+)", out.read_text(), flags=re.MULTILINE)
+        yield Row(name=f"C core, gcc {flag}, frame {what}", value=int(instructions) / count, unit="instructions")
 
 
 def fuzz(folder: Path, seconds: int) -> None:
@@ -337,15 +303,6 @@ def main() -> None:
                 show(compare(Path(name), arguments.frames))
             case _:
                 show(list(measure(Path(name))))
-
-
-def show(rows: list[Row]) -> None:
-    """Print a table."""
-    from rich.console import Console  # noqa: PLC0415  # tests need neither, and they are slow
-
-    from bench.all import table_of  # noqa: PLC0415
-
-    Console(width=None if sys.stdout.isatty() else 160).print(table_of(rows))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """The page of a large fleet: how long it takes to write, how large it is, and how soon a browser has it ready."""
 
-import argparse
 import shutil
 import tempfile
 import time
@@ -9,30 +8,16 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 from selenium import webdriver
-from selenium.webdriver.chrome.options import Options
-from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.support.wait import WebDriverWait
 
-from bench.row import Row
+from bench.row import LAYOUT, Row, run
+from bench.true_parameters import true_parameters
 from calibrator.estimator.evidence import VehicleEvidence, evidence_names
-from calibrator.estimator.results import (
-    PARTS,
-    RunRecord,
-    encode_chunk,
-    join_rows,
-    part_file,
-    write_run,
-)
+from calibrator.estimator.results import PARTS, RunRecord, encode_chunk, join_rows, part_file, write_run
 from calibrator.report.page import fleet_report
-from ecu_node.parameters import (
-    BranchParameters,
-    Explanation,
-    FileReference,
-    HardwareFault,
-    JunctionResidual,
-    Provenance,
-    VehicleParameters,
-)
+from ecu_node.database import read_database
+from ecu_node.layout import read_layout
+from ecu_node.parameters import BranchParameters, Explanation, HardwareFault, JunctionResidual, VehicleParameters
 
 __all__ = ["rows"]
 
@@ -44,66 +29,52 @@ FAULTY, UNDECIDED, SUSPECTED = 0.2, 0.1, 0.02
 OPENED = 5
 """How often the page is opened; the median counts."""
 PATIENCE_S = 120.0
-NOTHING = FileReference(name="none", sha256="0" * 64)
-RUN = RunRecord(
-    tool="bench",
-    method="posterior",
-    fleet="bench",
-    layout="bench",
-    branches=list(BRANCHES),
-    model_inputs=[],
-    settings={},
-    created="2026-01-01T00:00:00Z",
-    details={"evidence": evidence_names(BRANCHES)},
-    vehicles=1,
-    full_scale_a=FULL_SCALE_A,
-    left_out={},
-    notices=[],
-)
 
 
 def rows(*, quick: bool) -> list[Row]:
-    """Measure.
-
-    Parameters
-    ----------
-    quick : bool
-        A small fleet.
-
-    Returns
-    -------
-    list of Row
-        Seconds to write the page, its size, and seconds from opening it to its being ready.
-    """
+    """Measure seconds to write the page, its size, and seconds from opening it to its being ready."""
     vehicles = QUICK_FLEET if quick else FLEET
     with tempfile.TemporaryDirectory() as folder:
-        result, page = make_result(Path(folder) / "result", vehicles), Path(folder) / "report.html"
+        result, page = Path(folder) / "result", Path(folder) / "report.html"
+        write_result(result, vehicles)
         started = time.perf_counter()
-        text, _ = fleet_report(result)
-        page.write_text(text)
-        written_s = time.perf_counter() - started
-        ready_s = ready_times_s(page)
+        page.write_text(fleet_report(result)[0])
+        written_s, ready_s = time.perf_counter() - started, float(np.median(ready_times_s(page)))
         what = f"report of {vehicles} vehicles"
         return [
             Row(name=f"{what}: written", value=written_s, unit="s"),
             Row(name=f"{what}: size", value=page.stat().st_size / 1e6, unit="MB"),
-            Row(name=f"{what}: ready in Chromium, median of {OPENED}", value=float(np.median(ready_s)), unit="s"),
+            Row(name=f"{what}: ready in Chromium, median of {OPENED}", value=ready_s, unit="s"),
         ]
 
 
-def make_result(folder: Path, vehicles: int) -> Path:
+def write_result(folder: Path, vehicles: int) -> None:
     """Write a result as a calibration does, with faults drawn as in the paper."""
-    rng = np.random.default_rng(0)
-    items = [drawn_vehicle(rng, f"WVW{number:014d}", vehicles) for number in range(vehicles)]
+    rng, like = np.random.default_rng(0), true_parameters(read_database(read_layout(LAYOUT)), {})
+    items = [drawn_vehicle(rng, replace(like, vehicle=f"WVW{number:014d}")) for number in range(vehicles)]
     (folder / PARTS).mkdir(parents=True)
     evidence = {item.vehicle: drawn_evidence(rng, item) for item in items}
     part_file(folder, 0).write_bytes(encode_chunk(items, {}, evidence=evidence))
     join_rows(folder, {})  # no file per vehicle, as of every large fleet
-    write_run(folder, replace(RUN, vehicles=vehicles))
-    return folder
+    record = RunRecord(
+        tool="bench",
+        method="posterior",
+        fleet="bench",
+        layout="bench",
+        branches=list(BRANCHES),
+        model_inputs=[],
+        settings={},
+        created="2026-01-01T00:00:00Z",
+        details={"evidence": evidence_names(BRANCHES)},
+        vehicles=vehicles,
+        full_scale_a=FULL_SCALE_A,
+        left_out={},
+        notices=[],
+    )
+    write_run(folder, record)
 
 
-def drawn_vehicle(rng: np.random.Generator, name: str, vehicles: int) -> VehicleParameters:
+def drawn_vehicle(rng: np.random.Generator, like: VehicleParameters) -> VehicleParameters:
     """Parameters of one vehicle."""
     undecided, suspected = bool(rng.random() < UNDECIDED), bool(rng.random() < SUSPECTED)
     branches = {branch: drawn_sensor(rng, apply=not undecided) for branch in BRANCHES}
@@ -113,10 +84,8 @@ def drawn_vehicle(rng: np.random.Generator, name: str, vehicles: int) -> Vehicle
         for p in ((0.5, 0.4, 0.1) if undecided else ())
     ]
     hardware_drift = 0.1 * rng.normal() if suspected else 0.0
-    return VehicleParameters(
-        vehicle=name,
-        layout=NOTHING,
-        dbc=NOTHING,
+    return replace(
+        like,
         verdict="cannot tell" if undecided else "corrected" if found else "no sensor fault",
         confidence=rng.uniform(0.3, 1.0),
         branches=branches,
@@ -124,27 +93,17 @@ def drawn_vehicle(rng: np.random.Generator, name: str, vehicles: int) -> Vehicle
         explanations=explanations,
         deciding_evidence=f"a zero-current window would decide: {rng.normal():+.1f} A" if undecided else "",
         junction_residual=JunctionResidual(measured_a=rng.exponential(20.0), corrected_a=rng.exponential(1.0)),
-        provenance=Provenance(
-            tool="bench",
-            method="posterior",
-            created="2026-01-01T00:00:00Z",
-            fleet="bench",
-            fleet_size=vehicles,
-            drives=["d"],
-            duration_s=rng.uniform(600.0, 36000.0),
-        ),
+        provenance=replace(like.provenance, drives=["d"], duration_s=rng.uniform(600.0, 36000.0)),
     )
 
 
 def drawn_sensor(rng: np.random.Generator, *, apply: bool) -> BranchParameters:
     """One sensor, with a fault or not."""
-    drift, offset = (
-        float(rng.choice([-1.0, 1.0])) * rng.uniform(0.05, 0.25) if rng.random() < FAULTY else 0.0 for _ in range(2)
-    )
-    faulty = drift != 0.0 or offset != 0.0
+    size = rng.choice([-1.0, 1.0], 2) * rng.uniform(0.05, 0.25, 2) * (rng.random(2) < FAULTY)
+    faulty = bool(size.any())
     return BranchParameters(
-        drift=drift,
-        offset_a=offset * FULL_SCALE_A,
+        drift=float(size[0]),
+        offset_a=float(size[1]) * FULL_SCALE_A,
         drift_sd=rng.exponential(0.002),
         offset_sd_a=rng.exponential(0.3),
         apply=apply and faulty,
@@ -157,17 +116,12 @@ def drawn_sensor(rng: np.random.Generator, *, apply: bool) -> BranchParameters:
 
 def drawn_evidence(rng: np.random.Generator, item: VehicleParameters) -> VehicleEvidence:
     """Rows as full of digits as real ones."""
-    drift = [branch.drift for branch in item.branches.values()]
-    count = 5 * len(BRANCHES)
-    value = rng.normal(0.0, 10.0, count)
-    value[: len(drift)] = 1.0 + np.array(drift)
-    unread = {5, 6, 7, 12, 13, 14}
-    sd = rng.exponential(0.1, count)
-    return VehicleEvidence(
-        value=[None if r in unread else float(value[r]) for r in range(count)],
-        sd=[None if r in unread else float(sd[r]) for r in range(count)],
-        explained=(value + sd * rng.normal(size=count)).tolist(),
-    )
+    count, unread = 5 * len(BRANCHES), [5, 6, 7, 12, 13, 14]
+    value, sd = rng.normal(0.0, 10.0, count), rng.exponential(0.1, count)
+    value[: len(BRANCHES)] = 1.0 + np.array([branch.drift for branch in item.branches.values()])
+    explained = (value + sd * rng.normal(size=count)).tolist()
+    read, read_sd = ([None if r in unread else x for r, x in enumerate(some.tolist())] for some in (value, sd))
+    return VehicleEvidence(value=read, sd=read_sd, explained=explained)
 
 
 def ready_times_s(page: Path) -> list[float]:
@@ -175,31 +129,19 @@ def ready_times_s(page: Path) -> list[float]:
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if chromium is None or driver is None:
         raise SystemExit("bench: no chromium and chromedriver here (Debian: apt-get install chromium chromium-driver)")
-    options = Options()
+    options, found = webdriver.ChromeOptions(), []
     options.binary_location = chromium
     for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,1000"):
         options.add_argument(argument)
-    browser = webdriver.Chrome(options=options, service=Service(driver))
-    try:
-        found = []
+    with webdriver.Chrome(options=options, service=webdriver.ChromeService(driver)) as browser:
         for _ in range(OPENED):
             browser.get(f"file://{page}")
             ready = WebDriverWait(browser, PATIENCE_S).until(
                 lambda it: it.execute_script("return document.body.dataset.ready || document.body.dataset.failed")
             )
             found.append(float(ready) / 1e3)
-        return found
-    finally:
-        browser.quit()
-
-
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a small fleet")
-    for row in rows(quick=parser.parse_args().quick):
-        print(f"{row.name}: {row.value:.3g} {row.unit}")
+    return found
 
 
 if __name__ == "__main__":
-    main()
+    run(rows)

@@ -1,10 +1,14 @@
 """Whole calibrations from summaries on disk: time and memory over the size of the fleet, and going on after a kill.
 
-Every run is the command that a user types, watched from outside: its processes' memory, and when its chunks appear.
+    python -m bench.fleet_run --vehicles 1000000          (in tools/)
+
+Every run is the command that a user types, and its processes' memory is watched from outside. The summaries are those
+of an artificial fleet, made without any drive being read: some trips of the built-in vehicle are recorded without
+faults and summarised, and every vehicle takes one of them. What its faults do to the currents, (11) and (13) of the
+paper, is linear, so it is done to the moments.
 """
 
 import argparse
-import contextlib
 import os
 import random
 import shutil
@@ -14,56 +18,49 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from bench.row import Row
-from bench.synthetic_store import LAYOUT, make_store
+from bench.row import LAYOUT, MEBIBYTE, Row
+from calibrator.artificial.random_fleet import draw_faults
 from calibrator.artificial.simulate import FleetPlan, draw_vehicles, simulate_fleet, trip_of, vehicle_drive
 from calibrator.artificial.trips import BuiltinTrips
-from calibrator.drive import Drive
+from calibrator.drive import Array
+from calibrator.drives.delays import BranchDelays
 from calibrator.drives.store import write_drive
+from calibrator.experiments.recorded_trips import RecordedCase, builtin_fleet, record_vehicles
+from calibrator.faults import Faults
+from calibrator.files.storage import open_storage
+from calibrator.processes.run_many import Workers, run_many
+from calibrator.sources.fleet_source import Equipment
+from calibrator.summaries.identity import store_identity, write_identity
+from calibrator.summaries.moments import DriveSummary
+from calibrator.summaries.record import Record
+from calibrator.summaries.store import SummaryStore
+from calibrator.summaries.summariser import summarise_samples
+from calibrator.summaries.vehicle_summary import VehicleSummary
+from calibrator.summaries.zero_current import ZeroCurrent
+from calibrator.terminal.progress import shown
 from ecu_node.database import read_database
 from ecu_node.layout import read_layout
 
-__all__ = ["resident_bytes", "rows"]
+__all__ = ["make_store", "resident_bytes", "rows"]
 
-FLEETS = (1_000, 10_000, 100_000)
-QUICK_FLEETS = (500, 1_000)
+FLEETS, QUICK_FLEETS = (1_000, 10_000, 100_000), (500, 1_000)
 KILLED_FLEET, KILLS = 2_000, 20
 QUICK_KILLED_FLEET, QUICK_KILLS = 500, 2
-DRIVE_S, TRIPS = 600.0, 20
-"""Length of a drive [s], and how many different ones there are; noise makes each its own."""
+TRIPS, MINUTES = 64, 6.0
+"""Different trips of the summaries, and their least length. [min]"""
+BRANCHES, MAGNITUDE, SPARSITY = ("battery", "motor"), (0.05, 0.25), 80.0
+"""Of the fleets; faults are drawn as in the paper. [1], [%]"""
+DRIVES, DRIVE_S = 20, 600.0
+"""Different drives that are read, and their length [s]; noise makes each its own."""
 WORKERS = 2
-"""Processes that make fleets and calibrate them. The time per vehicle is that of one process: of several, the later
-ones are still starting while the first one is done with a small fleet."""
-WATCH_EVERY_S, WATCHED_SHARE = 0.02, 0.05
-"""Least time between two looks at a run, and the largest share of the time that is spent on them. [s], [1]"""
-MEBIBYTE = 1024.0**2
-
-
-@dataclass(frozen=True, kw_only=True)
-class Watched:
-    """What was seen of one run.
-
-    Attributes
-    ----------
-    whole_s : float
-        From start to end. [s]
-    steady_s : float
-        From when half of the chunks were written to the last one: all has been loaded by then. [s]
-    share : float
-        Of the chunks that came within that time. [1]
-    peak_bytes : float
-        Largest sum of the resident memory of its processes. [byte]
-    """
-
-    whole_s: float
-    steady_s: float
-    share: float
-    peak_bytes: float
+"""Processes that make fleets and calibrate them."""
+WATCH_EVERY_S = 0.2
 
 
 def rows(*, quick: bool) -> list[Row]:
@@ -77,89 +74,53 @@ def rows(*, quick: bool) -> list[Row]:
     Returns
     -------
     list of Row
-        Per fleet size the time per vehicle once the reference is known (in one process), that of the whole run, and the
-        peak memory, against those of the smallest fleet; and how many of the killed runs gave the same result.
+        Per fleet size the time and the peak memory of a run, against those of the smallest fleet; and how many of the
+        killed runs gave the same result.
     """
-    found: list[Row] = []
-    first: tuple[float, float] | None = None
+    found, first = list[Row](), None
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
+        folder = Path(name)
         for vehicles in QUICK_FLEETS if quick else FLEETS:
-            seen, per_vehicle_s = measure(Path(name), vehicles)
-            first = first or (per_vehicle_s, seen.peak_bytes)
-            peer = None if first == (per_vehicle_s, seen.peak_bytes) else "the smallest fleet"
-            label = f"{vehicles} vehicles from summaries"
+            make_store(folder / "store", vehicles=vehicles)
+            seconds, peak = watched(_command(folder / "store", folder / "result"))
+            for made in ("store", "result"):
+                shutil.rmtree(folder / made)
+            peer, ratio = ("the smallest fleet", first / peak) if first else (None, None)
+            first, label = first or peak, f"{vehicles} vehicles from summaries"
+            memory = {"value": peak / MEBIBYTE, "unit": "MiB", "peer": peer, "ratio": ratio}
             found += [
-                Row(
-                    name=f"{label}, per vehicle once the reference is known",
-                    value=1e3 * per_vehicle_s,
-                    unit="ms",
-                    peer=peer,
-                    ratio=first[0] / per_vehicle_s if peer else None,
-                ),
-                Row(name=f"{label}, whole run", value=seen.whole_s, unit="s"),
-                Row(
-                    name=f"{label}, peak memory of all processes",
-                    value=seen.peak_bytes / MEBIBYTE,
-                    unit="MiB",
-                    peer=peer,
-                    ratio=first[1] / seen.peak_bytes if peer else None,
-                ),
+                Row(name=f"{label}, whole run", value=seconds, unit="s"),
+                Row(name=f"{label}, peak memory of all processes", **memory),
             ]
         vehicles, kills = (QUICK_KILLED_FLEET, QUICK_KILLS) if quick else (KILLED_FLEET, KILLS)
-        same = killed_runs(Path(name), vehicles, kills)
+        same = killed_runs(folder, vehicles, kills)
     return [
         *found,
         Row(name=f"runs killed at random moments with the identical result, of {kills}", value=same, unit="1"),
     ]
 
 
-def measure(folder: Path, vehicles: int) -> tuple[Watched, float]:
-    """What was seen of a run, and of one in one process the time per vehicle in its later half. [s]"""
-    store, out = folder / f"store-{vehicles}", folder / f"result-{vehicles}"
-    make_store(store, vehicles=vehicles, workers=WORKERS)
-    seen = watch(store, out, workers=WORKERS)
-    shutil.rmtree(out)
-    alone = watch(store, out, workers=1)
-    shutil.rmtree(out)
-    shutil.rmtree(store)
-    return seen, alone.steady_s / (alone.share * vehicles)
-
-
-def watch(store: Path, out: Path, *, workers: int) -> Watched:
-    """Calibrate, and look at it from outside."""
-    chunks = out.with_name(f".{out.name}.unfinished") / "chunks"
-    total = len(list((store / "buckets").iterdir()))
-    start = time.monotonic()
-    written_s: dict[str, float] = {}
-    peak = 0.0
-    with subprocess.Popen(_command(store, out, workers), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
-        while run.poll() is None:
-            look_s = time.monotonic()
-            peak = max(peak, resident_bytes(run.pid))
-            if len(written_s) < total:
-                with contextlib.suppress(FileNotFoundError):  # the result is there, and the chunks are gone
-                    written_s |= {chunk.name: chunk.stat().st_mtime for chunk in chunks.glob("*.rows.parquet")}
-            time.sleep(max(WATCH_EVERY_S, (time.monotonic() - look_s) / WATCHED_SHARE))
-        whole_s = time.monotonic() - start
-        assert run.stderr is not None
-        errors = run.stderr.read().decode()
-    if run.returncode:
-        raise RuntimeError(errors)
-    later_s = sorted(written_s.values())[total // 2 - 1 :]
-    return Watched(
-        whole_s=whole_s, steady_s=later_s[-1] - later_s[0], share=(len(later_s) - 1) / total, peak_bytes=peak
-    )
-
-
-def _command(given: Path, out: Path, workers: int, command: str = "calibrate") -> list[str]:
-    options = ["--layout", str(LAYOUT), "--out", str(out), "--workers", str(workers)]
+def _command(given: Path, out: Path, command: str = "calibrate") -> list[str]:
+    options = ("--layout", str(LAYOUT), "--out", str(out), "--workers", str(WORKERS))
     return [sys.executable, "-m", "calibrator", command, str(given), *options]
+
+
+def watched(command: Sequence[str]) -> tuple[float, float]:
+    """Run a command: its time [s], and the largest sum of the resident memory of its processes [byte]."""
+    start_s, peak = time.monotonic(), 0.0
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
+        while run.poll() is None:
+            peak = max(peak, resident_bytes(run.pid))
+            time.sleep(WATCH_EVERY_S)
+        assert run.stderr is not None
+        if run.returncode:
+            raise RuntimeError(run.stderr.read().decode())
+    return time.monotonic() - start_s, peak
 
 
 def resident_bytes(process: int) -> float:
     """Resident memory of a process and all that descend from it; what processes share is counted in each. [byte]"""
-    parents: dict[int, int] = {}
-    resident: dict[int, float] = {}
+    parents, resident = dict[int, int](), dict[int, float]()
     for entry in Path("/proc").iterdir():
         if entry.name.isdecimal():
             try:
@@ -186,65 +147,101 @@ def killed_runs(folder: Path, vehicles: int, kills: int, command: str = "calibra
     command : str
         ``import``, ``summarise`` or ``calibrate``.
     """
+    given = folder / "given"
     if command == "calibrate":
-        given = folder / "store-killed"
-        make_store(given, vehicles=vehicles, workers=WORKERS)
+        make_store(given, vehicles=vehicles)
     else:
-        plan = FleetPlan(vehicles=vehicles, currents=2, sparsity=80.0, magnitude=(0.05, 0.25))
+        plan = FleetPlan(vehicles=vehicles, currents=len(BRANCHES), sparsity=SPARSITY, magnitude=MAGNITUDE)
         trips = BuiltinTrips(seed=0, duration_s=DRIVE_S, unseen_s=60.0)
-        simulate_fleet(plan, trips, read_database(read_layout(LAYOUT)), folder / "fleet", workers=WORKERS)
-        given = folder / "fleet" / "logs"
+        simulate_fleet(plan, trips, read_database(read_layout(LAYOUT)), given, workers=WORKERS)
+        given /= "logs"
     environment = {**os.environ, "SOURCE_DATE_EPOCH": "1700000000"}
 
-    def run(out: Path) -> list[str]:
-        return _command(given, out, WORKERS, command)
-
-    start = time.monotonic()
-    subprocess.run(run(folder / "whole"), check=True, capture_output=True, env=environment)
-    whole_s = time.monotonic() - start
-    expected, chance = _contents(folder / "whole"), random.Random(0)  # noqa: S311 (moments, no secrets)
-    same = 0
-    for number in range(kills):
-        out = folder / f"killed-{number}"
-        with subprocess.Popen(
-            run(out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment, process_group=0
-        ) as killed:
+    def run(out: Path, limit_s: float | None = None) -> float:
+        """Run to the end, or for so long, and return the time. [s]"""
+        start_s, quiet = time.monotonic(), subprocess.DEVNULL
+        words = _command(given, out, command)
+        with subprocess.Popen(words, stdout=quiet, stderr=quiet, env=environment, process_group=0) as process:
             try:
-                killed.wait(chance.uniform(0.0, whole_s))
+                if process.wait(limit_s):
+                    raise RuntimeError(f"calibrator {command} ended with {process.returncode}")
             except subprocess.TimeoutExpired:
-                os.killpg(killed.pid, signal.SIGKILL)
+                os.killpg(process.pid, signal.SIGKILL)
+        return time.monotonic() - start_s
+
+    whole_s, chance, same = run(folder / "whole"), random.Random(0), 0  # noqa: S311 (moments, no secrets)
+    for _ in range(kills):
+        out = folder / "killed"
+        run(out, chance.uniform(0.0, whole_s))
         if command != "calibrate" or not out.exists():
-            subprocess.run(run(out), check=True, capture_output=True, env=environment)
-        same += _contents(out) == expected
+            run(out)
+        same += _contents(out) == _contents(folder / "whole")
         shutil.rmtree(out)
     return same
 
 
-def read_fleet(folder: Path, drives: int, *, per_vehicle: int = 10) -> tuple[Watched, Watched, float]:
-    """Summarise drives of ten minutes at 10 Hz and calibrate their vehicles.
+def _contents(result: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(result)): path.read_bytes() for path in result.rglob("*") if path.is_file()}
 
-    Parameters
-    ----------
-    folder : Path
-        An empty one.
-    drives, per_vehicle : int
-        Number of drives, and how many each vehicle has.
 
-    Returns
-    -------
-    reading, calibrating : Watched
-        What was seen of the two commands.
-    hours : float
-        Of driving. [h]
-    """
-    database = read_database(read_layout(LAYOUT))
-    trips, seconds = BuiltinTrips(seed=0, duration_s=DRIVE_S, unseen_s=60.0), 0.0
-    rng = np.random.default_rng(0)
-    plan = FleetPlan(vehicles=-(-drives // per_vehicle), currents=2, sparsity=80.0, magnitude=(0.05, 0.25))
-    base: list[Drive] = []
-    for number, vehicle in enumerate(draw_vehicles(plan, database.layout, ("battery", "motor"))):
+def make_store(folder: Path, *, vehicles: int) -> None:
+    """Write a store of summaries of so many vehicles with known kinds of faults."""
+    database, K = read_database(read_layout(LAYOUT)), len(BRANCHES)
+    fleet = builtin_fleet(database, trips=TRIPS, duration_s=60.0 * MINUTES)
+    case = RecordedCase(branches=K, sparsity=100.0, magnitude=MAGNITUDE)
+    inputs = database.layout.fleet_inputs or database.layout.model_inputs
+    recorded = record_vehicles(fleet, case, fleet.with_branches(K), 0).samples
+    trips = [summarise_samples([item.with_inputs(inputs)], period_s=fleet.period_s) for item in recorded]
+    fleet_inputs = recorded[0].with_inputs(inputs).input_names
+    equipment = Equipment(
+        branches=BRANCHES, inputs=tuple(database.layout.model_inputs), fleet_inputs=fleet_inputs, notices=()
+    )
+    identity = store_identity(equipment, database, vehicles=vehicles, fleet="synthetic", fleet_ids=frozenset())
+    store = SummaryStore(storage=open_storage(folder), identity=identity)
+    write_identity(store.storage, identity)
+    buckets = store.by_bucket(f"V{number:08d}" for number in range(vehicles))
+    write = partial(_write, store=store, trips=trips, full_scale_a=database.layout.full_scale_a)
+    for _ in shown(run_many(write, buckets.items(), Workers(processes=WORKERS)), "summaries", len(buckets), "buckets"):
+        pass
+
+
+def _write(
+    bucket: tuple[int, Sequence[str]], *, store: SummaryStore, trips: Sequence[DriveSummary], full_scale_a: float
+) -> None:
+    (number, names), K = bucket, len(BRANCHES)
+    rng, kind = np.random.default_rng(number), {"sparsity": SPARSITY, "magnitude": MAGNITUDE, "balanced": True}
+    faults = draw_faults(rng, vehicles=len(names), branches=K, full_scale_a=full_scale_a, **kind)
+    zero, unknown = np.zeros(K), np.full(K, np.nan)
+    records = {}
+    for j, name in enumerate(names):
+        found = VehicleSummary(
+            vehicle=name,
+            drives=("trip",),
+            summary=_measured(trips[int(name[1:]) % TRIPS], faults.take(j)),
+            delays=BranchDelays(branches=BRANCHES, delay_s=zero, sd_s=zero, known=np.ones(K, bool)),
+            zero_current=ZeroCurrent(offset_a=unknown, sd_a=unknown),
+        )
+        records[name] = [Record(vehicle=name, drives=("trip",), sources=("",), found=found)]
+    store.append(number, records)
+
+
+def _measured(trip: DriveSummary, faults: Faults) -> DriveSummary:
+    """The trip's summary as a vehicle with these faults measures it."""
+    gain, own = (1.0 + faults.drift) * (1.0 + faults.hardware_drift), np.arange(trip.branches) + trip.inputs
+    change: Array = np.eye(trip.moments.shape[1])
+    change[own, own] = gain
+    change[own, -1] = (1.0 + faults.drift) * faults.hardware_offset_a + faults.offset_a
+    return replace(trip, moments=change @ trip.moments @ change.T, noise_a2=trip.noise_a2 * gain**2, fit=None)
+
+
+def write_drives(folder: Path, drives: int, *, per_vehicle: int = 10) -> float:
+    """Write drives of ten minutes at 10 Hz into a store; how long they are together. [h]"""
+    database, rng, base, seconds = read_database(read_layout(LAYOUT)), np.random.default_rng(0), [], 0.0
+    trips = BuiltinTrips(seed=0, duration_s=DRIVE_S, unseen_s=60.0)
+    plan = FleetPlan(vehicles=-(-drives // per_vehicle), currents=len(BRANCHES), sparsity=SPARSITY, magnitude=MAGNITUDE)
+    for number, vehicle in enumerate(draw_vehicles(plan, database.layout, BRANCHES)):
         for trip in range(per_vehicle):
-            if len(base) < TRIPS:
+            if len(base) < DRIVES:
                 truth = trip_of(trips, vehicle, len(base), "calibration", database.layout)
                 base.append(vehicle_drive(rng, database, vehicle, truth))
             like = base[(number + trip) % len(base)]
@@ -252,30 +249,10 @@ def read_fleet(folder: Path, drives: int, *, per_vehicle: int = 10) -> tuple[Wat
                 name: replace(channel, value=channel.value + rng.normal(scale=0.1, size=len(channel.value)))
                 for name, channel in like.branches.items()
             }
-            write_drive(folder / "fleet", replace(like, vehicle=vehicle.name, name=f"d{trip}", branches=noisy),
-                        database.layout)  # fmt: skip
-            seconds += like.duration_s
-    reading = _watched(_command(folder / "fleet", folder / "store", WORKERS, "summarise"))
-    calibrating = _watched(_command(folder / "store", folder / "result", WORKERS))
-    return reading, calibrating, seconds / 3600.0
-
-
-def _watched(command: Sequence[str]) -> Watched:
-    """Run a command, and look at its memory."""
-    start, peak = time.monotonic(), 0.0
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
-        while run.poll() is None:
-            peak = max(peak, resident_bytes(run.pid))
-            time.sleep(0.5)
-        assert run.stderr is not None
-        if run.returncode:
-            raise RuntimeError(run.stderr.read().decode())
-    return Watched(whole_s=time.monotonic() - start, steady_s=0.0, share=0.0, peak_bytes=peak)
-
-
-def _contents(result: Path) -> dict[str, bytes]:
-    files: Sequence[Path] = [path for path in sorted(result.rglob("*")) if path.is_file()]
-    return {str(path.relative_to(result)): path.read_bytes() for path in files}
+            drive = replace(like, vehicle=vehicle.name, name=f"d{trip}", branches=noisy)
+            write_drive(folder, drive, database.layout)
+            seconds += drive.duration_s
+    return seconds / 3600.0
 
 
 def main() -> None:
@@ -289,23 +266,19 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
         folder = arguments.folder or Path(name)
+        store = folder / "store"
         if arguments.kill:
             same = killed_runs(folder, arguments.vehicles, arguments.kills, arguments.kill)
             print(f"{arguments.kill}: {same} of {arguments.kills} killed runs gave the identical result")
             return
         if arguments.drives:
-            reading, seen, hours = read_fleet(folder, arguments.drives)
-            print(
-                f"{arguments.drives} drives, {hours:.0f} h: summarised in {reading.whole_s:.0f} s, "
-                f"{reading.peak_bytes / MEBIBYTE:.0f} MiB; calibrated in {seen.whole_s:.0f} s, "
-                f"{seen.peak_bytes / MEBIBYTE:.0f} MiB"
-            )
-            return
-        store = folder / f"store-{arguments.vehicles}"
-        if not store.exists():
-            make_store(store, vehicles=arguments.vehicles, workers=WORKERS)
-        seen = watch(store, folder / f"result-{arguments.vehicles}", workers=WORKERS)
-    print(f"{arguments.vehicles} vehicles: {seen.whole_s:.0f} s, {seen.peak_bytes / MEBIBYTE:.0f} MiB")
+            hours = write_drives(folder / "fleet", arguments.drives)
+            seconds, peak = watched(_command(folder / "fleet", store, "summarise"))
+            print(f"{arguments.drives} drives, {hours:.0f} h, summarised: {seconds:.0f} s, {peak / MEBIBYTE:.0f} MiB")
+        elif not store.exists():
+            make_store(store, vehicles=arguments.vehicles)
+        seconds, peak = watched(_command(store, folder / "result"))
+    print(f"calibrated: {seconds:.0f} s, {peak / MEBIBYTE:.0f} MiB")
 
 
 if __name__ == "__main__":

@@ -8,19 +8,20 @@ processor, that of helping processes included: a machine that does other things 
 import gzip
 import resource
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import can
 import numpy as np
+import psutil
 from threadpoolctl import threadpool_limits
 
-from bench.row import Row
+from bench.row import LAYOUT, Row, run
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
-from calibrator.drive import Channel, Drive, DriveFile
+from calibrator.drive import Channel, DriveFile
 from calibrator.drives.align import choose_inputs
 from calibrator.drives.store import list_drives, write_drive
 from calibrator.recordings.readers import read_recording
@@ -29,10 +30,9 @@ from calibrator.summaries.summarise_fleet import read_vehicle_summary
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout, split_signal
 
-__all__ = ["main", "rows"]
+__all__ = ["rows"]
 
 Result = TypeVar("Result")
-LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 PLAN = FleetPlan(vehicles=1, currents=3, sparsity=80.0, magnitude=(0.05, 0.25), delay_max_s=0.1)
 MINUTES, QUICK_MINUTES = 10.0, 3.0
 """Of the log. [min]"""
@@ -42,13 +42,6 @@ TIME_STAMP_S = 1e-5
 """Log formats differ by less. [s]"""
 STORE_PERIOD_S = 0.1
 """Of the samples in the drive store. [s]"""
-
-
-def main() -> None:
-    """Print one line per row."""
-    for row in rows(quick=False):
-        ratio = "" if row.ratio is None else f", {row.ratio:.1f} times {row.peer}"
-        print(f"{row.name}: {row.value:.3g} {row.unit}{ratio}")
 
 
 def rows(*, quick: bool) -> list[Row]:
@@ -65,34 +58,29 @@ def rows(*, quick: bool) -> list[Row]:
         Frames per second of a log of each format, and hours of driving summarised per second from the same logs, from a
         drive store, and what unpacking the candump log alone would allow.
     """
-    database = read_database(read_layout(LAYOUT))
-    with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
-        log = _candump_log(Path(folder), database, QUICK_MINUTES if quick else MINUTES)
+    database, minutes = read_database(read_layout(LAYOUT)), QUICK_MINUTES if quick else MINUTES
+    with tempfile.TemporaryDirectory() as place, threadpool_limits(1):
+        folder, trips = Path(place), BuiltinTrips(seed=0, duration_s=60.0 * minutes, unseen_s=60.0)
+        simulate_fleet(PLAN, trips, database, folder / "fleet", workers=1)
+        (packed,) = (folder / "fleet" / "logs").glob("*/*.log.gz")
+        log = folder / "drive.log"
+        log.write_bytes(gzip.decompress(packed.read_bytes()))
         logs = {"BLF": _as(log, ".blf"), "candump": log, "ASC": _as(log, ".asc"), "MF4": _as(log, ".mf4")}
         found = [_log_row(name, path, database) for name, path in logs.items()]
-        logs["candump.gz"] = packed = log.with_suffix(".log.gz")
-        packed.write_bytes(gzip.compress(log.read_bytes()))
-        recording = read_recording(log, database, vehicle="V", name="d")
-        hours = recording.drive.duration_s / 3600.0
+        logs["candump.gz"] = packed
         del logs["candump"]
         for name, path in logs.items():
             entry = DriveFile(vehicle="V", name="d", place=str(path))
             found.append(_summary_row(f"{name} log to summary", entry, ("battery", "motor", "auxiliary"), database))
+        drive = read_recording(log, database, vehicle="V", name="d").drive
         seconds = _best(lambda: gzip.decompress(packed.read_bytes()), READINGS)[1]
-        found.append(Row(name="candump.gz unpacked, nothing else", value=hours / seconds, unit="h/s"))
-        write_drive(Path(folder) / "store", _two_branches(recording.drive), database.layout)
-        (entry,) = list_drives(Path(folder) / "store")
-        name = "drive of a store (10 Hz, 2 branches) to summary"
-        return [*found, _summary_row(name, entry, ("battery", "motor"), database)]
-
-
-def _candump_log(folder: Path, database: VehicleDatabase, minutes: float) -> Path:
-    trips = BuiltinTrips(seed=0, duration_s=60.0 * minutes, unseen_s=60.0)
-    simulate_fleet(PLAN, trips, database, folder / "fleet", workers=1)
-    (packed,) = (folder / "fleet" / "logs").glob("*/*.log.gz")
-    log = folder / "drive.log"
-    log.write_bytes(gzip.decompress(packed.read_bytes()))
-    return log
+        found.append(Row(name="candump.gz unpacked, nothing else", value=drive.duration_s / 3600 / seconds, unit="h/s"))
+        thin = {name: _thinned(channel) for name, channel in (drive.branches | drive.inputs).items()}
+        two = {name: thin[name] for name in ("battery", "motor")}
+        inputs = {name: thin[name] for name in drive.inputs}
+        write_drive(folder / "store", replace(drive, branches=two, inputs=inputs), database.layout)
+        (entry,) = list_drives(folder / "store")
+        return [*found, _summary_row("drive of a store (10 Hz, 2 branches) to summary", entry, tuple(two), database)]
 
 
 def _as(log: Path, suffix: str) -> Path:
@@ -105,74 +93,49 @@ def _as(log: Path, suffix: str) -> Path:
     return path
 
 
+def _thinned(channel: Channel) -> Channel:
+    """Ten samples a second."""
+    step = max(round(STORE_PERIOD_S / float(np.median(np.diff(channel.time_s)))), 1)
+    return Channel(time_s=channel.time_s[::step], value=channel.value[::step], good=channel.good[::step])
+
+
 def _log_row(name: str, path: Path, database: VehicleDatabase) -> Row:
-    """Frames per second of a log file."""
+    """Frames per second of a log file; refused if both ways give different results."""
     recording, seconds = _best(lambda: read_recording(path, database, vehicle="V", name="d"), READINGS)
-    channels, peer_seconds = _best(lambda: _message_by_message(path, database), 1)
-    _require_equal({**recording.drive.branches, **recording.drive.inputs}, channels)
+    others, peer_seconds = _best(lambda: _message_by_message(path, database), 1)
+    for channel_name, channel in (recording.drive.branches | recording.drive.inputs).items():
+        time_s, value = others[channel_name]
+        np.testing.assert_allclose(channel.time_s, time_s, atol=TIME_STAMP_S, rtol=0.0, err_msg=channel_name)
+        np.testing.assert_allclose(channel.value, value, rtol=1e-12, err_msg=channel_name)
     frames = recording.report.frames
+    peer = f"python-can and cantools message by message, {frames / peer_seconds:.3g} frames/s"
     return Row(
-        name=f"{name} log to drive",
-        value=frames / seconds,
-        unit="frames/s",
-        peer=f"python-can and cantools message by message, {frames / peer_seconds:.3g} frames/s",
-        ratio=peer_seconds / seconds,
+        name=f"{name} log to drive", value=frames / seconds, unit="frames/s", peer=peer, ratio=peer_seconds / seconds
     )
 
 
-def _message_by_message(path: Path, database: VehicleDatabase) -> dict[str, Channel]:
-    """The same channels as most programs make them."""
+def _message_by_message(path: Path, database: VehicleDatabase) -> dict[str, tuple[Any, Any]]:
+    """Times [s] and values of the same channels as most programs make them."""
     layout = database.layout
     signals = {branch.name: (branch.source, branch.sign) for branch in layout.branch}
     signals |= {item.name: (item.signal, 1) for item in layout.input}
-    names: dict[int, list[tuple[str, str]]] = {}
-    for name, (source, _) in signals.items():
+    wanted: dict[int, list[tuple[str, str, int]]] = {}
+    for name, (source, sign) in signals.items():
         message, signal = split_signal(source)
-        names.setdefault(database.message(message).frame_id, []).append((name, signal))
-    times: dict[int, list[float]] = {frame_id: [] for frame_id in names}
+        wanted.setdefault(database.message(message).frame_id, []).append((name, signal, sign))
+    times: dict[int, list[float]] = {frame_id: [] for frame_id in wanted}
     values: dict[str, list[float]] = {name: [] for name in signals}
     decode: Any = database.databases[""].decode_message
     with can.LogReader(path) as reader:
         for frame in reader:
-            wanted = names.get(frame.arbitration_id)
-            if wanted is None:
-                continue
-            times[frame.arbitration_id].append(frame.timestamp)
-            decoded = decode(frame.arbitration_id, frame.data, decode_choices=False)
-            for name, signal in wanted:
-                values[name].append(decoded[signal])
-    start_s = min(min(stamps) for stamps in times.values() if stamps)
-    found = {name: frame_id for frame_id, pairs in names.items() for name, _ in pairs if times[frame_id]}
-    return {
-        name: Channel(
-            time_s=np.array(times[frame_id]) - start_s,
-            value=signals[name][1] * np.array(values[name]),
-            good=np.full(len(values[name]), fill_value=True),
-        )
-        for name, frame_id in found.items()
-    }
-
-
-def _require_equal(channels: Mapping[str, Channel], others: Mapping[str, Channel]) -> None:
-    """Refuse to compare ways that give different results."""
-    for name, channel in channels.items():
-        other = others[name]
-        np.testing.assert_allclose(channel.time_s, other.time_s, atol=TIME_STAMP_S, rtol=0.0, err_msg=name)
-        np.testing.assert_allclose(channel.value, other.value, rtol=1e-12, err_msg=name)
-
-
-def _two_branches(drive: Drive) -> Drive:
-    """Battery and motor of a drive, ten samples a second."""
-
-    def thinned(channel: Channel) -> Channel:
-        step = max(round(STORE_PERIOD_S / float(np.median(np.diff(channel.time_s)))), 1)
-        return Channel(time_s=channel.time_s[::step], value=channel.value[::step], good=channel.good[::step])
-
-    return replace(
-        drive,
-        branches={name: thinned(drive.branches[name]) for name in ("battery", "motor")},
-        inputs={name: thinned(channel) for name, channel in drive.inputs.items()},
-    )
+            if frame.arbitration_id in wanted:
+                times[frame.arbitration_id].append(frame.timestamp)
+                decoded = decode(frame.arbitration_id, frame.data, decode_choices=False)
+                for name, signal, sign in wanted[frame.arbitration_id]:
+                    values[name].append(sign * decoded[signal])
+    start_s = min(stamps[0] for stamps in times.values() if stamps)
+    return {name: (np.array(times[frame_id]) - start_s, np.array(values[name]))
+            for frame_id, items in wanted.items() for name, *_ in items if times[frame_id]}  # fmt: skip
 
 
 def _summary_row(name: str, entry: DriveFile, branches: tuple[str, ...], database: VehicleDatabase) -> Row:
@@ -184,8 +147,8 @@ def _summary_row(name: str, entry: DriveFile, branches: tuple[str, ...], databas
     return Row(name=name, value=drive.duration_s / 3600.0 / seconds, unit="h/s")
 
 
-def _best(measured: "Callable[[], Result]", repetitions: int) -> "tuple[Result, float]":
-    """Result of a call and the least processor time it took. [s]"""
+def _best(measured: Callable[[], Result], repetitions: int) -> tuple[Result, float]:
+    """Result of a call and the least processor time it took, of those that it waited for too. [s]"""
     seconds = []
     for _ in range(repetitions):
         start = _processor_s()
@@ -195,10 +158,11 @@ def _best(measured: "Callable[[], Result]", repetitions: int) -> "tuple[Result, 
 
 
 def _processor_s() -> float:
-    """Processor time of this process and of those that it waited for; finer than the ticks of os.times. [s]"""
+    """Processor time of this process, of those that it waited for, and of those that still run. [s]"""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(each.ru_utime + each.ru_stime for each in used)
+    living = [child.cpu_times() for child in psutil.Process().children(recursive=True)]
+    return sum(each.ru_utime + each.ru_stime for each in used) + sum(each.user + each.system for each in living)
 
 
 if __name__ == "__main__":
-    main()
+    run(rows)

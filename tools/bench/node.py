@@ -1,4 +1,4 @@
-"""The node: time per frame, start, memory and load of its process, beside its peers in the same run.
+"""The node: time per frame, start and memory of its process, beside its peers in the same run.
 
 Work per frame is measured without a bus. ``ecu-node run`` runs in a process of its own on the virtual bus, whose thread
 beside it is :mod:`bench.node_child`. Rates and latencies on SocketCAN: :mod:`bench.node_socketcan`.
@@ -10,53 +10,34 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from statistics import median
-from typing import cast
+from typing import Any
 
-from bench.node_child import Seen
 from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle, plain_job
-from bench.row import Row
+from bench.row import Row, run
 from ecu_node.bus.wiring import Mode
-from ecu_node.parameters import write_parameters
 
-__all__ = ["command_line", "core_rows", "process_rows", "rows"]
+__all__ = ["core_rows", "process_rows", "rows"]
 
 ROOT = Path(__file__).parents[2]
-TOOLS_ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"}
+ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}"}
 NO_KERNEL = 2
 """Exit code of tools/with_vcan where there is no SocketCAN."""
 ONE_CODE_A = 0.1
 """cantools rounds halves to even codes, the node upwards. [A]"""
-FULL_BUS_HZ = 24_316.0
-"""Frames of 8 bytes on a full CAN FD bus of 1 and 8 Mbit/s."""
 STARTS = 5
 """Of which the median counts."""
-SHORT = 15
-"""Frames that are enough to see the start."""
-MEBIBYTE = 1024.0**2
+SHORT, ROUND = 15, 150
+"""Frames that are enough to see the start; and until they come round again in a process."""
 
 
 def rows(*, quick: bool) -> list[Row]:
-    """Measure.
-
-    Parameters
-    ----------
-    quick : bool
-        Whether few frames are enough.
-
-    Returns
-    -------
-    list of Row
-        All figures of the node; without those of SocketCAN where there is none, which is said on standard error.
-    """
+    """Measure; figures of SocketCAN are left out where there is none, which is said on standard error."""
     found = core_rows(20 if quick else 100) + process_rows(100_000 if quick else 10_000_000)
-    command = [sys.executable, "-m", "bench.node_socketcan", "--frames", "1000" if quick else "10000", "--json"]
-    done = subprocess.run(
-        [ROOT / "tools" / "with_vcan", *command],
-        capture_output=True, text=True, check=False, cwd=ROOT, env=TOOLS_ENVIRONMENT,
-    )  # fmt: skip
+    words = ("-m", "bench.node_socketcan", "--frames", "1000" if quick else "10000", "--json")
+    command = [ROOT / "tools" / "with_vcan", sys.executable, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT, env=ENVIRONMENT)
     if done.returncode == NO_KERNEL:
         print(f"bench: no rows of SocketCAN: {done.stderr.strip()}", file=sys.stderr, flush=True)
         return found
@@ -78,51 +59,37 @@ def core_rows(repeats: int) -> list[Row]:
     list of Row
         Time per frame.
     """
+    found = []
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
-        vehicle = make_vehicle(Path(folder), numbered=False)
-        return [_core_row(vehicle, mode, repeats) for mode in Mode]
-
-
-def _core_row(vehicle: BenchVehicle, mode: Mode, repeats: int) -> Row:
-    _require_equal(vehicle, mode)
-    sources, job, frames = vehicle.corrector(mode).sources, plain_job(vehicle, mode), vehicle.frames
-
-    def node() -> None:  # as the loop over a bus hands them to the core
-        find, key, overlay = sources.get, (IDENTIFIER, False), mode is Mode.OVERLAY
-        for payload in frames:
-            source = find(key)
-            if source is not None:
-                if overlay:
-                    source.answer(payload, 0.0)
-                else:
-                    source.forward(payload, 0.0)
-
-    def plain() -> None:
-        for payload in frames:
-            job(payload)
-
-    both = [(_timed_s(node), _timed_s(plain)) for _ in range(repeats)]
-    per_frame_s, peer_s = (min(times) / len(frames) for times in zip(*both, strict=True))
-    return Row(
-        name=f"branch frame, {mode.name.lower()}, two currents and P01, no bus",
-        value=1e6 * per_frame_s,
-        unit="us",
-        peer=f"cantools decode and encode, {1e6 * peer_s:.1f} us",
-        ratio=peer_s / per_frame_s,
-    )
-
-
-def _timed_s(run: Callable[[], None]) -> float:
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start
+        vehicle = make_vehicle(Path(folder))
+    for mode in Mode:
+        _require_equal(vehicle, mode)
+        sources, job = vehicle.corrector(mode).sources, plain_job(vehicle, mode)
+        times: list[tuple[float, float]] = []
+        for _ in range(repeats):
+            start_s = time.perf_counter()
+            for payload in vehicle.frames:  # as the loop over a bus hands them to the core
+                source = sources.get((IDENTIFIER, False))  # type: ignore[call-overload]
+                if source is not None:
+                    if mode is Mode.OVERLAY:
+                        source.answer(payload, 0.0)
+                    else:
+                        source.forward(payload, 0.0)
+            middle_s = time.perf_counter()
+            for payload in vehicle.frames:
+                job(payload)
+            times.append((middle_s - start_s, time.perf_counter() - middle_s))
+        ours_us, peer_us = (1e6 * min(some) / len(vehicle.frames) for some in zip(*times, strict=True))
+        name = f"branch frame, {mode.name.lower()}, two currents and P01, no bus"
+        peer = f"cantools decode and encode, {peer_us:.1f} us"
+        found.append(Row(name=name, value=ours_us, unit="us", peer=peer, ratio=peer_us / ours_us))
+    return found
 
 
 def _require_equal(vehicle: BenchVehicle, mode: Mode) -> None:
     """Refuse to compare ways that give different results."""
     message = vehicle.database.message("Pair" if mode is Mode.GATEWAY else "PairOut")
-    job = plain_job(vehicle, mode)
-    others = [bytes(payload) for payload in map(job, vehicle.frames) if payload is not None]
+    others = [payload for payload in map(plain_job(vehicle, mode), vehicle.frames) if payload is not None]
     for ours, other in zip(vehicle.corrected(mode), others, strict=True):
         a, b = message.decode_simple(ours), message.decode_simple(other)
         for name in a.keys() - {"Crc"}:  # which follows from the others
@@ -132,87 +99,42 @@ def _require_equal(vehicle: BenchVehicle, mode: Mode) -> None:
 
 
 def process_rows(frames: int) -> list[Row]:
-    """Start, memory and processor time of a real ``ecu-node run``.
-
-    Parameters
-    ----------
-    frames : int
-        After how many the memory is read.
-
-    Returns
-    -------
-    list of Row
-        Time to the first corrected frame, memory at the start and at the end, processor time.
-    """
+    """Time to the first corrected frame and memory of a real ``ecu-node run``, after so many frames."""
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
-        vehicle = make_vehicle(Path(folder), numbered=True)
-        write_parameters(vehicle.parameters, Path(folder) / "params.json")
+        vehicle = make_vehicle(Path(folder))
         starts = [_watched(vehicle, SHORT) for _ in range(STARTS)]
         long = _watched(vehicle, frames)
-    if long["wrong"] or long["frames"] != frames or long["modules"]:
+    if long["wrong"] or long["received"] != frames or long["heavy_modules"] or long["code"]:
         raise RuntimeError(f"the node's process is not what it should be: {long}")
     label = "ecu-node run, gateway on the virtual bus"
-    after = f"{label}: memory after {frames:,} frames"
-    extras = f"{long['extras_bytes'] / MEBIBYTE:.1f} MiB of which belong to the thread, bus and frames beside it"
+    extras = f"{long['beside_mib'] - long['ready_mib']:.1f} MiB of which belong to the thread, bus and frames beside it"
+    after, growth = f"{label}: memory after {frames:,} frames, {extras}", long["end_mib"] - long["beside_mib"]
     return [
         Row(name=f"{label}: process to first corrected frame", value=median(s["start_s"] for s in starts), unit="s"),
         Row(name=f"{label}: process to ready", value=median(s["ready_s"] for s in starts), unit="s"),
-        Row(name=f"{label}: memory when ready", value=long["ready_bytes"] / MEBIBYTE, unit="MiB"),
-        Row(name=f"{after}, {extras}", value=long["end_bytes"] / MEBIBYTE, unit="MiB"),
-        Row(name=f"{label}: peak memory, the same included", value=long["peak_bytes"] / MEBIBYTE, unit="MiB"),
-        Row(
-            name=f"{label}: growth from the first frame to the last",
-            value=(long["end_bytes"] - long["ready_bytes"] - long["extras_bytes"]) / MEBIBYTE,
-            unit="MiB",
-        ),
-        Row(
-            name=f"{label}: share of a core at {FULL_BUS_HZ:.0f} frames/s, a full CAN FD bus",
-            value=100.0 * FULL_BUS_HZ * long["cpu_s"] / frames,
-            unit="%",
-        ),
+        Row(name=after, value=long["end_mib"], unit="MiB"),
+        Row(name=f"{label}: growth from the first frame to the last", value=growth, unit="MiB"),
     ]
 
 
-def command_line(vehicle: BenchVehicle, *options: str) -> list[str]:
-    """Arguments of ``ecu-node`` for a vehicle whose parameters stand beside its layout."""
-    layout = vehicle.database.layout.path
-    return ["run", "--unsigned", "--params", str(layout.parent / "params.json"), "--layout", str(layout), *options]
-
-
-def _watched(vehicle: BenchVehicle, frames: int) -> Seen:
-    """Start a node in a process of its own, let it correct frames, and end it.
-
-    Parameters
-    ----------
-    vehicle : BenchVehicle
-        Whose frames are sent; ``params.json`` stands beside its layout.
-    frames : int
-        How many are sent.
-
-    Returns
-    -------
-    Seen
-        What the thread beside the node saw.
-
-    Raises
-    ------
-    RuntimeError
-        If the node did not do its work.
-    """
+def _watched(vehicle: BenchVehicle, frames: int) -> dict[str, Any]:
+    """Start a node in a process of its own, let it correct frames, and end it; what was seen."""
     channels = ["node in", "node out"]
     job = {
-        "arguments": command_line(
-            vehicle, "--interface", "virtual", "--channel", channels[0], "--gateway", channels[1]
-        ),
+        "arguments": vehicle.command("--interface", "virtual", "--channel", channels[0], "--gateway", channels[1]),
         "channels": channels,
         "identifier": IDENTIFIER,
-        "frames": [frame.hex() for frame in vehicle.frames[:150]],
-        "expected": [frame.hex() for frame in vehicle.corrected(Mode.GATEWAY)[:150]],
+        "frames": [frame.hex() for frame in vehicle.frames[:ROUND]],
+        "expected": [frame.hex() for frame in vehicle.corrected(Mode.GATEWAY)[:ROUND]],
         "count": frames,
         "created_s": time.monotonic(),
     }
     command = [sys.executable, "-m", "bench.node_child", json.dumps(job)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=TOOLS_ENVIRONMENT)
-    if done.returncode or "frames" not in done.stdout:
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=ENVIRONMENT)
+    if done.returncode or "received" not in done.stdout:
         raise RuntimeError(f"the node did not run: {done.stdout}{done.stderr}")
-    return cast("Seen", json.loads(done.stdout))
+    return dict(json.loads(done.stdout))
+
+
+if __name__ == "__main__":
+    run(rows)

@@ -1,18 +1,16 @@
 """The node as a process on SocketCAN, beside other ways from vcan0 to vcan1: run with ``tools/with_vcan``.
 
     PYTHONPATH=tools tools/with_vcan python -m bench.node_socketcan --frames 20000
-    python -m bench.node_socketcan --peer bare|plain CHANNEL_IN CHANNEL_OUT    one of the other ways, until it is ended
 
 Compared are ``ecu-node run --gateway``, a program in C that does the same, a python-can loop that only receives and
-sends, the plain version with Notifier and cantools, and the kernel's own gateway (cangw), which changes nothing. One
-raw socket sends, another one receives and compares each frame, both many frames at a time, so that what is measured is
-what is between them. Where this runs on user-mode-linux a system call costs ten times more than on a bare machine, and
-all share one processor: the ratios count there, not the rates.
+sends, and the plain version with Notifier and cantools. One raw socket sends, another one receives and compares each
+frame, both many frames at a time, so that what is measured is what is between them. Where this runs on user-mode-linux
+a system call costs ten times more than on a bare machine, and all share one processor: the ratios count there, not the
+rates.
 """
 
 import argparse
 import json
-import os
 import shutil
 import signal
 import socket
@@ -21,21 +19,18 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from statistics import median, quantiles
 
 import can
 
 from bench.c_core import CORE
-from bench.node import MEBIBYTE, command_line
 from bench.node_vehicle import IDENTIFIER, BenchVehicle, make_vehicle, plain_job
-from bench.row import Row
+from bench.row import Row, show
 from calibrator.export.core import Checked, c_text
 from ecu_node.bus.steady_bus import SocketCanLink
 from ecu_node.bus.wiring import Mode
-from ecu_node.parameters import write_parameters
 
 __all__ = ["rows"]
 
@@ -45,6 +40,7 @@ ROUNDS = 3
 WINDOW = 64
 """Frames that are on their way at most: a socket's buffer holds some hundreds."""
 PATIENCE_S = 60.0
+WHAT = ("rate, frames/s", "latency, median, us", "latency, 99.9 %, us")
 QUIET_S = 0.5
 """When no frame comes for this long none is on its way. [s]"""
 LATENCY_SHARE = 10
@@ -52,83 +48,51 @@ LATENCY_SHARE = 10
 
 
 def rows(frames: int) -> list[Row]:
-    """Measure.
-
-    Parameters
-    ----------
-    frames : int
-        Sent through each of the ways, in each of the rounds.
-
-    Returns
-    -------
-    list of Row
-        Rate, latency, processor time, start and memory of each.
-    """
+    """Measure rate and latencies of each of the ways, by so many frames in each of the rounds."""
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
-        vehicle = make_vehicle(Path(folder), numbered=True)
-        write_parameters(vehicle.parameters, Path(folder) / "params.json")
-        same = [bytes(payload) for payload in vehicle.frames]
+        vehicle, python = make_vehicle(Path(folder)), [sys.executable, "-m"]
+        corrected = vehicle.corrected(Mode.GATEWAY)
         plain = [bytes(found) for found in map(plain_job(vehicle, Mode.GATEWAY), vehicle.frames) if found is not None]
-        node = command_line(vehicle, "--interface", "socketcan", "--channel", IN, "--gateway", OUT)
-        python = [sys.executable, "-m"]
-        peer = [*python, "bench.node_socketcan", "--peer"]
-        in_c = [str(_compiled_gateway(vehicle, Path(folder))), IN, OUT]
-        ways: dict[str, Callable[[], dict[str, float]]] = {
-            "cangw": lambda: _kernel(vehicle, same, frames),
-            "bare loop": lambda: _process([*peer, "bare", IN, OUT], vehicle, same, frames),
-            "plain": lambda: _process([*peer, "plain", IN, OUT], vehicle, plain, frames),
-            "C": lambda: _process(in_c, vehicle, vehicle.corrected(Mode.GATEWAY), frames),
-            "ecu-node": lambda: _process(
-                [*python, "ecu_node", *node], vehicle, vehicle.corrected(Mode.GATEWAY), frames
-            ),
+        node = vehicle.command("--interface", "socketcan", "--channel", IN, "--gateway", OUT)
+        ways = {
+            "bare loop": ([*python, "bench.node_socketcan", "--peer", "bare"], [bytes(x) for x in vehicle.frames]),
+            "plain": ([*python, "bench.node_socketcan", "--peer", "plain"], plain),
+            "C": ([str(_compiled_gateway(vehicle, Path(folder))), IN, OUT], corrected),
+            "ecu-node": ([*python, "ecu_node", *node], corrected),
         }
-        rounds = [{name: way() for name, way in ways.items()} for _ in range(ROUNDS)]
-    seen = {name: _best([found[name] for found in rounds]) for name in ways}
-    return [row for name, figures in seen.items() for row in _rows(name, figures, seen["ecu-node"])]
+        rounds = [{name: _measured(*way, vehicle, frames) for name, way in ways.items()} for _ in range(ROUNDS)]
+    best = {
+        name: {what: (max if what == "rate, frames/s" else min)(found[name][what] for found in rounds) for what in WHAT}
+        for name in ways
+    }
+    found = []
+    for name, figures in best.items():
+        for what, value in figures.items():
+            (label, _, unit), ours = what.rpartition(", "), best["ecu-node"][what]
+            peer, ratio = (
+                f"as the peer of ecu-node, {ours:.3g} {unit}",
+                value / ours if label == "rate" else ours / value,
+            )
+            if name == "ecu-node":
+                peer = ratio = None
+            found.append(Row(name=f"SocketCAN, {name}: {label}", value=value, unit=unit, peer=peer, ratio=ratio))
+    return found
 
 
-def _best(figures: list[dict[str, float]]) -> dict[str, float]:
-    """The best of each figure: the highest rate, the least of all others."""
-    return {what: (max if what.startswith("rate") else min)(found[what] for found in figures) for what in figures[0]}
-
-
-def _rows(name: str, figures: dict[str, float], node: dict[str, float]) -> Iterator[Row]:
-    for what, value in figures.items():
-        label, _, unit = what.rpartition(", ")
-        peer = ratio = None
-        if name != "ecu-node" and label != "memory" and what in node:
-            ours = node[what]
-            peer = f"as the peer of ecu-node, {ours:.3g} {unit}"
-            ratio = value / ours if label == "rate" else ours / value
-        yield Row(name=f"SocketCAN, {name}: {label}", value=value, unit=unit, peer=peer, ratio=ratio)
-
-
-def _kernel(vehicle: BenchVehicle, expected: list[bytes], frames: int) -> dict[str, float]:
-    subprocess.run(["cangw", "-A", "-s", IN, "-d", OUT, "-e"], check=True)
-    try:
-        with _line(vehicle, expected) as line:
-            return line.measured(frames)
-    finally:
-        subprocess.run(["cangw", "-F"], check=True)
-
-
-def _process(command: list[str], vehicle: BenchVehicle, expected: list[bytes], frames: int) -> dict[str, float]:
-    with _line(vehicle, expected) as line:
-        start_s = time.monotonic()
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+def _measured(command: list[str], expected: list[bytes], vehicle: BenchVehicle, frames: int) -> dict[str, float]:
+    """Rate and latencies of a process between the two buses; frames must arrive in order and all."""
+    kind, quiet = (socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW), subprocess.DEVNULL
+    with socket.socket(*kind) as near, socket.socket(*kind) as far:
+        near.bind((IN,))
+        far.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", IDENTIFIER, socket.CAN_SFF_MASK))
+        far.bind((OUT,))
+        line = _Line(near, far, vehicle, expected)
+        with subprocess.Popen(command, stdout=quiet, stderr=quiet) as process:
             try:
                 line.wait_for_first(lambda: process.poll() is None)
-                begin_s = time.monotonic() - start_s
-                line.let_run_dry()
-                before_s = _cpu_s(process.pid)
-                figures = line.measured(frames)
-                all_frames = frames + frames // LATENCY_SHARE
-                figures["CPU per 10^6 frames, s"] = 1e6 * (_cpu_s(process.pid) - before_s) / all_frames
-                figures["start to first frame, s"] = begin_s
-                figures["memory, MiB"] = _resident_bytes(process.pid) / MEBIBYTE
+                return line.measured(frames)
             finally:
                 process.terminate()
-    return figures
 
 
 class _Line:
@@ -167,38 +131,30 @@ class _Line:
         while True:
             self.send()
             if self.receive(0.01) is not None:
+                while self.receive(QUIET_S) is not None:  # what is still on its way
+                    pass
                 return
             if not lives() or time.monotonic() > give_up_s:
                 raise RuntimeError("nothing passes the frames on")
 
-    def let_run_dry(self) -> None:
-        """Receive what is still on its way."""
-        while self.receive(QUIET_S) is not None:
-            pass
-
     def measured(self, frames: int) -> dict[str, float]:
         """Rate and latencies; frames must arrive in order and all."""
         received = first = self._sent
-        start_s = time.monotonic()
+        start_s, latencies_s = time.monotonic(), []
         while received < first + frames:
             if self._sent - received <= WINDOW // 2 and self._sent < first + frames:
                 self.send(min(received + WINDOW, first + frames) - self._sent)
             self._require(received)
             received += 1
         per_frame_s = (time.monotonic() - start_s) / frames
-        latencies_s = []
         for _ in range(frames // LATENCY_SHARE):
             time.sleep(0.001)
             start_s = time.monotonic()
             self.send()
             self._require(self._sent - 1)
             latencies_s.append(time.monotonic() - start_s)
-        return {
-            "rate, frames/s": 1.0 / per_frame_s,
-            "latency, median, us": 1e6 * median(latencies_s),
-            "latency, 99 %, us": 1e6 * quantiles(latencies_s, n=100, method="inclusive")[98],
-            "latency, 99.9 %, us": 1e6 * quantiles(latencies_s, n=1000, method="inclusive")[998],
-        }
+        slow_us = 1e6 * quantiles(latencies_s, n=1000, method="inclusive")[998]
+        return dict(zip(WHAT, (1.0 / per_frame_s, 1e6 * median(latencies_s), slow_us), strict=True))
 
     def _require(self, number: int) -> None:
         found = self.receive(PATIENCE_S)
@@ -206,37 +162,27 @@ class _Line:
             raise RuntimeError(f"frame {found} arrived, expected {number % len(self._frames)}")
 
 
-@contextmanager
-def _line(vehicle: BenchVehicle, expected: list[bytes]) -> Iterator[_Line]:
-    kind = socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW
-    with socket.socket(*kind) as near, socket.socket(*kind) as far:
-        near.bind((IN,))
-        far.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", IDENTIFIER, socket.CAN_SFF_MASK))
-        far.bind((OUT,))
-        yield _Line(near, far, vehicle, expected)
-
-
 def _compiled_gateway(vehicle: BenchVehicle, folder: Path) -> Path:
     """The program in C, ``gateway CHANNEL_IN CHANNEL_OUT``: the C core with the vehicle's calibration."""
-    checked = Checked(name="params", digest="0" * 64, parameters=vehicle.parameters, database=vehicle.database)
+    checked = Checked(name="params", digest="0" * 64, parameters=vehicle.in_force.parameters, database=vehicle.database)
     (folder / "hv_calibration.c").write_text(c_text(checked))
     sources = [Path(__file__).with_name("node_gateway.c"), folder / "hv_calibration.c", CORE / "hv_correction.c"]
     subprocess.run([shutil.which("gcc") or "gcc", "-O2", f"-I{CORE}", *sources, "-o", folder / "gateway"], check=True)
     return folder / "gateway"
 
 
-def _pass_on(kind: str, source: str, target: str) -> None:
+def _pass_on(kind: str) -> None:
     """The loop that receives and sends, or the plain version."""
     with (
-        can.Bus(source, "socketcan", ignore_config=True) as receiving,
-        can.Bus(target, "socketcan", ignore_config=True) as sending,
+        can.Bus(IN, "socketcan", ignore_config=True) as receiving,
+        can.Bus(OUT, "socketcan", ignore_config=True) as sending,
         tempfile.TemporaryDirectory(prefix="bench-") as folder,
     ):
         while kind == "bare":
             message = receiving.recv()
             if message is not None:
                 sending.send(message)
-        job = plain_job(make_vehicle(Path(folder), numbered=True), Mode.GATEWAY)
+        job = plain_job(make_vehicle(Path(folder)), Mode.GATEWAY)
 
         def on_message(message: can.Message) -> None:
             data = job(message.data) if message.arbitration_id == IDENTIFIER else message.data
@@ -248,33 +194,20 @@ def _pass_on(kind: str, source: str, target: str) -> None:
             signal.pause()
 
 
-def _cpu_s(process: int) -> float:
-    """Processor time of a process so far. [s]"""
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / float(os.sysconf("SC_CLK_TCK"))
-
-
-def _resident_bytes(process: int) -> float:
-    return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * float(os.sysconf("SC_PAGE_SIZE"))
-
-
 def main() -> None:
     """Measure and print one line per row, or JSON."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--frames", type=int, default=20_000)
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--peer", nargs=3, metavar=("KIND", "CHANNEL_IN", "CHANNEL_OUT"), help="bare or plain")
+    parser.add_argument("--peer", choices=("bare", "plain"), help="be one of the other ways, until it is ended")
     arguments = parser.parse_args()
     if arguments.peer:
-        _pass_on(*arguments.peer)
-    if shutil.which("cangw") is None:
-        parser.exit(2, "cangw is not installed: apt-get install can-utils\n")
+        _pass_on(arguments.peer)
     found = rows(arguments.frames)
     if arguments.json:
         print(json.dumps([vars(row) for row in found]))
     else:
-        for row in found:
-            print(f"{row.name}: {row.value:.4g} {row.unit}")
+        show(found)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 Beside it the node's work as most programs would do it: cantools decodes the message, cantools encodes it again.
 
 The true currents sum to zero and the parameters are those of the sensors' faults, so that the node has no reason to
-doubt its corrections, however long it runs. Nothing here needs numpy: it is loaded beside a node whose memory counts.
+doubt its corrections, however long it runs.
 """
 
 import math
@@ -19,20 +19,19 @@ from ecu_node.core.e2e import Check, Protection, Receiver, protection_of
 from ecu_node.core.status import Quality
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
-from ecu_node.parameters import BranchParameters, VehicleParameters
+from ecu_node.parameters import BranchParameters, write_parameters
 
-__all__ = ["FAULTS", "IDENTIFIER", "NUMBERS", "OUT_IDENTIFIER", "BenchVehicle", "PlainJob", "make_vehicle", "plain_job"]
+__all__ = ["IDENTIFIER", "BenchVehicle", "make_vehicle", "plain_job"]
 
-IDENTIFIER, OUT_IDENTIFIER = 0x100, 0x200
-"""Of the message with the currents, and of the one that answers it."""
+IDENTIFIER = 0x100
+"""Of the message with the currents."""
 NUMBERS = 1500
 """Frames until they come round again: a multiple of the 15 codes of the counter."""
 FAULTS = {"battery": (0.02, 3.0), "motor": (-0.03, 1.0)}
 """Drift [1] and offset [A] of the sensors, positive into the junction."""
-
 _AMPLITUDE_A = 200.0
-_STEPS_A = {"battery": 0.1, "motor": -0.05}
-_SIGNS = {"battery": 1, "motor": -1}
+_A_PER_CODE = {"battery": 0.1, "motor": 0.05}
+"""Into the junction."""
 
 _LAYOUT = """schema = 1
 name = "bench"
@@ -45,25 +44,21 @@ branch = [
 status = { message = "Status", state = "State", reason = "Reason" }
 e2e = { profile = "P01", messages = ["Pair", "PairOut", "Status"] }
 """
-_NUMBER = '\n SG_ Number : 48|16@1+ (1,0) [0|65535] "" Corrector'
-_DBC = """VERSION ""
-BU_: Sensor Corrector
+_HEADER = """ SG_ Crc : 0|8@1+ (1,0) [0|255] "" X
+ SG_ Counter : 8|4@1+ (1,0) [0|14] "" X
+"""
+_CURRENTS = """ SG_ Battery : 16|16@1- (0.1,0) [-3000|3000] "A" X
+ SG_ Motor : 32|16@1- (-0.05,0) [-1600|1600] "A" X
+"""
+_DBC = f"""VERSION ""
+BU_: Sensor Corrector X
 BO_ 256 Pair: 8 Sensor
- SG_ Crc : 0|8@1+ (1,0) [0|255] "" Corrector
- SG_ Counter : 8|4@1+ (1,0) [0|14] "" Corrector
- SG_ Battery : 16|16@1- (0.1,0) [-3000|3000] "A" Corrector
- SG_ Motor : 32|16@1- (-0.05,0) [-1600|1600] "A" Corrector{number}
+{_HEADER}{_CURRENTS} SG_ Number : 48|16@1+ (1,0) [0|65535] "" X
 BO_ 512 PairOut: 8 Corrector
- SG_ Crc : 0|8@1+ (1,0) [0|255] "" Sensor
- SG_ Counter : 8|4@1+ (1,0) [0|14] "" Sensor
- SG_ Battery : 16|16@1- (0.1,0) [-3000|3000] "A" Sensor
- SG_ Motor : 32|16@1- (-0.05,0) [-1600|1600] "A" Sensor
- SG_ Quality : 48|2@1+ (1,0) [0|3] "" Sensor
+{_HEADER}{_CURRENTS} SG_ Quality : 48|2@1+ (1,0) [0|3] "" X
 BO_ 513 Status: 8 Corrector
- SG_ Crc : 0|8@1+ (1,0) [0|255] "" Sensor
- SG_ Counter : 8|4@1+ (1,0) [0|14] "" Sensor
- SG_ State : 16|3@1+ (1,0) [0|7] "" Sensor
- SG_ Reason : 24|4@1+ (1,0) [0|15] "" Sensor
+{_HEADER} SG_ State : 16|3@1+ (1,0) [0|7] "" X
+ SG_ Reason : 24|4@1+ (1,0) [0|15] "" X
 VAL_ 256 Battery -32768 "SNA";
 VAL_ 512 Battery -32768 "SNA";
 VAL_ 512 Motor -32768 "SNA";
@@ -77,20 +72,20 @@ class BenchVehicle:
     Attributes
     ----------
     database : VehicleDatabase
-        Layout and DBC.
-    parameters : VehicleParameters
+        Layout and DBC; the parameters stand beside the layout, in ``params.json``.
+    in_force : InForce
         The true faults.
     frames : list of bytearray
         One round of payloads; the last is followed by the first. The last two bytes are the frame's number.
     """
 
     database: VehicleDatabase
-    parameters: VehicleParameters
+    in_force: InForce
     frames: list[bytearray]
 
     def corrector(self, mode: Mode) -> Corrector:
         """A node's core that corrects this vehicle."""
-        return wire(self.database, InForce(parameters=self.parameters), 0.0, mode=mode)
+        return wire(self.database, self.in_force, 0.0, mode=mode)
 
     def corrected(self, mode: Mode) -> list[bytes]:
         """What the node makes of one round of frames."""
@@ -100,57 +95,42 @@ class BenchVehicle:
         found = [source.forward(frame, 0.0) for frame in self.frames]
         return [bytes(payload) for payload in found if payload is not None]
 
+    def command(self, *options: str) -> list[str]:
+        """Arguments of ``ecu-node`` for it."""
+        layout = self.database.layout.path
+        return ["run", "--unsigned", "--params", f"{layout.parent}/params.json", "--layout", str(layout), *options]
 
-def make_vehicle(folder: Path, *, numbered: bool) -> BenchVehicle:
-    """Write layout and DBC, and make the frames.
+    def protection(self, name: str) -> Protection:
+        """End-to-end protection of a message."""
+        found = protection_of(self.database, self.database.message(name))
+        assert found is not None
+        return found
 
-    Parameters
-    ----------
-    folder : Path
-        Where ``bench.toml`` and ``bench.dbc`` are written.
-    numbered : bool
-        Whether the DBC has a signal for the frame's number; without it the frames have none.
 
-    Returns
-    -------
-    BenchVehicle
-        The vehicle.
-    """
-    (folder / "bench.dbc").write_text(_DBC.format(number=_NUMBER if numbered else ""))
+def make_vehicle(folder: Path) -> BenchVehicle:
+    """Write layout, DBC and parameters into a folder, and make the frames."""
+    (folder / "bench.dbc").write_text(_DBC)
     (folder / "bench.toml").write_text(_LAYOUT)
     database = read_database(read_layout(folder / "bench.toml"))
-    protection = protection_of(database, database.message("Pair"))
-    assert protection is not None
-    frames = []
-    for number in range(NUMBERS):
-        codes = _codes(_AMPLITUDE_A * math.sin(2.0 * math.pi * number / NUMBERS))
+    faults = {name: BranchParameters(drift=d, offset_a=o_a, apply=True) for name, (d, o_a) in FAULTS.items()}
+    parameters = true_parameters(database, faults)
+    write_parameters(parameters, folder / "params.json")
+    vehicle = BenchVehicle(database=database, in_force=InForce(parameters=parameters), frames=[])
+    protection = vehicle.protection("Pair")
+    for number in range(NUMBERS):  # this current flows from the battery into the motor
+        battery_a = _AMPLITUDE_A * math.sin(2.0 * math.pi * number / NUMBERS)
         payload = bytearray((0, number % protection.modulus))
-        payload += b"".join(code.to_bytes(2, "little", signed=True) for code in codes)
-        payload += (number if numbered else 0).to_bytes(2, "little")
+        for (name, (drift, offset_a)), current_a in zip(FAULTS.items(), (battery_a, -battery_a), strict=True):
+            code = round(((1.0 + drift) * current_a + offset_a) / _A_PER_CODE[name])
+            payload += code.to_bytes(2, "little", signed=True)
+        payload += number.to_bytes(2, "little")
         protection.seal(payload)
-        frames.append(payload)
-    faults = {
-        name: BranchParameters(drift=drift, offset_a=offset, apply=True) for name, (drift, offset) in FAULTS.items()
-    }
-    return BenchVehicle(database=database, parameters=true_parameters(database, faults), frames=frames)
+        vehicle.frames.append(payload)
+    return vehicle
 
 
-def _codes(current_a: float) -> list[int]:
-    """What the sensors send while this current flows from the battery into the motor."""
-    return [
-        round(sign * ((1.0 + FAULTS[name][0]) * sign * current_a + FAULTS[name][1]) / _STEPS_A[name])
-        for name, sign in _SIGNS.items()
-    ]
-
-
-PlainJob = Callable[[bytearray], bytearray | None]
-"""Takes the payload of a frame and makes the one to send; None if the frame is not used."""
-
-_USABLE = frozenset({Check.OK, Check.LOST})
-
-
-def plain_job(vehicle: BenchVehicle, mode: Mode) -> PlainJob:
-    """The work of one mode, with the node's own end-to-end protection.
+def plain_job(vehicle: BenchVehicle, mode: Mode) -> Callable[[bytearray], bytearray | None]:
+    """The work of one mode with cantools, and with the node's own end-to-end protection.
 
     Parameters
     ----------
@@ -162,53 +142,29 @@ def plain_job(vehicle: BenchVehicle, mode: Mode) -> PlainJob:
     Returns
     -------
     callable
-        The work of one frame.
+        Takes the payload of a frame and makes the one to send; None if the frame is not used.
     """
     (battery, battery_a), (motor, motor_a) = FAULTS.values()
-    database = vehicle.database
-    message, answer = database.message("Pair"), database.message("PairOut")
-    check = Receiver(_protection(vehicle, "Pair")).check
-    seal, advance = _protection(vehicle, "Pair").seal, _protection(vehicle, "PairOut").advance
+    message, answer = vehicle.database.message("Pair"), vehicle.database.message("PairOut")
+    check, count = Receiver(vehicle.protection("Pair")).check, -1
+    seal, advance = vehicle.protection("Pair").seal, vehicle.protection("PairOut").advance
 
-    def corrected(payload: bytearray) -> dict[str, Any]:
+    def job(payload: bytearray) -> bytearray | None:
+        nonlocal count
+        if check(payload) not in {Check.OK, Check.LOST}:
+            return None
         values: dict[str, Any] = message.decode(payload)  # type: ignore[arg-type, assignment]
         values["Battery"] = (values["Battery"] - battery_a) / (1.0 + battery)
         values["Motor"] = -(-values["Motor"] - motor_a) / (1.0 + motor)
-        return values
-
-    def rewrite(payload: bytearray) -> bytearray | None:
-        if check(payload) not in _USABLE:
-            return None
-        out = bytearray(message.encode(corrected(payload)))
-        seal(out)
-        return out
-
-    counter = -1
-
-    def fill(payload: bytearray) -> bytearray | None:
-        nonlocal counter
-        if check(payload) not in _USABLE:
-            return None
-        values = corrected(payload)
-        out = bytearray(
-            answer.encode(
-                {
-                    "Crc": 0,
-                    "Counter": counter % 15,
-                    "Battery": values["Battery"],
-                    "Motor": values["Motor"],
-                    "Quality": int(Quality.CORRECTED),
-                }
-            )
-        )
+        if mode is Mode.GATEWAY:
+            out = bytearray(message.encode(values))
+            seal(out)
+            return out
+        values |= {"Crc": 0, "Counter": count % 15, "Quality": int(Quality.CORRECTED)}
+        del values["Number"]
+        out = bytearray(answer.encode(values))
         advance(out)
-        counter += 1
+        count += 1
         return out
 
-    return rewrite if mode is Mode.GATEWAY else fill
-
-
-def _protection(vehicle: BenchVehicle, name: str) -> Protection:
-    found = protection_of(vehicle.database, vehicle.database.message(name))
-    assert found is not None
-    return found
+    return job

@@ -14,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.ingest import LAYOUT
-from bench.row import Row
+from bench.row import LAYOUT, Row, show
 from calibrator.artificial.simulate import FleetPlan, simulate_fleet
 from calibrator.artificial.trips import BuiltinTrips
 from calibrator.recordings.frames import read_frames
@@ -26,21 +25,14 @@ from ecu_node.core.signals import FrameKey
 from ecu_node.database import VehicleDatabase, read_database
 from ecu_node.layout import read_layout
 
-__all__ = ["main", "rows"]
+__all__ = ["rows"]
 
-
-def main() -> None:
-    """Print one line per row."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--vehicles", type=int, default=24)
-    parser.add_argument("--minutes", type=float, default=20.0)
-    options = parser.parse_args()
-    for row in rows(vehicles=options.vehicles, minutes=options.minutes):
-        print(f"{row.name}: {row.value:.3g} {row.unit}")
+FEWEST = 8
+"""Vehicles that are calibrated."""
 
 
 def rows(*, vehicles: int, minutes: float) -> list[Row]:
-    """Measure.
+    """Measure share of a core and size, and how much the parameters of the two ways differ.
 
     Parameters
     ----------
@@ -48,23 +40,13 @@ def rows(*, vehicles: int, minutes: float) -> list[Row]:
         Of the fleet; below 8 none is calibrated.
     minutes : float
         Of each drive. [min]
-
-    Returns
-    -------
-    list of Row
-        Share of a core, size, and how much the parameters differ between both ways.
     """
-    database = read_database(read_layout(LAYOUT))
+    database, trips = read_database(read_layout(LAYOUT)), BuiltinTrips(seed=0, duration_s=60 * minutes, unseen_s=60.0)
+    plan = FleetPlan(vehicles=vehicles, currents=3, sparsity=80.0, magnitude=(0.05, 0.25), delay_max_s=0.1)
     with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        plan = FleetPlan(vehicles=vehicles, currents=3, sparsity=80.0, magnitude=(0.05, 0.25), delay_max_s=0.1)
-        simulate_fleet(
-            plan, BuiltinTrips(seed=0, duration_s=60.0 * minutes, unseen_s=60.0), database, folder / "fleet", workers=1
-        )
-        found = _replayed(folder, database)
-        if vehicles >= 8:
-            found += _compared(folder)
-    return found
+        simulate_fleet(plan, trips, database, Path(place) / "fleet", workers=1)
+        found = _replayed(Path(place), database)
+        return found + _compared(Path(place)) if vehicles >= FEWEST else found
 
 
 def _replayed(folder: Path, database: VehicleDatabase) -> list[Row]:
@@ -74,18 +56,12 @@ def _replayed(folder: Path, database: VehicleDatabase) -> list[Row]:
     spent_s = driven_s = 0.0
     for vehicle, entries in fleet.vehicles.items():
         delays = read_vehicle_summary(entries, equipment, database).delays
-        told = {
-            name: (float(delay_s), float(sd_s) if known else None)
-            for name, delay_s, sd_s, known in zip(
-                delays.branches, delays.delay_s, delays.sd_s, delays.known, strict=True
-            )
-        }
+        rows = zip(delays.branches, delays.delay_s, delays.sd_s, delays.known, strict=True)
+        told = {name: (float(delay_s), float(sd_s) if known else None) for name, delay_s, sd_s, known in rows}
         summary = OnBoardSummary(folder / "on_board", vehicle, database, delays=told, say=lambda _: None)
         frames = read_frames(Path(entries[0].place))
-        messages = [
-            (FrameKey(message.arbitration_id, message.is_extended_id), message.data, message.timestamp)
-            for message in frames.messages()
-        ]
+        messages = [(FrameKey(item.arbitration_id, item.is_extended_id), item.data, item.timestamp)
+                    for item in frames.messages()]  # fmt: skip
         started_s = time.process_time()
         for number, message in enumerate(messages):
             summary.take(*message)
@@ -103,20 +79,20 @@ def _replayed(folder: Path, database: VehicleDatabase) -> list[Row]:
 
 def _compared(folder: Path) -> list[Row]:
     """Differences of the drifts and offsets between both ways, over their standard deviations."""
+    found = []
     for name, source in (("of_logs", "fleet"), ("of_nodes", "on_board")):
-        where = ["--layout", str(LAYOUT), "--out", str(folder / name)]
-        command = [sys.executable, "-m", "calibrator", "calibrate", str(folder / source), *where, "--workers", "1"]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    far, verdicts = [], 0
-    for path in sorted((folder / "of_logs" / "params").glob("*.json")):
-        one, other = (
-            json.loads((folder / name / "params" / path.name).read_text()) for name in ("of_logs", "of_nodes")
-        )
-        verdicts += one["verdict"] != other["verdict"]
-        for branch, values in one["branches"].items():
-            for key, sd in (("drift", "drift_sd"), ("offset_a", "offset_sd_a")):
-                if values[sd]:
-                    far.append((values[key] - other["branches"][branch][key]) / values[sd])
+        words = ("calibrate", folder / source, "--layout", LAYOUT, "--out", folder / name, "--workers", "1")
+        subprocess.run([sys.executable, "-m", "calibrator", *words], check=True, stdout=subprocess.DEVNULL)
+        files = sorted((folder / name / "params").glob("*.json"))
+        found.append([json.loads(path.read_text()) for path in files])
+    far = [
+        (values[key] - other["branches"][branch][key]) / values[sd]
+        for one, other in zip(*found, strict=True)
+        for branch, values in one["branches"].items()
+        for key, sd in (("drift", "drift_sd"), ("offset_a", "offset_sd_a"))
+        if values[sd]
+    ]
+    verdicts = sum(one["verdict"] != other["verdict"] for one, other in zip(*found, strict=True))
     return [
         Row(name="difference of parameters, root mean square", value=float(np.std(far)), unit="standard deviations"),
         Row(name="vehicles with another verdict", value=verdicts, unit="vehicles"),
@@ -124,4 +100,7 @@ def _compared(folder: Path) -> list[Row]:
 
 
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--vehicles", type=int, default=24)
+    parser.add_argument("--minutes", type=float, default=20.0)
+    show(rows(**vars(parser.parse_args())))

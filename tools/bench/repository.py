@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,8 @@ from unittest.mock import patch
 from msgspec.structs import replace
 from securesystemslib.signer import SSlibKey
 from tuf.api.metadata import SuccinctRoles
-from tuf.api.serialization.json import CanonicalJSONSerializer, JSONDeserializer
 
+from bench.row import LAYOUT
 from bench.true_parameters import true_parameters
 from calibrator.repository.repository import BIN_BITS
 from ecu_node.database import VehicleDatabase, read_database
@@ -33,8 +33,10 @@ from ecu_node.layout import read_layout
 from ecu_node.parameters import BranchParameters, encode_parameters
 from ecu_node.update.client import provision, update
 
-_LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
-_UPDATES = 20
+KEYS = {"root": "root", "targets": "targets", "snapshot": "online", "timestamp": "online"}
+"""By role."""
+UPDATES = 20
+"""Of which the quickest counts: others on the machine make it longer, nothing makes it shorter."""
 
 
 def calibrator(*words: object) -> float:
@@ -47,11 +49,11 @@ def calibrator(*words: object) -> float:
 
 def sampled(vehicles: int) -> list[int]:
     """The vehicles of one bin, and one of each other bin: bundle and snapshot are those of the whole fleet."""
-    bins = SuccinctRoles([], 1, BIN_BITS, "bins")
-    found: dict[str, list[int]] = {}
+    bins, found = SuccinctRoles([], 1, BIN_BITS, "bins"), dict[str, list[int]]()
     for number in range(vehicles):
         found.setdefault(bins.get_role_for_target(f"V{number:07d}.json"), []).append(number)
-    return [*next(iter(found.values())), *(numbers[0] for numbers in list(found.values())[1:])]
+    first, *others = found.values()
+    return [*first, *(numbers[0] for numbers in others)]
 
 
 def write_parameters(database: VehicleDatabase, folder: Path, vehicles: Iterable[int], drift: float) -> None:
@@ -69,62 +71,39 @@ def write_parameters(database: VehicleDatabase, folder: Path, vehicles: Iterable
 
 def measured(folder: Path, vehicles: Iterable[int]) -> dict[str, float]:
     """Publish twice, and verify one bundle."""
-    database = read_database(read_layout(_LAYOUT))
-    repository, keys, params = folder / "repository", folder / "keys", folder / "params"
-    for name in ("root", "targets", "online"):
+    database, now, found = read_database(read_layout(LAYOUT)), datetime.now(UTC), dict[str, float]()
+    repository, keys, params, state = (folder / name for name in ("repository", "keys", "params", "state"))
+    for name in sorted({*KEYS.values()}):
         calibrator("key", name, "--no-passphrase", "--out", keys)
-    roles = {"root": "root", "targets": "targets", "snapshot": "online", "timestamp": "online"}
-    calibrator(
-        "init", repository, *(word for role, name in roles.items() for word in (f"--{role}", keys / f"{name}.pub"))
-    )
-    private = [word for name in ("root", "targets", "online") for word in ("--key", keys / f"{name}.key")]
-    found: dict[str, float] = {}
+    calibrator("init", repository, *(w for role, name in KEYS.items() for w in (f"--{role}", keys / f"{name}.pub")))
+    private = [word for name in sorted({*KEYS.values()}) for word in ("--key", keys / f"{name}.key")]
     for name, drift in (("first", 0.05), ("all changed", 0.06)):
         write_parameters(database, params, vehicles, drift)
         found[f"{name}: add [s]"] = calibrator("add", repository, params)
         found[f"{name}: publish [s]"] = calibrator("publish", repository, *private)
         print(found, file=sys.stderr)
         if name == "first":
-            provision(folder / "state", "V0000000", repository / "metadata" / "1.root.json", datetime.now(UTC))
-            update(folder / "state", str(repository), database, datetime.now(UTC))
+            provision(state, "V0000000", repository / "metadata" / "1.root.json", now)
+            update(state, str(repository), database, now)
     found["memory [GiB]"] = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
     calibrator("bundle", repository, "V0000000", "--out", folder)
     bundle = folder / "V0000000.json.xz"
     found["bundle [KiB]"] = bundle.stat().st_size / 1024
-    return found | time_to_verify(folder / "state", bundle, database)
+    times_s, signatures_s, verify = [], list[float](), SSlibKey.verify_signature
 
+    def timed(*arguments: Any) -> None:
+        start_s = time.process_time()
+        verify(*arguments)
+        signatures_s.append(time.process_time() - start_s)
 
-def time_to_verify(state: Path, bundle: Path, database: VehicleDatabase) -> dict[str, float]:
-    """Processor time of an update on board, and of its parts, which python-tuf's modules are asked for one by one."""
-    parts_s = dict.fromkeys(("signatures", "canonical JSON", "reading metadata"), 0.0)
-
-    def timed(part: str, work: Callable[..., Any]) -> Callable[..., Any]:
-        def measured_work(*arguments: Any) -> Any:
-            start_s = time.process_time()
-            try:
-                return work(*arguments)
-            finally:
-                parts_s[part] += time.process_time() - start_s
-
-        return measured_work
-
-    def updates_s() -> float:
-        times_s = []
-        for _ in range(_UPDATES):
+    with patch.object(SSlibKey, "verify_signature", timed):
+        for _ in range(UPDATES):
+            signatures_s.clear()
             start_s = time.process_time()
             update(state, str(bundle), database, datetime.now(UTC), dry_run=True)
-            times_s.append(time.process_time() - start_s)
-        return min(times_s)  # others on the machine make it longer, nothing makes it shorter
-
-    found = {"verify [ms]": 1e3 * updates_s()}
-    with (
-        patch.object(SSlibKey, "verify_signature", timed("signatures", SSlibKey.verify_signature)),
-        patch.object(CanonicalJSONSerializer, "serialize", timed("canonical JSON", CanonicalJSONSerializer.serialize)),
-        patch.object(JSONDeserializer, "deserialize", timed("reading metadata", JSONDeserializer.deserialize)),
-    ):
-        updates_s()
-    found |= {f"of this {part} [ms]": 1e3 * total_s / _UPDATES for part, total_s in parts_s.items()}
-    found["verify without signatures [ms]"] = found["verify [ms]"] - found["of this signatures [ms]"]
+            times_s.append((time.process_time() - start_s, sum(signatures_s)))
+    whole_s, of_signatures_s = min(times_s)
+    found["verify [ms]"], found["verify without signatures [ms]"] = 1e3 * whole_s, 1e3 * (whole_s - of_signatures_s)
     return found
 
 

@@ -1,8 +1,15 @@
-"""One figure of the benchmarks, beside that of its peer in the same run."""
+"""One figure of the benchmarks, beside that of its peer in the same run; how it is shown, and how it is asked for."""
 
+import argparse
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-__all__ = ["Row"]
+__all__ = ["LAYOUT", "MEBIBYTE", "Row", "run", "show"]
+
+LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
+MEBIBYTE = 1024.0**2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,3 +35,22 @@ class Row:
     unit: str
     peer: str | None = None
     ratio: float | None = None
+
+
+def show(rows: Sequence[Row]) -> None:
+    """Print a table."""
+    from rich.console import Console  # noqa: PLC0415  # slow, and tests do not need it
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table("what", "figure", "unit", "peer", "times better")
+    for row in rows:
+        ratio = "" if row.ratio is None else f"{row.ratio:.3g}"
+        table.add_row(row.name, f"{row.value:.4g}", row.unit, row.peer or "", ratio)
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
+
+
+def run(rows: Callable[..., Sequence[Row]]) -> None:
+    """Measure one group of benchmarks from the command line."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--quick", action="store_true", help="small sizes: shows that all works")
+    show(rows(quick=parser.parse_args().quick))

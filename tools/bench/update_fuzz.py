@@ -27,9 +27,10 @@ from typing import Any
 
 import msgspec
 from msgspec.structs import replace
-from securesystemslib.signer import CryptoSigner, SSlibKey
+from securesystemslib.signer import CryptoSigner
 from tuf.api.metadata import Metadata
 
+from bench.row import LAYOUT
 from bench.true_parameters import true_parameters
 from calibrator.repository.repository import ROLES, NewKeys, Repository
 from ecu_node.core.status import UnfitError
@@ -40,7 +41,6 @@ from ecu_node.update.client import provision, update
 
 __all__ = ["Vehicle", "WrongAnswerError", "fuzz"]
 
-_LAYOUT = Path(__file__).parents[2] / "dbc" / "hv_powertrain.toml"
 _MEMORY = Path("/dev/shm")  # noqa: S108
 _CHUNK = 1000
 """Bundles that a process takes at a time."""
@@ -62,27 +62,24 @@ class Vehicle:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._state = folder / "state"
-        self._bundle = folder / "bundle.json.xz"
-        self._database = read_database(read_layout(_LAYOUT))
-        signers = {role: CryptoSigner.generate_ed25519() for role in ROLES}
-        keys = {role: NewKeys([_public(signer)], 1) for role, signer in signers.items()}
-        found = Repository.create(folder / "repository", keys)
-        self.bundles = []
+        self._state, self._bundle = folder / "state", folder / "bundle.json.xz"
+        self._database, now = read_database(read_layout(LAYOUT)), datetime.now(UTC)
+        signers: dict[str, Any] = {role: CryptoSigner.generate_ed25519() for role in ROLES}
+        keys = {role: NewKeys([signer.public_key], 1) for role, signer in signers.items()}
+        found, self.bundles = Repository.create(folder / "repository", keys), list[bytes]()
         for drift in (0.05, 0.06):
-            for vehicle in ("bench", "other"):
+            for name in ("bench", "other"):
                 branch = BranchParameters(drift=drift, offset_a=1.0, apply=True)
                 parameters = true_parameters(self._database, {"battery": branch})
-                path = folder / f"{vehicle}.json"
-                path.write_bytes(encode_parameters(replace(parameters, vehicle=vehicle), "fuzz"))
+                path = folder / f"{name}.json"
+                path.write_bytes(encode_parameters(replace(parameters, vehicle=name), "fuzz"))
                 found.add([path], days=365, allow_large_step=False)
             list(found.publish(list(signers.values())))
             found = Repository(folder / "repository")
             self.bundles.append(found.bundle("bench"))
             if drift == 0.05:
-                provision(self._state, "bench", folder / "repository" / "metadata" / "1.root.json", datetime.now(UTC))
-                self._bundle.write_bytes(self.bundles[0])
-                update(self._state, str(self._bundle), self._database, datetime.now(UTC))
+                provision(self._state, "bench", folder / "repository" / "metadata" / "1.root.json", now)
+                self.update(self.bundles[0])
         self._files = [msgspec.json.decode(lzma.decompress(item), type=dict[str, str]) for item in self.bundles]
         self._held = (self._state / "state.json").read_bytes()
 
@@ -90,19 +87,18 @@ class Vehicle:
         """The second bundle, changed in one place or a few."""
         if rng.random() < 0.75:
             return changed_bytes(rng, self.bundles[1])
-        files = {name: text.encode() for name, text in self._files[1].items()}
-        name = rng.choice(sorted(files))
-        kind = rng.randrange(4)
+        first, files = self._files
+        texts = dict(files)
+        name, kind = rng.choice(sorted(texts)), rng.randrange(4)
         if kind == 0:
-            files[name] = changed_bytes(rng, files[name])
+            texts[name] = changed_bytes(rng, texts[name].encode()).decode(errors="replace")
         elif kind == 1:
-            files[name] = json.dumps(changed_value(rng, json.loads(files[name]))).encode()
-        elif kind == 2:
-            old = {key.partition(".")[2] if "root" not in key else key: text for key, text in self._files[0].items()}
-            files[name] = old.get(name.partition(".")[2], rng.choice(list(self._files[0].values()))).encode()
+            texts[name] = json.dumps(changed_value(rng, json.loads(texts[name])))
+        elif kind == 2:  # of the first publication: the file of this name, whatever its version
+            old = {key.partition(".")[2]: text for key, text in first.items() if "root" not in key}
+            texts[name] = old.get(name.partition(".")[2], rng.choice(list(first.values())))
         else:
-            del files[name]
-        texts = {key: text.decode(errors="replace") for key, text in files.items()}
+            del texts[name]
         packed = json.dumps(texts, ensure_ascii=False).encode(errors="replace")
         return lzma.compress(packed, check=lzma.CHECK_SHA256, preset=0)  # as bundle_bytes, but quickly
 
@@ -135,19 +131,13 @@ class Vehicle:
 
     def _is_same(self, content: bytes) -> bool:
         """Whether TUF reads all that is signed in the files that count as before, as where a space was added."""
-        files = msgspec.json.decode(lzma.decompress(content), type=dict[str, str])
 
         def signed(texts: dict[str, str]) -> dict[str, Any]:
             newest = {name: text for name, text in texts.items() if name.startswith("metadata") and "root" not in name}
             return {name: Metadata.from_bytes(text.encode()).signed for name, text in newest.items()}
 
+        files = msgspec.json.decode(lzma.decompress(content), type=dict[str, str])
         return signed(files) == signed(self._files[1])
-
-
-def _public(signer: CryptoSigner) -> SSlibKey:
-    key = signer.public_key
-    assert isinstance(key, SSlibKey)
-    return key
 
 
 def changed_bytes(rng: Random, content: bytes) -> bytes:
@@ -248,10 +238,7 @@ def main() -> int:
     start_s, done = time.monotonic(), 0
     parts = [range(first, min(first + _CHUNK, options.bundles)) for first in range(0, options.bundles, _CHUNK)]
     in_memory = _MEMORY if os.access(_MEMORY, os.W_OK) else None
-    with (
-        tempfile.TemporaryDirectory(prefix="fuzz-", dir=in_memory) as name,
-        multiprocessing.Pool(options.processes) as pool,
-    ):
+    with tempfile.TemporaryDirectory(dir=in_memory) as name, multiprocessing.Pool(options.processes) as pool:
         try:
             for refused in pool.imap_unordered(functools.partial(fuzz, folder=Path(name), seed=options.seed), parts):
                 done += refused

@@ -234,11 +234,14 @@ def test_what_python_can_complains_of_is_counted_and_not_printed(
 
 
 def test_reading_mf4_ends_at_its_time_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mf4, "START_S", 0.01)
-    path = tmp_path / "drive.mf4"
-    path.write_bytes(b"MDF")
-    with pytest.raises(LogError, match="was ended"):
-        read_frames(path)
+    path = write_log(tmp_path / "drive.mf4", some_messages(20))
+    mf4._process.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setattr(mf4, "START_S", 1e-5)
+        patch.setattr(mf4, "BYTES_PER_S", 1e9)
+        with pytest.raises(LogError, match="was ended"):
+            read_frames(path)
+    assert len(read_frames(path)) == 20, "the next file finds another process"
 
 
 def test_mf4_without_asammdf_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

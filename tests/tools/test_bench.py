@@ -1,0 +1,48 @@
+"""Benchmarks give a figure of every kind at small size, each of something that worked; how large it is, is for them."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from bench import ingest, posterior
+from bench.fleet_run import resident_bytes
+from bench.node import core_rows, process_rows
+
+
+def test_memory_is_that_of_the_process_and_its_children() -> None:
+    alone = resident_bytes(os.getpid())
+    code = "import sys; ballast = b'x' * 200_000_000; print(flush=True); sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        together = resident_bytes(os.getpid())
+        child.kill()
+    assert together > alone + 200_000_000
+
+
+def test_both_modes_of_the_node_stand_beside_cantools() -> None:
+    found = core_rows(2)  # which compares what the two make of each frame
+    assert [row.name.split(", ")[1] for row in found] == ["overlay", "gateway"]
+    assert all(row.ratio is not None and "cantools" in (row.peer or "") for row in found)
+
+
+def test_a_real_process_starts_and_keeps_its_memory() -> None:
+    found = process_rows(300)
+    assert [row.unit for row in found] == ["s", "s", "MiB", "MiB"]
+    assert all(row.value > 0.0 for row in found if "growth" not in row.name)
+
+
+@pytest.mark.long
+def test_both_ways_of_reading_give_the_same_channels_and_a_figure_each() -> None:
+    found = {row.name: row for row in ingest.rows(quick=True)}  # compares the channels of both ways
+    assert [row.unit for row in found.values()] == ["frames/s"] * 4 + ["h/s"] * 6
+    assert all((found[f"{name} log to drive"].ratio or 0.0) > 1.0 for name in ("BLF", "candump", "ASC"))
+
+
+@pytest.mark.long
+def test_posterior_stands_beside_basis_pursuit() -> None:
+    found = {row.name: row for row in posterior.rows(quick=True)}
+    assert sum(row.peer is not None for row in found.values()) == 4
+    assert all(f"posterior, K = {K}, S = {S} %" in found for K in (2, 3, 4, 5, 6, 8) for S in (80, 60))
