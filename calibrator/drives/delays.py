@@ -29,7 +29,7 @@ from calibrator.drive import Array, Drive, Mask
 from calibrator.drives.charge import Band, ChargeCurve, charge_curve, covered
 from calibrator.errors import DriveError
 
-__all__ = ["BranchDelays", "estimate_delays", "search_lags", "without_delays"]
+__all__ = ["BranchDelays", "estimate_delays", "without_delays"]
 
 MAX_DELAY_S = 0.5
 """Filters and gateways of real cars delay by tens to hundreds of milliseconds. [s]"""
@@ -179,7 +179,7 @@ def estimate_delays(drives: Sequence[Drive], branches: Sequence[str], *, max_sd_
     telling = _most_telling(stretches, band, blocks)
     found = _Fit(
         gain=np.ones(len(branches) - 1),
-        delay_s=search_lags([(part.curves, part.time_s) for part in telling], band),
+        delay_s=_search_lags(telling, band),
         sd_s=np.zeros(len(branches) - 1),
         free=np.ones(len(branches) - 1, np.bool_),
     )
@@ -279,33 +279,22 @@ def _most_telling(stretches: Sequence[_Stretch], band: Band, blocks: int) -> Seq
 # ---- first guess
 
 
-def search_lags(parts: Sequence[tuple[tuple[ChargeCurve, ...], Array]], band: Band) -> Array:
-    """Find the lags on a grid that make the junction sum smallest, gains free.
+def _search_lags(parts: Sequence[_Stretch], band: Band) -> Array:
+    """How much later than the first branch the others are seen, in whole steps of a grid, shape (K-1,). [s]
 
-    The second moments of the bands of all branches at all lags are gathered once; every combination of lags is then a
-    small least-squares problem made of some of them. Two branches at a time take their best lags with those of the
-    others held: branches that do much the same, as two motors, pull each other's lag off when searched one by one.
-
-    Parameters
-    ----------
-    parts : sequence of (curves, time_s)
-        Currents of the K branches on each drive of one vehicle, and the instants to look at, shape (T,). [s]
-    band : Band
-        Windows of the averages.
-
-    Returns
-    -------
-    ndarray of shape (K-1,)
-        How much later than the first branch the others are seen, in whole steps of the grid. [s]
+    With these lags the junction sum is smallest, gains free. The second moments of the bands of all branches at all
+    lags are gathered once; every combination of lags is then a small least-squares problem made of some of them. Two
+    branches at a time take their best lags with those of the others held: branches that do much the same, as two
+    motors, pull each other's lag off when searched one by one.
     """
     reach = int(MAX_DELAY_S / LAG_STEP_S)
-    width, K = 2 * reach + 1, len(parts[0][0])
+    width, K = 2 * reach + 1, len(parts[0].curves)
     lags_s = LAG_STEP_S * np.arange(-reach, reach + 1)
-    thinning = -(-sum(len(time_s) for _, time_s in parts) // SEARCHED_INSTANTS)
+    thinning = -(-sum(len(part.time_s) for part in parts) // SEARCHED_INSTANTS)
     moments = np.zeros((K * width, K * width))
-    for curves, time_s in parts:
-        instants = (time_s[::thinning, None] + lags_s).ravel()
-        z = np.hstack([curve.band(instants, band)[0].reshape(-1, width) for curve in curves])
+    for part in parts:
+        instants = (part.time_s[::thinning, None] + lags_s).ravel()
+        z = np.hstack([curve.band(instants, band)[0].reshape(-1, width) for curve in part.curves])
         moments += z.T @ z
     column = reach + width * np.arange(K)
     for group in [*combinations(range(1, K), min(2, K - 1))] * SWEEPS:

@@ -7,7 +7,7 @@ interpolated. Every branch keeps the instants of its own frames or rows. Current
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -30,7 +30,6 @@ from ecu_node.layout import Branch, split_signal
 from ecu_node.summary import codes_of_no_value
 
 __all__ = [
-    "ChannelReport",
     "FrameSource",
     "Recording",
     "RecordingReport",
@@ -50,32 +49,14 @@ MOST_STRAY = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChannelReport:
-    """What a log holds of one branch or input.
-
-    Attributes
-    ----------
-    name, signal : str
-        Name in the layout; ``Message.Signal`` in the DBC.
-    frames, not_good : int
-        Frames that carry it, and how many of them are labelled as not good.
-    """
-
-    name: str
-    signal: str
-    frames: int
-    not_good: int
-
-
-@dataclass(frozen=True, kw_only=True)
 class RecordingReport:
     """What a log holds, and what of it could not be used.
 
     Attributes
     ----------
-    channels : tuple of ChannelReport
-        All branches and inputs of the layout, in its order.
-    frames, error_frames, remote_frames, damaged : int
+    channels : collection of (str, Channel)
+        All branches and inputs of the layout by name, in its order.
+    frames, error_frames, damaged : int
         Counts over the whole log; rows of a table are its frames.
     disordered, clock_steps : int
         Frames logged before an earlier one; steps of the clock that became gaps.
@@ -88,10 +69,9 @@ class RecordingReport:
         have, columns of branches whose cells are no numbers; empty for nothing.
     """
 
-    channels: tuple[ChannelReport, ...]
+    channels: Collection[tuple[str, Channel]]
     frames: int
     error_frames: int = 0
-    remote_frames: int = 0
     damaged: int = 0
     disordered: int = 0
     clock_steps: int = 0
@@ -101,13 +81,17 @@ class RecordingReport:
 
     def notices(self) -> list[Notice]:
         """Return what a user should know; empty if the log is whole and sound."""
-        absent = ", ".join(item.name for item in self.channels if not item.frames)
-        spoilt = [
-            Notice(text=f"{item.name}: {{}} of {{}} frames not usable", counts=(item.not_good, item.frames))
-            for item in self.channels
-            if item.not_good
+        absent = ", ".join(name for name, channel in self.channels if not channel.time_s.size)
+        spoilt = {name: (int(np.sum(~channel.good)), len(channel.good)) for name, channel in self.channels}
+        return [
+            *([Notice(text=f"no frames of {absent}")] if absent else []),
+            *(
+                Notice(text=f"{n}: {{}} of {{}} frames not usable", counts=counts)
+                for n, counts in spoilt.items()
+                if counts[0]
+            ),
+            *self.log_notices(),
         ]
-        return [*([Notice(text=f"no frames of {absent}")] if absent else []), *spoilt, *self.log_notices()]
 
     def log_notices(self) -> list[Notice]:
         """Return those of the notices that concern the log as a whole, not single channels."""
@@ -195,11 +179,6 @@ def _recording(source: "SignalSource", vehicle: str, name: str) -> Recording:
         raise LogError(what, "check that layout and log belong to the same vehicle and bus")
     inputs = {item.name: source.samples(item.signal)[0] for item in layout.input}
     corrected = {branch.name: source.branch(branch, branch.corrected) for branch in layout.branch if branch.corrected}
-    signals = {branch.name: branch.source for branch in layout.branch} | {i.name: i.signal for i in layout.input}
-    channels = tuple(
-        ChannelReport(name=key, signal=signals[key], frames=len(c.time_s), not_good=int(np.sum(~c.good)))
-        for key, c in (branches | inputs).items()
-    )
     drive = Drive(
         vehicle=vehicle,
         name=name,
@@ -207,7 +186,7 @@ def _recording(source: "SignalSource", vehicle: str, name: str) -> Recording:
         inputs={key: channel for key, channel in inputs.items() if channel.good.any()},
     )
     corrected = {key: channel for key, channel in corrected.items() if channel.time_s.size}
-    return Recording(drive=drive, corrected=corrected, report=source.report(channels))
+    return Recording(drive=drive, corrected=corrected, report=source.report(tuple((branches | inputs).items())))
 
 
 class SignalSource(ABC):
@@ -241,7 +220,7 @@ class SignalSource(ABC):
         """What the recording has and what the branches need, for a message."""
 
     @abstractmethod
-    def report(self, channels: tuple[ChannelReport, ...]) -> RecordingReport:
+    def report(self, channels: Collection[tuple[str, Channel]]) -> RecordingReport:
         """The account of the recording."""
 
     def branch(self, branch: Branch, signal_name: str) -> Channel:
@@ -336,7 +315,7 @@ class FrameSource(SignalSource):
             f"{expected or 'signals of the inputs'}{wanted}"
         )
 
-    def report(self, channels: tuple[ChannelReport, ...]) -> RecordingReport:  # noqa: D102 (as above)
+    def report(self, channels: Collection[tuple[str, Channel]]) -> RecordingReport:  # noqa: D102 (as above)
         here = self.frames.channels
         lacking = ", ".join(channel for channel in self._named if channel not in here)
         unfit = (
@@ -347,7 +326,6 @@ class FrameSource(SignalSource):
             channels=channels,
             frames=len(self.frames),
             error_frames=self.frames.error_frames,
-            remote_frames=self.frames.remote_frames,
             damaged=self.frames.damaged,
             disordered=self.time.disordered,
             clock_steps=self.time.clock_steps,
@@ -415,7 +393,7 @@ class TableSource(SignalSource):
         expected = ", ".join(repr(branch.source) for branch in self.database.layout.branch)
         return f"{self.table.known(self.database.layout.branch[0].source)}; expected {expected}"
 
-    def report(self, channels: tuple[ChannelReport, ...]) -> RecordingReport:  # noqa: D102 (as above)
+    def report(self, channels: Collection[tuple[str, Channel]]) -> RecordingReport:  # noqa: D102 (as above)
         names = [item.source for item in self.database.layout.branch if not item.computed]
         return RecordingReport(
             channels=channels,

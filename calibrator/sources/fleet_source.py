@@ -9,7 +9,7 @@ vehicles whose name stands for two folders, and drives that two files claim, are
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -137,9 +137,7 @@ def find_fleet(place: str | Path) -> FleetSource:
         raise FleetError(f"{place}: no drive in it{few_reasons(fleet.left_out)}")
     beside = storage.url.rpartition("/")[0] if folder is storage and Path(storage.url).is_file() else folder.url
     ids = read_fleet_ids(storage.url if folder.url.endswith(f"/{DRIVES_FOLDER}") else beside)
-    return FleetSource(
-        place=str(place), vehicles=fleet.vehicles, left_out=fleet.left_out, sizes=fleet.sizes, fleet_ids=ids
-    )
+    return replace(fleet, place=str(place), fleet_ids=ids)
 
 
 def find_logs(arguments: Iterable[str | Path]) -> FleetSource:
