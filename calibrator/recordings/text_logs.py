@@ -248,7 +248,7 @@ def _candump_line(  # noqa: PLR0911 (a line is judged from left to right)
     if at == len(text):
         return NOTHING, 0, 0
     time_ns, fraction, at = _time(text, at + 1) if text[at] == ord("(") else (-1, 0, at)
-    if time_ns < 0 or fraction not in (6, 9) or at + 1 >= len(text) or text[at] != ord(")"):
+    if time_ns < 0 or fraction not in (6, 9) or at + 1 >= len(text) or text[at] != ord(")") or text[at + 1] != ord(" "):
         return DAMAGED, 0, 0
     first, last = _word(text, at + 1)
     at, end = _word(text, last)
@@ -359,7 +359,7 @@ def _time(text: _Text, at: int) -> tuple[int, int, int]:
         elif time_ns < 10**11:
             time_ns = 10 * time_ns + (text[at] - ord("0"))
         at += 1
-    digits = at - point - 1 if point > start else -1
+    digits = at - point - 1 if point >= start else -1
     if digits < 0 or digits > _NANOSECOND_DIGITS or seconds >= 9 * 10**9:
         return -1, digits, at
     for _ in range(digits, _NANOSECOND_DIGITS):

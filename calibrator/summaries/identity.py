@@ -1,6 +1,7 @@
 """What a store of summaries is of: summaries add up only if branches, inputs, filters and time base are the same."""
 
 import hashlib
+from typing import Annotated
 
 import msgspec
 
@@ -51,13 +52,13 @@ class StoreIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     layout: str
     layout_sha256: str
     dbc_sha256: str
-    branches: tuple[str, ...]
+    branches: Annotated[tuple[str, ...], msgspec.Meta(min_length=2)]
     inputs: tuple[str, ...]
     fleet_inputs: tuple[str, ...]
     notices: tuple[str, ...]
     bank: FilterBank
     block_s: float
-    buckets: int
+    buckets: Annotated[int, msgspec.Meta(ge=FEWEST_BUCKETS, le=MOST_BUCKETS)]
     fleet: str
     fleet_ids: tuple[str, ...] = ()
 
@@ -175,32 +176,14 @@ def read_identity(storage: Storage, database: VehicleDatabase | None = None) -> 
         identity = msgspec.convert(raw, StoreIdentity)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, DriveError) as error:
         raise FleetError(f"{where}: not a store of summaries: {error}; summarise the drives again") from None
-    if problem := _problem(identity, database):
-        raise FleetError(f"{where}: {problem}; summarise the drives again, into another store")
+    if database is None:
+        return identity
+    layout = database.layout
+    for what, its, mine in (
+        (f"another layout than {layout.path}", identity.layout_sha256, layout.digest),
+        (f"another DBC than {layout.dbc_path}", identity.dbc_sha256, database.digest),
+        (f"blocks of {identity.block_s:g} s, not {BLOCK_S:g} s", identity.block_s, BLOCK_S),
+    ):
+        if its != mine:
+            raise FleetError(f"{where}: made with {what}; summarise the drives again, into another store")
     return identity
-
-
-def _problem(identity: StoreIdentity, database: VehicleDatabase | None) -> str:
-    """Why a store cannot be used with a layout, or at all; empty if it can."""
-    wrong = {
-        f"{identity.buckets} buckets, expected {FEWEST_BUCKETS} to {MOST_BUCKETS}": not (
-            FEWEST_BUCKETS <= identity.buckets <= MOST_BUCKETS
-        ),
-        f"blocks of {identity.block_s:g} s, expected {BLOCK_S:g} s": identity.block_s != BLOCK_S,
-    }
-    if database is not None:
-        layout = database.layout
-        wrong[f"made with another layout than {layout.path}"] = identity.layout_sha256 != layout.digest
-        wrong[f"made with another DBC than {layout.dbc_path}"] = identity.dbc_sha256 != database.digest
-        inputs = {item.name for item in layout.input} | {item.name for item in layout.derived}
-        for what, names, known, fewest in (
-            ("branches", identity.branches, set(layout.branch_names), 2),
-            ("inputs", identity.inputs, inputs, 1),
-            ("fleet_inputs", identity.fleet_inputs, inputs, 0),
-            ("inputs of the bank", identity.bank.input_names, set(identity.fleet_inputs), len(identity.fleet_inputs)),
-        ):
-            shown = f"{what} {', '.join(names) or 'none'}"
-            wrong[f"{shown}; expected {fewest} or more different ones of {', '.join(sorted(known))}"] = (
-                len(names) < fewest or len(set(names)) < len(names) or not known.issuperset(names)
-            )
-    return next((text for text, is_wrong in wrong.items() if is_wrong), "")

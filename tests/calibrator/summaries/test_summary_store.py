@@ -224,23 +224,12 @@ def test_a_store_of_another_layout_version_or_content_is_refused(tmp_path: Path,
         ((identity.layout_sha256, "0" * 64), "made with another layout than"),
         ((identity.dbc_sha256, "0" * 64), "made with another DBC than"),
         ((f'"schema_version": {SCHEMA_VERSION}', '"schema_version": 99'), "schema version 99, expected"),
-        (('"block_s": 30.0', '"block_s": 60.0'), "blocks of 60 s, expected 30 s"),
+        (('"block_s": 30.0', '"block_s": 60.0'), "made with blocks of 60 s, not 30 s"),
         (("{", "[", 1), "not a store of summaries"),
         (('"branches"', '"branchs"'), "not a store of summaries"),
         (("{", 2000 * "[", 1), "not a store of summaries"),
-        (('"buckets": 16', '"buckets": 0'), "0 buckets, expected 16 to 32768"),
-        (('"buckets": 16', '"buckets": 40000'), "40000 buckets, expected 16 to 32768"),
-        (('    "motor"', '    "steam"'), "branches battery, steam; expected 2 or more different ones of auxiliary, "),
-        (('    "motor"', '    "battery"'), "branches battery, battery; expected 2 or more different ones of"),
-        (
-            ('    "torque"', '    "magic"', 1),
-            "fleet_inputs speed, magic, voltage; expected 0 or more different ones of",
-        ),
-        (
-            ('"input_names": [\n      "speed"', '"input_names": [\n      "torque2"'),
-            "inputs of the bank torque2, torque",
-        ),
-        (('"period_s": 1.0', '"period_s": 0.0'), "filter bank: period 0.0 s; expected a positive number; summarise"),
+        (('"buckets": 16', '"buckets": 0'), r"not a store of summaries: Expected `int` >= 16 - at `\$.buckets`"),
+        (('"period_s": 1.0', '"period_s": 0.0'), "filter bank: period 0.0 s; expected a positive number"),
     ):
         path.write_text(text.replace(*change))
         assert path.read_text() != text
