@@ -9,7 +9,7 @@ import hashlib
 import io
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ import pyarrow.parquet as pq
 from calibrator.drive import Channel, Drive, DriveFile
 from calibrator.errors import DriveError
 from calibrator.files.storage import Storage, StorageError, open_storage
-from ecu_node.errors import UserError
 from ecu_node.layout import Layout
 
 __all__ = [
@@ -150,21 +149,10 @@ def list_drives(store: Path) -> list[DriveFile]:
     return [DriveFile(vehicle=path.parent.name, name=path.stem, place=str(path)) for path in paths]
 
 
-def iterate_drives(
-    store: Path, layout: Layout, *, on_error: Callable[[UserError], None] | None = None
-) -> Iterator[Drive]:
-    """Read the drives of a store of this machine, made with this layout, in the order of :func:`list_drives`.
-
-    ``on_error`` is called with the error of a file that cannot be used, which is then left out; by default the error is
-    raised.
-    """
+def iterate_drives(store: Path, layout: Layout) -> Iterator[Drive]:
+    """Read the drives of a store of this machine, made with this layout, in the order of :func:`list_drives`."""
     for entry in list_drives(store):
-        try:
-            yield read_drive_file(Path(entry.place), layout)
-        except UserError as error:
-            if on_error is None:
-                raise
-            on_error(error)
+        yield read_drive_file(Path(entry.place), layout)
 
 
 def is_drive_file(path: Path) -> bool:

@@ -95,8 +95,8 @@ def sent_values(signal: Signal, values: Array) -> Array:
     return np.asarray(_raw_codes(signal, values) * float(signal.scale) + float(signal.offset))
 
 
-def write_candump(path: Path, series: Iterable[FrameSeries], *, start_s: float = 0.0, channel: str = "can0") -> int:
-    """Write frames in the order of their instants as ``candump -L`` does.
+def write_candump(path: Path, series: Iterable[FrameSeries]) -> int:
+    """Write frames of can0 in the order of their instants as ``candump -L`` does.
 
     Parameters
     ----------
@@ -104,10 +104,6 @@ def write_candump(path: Path, series: Iterable[FrameSeries], *, start_s: float =
         ``.log``, or ``.log.gz`` to compress.
     series : iterable of FrameSeries
         The frames, one series per identifier.
-    start_s : float
-        Time of instant 0 since 1970. [s]
-    channel : str
-        Interface named in the log.
 
     Returns
     -------
@@ -122,7 +118,7 @@ def write_candump(path: Path, series: Iterable[FrameSeries], *, start_s: float =
         width = 2 * item.data.shape[1]
         separator = "#" if item.data.shape[1] <= CLASSIC_BYTES else "##1"
         lines += [
-            f"({start_s + t:.6f}) {channel} {name}{separator}{text[k * width : (k + 1) * width]}\n"
+            f"({t:.6f}) can0 {name}{separator}{text[k * width : (k + 1) * width]}\n"
             for k, t in enumerate(item.time_s.tolist())
         ]
         times.append(item.time_s)

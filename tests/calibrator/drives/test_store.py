@@ -10,7 +10,6 @@ from calibrator.drive import Channel, Drive
 from calibrator.drives.store import iterate_drives, list_drives, read_drive_file, write_drive
 from calibrator.errors import DriveError
 from ecu_node.database import VehicleDatabase
-from ecu_node.errors import UserError
 from ecu_node.layout import Layout, read_layout
 
 
@@ -80,16 +79,6 @@ def test_another_schema_version_is_refused(tmp_path: Path, layout: Layout) -> No
     pq.write_table(table.replace_schema_metadata({b"calibrator.drive": json.dumps(about)}), path)
     with pytest.raises(DriveError, match="schema version 99, expected 1"):
         read_drive_file(path, layout)
-
-
-def test_one_bad_file_does_not_stop_the_others(tmp_path: Path, layout: Layout) -> None:
-    Path(write_drive(tmp_path, some_drive("V1"), layout)).write_bytes(b"")
-    write_drive(tmp_path, some_drive("V2"), layout)
-    errors: list[UserError] = []
-    assert [drive.vehicle for drive in iterate_drives(tmp_path, layout, on_error=errors.append)] == ["V2"]
-    assert len(errors) == 1
-    with pytest.raises(DriveError, match="not a drive"):
-        list(iterate_drives(tmp_path, layout))
 
 
 def test_a_folder_that_is_no_store_is_refused(tmp_path: Path) -> None:
